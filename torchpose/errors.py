@@ -1,0 +1,15 @@
+"""The errors that torchpose raises on purpose. Each message is one line that names the file, the field and the fix."""
+
+from __future__ import annotations
+
+
+class TorchposeError(Exception):
+    """Base of every deliberate error; the command line prints its message alone and exits with 2."""
+
+
+class ConfigError(TorchposeError):
+    """A camera, target, pipeline or hand-eye file, or a command-line argument, is wrong."""
+
+
+class FrameError(TorchposeError):
+    """Frames of a wrong size, type or value range were passed to a stage."""
