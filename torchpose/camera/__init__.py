@@ -1,0 +1,5 @@
+"""Camera models and their files."""
+
+from torchpose.camera.model import Camera
+
+__all__ = ["Camera"]

@@ -1,0 +1,285 @@
+"""Pinhole camera with Brown-Conrady (rational) or Kannala-Brandt distortion: projection, undistortion, Jacobian."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal, get_args
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchpose.errors import ConfigError
+
+Model = Literal["brown_conrady", "kannala_brandt"]
+_MAX_ITERATIONS = 60
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """Intrinsic calibration of one camera; the conventions and coefficients of OpenCV.
+
+    Pixel centres lie at integer coordinates, u to the right, v down. With normalised coordinates x = X/Z, y = Y/Z and
+    r^2 = x^2 + y^2, the distorted normalised point is
+
+    - brown_conrady (Brown 1971; rational radial part as in OpenCV), coefficients k1 k2 p1 p2 [k3 [k4 k5 k6]]:
+      s = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6),
+      (s x + 2 p1 x y + p2 (r^2 + 2 x^2), s y + p1 (r^2 + 2 y^2) + 2 p2 x y);
+    - kannala_brandt (Kannala, Brandt 2006), coefficients k1 k2 k3 k4, with theta = atan(r):
+      (x, y) theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) / r.
+
+    Attributes:
+        width, height: size of the frame, px.
+        matrix: (3, 3) float64, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] px. Skew is rejected: none of the file formats but
+            the bare matrix could hold it, and OpenCV ignores it.
+        distortion: (0|4|5|8,) float64 for brown_conrady, (4,) for kannala_brandt. The 12 or 14 coefficients of OpenCV's
+            thin-prism and tilted models are accepted where those beyond the eighth are zero.
+        model: which of the two.
+        covariance: (4, 4) float64 of fx, fy, cx, cy in px^2, or None.
+
+    Arguments may be anything that `torch.as_tensor` accepts. All methods take any leading dimensions (...), work in the
+    dtype and on the device of their points, and are differentiable in the points, ``matrix`` and ``distortion``.
+
+    Raises:
+        ConfigError: a field is wrong; the message names it as the native camera file does.
+    """
+
+    width: int
+    height: int
+    matrix: Tensor
+    distortion: Tensor
+    model: Model = "brown_conrady"
+    covariance: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        for name, field in (
+            ("matrix", "camera_matrix"),
+            ("distortion", "distortion_coefficients"),
+            ("covariance", "camera_matrix_covariance"),
+        ):
+            value = getattr(self, name)
+            if value is None and name == "covariance":
+                continue
+            if not (isinstance(value, Tensor) and value.is_floating_point()):
+                try:
+                    value = torch.as_tensor(value, dtype=torch.float64)
+                except (ValueError, TypeError, RuntimeError):
+                    raise ConfigError(f"{field}: is not a table of numbers; write numbers only") from None
+            if not bool(value.detach().isfinite().all()):
+                raise ConfigError(f"{field}: holds NaN or infinity; calibrate again or correct the entry")
+            object.__setattr__(self, name, value)
+        for field, size in (("image_width", self.width), ("image_height", self.height)):
+            if isinstance(size, bool) or not isinstance(size, int) or size <= 0:
+                raise ConfigError(f"{field}: is {size!r}; give the frame size as a positive integer, in px")
+        self._check_matrix()
+        self._check_distortion()
+        self._check_covariance()
+
+    def _check_matrix(self) -> None:
+        m = self.matrix.detach()
+        if m.shape != (3, 3):
+            raise ConfigError(f"camera_matrix: has shape {tuple(m.shape)}; give 3 rows of 3")
+        (fx, skew, _), (below, fy, _), last = m.tolist()
+        if last != [0, 0, 1]:
+            raise ConfigError(f"camera_matrix: last row is {last}; write [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+        if skew or below:
+            raise ConfigError(f"camera_matrix: has a skew entry ({skew or below}); calibrate without skew and write 0")
+        for name, f in (("fx", fx), ("fy", fy)):
+            if f <= 0:
+                raise ConfigError(f"camera_matrix: focal length {name} is {f}; give a positive number of px")
+
+    def _check_distortion(self) -> None:
+        d = self.distortion.detach()
+        if self.model not in get_args(Model):
+            raise ConfigError(f"distortion_model: is {self.model!r}; known are {', '.join(get_args(Model))}")
+        if d.ndim != 1:
+            raise ConfigError(f"distortion_coefficients: has shape {tuple(d.shape)}; give one list")
+        n = len(d)
+        if self.model == "brown_conrady" and n in (12, 14):
+            if bool(d[8:].any()):
+                raise ConfigError(
+                    "distortion_coefficients: thin-prism or tilted terms are not zero; calibrate with 8 coefficients"
+                )
+            object.__setattr__(self, "distortion", self.distortion[:8])
+        elif n not in ((4,) if self.model == "kannala_brandt" else (0, 4, 5, 8)):
+            wanted = "k1 k2 k3 k4" if self.model == "kannala_brandt" else "none or k1 k2 p1 p2 [k3 [k4 k5 k6]]"
+            raise ConfigError(f"distortion_coefficients: {n} coefficients for {self.model}; give {wanted}")
+
+    def _check_covariance(self) -> None:
+        if self.covariance is None:
+            return
+        c = self.covariance.detach()
+        if c.shape != (4, 4):
+            raise ConfigError(f"camera_matrix_covariance: has shape {tuple(c.shape)}; give 4 x 4 for fx fy cx cy")
+        slack = c.abs().max() * (1e-9 if c.dtype == torch.float64 else 1e-5)
+        if bool((c - c.T).abs().max() > slack):
+            raise ConfigError("camera_matrix_covariance: is not symmetric; give the covariance of fx fy cx cy in px^2")
+        if bool(torch.linalg.eigvalsh(c)[0] < -slack):
+            raise ConfigError(
+                "camera_matrix_covariance: has a negative eigenvalue; give the covariance of fx fy cx cy in px^2"
+            )
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Camera:
+        """Reads a camera file in any of the formats of `torchpose.camera.formats`; ``FILE#cam1`` picks one of several.
+
+        Raises:
+            ConfigError: one line ``FILE: FIELD: what is wrong; the fix``.
+        """
+        from torchpose.camera import formats
+
+        return formats.load(path)
+
+    def save(
+        self, path: str | os.PathLike[str], format: Literal["opencv", "json", "ros", "kalibr", "colmap"] | None = None
+    ) -> None:
+        """Writes the camera file in one piece; see `torchpose.camera.formats.save`.
+
+        Raises:
+            ConfigError: the format cannot hold this camera, or the file cannot be written.
+        """
+        from torchpose.camera import formats
+
+        formats.save(self, path, format)
+
+    def to(self, *args: Any, **kwargs: Any) -> Camera:
+        """Same as `Tensor.to` on every tensor; ``self`` where nothing changes."""
+        matrix, distortion = self.matrix.to(*args, **kwargs), self.distortion.to(*args, **kwargs)
+        covariance = None if self.covariance is None else self.covariance.to(*args, **kwargs)
+        if matrix is self.matrix and distortion is self.distortion and covariance is self.covariance:
+            return self
+        return replace(self, matrix=matrix, distortion=distortion, covariance=covariance)
+
+    @cached_property
+    def fold_radius(self) -> float:
+        """Largest normalised radius r up to which the radial distortion grows with r (inf where it always does).
+
+        Beyond it the model folds back onto the image and has no inverse.
+        """
+        d = np.zeros(8)
+        d[: len(self.distortion)] = self.distortion.detach().cpu().double().numpy()
+        if self.model == "kannala_brandt":
+            # derivative of theta (1 + k1 theta^2 + ...) as a polynomial in theta^2
+            growth = np.polynomial.Polynomial([1.0, *(d[:4] * [3, 5, 7, 9])])
+            theta = math.sqrt(_first_positive_root(growth))
+            return math.tan(theta) if theta < math.pi / 2 else math.inf
+        n = np.polynomial.Polynomial([1.0, d[0], d[1], d[4]])
+        q = np.polynomial.Polynomial([1.0, *d[5:8]])
+        u = np.polynomial.Polynomial([0.0, 1.0])
+        # numerator of d/dr of r n(r^2) / q(r^2), and the pole
+        growth = n * q + 2 * u * (n.deriv() * q - n * q.deriv())
+        return math.sqrt(min(_first_positive_root(growth), _first_positive_root(q)))
+
+    def project(self, points_camera: Tensor) -> Tensor:
+        """Pixels (..., 2) of points (..., 3) in the camera frame, mm. NaN where Z <= 0: there is no image."""
+        z = points_camera[..., 2:]
+        ahead = z > 0
+        pixels = self.distort(points_camera[..., :2] / torch.where(ahead, z, torch.ones_like(z)))
+        return torch.where(ahead, pixels, torch.nan)
+
+    def distort(self, xy: Tensor) -> Tensor:
+        """Pixels (..., 2) of undistorted normalised coordinates (..., 2), x = X/Z, y = Y/Z."""
+        focal, center = self._intrinsics(xy)
+        return self._distort(xy)[0] * focal + center
+
+    def J_distort(self, xy: Tensor) -> Tensor:
+        """Jacobian (..., 2, 2) of `distort`: d(u, v)/d(x, y), px per unit of normalised coordinates."""
+        return self._distort(xy)[1] * self._intrinsics(xy)[0][:, None]
+
+    def undistort_points(self, uv: Tensor) -> Tensor:
+        """Undistorted normalised coordinates (..., 2) of pixels (..., 2): the inverse of `distort`, to rounding.
+
+        Newton's method with the analytic Jacobian; steps are halved where the residual does not fall or the iterate
+        would pass `fold_radius`. The gradient follows from the implicit function theorem (first derivatives only).
+        NaN where there is no valid inverse: the pixel lies beyond the image of the fold, or is not finite.
+        """
+        focal, center = self._intrinsics(uv)
+        xy_distorted = (uv - center) / focal
+        if len(self.distortion) == 0:
+            return xy_distorted
+        with torch.no_grad():
+            xy = self._invert(xy_distorted.detach())
+        # one more Newton step, differentiable: d xy = J^-1 (d xy_distorted - d distortion terms)
+        distorted, jacobian = self._distort(xy)
+        return xy - _solve2(jacobian.detach(), distorted - xy_distorted)
+
+    def _invert(self, target: Tensor) -> Tensor:
+        eps = torch.finfo(target.dtype).eps
+        limit = self.fold_radius
+        scale = 1 + target.norm(dim=-1)
+        x = target * (0.99 * limit / target.norm(dim=-1, keepdim=True).clamp_min(eps)).clamp_max(1)
+        distorted, jacobian = self._distort(x)
+        residual = distorted - target
+        error = residual.norm(dim=-1)
+        fraction = torch.ones_like(error)
+        for _ in range(_MAX_ITERATIONS):
+            if bool(((error <= 4 * eps * scale) | ~error.isfinite() | (fraction < 1e-6)).all()):
+                break
+            trial = x - fraction[..., None] * _solve2(jacobian, residual)
+            distorted, trial_jacobian = self._distort(trial)
+            trial_residual = distorted - target
+            trial_error = trial_residual.norm(dim=-1)
+            better = (trial_error < error) & (trial.norm(dim=-1) < limit)
+            x = torch.where(better[..., None], trial, x)
+            residual = torch.where(better[..., None], trial_residual, residual)
+            jacobian = torch.where(better[..., None, None], trial_jacobian, jacobian)
+            error = torch.where(better, trial_error, error)
+            fraction = torch.where(better, 1.0, 0.5 * fraction)
+        determinant = jacobian[..., 0, 0] * jacobian[..., 1, 1] - jacobian[..., 0, 1] * jacobian[..., 1, 0]
+        valid = (error <= 1e4 * eps * scale) & (determinant > 0)
+        return torch.where(valid[..., None], x, torch.nan)
+
+    def _intrinsics(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        m = self.matrix.to(like)
+        return m.diagonal()[:2], m[:2, 2]
+
+    def _distort(self, xy: Tensor) -> tuple[Tensor, Tensor]:
+        """Distorted normalised coordinates (..., 2) and their Jacobian (..., 2, 2)."""
+        x, y = xy.unbind(-1)
+        r2 = x * x + y * y
+        if self.model == "kannala_brandt":
+            k1, k2, k3, k4 = self.distortion.to(xy).unbind()
+            small = r2 < 1e-6
+            r2_safe = torch.where(small, torch.ones_like(r2), r2)
+            r = r2_safe.sqrt()
+            theta_over_r = torch.where(small, 1 - r2 / 3 + r2 * r2 / 5, torch.atan(r) / r)
+            t2 = theta_over_r * theta_over_r * r2
+            s = theta_over_r * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+            growth = (1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))) / (1 + r2)
+            # 2 ds/d(r^2); its series at the axis
+            slope = torch.where(small, 2 * (k1 - 1 / 3) + r2 * (4 * k2 - 4 * k1 + 0.8), (growth - s) / r2_safe)
+            tangential_x = tangential_y = mixed = j_xx = j_yy = torch.zeros_like(x)
+        else:
+            d = self.distortion.to(xy)
+            k1, k2, p1, p2, k3, k4, k5, k6 = pad(d, (0, 8 - len(d))).unbind()
+            numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+            denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+            s = numerator / denominator
+            d_numerator = k1 + r2 * (2 * k2 + r2 * 3 * k3)
+            d_denominator = k4 + r2 * (2 * k5 + r2 * 3 * k6)
+            slope = 2 * (d_numerator - s * d_denominator) / denominator
+            tangential_x = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+            tangential_y = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+            mixed = 2 * (p1 * x + p2 * y)
+            j_xx, j_yy = 2 * p1 * y + 6 * p2 * x, 6 * p1 * y + 2 * p2 * x
+        distorted = torch.stack([s * x + tangential_x, s * y + tangential_y], -1)
+        off = slope * x * y + mixed
+        jacobian = torch.stack([s + slope * x * x + j_xx, off, off, s + slope * y * y + j_yy], -1)
+        return distorted, jacobian.unflatten(-1, (2, 2))
+
+
+def _first_positive_root(polynomial: np.polynomial.Polynomial) -> float:
+    roots = polynomial.trim().roots()
+    positive = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0)]
+    return float(positive.min()) if positive.size else math.inf
+
+
+def _solve2(matrix: Tensor, rhs: Tensor) -> Tensor:
+    """Cramer's rule for matrices (..., 2, 2) and right-hand sides (..., 2)."""
+    a, b, c, d = matrix.flatten(-2).unbind(-1)
+    e, f = rhs.unbind(-1)
+    return torch.stack([d * e - b * f, a * f - c * e], -1) / (a * d - b * c)[..., None]

@@ -1,0 +1,269 @@
+"""The target: coded concentric rings on a part, and its file."""
+
+from __future__ import annotations
+
+import os
+import unicodedata
+from dataclasses import dataclass, fields, replace
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import torch
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
+from torch import Tensor
+
+from torchpose.errors import ConfigError
+from torchpose.geometry import rotations
+from torchpose.yaml_files import format_list, format_number, read_yaml, validate, write_text
+
+MIN_RATIO_GAP = 0.05  # smallest difference between the inner/outer ratios of two markers that can be told apart
+RATIO_RANGE = (0.15, 0.9)  # inner/outer: a smaller hole or a thinner ring is not readable
+MIN_SPREAD = 1e-2  # second / first singular value of the centred marker centres; below, they count as collinear
+
+_FROZEN = ConfigDict(extra="forbid", frozen=True)
+Vector = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
+
+
+class RigidTransformFile(BaseModel):
+    """A pose in a file: rotation vector in rad, translation in mm."""
+
+    model_config = _FROZEN
+    rotation: Vector
+    translation: Vector
+
+
+class _MarkerFile(BaseModel):
+    model_config = _FROZEN
+    id: int
+    center: list[FiniteFloat]
+    outer_radius: FiniteFloat
+    inner_radius: FiniteFloat
+    normal: Vector = [0.0, 0.0, 1.0]
+
+    @field_validator("center")
+    @classmethod
+    def _in_space(cls, value: list[float]) -> list[float]:
+        if len(value) not in (2, 3):
+            raise ValueError(f"has {len(value)} entries; give [x, y, z], or [x, y] for z = 0")
+        return value if len(value) == 3 else [*value, 0.0]
+
+
+class _TargetFile(BaseModel):
+    model_config = _FROZEN
+    name: str
+    units: Literal["mm"]
+    background: Literal["light", "dark"]
+    markers: list[_MarkerFile]
+    part_from_target: RigidTransformFile | None = None
+
+    @field_validator("units", mode="before")
+    @classmethod
+    def _millimetres(cls, value: Any) -> Any:
+        if value != "mm":
+            raise ValueError(f"is {value!r}; convert all lengths to millimetres and write mm")
+        return value
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """M concentric-ring markers in the target's frame. Their ids are told apart by (inner/outer)^2.
+
+    Attributes:
+        name: goes into result tables and file names.
+        background: tone around the rings and in their holes; the rings themselves are of the other one.
+        ids: (M,) int64, unique, not negative.
+        centers: (M, 3) float64, mm.
+        normals: (M, 3) float64, unit, perpendicular to each ring and away from whoever sees its printed side: the default
+            [0, 0, 1] is seen by a camera with R = I, whose z axis points at the target.
+        radii: (M, 2) float64, outer and inner radius, mm.
+        part_rotation, part_translation: (3,) float64 rotation vector in rad and translation in mm that map target
+            coordinates to those of the part, both or neither.
+
+    Raises:
+        ConfigError: duplicate ids, rings that cannot be told apart or read, overlapping markers, fewer than 3 markers,
+            (nearly) collinear centres, or another inconsistency; named as in the file.
+    """
+
+    name: str
+    background: Literal["light", "dark"]
+    ids: Tensor
+    centers: Tensor
+    normals: Tensor
+    radii: Tensor
+    part_rotation: Tensor | None = None
+    part_translation: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        _check_name(self.name)
+        if self.background not in ("light", "dark"):
+            raise ConfigError(f"background: is {self.background!r}; write light or dark")
+        m = len(self.ids)
+        for field, shape in (("ids", (m,)), ("centers", (m, 3)), ("normals", (m, 3)), ("radii", (m, 2))):
+            if getattr(self, field).shape != shape:
+                raise ConfigError(f"{field}: has shape {tuple(getattr(self, field).shape)}; give {shape}")
+        if (self.part_rotation is None) != (self.part_translation is None):
+            raise ConfigError("part_from_target: is half given; give both rotation and translation")
+        self._check_markers()
+
+    def _check_markers(self) -> None:
+        ids = self.ids.tolist()
+        if len(ids) < 3:
+            raise ConfigError(f"markers: {len(ids)} given; a pose needs at least 3")
+        for i, marker in enumerate(ids):
+            if marker < 0:
+                raise ConfigError(f"markers[{i}].id: is {marker}; give an integer from 0")
+            if marker in ids[:i]:
+                raise ConfigError(f"markers[{i}].id: {marker} is given twice; number the markers differently")
+        if not bool(torch.cat([self.centers, self.normals, self.radii], -1).isfinite().all()):
+            raise ConfigError("markers: NaN or infinity; write finite numbers")
+        for i, (outer, inner) in enumerate(self.radii.tolist()):
+            for field, radius in (("outer_radius", outer), ("inner_radius", inner)):
+                if radius <= 0:
+                    raise ConfigError(f"markers[{i}].{field}: is {radius:g}; give a positive length in mm")
+            if inner >= outer:
+                raise ConfigError(
+                    f"markers[{i}].inner_radius: {inner:g} is not below the outer {outer:g}; swap or shrink"
+                )
+            if not RATIO_RANGE[0] - 1e-9 <= inner / outer <= RATIO_RANGE[1] + 1e-9:
+                raise ConfigError(
+                    f"markers[{i}].inner_radius: inner/outer is {inner / outer:.3g}; "
+                    f"rings are readable from {RATIO_RANGE[0]} to {RATIO_RANGE[1]}"
+                )
+        lengths = self.normals.norm(dim=-1).tolist()
+        for i, length in enumerate(lengths):
+            if abs(length - 1) > 1e-5:
+                raise ConfigError(f"markers[{i}].normal: has length {length:.3g}; give a unit vector")
+        ratio, order = (self.radii[:, 1] / self.radii[:, 0]).sort()
+        gap, k = ratio.diff().min(0)
+        if float(gap) < MIN_RATIO_GAP - 1e-9:
+            a, b = sorted((ids[int(order[k])], ids[int(order[k + 1])]))
+            raise ConfigError(
+                f"markers: ids {a} and {b} cannot be told apart (inner/outer differ by {float(gap):.3g}); "
+                f"make them differ by at least {MIN_RATIO_GAP}"
+            )
+        spread = torch.linalg.svdvals(self.centers - self.centers.mean(0))
+        if bool(spread[1] <= MIN_SPREAD * spread[0]):
+            raise ConfigError("markers: the centers lie on one line; move one of them off it")
+        self._check_overlap(ids)
+
+    def _check_overlap(self, ids: list[int]) -> None:
+        # discs in one plane; discs in different planes (a corner of a box) may come as near as they like
+        offset = self.centers[None] - self.centers[:, None]
+        same_plane = (self.normals @ self.normals.T > 1 - 1e-6) & (
+            (offset * self.normals[:, None]).sum(-1).abs() < 1e-3 * self.radii[:, 0, None]
+        )
+        reach = self.radii[:, None, 0] + self.radii[None, :, 0]
+        overlap = (same_plane & (offset.norm(dim=-1) < reach * (1 - 1e-9))).triu(1).nonzero().tolist()
+        if overlap:
+            a, b = overlap[0]
+            raise ConfigError(f"markers: ids {ids[a]} and {ids[b]} overlap; move them apart or shrink outer_radius")
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @property
+    def codes(self) -> Tensor:
+        """(M,) float64 ring codes (inner/outer)^2, the ratio of the areas of the two circles."""
+        return (self.radii[:, 1] / self.radii[:, 0]).square()
+
+    @property
+    def part_from_target(self) -> tuple[Tensor, Tensor] | None:
+        """R (3, 3), t (3,) mm with X_part = R X_target + t, for `Poses.moved`; None where the file has none."""
+        if self.part_rotation is None or self.part_translation is None:
+            return None
+        return rotations.exp(self.part_rotation), self.part_translation
+
+    @property
+    def coplanar(self) -> bool:
+        """Whether all rings lie in one plane and face the same way, to 1e-9 of the target's extent."""
+        offset = self.centers - self.centers[0]
+        scale = offset.norm(dim=-1).max()
+        one_normal = (self.normals - self.normals[0]).norm(dim=-1).max() < 1e-9
+        return bool(one_normal & ((offset @ self.normals[0]).abs().max() < 1e-9 * scale))
+
+    def to(self, *args: Any, **kwargs: Any) -> Target:
+        """Same as `Tensor.to` on every tensor; ids keep their dtype."""
+
+        moved = {f.name: v.to(*args, **kwargs) for f in fields(self) if isinstance(v := getattr(self, f.name), Tensor)}
+        moved["ids"] = moved["ids"].to(self.ids.dtype)
+        return replace(self, **moved)  # type: ignore[arg-type]
+
+    @staticmethod
+    def builtin_names() -> list[str]:
+        """Names of the targets that come with the package, for `load`."""
+        folder = resources.files("torchpose") / "targets"
+        return sorted(Path(f.name).stem for f in folder.iterdir() if f.name.endswith(".yaml"))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Target:
+        """Reads a target file, or a built-in target by its name where no such file exists.
+
+        Raises:
+            ConfigError: one line ``FILE: FIELD: what is wrong; the fix``.
+        """
+        source = Path(path)
+        if not source.exists():
+            if os.fspath(path) in cls.builtin_names():
+                with resources.as_file(resources.files("torchpose") / "targets" / f"{os.fspath(path)}.yaml") as builtin:
+                    return cls._read(builtin)
+            if source.suffix == "" and source.parent == Path():
+                known = ", ".join(cls.builtin_names())
+                raise ConfigError(f"{path}: target: is neither a file nor built in; give a path or one of {known}")
+        return cls._read(source)
+
+    @classmethod
+    def _read(cls, path: Path) -> Target:
+        data = validate(_TargetFile, read_yaml(path), path)
+        normals = _floats([m.normal for m in data.markers]).reshape(-1, 3)
+        lengths = normals.norm(dim=-1, keepdim=True)
+        if bool((lengths == 0).any()):
+            i = int((lengths[:, 0] == 0).nonzero()[0])
+            raise ConfigError(
+                f"{path}: markers[{i}].normal: is zero; give the direction into the printed plane, such as [0, 0, 1]"
+            )
+        pose = data.part_from_target
+        try:
+            return cls(
+                name=data.name,
+                background=data.background,
+                ids=torch.tensor([m.id for m in data.markers], dtype=torch.int64),
+                centers=_floats([m.center for m in data.markers]).reshape(-1, 3),
+                normals=normals / lengths,
+                radii=_floats([[m.outer_radius, m.inner_radius] for m in data.markers]).reshape(-1, 2),
+                part_rotation=None if pose is None else _floats(pose.rotation),
+                part_translation=None if pose is None else _floats(pose.translation),
+            )
+        except ConfigError as error:
+            raise ConfigError(f"{path}: {error}") from None
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes a target file in one piece; centers, radii and the part's pose read back exactly.
+
+        Raises:
+            ConfigError: the folder does not exist or cannot be written.
+        """
+        lines = [f'name: "{self.name}"', "units: mm", f"background: {self.background}", "markers:"]
+        rows = zip(self.ids.tolist(), self.centers.tolist(), self.radii.tolist(), self.normals.tolist(), strict=True)
+        for marker, center, (outer, inner), normal in rows:
+            facing = "" if normal == [0, 0, 1] else f", normal: {format_list(normal)}"
+            lines.append(
+                f"  - {{id: {marker}, center: {format_list(center)}, outer_radius: {format_number(outer)}, "
+                f"inner_radius: {format_number(inner)}{facing}}}"
+            )
+        if self.part_rotation is not None and self.part_translation is not None:
+            rotation, translation = map(format_list, (self.part_rotation.tolist(), self.part_translation.tolist()))
+            lines.append(f"part_from_target: {{rotation: {rotation}, translation: {translation}}}")
+        write_text(path, "\n".join(lines) + "\n")
+
+
+def _floats(values: Any) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def _check_name(name: str) -> None:
+    if not name or name != name.strip() or name in (".", ".."):
+        raise ConfigError(f"name: is {name!r}; give a word, it goes into result tables and file names")
+    for character in name:
+        if character in ',/\\"' or (unicodedata.category(character)[0] in "CZ" and character != " "):
+            raise ConfigError(f"name: has the character {character!r}; use letters, digits, _ and -")
