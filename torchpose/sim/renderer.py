@@ -1,19 +1,19 @@
 """Analytic renderer: grey frames of a flat ring target, exact under perspective, lens distortion and blur.
 
-What is modelled: the scene is piecewise constant (ink, paper, surround); its image is convolved with an isotropic Gaussian
-point-spread function of standard deviation ``psf_sigma`` and with the unit square of the pixel (fill factor 1), both in the
-raw, distorted pixel frame; the sensor is linear. Nothing is rounded or clipped before `add_noise`.
+What is modelled: the scene is piecewise constant (ink, paper, surround); its image is convolved with an isotropic
+Gaussian point-spread function of standard deviation ``psf_sigma`` and with the unit square of the pixel (fill factor
+1), both in the raw, distorted pixel frame; the sensor is linear. Nothing is rounded or clipped before `add_noise`.
 
-How: the blurred indicator of a region is a boundary integral. With the separable kernel k(x) k(y), k = Gaussian * box, and its
-antiderivative c, Green's theorem gives
+How: the blurred indicator of a region is a boundary integral. With the separable kernel k(x) k(y), k = Gaussian * box,
+and its antiderivative c, Green's theorem gives
 
     I(p) = integral over the region of k(u - p_u) k(v - p_v) du dv = - closed integral of c(p_u - u) k(p_v - v) dv .
 
-The boundary is a closed analytic curve (a circle through pose, projection and distortion), so the trapezoidal rule converges
-geometrically (Trefethen and Weideman 2014): steps of one ``psf_sigma`` leave about 2 exp(-2 pi^2) = 5e-9. No tangent, chord or
-curvature approximation is made. Differences along a row have the support of the kernel, so every boundary sample is scattered
-into a small patch and a running sum along rows fills the regions. docs/decisions/0003-renderer.md compares it with
-supersampling.
+The boundary is a closed analytic curve (a circle through pose, projection and distortion), so the trapezoidal rule
+converges geometrically (Trefethen and Weideman 2014): steps of one ``psf_sigma`` leave about 2 exp(-2 pi^2) = 5e-9. No
+tangent, chord or curvature approximation is made. Differences along a row have the support of the kernel, so every
+boundary sample is scattered into a small patch and a running sum along rows fills the regions.
+docs/decisions/0003-renderer.md compares it with supersampling.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from torchpose.errors import ConfigError, FrameError
 from torchpose.target import Target
 
 GREY_MAX = 255.0  # grey levels of rendered frames, whatever the bit depth of the sensor
-_REACH = 5.0  # the Gaussian is cut at this many standard deviations: 6e-7 of an edge's contrast
+REACH = 5.0  # the Gaussian is cut at this many standard deviations: 6e-7 of an edge's contrast
 _COARSE = 72  # samples a circle from which its speed and extent in pixels are taken
 _GAUSS_NODES = 8  # Gauss-Legendre nodes on each 4 sigma of a plate's side
-_CHUNK_PIXELS = 1 << 25  # pixels rendered at a time: 0.25 GiB for each full-frame float64 buffer
+_CHUNK_PIXELS = 1 << 24  # pixels rendered at a time: 128 MiB for each full-frame float64 buffer
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,8 @@ def render(
     """Noise-free frames of a target, grey values 0..255, differentiable in pose, blur and grey levels.
 
     The target's rings are drawn with ``dark`` on ``light``, or the other way round where ``target.background`` is dark.
-    A marker is drawn from either side, and not at all where it reaches behind the camera or beyond the radius up to which
-    the distortion model is one-to-one.
+    A marker is drawn from either side, and not at all where it reaches behind the camera or beyond the radius up to
+    which the distortion model is one-to-one.
 
     Args:
         camera: the camera; its width and height are those of the frames.
@@ -88,8 +88,8 @@ def render(
         R, t: (B, 3, 3) and (B, 3), target to camera, mm.
         psf_sigma: Gaussian blur in px, above 0; the pixel's own area comes on top. A number or (B,).
         dark, light: grey levels; numbers or (B,).
-        plate: width and height in mm of the plate, centred on the target's origin in its plane z = 0; None: it fills the
-            frame.
+        plate: width and height in mm of the plate, centred on the target's origin in its plane z = 0; None: it fills
+            the frame.
         surround: grey level around the plate; a number or (B,).
 
     Returns:
@@ -99,11 +99,10 @@ def render(
         ConfigError: ``psf_sigma`` is not above 0.
         FrameError: shapes of R and t disagree.
     """
-    R, t = _poses(R, t)
+    R, t = check_poses(R, t)
     batch = t.shape[0]
-    sigma, dark_, light_, around = (_per_frame(x, t) for x in (psf_sigma, dark, light, surround))
-    if not bool((sigma > 0).all()):
-        raise ConfigError("psf_sigma: the blur must be above 0 px; give for example 0.3 for a very sharp lens")
+    sigma = check_blur(psf_sigma, t)
+    dark_, light_, around = (per_frame(x, t) for x in (dark, light, surround))
     ink, paper = (light_, dark_) if target.background == "dark" else (dark_, light_)
     frames = max(1, _CHUNK_PIXELS // (camera.width * camera.height))
     out = []
@@ -117,15 +116,9 @@ def render(
             edges, contrast = Boundary.cat(edges, rim), torch.cat([contrast, (paper - around)[s][rim.frame]])
             base = around[s]
         position, dv = project(camera, edges, R[s], t[s])
-        canvas = fill(
-            position,
-            dv * edges.sign * contrast,
-            sigma[s][edges.frame],
-            edges.frame,
-            base.shape[0],
-            camera.height,
-            camera.width,
-        )
+        dv = dv * edges.sign * contrast
+        size = (base.shape[0], camera.height, camera.width)
+        canvas = fill(position, dv, sigma[s][edges.frame], kernel_reach(sigma[s]), edges.frame, *size)
         out.append((base[:, None, None] + canvas).float())
     return torch.cat(out) if out else t.new_zeros(0, camera.height, camera.width, dtype=torch.float32)
 
@@ -152,7 +145,7 @@ def ring_boundary(camera: Camera, target: Target, R: Tensor, t: Tensor, sigma: T
         (rotation @ point[..., None]).squeeze(-1) + t[:, None, None, None],
         (rotation @ step[..., None]).squeeze(-1),
     )  # (B, M, 2, A, ...)
-    reach = 1.0 + _REACH * sigma[:, None, None]
+    reach = 1.0 + REACH * sigma[:, None, None]
     size = torch.tensor([camera.width, camera.height], dtype=t.dtype, device=t.device)
     low, high = pixel.amin((2, 3)), pixel.amax((2, 3))  # (B, M, 2)
     valid = valid.all(-1).all(-1) & ((high > -reach) & (low < size + reach)).all(-1)
@@ -182,7 +175,7 @@ def ring_boundary(camera: Camera, target: Target, R: Tensor, t: Tensor, sigma: T
 
 @torch.no_grad()
 def _plate_boundary(camera: Camera, plate: tuple[float, float], R: Tensor, t: Tensor, sigma: Tensor) -> Boundary:
-    """Boundary samples of the plate: composite Gauss-Legendre along its four sides, panels of at most 4 ``sigma`` px."""
+    """Boundary samples of the plate: composite Gauss-Legendre along its sides, panels of at most 4 ``sigma`` px."""
     w, h = plate[0] / 2, plate[1] / 2
     corners = torch.tensor([[-w, -h, 0], [w, -h, 0], [w, h, 0], [-w, h, 0]], dtype=t.dtype, device=t.device)
     sides = corners.roll(-1, 0) - corners
@@ -224,19 +217,20 @@ def project(camera: Camera, edges: Boundary, R: Tensor, t: Tensor) -> tuple[Tens
     return pixel, tangent[:, 1]
 
 
-def fill(position: Tensor, dv: Tensor, sigma: Tensor, canvas: Tensor, count: int, height: int, width: int) -> Tensor:
+def fill(
+    position: Tensor, dv: Tensor, sigma: Tensor, reach: int, canvas: Tensor, count: int, height: int, width: int
+) -> Tensor:
     """Blurred regions from their boundary samples: ``sum of - c(p_u - u) k(p_v - v) dv`` at every pixel p.
 
     Args:
         position: (N, 2) float64, px from the centre of the canvas' first pixel. dv: (N,), px, times any amplitude.
-        sigma: (N,), px. canvas: (N,) int64, which of the ``count`` canvases.
+        sigma: (N,), blur, px. reach: `kernel_reach` of it. canvas: (N,) int64, which of the ``count`` canvases.
         count, height, width: size of the result. Samples may lie outside.
 
     Returns:
         (count, height, width), of the dtype of the positions.
     """
-    half = math.ceil(0.5 + _REACH * float(sigma.detach().max()) + 0.5) if len(sigma) else 1
-    offset = torch.arange(-half, half + 1, device=position.device)
+    offset = torch.arange(-reach, reach + 1, device=position.device)
     nearest = position.detach().round().long()
     column, row = nearest[:, :1] + offset, nearest[:, 1:] + offset  # (N, n)
     s = sigma[:, None]
@@ -257,8 +251,9 @@ def add_noise(
 ) -> Tensor:
     """Frames as the sensor delivers them: white Gaussian noise, rounding to ``bits`` bits, clipping.
 
-    The noise of a pixel depends on ``seed``, the frame's number and the pixel alone (a counter-based generator: SplitMix64 of
-    Steele, Lea and Flood 2014 and the Box-Muller transform), so it is the same in any batch and on any device.
+    The noise of a pixel depends on ``seed``, the frame's number and the pixel alone (a counter-based generator:
+    SplitMix64 of Steele, Lea and Flood 2014 and the Box-Muller transform), so it is the same in any batch and on any
+    device.
 
     Args:
         frames: (B, H, W), grey levels 0..255. sigma: noise in grey levels of 0..255; a number or (B,).
@@ -276,7 +271,7 @@ def add_noise(
     top = 2**bits - 1
     number = torch.arange(frames.shape[0], device=frames.device) if index is None else index.to(frames.device)
     noise = _normal(seed, number, frames.shape[1] * frames.shape[2]).view_as(frames)
-    level = (frames + _per_frame(sigma, noise)[:, None, None] * noise) * (top / GREY_MAX)
+    level = (frames + per_frame(sigma, noise)[:, None, None] * noise) * (top / GREY_MAX)
     return level.round().clamp(0, top).to(torch.uint8 if bits <= 8 else torch.uint16)
 
 
@@ -302,7 +297,7 @@ def _mix64(x: Tensor) -> Tensor:
 
 
 def _image(camera: Camera, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Pixels (..., 2) of camera points (..., 3), images (..., 2) of their steps, and whether the camera sees them (...,)."""
+    """Pixels (..., 2) of camera points (..., 3), images (..., 2) of their steps, and which points are seen (...,)."""
     z = x[..., 2:]
     normalised = x[..., :2] / z
     d_normalised = (dx[..., :2] - normalised * dx[..., 2:]) / z
@@ -327,7 +322,7 @@ def _normal_loss(a: Tensor) -> Tensor:
 
 
 def _plane_axes(normals: Tensor) -> tuple[Tensor, Tensor]:
-    """Two unit vectors (M, 3) each, orthogonal to unit normals (M, 3) and to each other (Duff et al. 2017); x, y for z."""
+    """Unit vectors (M, 3), (M, 3) at right angles to unit normals (M, 3) and each other (Duff et al. 2017); x, y for z."""
     x, y, z = normals.unbind(-1)
     sign = torch.where(z < 0, -1.0, 1.0).to(z)
     a = -1 / (sign + z)
@@ -343,12 +338,27 @@ def _gauss_legendre(order: int, like: Tensor) -> tuple[Tensor, Tensor]:
     return (node + 1) / 2, vector[0].square()
 
 
-def _per_frame(value: float | Tensor, like: Tensor) -> Tensor:
+def per_frame(value: float | Tensor, like: Tensor) -> Tensor:
     """(B,) tensor of a number or a (B,) tensor, of the dtype and device of ``like`` (B, ...)."""
     return torch.as_tensor(value, dtype=like.dtype, device=like.device).expand(like.shape[0])
 
 
-def _poses(R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+def check_blur(psf_sigma: float | Tensor, like: Tensor) -> Tensor:
+    """(B,) blur in px, after a check of its sign."""
+    sigma = per_frame(psf_sigma, like)
+    if not bool((sigma > 0).all()):
+        raise ConfigError("psf_sigma: the blur must be above 0 px; give for example 0.3 for a very sharp lens")
+    return sigma
+
+
+def kernel_reach(sigma: Tensor) -> int:
+    """Pixels from the one nearest to a boundary sample up to which its blurred effect is drawn."""
+    # half a pixel to the nearest centre and half a pixel of its area
+    return math.ceil(1.0 + REACH * float(sigma.detach().max())) if len(sigma) else 1
+
+
+def check_poses(R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+    """R and t in float64, after a check of their shapes."""
     if R.ndim != 3 or R.shape[1:] != (3, 3) or t.shape != (R.shape[0], 3):
         raise FrameError(f"R, t: shapes {tuple(R.shape)} and {tuple(t.shape)} are not (B, 3, 3) and (B, 3)")
     return R.double(), t.double()

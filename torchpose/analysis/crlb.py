@@ -1,0 +1,106 @@
+"""Cramer-Rao bound of the target pose: no unbiased estimator from the grey values has a smaller covariance."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchpose.camera import Camera
+from torchpose.geometry import rotations
+from torchpose.sim import renderer
+from torchpose.target import Target
+
+_CHUNK_POSES = 16  # poses differentiated at a time
+
+
+def pose_crlb(
+    camera: Camera,
+    target: Target,
+    R: Tensor,
+    t: Tensor,
+    *,
+    psf_sigma: float | Tensor = 0.7,
+    dark: float | Tensor = 30.0,
+    light: float | Tensor = 220.0,
+    noise_sigma: float | Tensor = 1.0,
+    bits: int = 8,
+) -> Tensor:
+    """Lower bound of the pose covariance from frames of `torchpose.sim.render` with white Gaussian noise.
+
+    Inverse Fisher information of the grey values (Kay 1993, section 3.9), of all pixels of every marker's bounding box
+    and of a margin as wide as the blur reaches; derivatives by forward-mode differentiation of the renderer. Unknown
+    besides the pose: one blur per frame, a dark and a light level per marker. The camera is exact. Quantisation counts
+    as noise of step^2 / 12, which holds from a noise of about half a step upwards; clipping is not modelled.
+
+    Args:
+        camera, target: as in `torchpose.sim.render`.
+        R, t: (B, 3, 3), (B, 3), target to camera, mm.
+        psf_sigma: px. dark, light, noise_sigma: grey levels of 0..255. Numbers or (B,).
+        bits: of the sensor; its step is 255 / (2^bits - 1) grey levels.
+
+    Returns:
+        (B, 6, 6) float64, mm and rad: translation, then rotation w with R_true = exp(w) R. NaN where the markers in
+        view do not determine the pose.
+
+    Raises:
+        ConfigError: ``psf_sigma`` is not above 0. FrameError: shapes of R and t disagree.
+    """
+    R, t = renderer.check_poses(R, t)
+    sigma = renderer.check_blur(psf_sigma, t)
+    dark_, light_, noise = (renderer.per_frame(x, t) for x in (dark, light, noise_sigma))
+    step = renderer.GREY_MAX / (2**bits - 1)
+    variance = noise.square() + step * step / 12
+    out = []
+    for a in range(0, t.shape[0], _CHUNK_POSES):
+        s = slice(a, a + _CHUNK_POSES)
+        information = _fisher(camera, target, R[s], t[s], sigma[s], (light_ - dark_)[s]) / variance[s, None, None]
+        out.append(_invert(information)[:, :6, :6])
+    return torch.cat(out) if out else t.new_zeros(0, 6, 6)
+
+
+def _fisher(camera: Camera, target: Target, R: Tensor, t: Tensor, sigma: Tensor, contrast: Tensor) -> Tensor:
+    """Fisher information (B, 7, 7) of translation, rotation and blur at unit noise, grey levels eliminated."""
+    edges = renderer.ring_boundary(camera, target, R, t, sigma)
+    # one canvas for every marker in view, its corner at a whole pixel
+    pair, canvas = (edges.frame * len(target) + edges.marker).unique(return_inverse=True)
+    if len(pair) == 0:
+        return t.new_zeros(t.shape[0], 7, 7)
+    frame = pair // len(target)
+    reach = renderer.kernel_reach(sigma)
+    pixel = renderer.project(camera, edges, R, t)[0]
+    index = canvas[:, None].expand_as(pixel)
+    low = torch.zeros_like(pixel[: len(pair)]).scatter_reduce(0, index, pixel, "amin", include_self=False)
+    high = torch.zeros_like(low).scatter_reduce(0, index, pixel, "amax", include_self=False)
+    margin = (0.5 + renderer.REACH * sigma[frame, None]).ceil()
+    low, high = low.floor() - margin, high.ceil() + margin
+    width, height = ((high - low).amax(0).long() + 1).tolist()
+
+    def coverage(delta: Tensor) -> tuple[Tensor, Tensor]:
+        rotation, translation, blur = rotations.exp(delta[3:6]) @ R, t + delta[:3], sigma + delta[6]
+        position, dv = renderer.project(camera, edges, rotation, translation)
+        position, dv = position - low[canvas], dv * edges.sign
+        c = renderer.fill(position, dv, blur[edges.frame], reach, canvas, len(pair), height, width)
+        return c, c
+
+    jacobian, c = torch.func.jacfwd(coverage, has_aux=True)(t.new_zeros(7))  # (P, h, w, 7), (P, h, w)
+
+    u = low[:, :1] + torch.arange(width, dtype=t.dtype, device=t.device)
+    v = low[:, 1:] + torch.arange(height, dtype=t.dtype, device=t.device)
+    use_u = (u >= 0) & (u < camera.width) & (u <= high[:, :1])
+    use_v = (v >= 0) & (v < camera.height) & (v <= high[:, 1:])
+    use = (use_v[:, :, None] & use_u[:, None]).flatten(1).to(t)
+    c = c.flatten(1)
+    jacobian = (contrast[frame, None, None] * jacobian.flatten(1, 2)) * use[:, :, None]
+    # levels: grey = dark c + light (1 - c) for rings darker than their ground, and the same two columns otherwise
+    levels = torch.stack([c, 1 - c], -1) * use[:, :, None]
+    cross = levels.mT @ jacobian
+    fisher = jacobian.mT @ jacobian - cross.mT @ torch.linalg.solve(levels.mT @ levels, cross)
+    return t.new_zeros(t.shape[0], 7, 7).index_add(0, frame, fisher)
+
+
+def _invert(information: Tensor) -> Tensor:
+    """Inverse of symmetric matrices (B, n, n) whose unknowns differ in scale; NaN where they are singular."""
+    scale = information.diagonal(dim1=-2, dim2=-1).clamp_min(torch.finfo(information.dtype).tiny).rsqrt()
+    factor, failed = torch.linalg.cholesky_ex(information * scale[:, :, None] * scale[:, None])
+    inverse = torch.cholesky_inverse(factor) * scale[:, :, None] * scale[:, None]
+    return torch.where((failed > 0)[:, None, None], torch.nan, inverse)
