@@ -1,0 +1,315 @@
+"""``torchpose estimate``: frames in, one row a frame and target out."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from torchpose.errors import ConfigError
+
+if TYPE_CHECKING:  # imported where they are used: torch takes more than a second, which --help need not wait for
+    from torchpose.camera import Camera
+    from torchpose.handeye import HandEye
+    from torchpose.io.reader import Batch
+    from torchpose.io.rows import Row
+    from torchpose.io.sources import Source
+    from torchpose.pipeline import PoseEstimator
+    from torchpose.report.overlay import Overlay
+    from torchpose.results import Poses
+    from torchpose.target import Target
+
+EPILOG = """
+Examples:
+
+`torchpose estimate frames/ --camera camera.yaml --target quad40 --out poses.csv`
+
+`torchpose estimate a.png b.tif --camera rig.yaml#cam1 --target left.yaml --target right.yaml --out poses.parquet`
+
+`torchpose estimate run/manifest.jsonl --camera camera.yaml --target quad40 --hand-eye handeye.yaml --out poses.jsonl`
+
+Exit codes: 0 every frame was processed, whatever its status; 1 a frame could not be read; 2 a usage or configuration
+error; 130 interrupted (go on with `--resume`).
+"""
+
+
+def estimate(
+    inputs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="INPUT...",
+            help="Image files (PNG, TIFF, BMP, JPEG, PGM; 8 or 16 bit, grey or colour), folders of them, searched "
+            "recursively and taken in natural order, or capture manifests (.jsonl).",
+        ),
+    ],
+    camera: Annotated[
+        str,
+        typer.Option(
+            help="Camera file: OpenCV YAML or JSON, ROS camera_info, Kalibr camchain, COLMAP cameras.txt. "
+            "FILE#cam1 or FILE#2 picks one of several."
+        ),
+    ],
+    target: Annotated[list[str], typer.Option(help="Target file or name of a built-in target; repeat for several.")],
+    out: Annotated[Path, typer.Option(help="Table of the poses: .csv, .jsonl or .parquet.")],
+    detections: Annotated[
+        Path | None, typer.Option(help="Table of the markers found: .csv, .jsonl or .parquet.")
+    ] = None,
+    overlay: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder for pictures of what was found, one a frame.")
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Keep the frames that an earlier run finished and do the rest.")
+    ] = False,
+    hand_eye: Annotated[
+        Path | None,
+        typer.Option(help="Calibrated camera-to-base or camera-to-tool transform; adds the poses in the robot base."),
+    ] = None,
+    batch: Annotated[int | None, typer.Option(min=1, help="Frames at once; by default chosen by their size.")] = None,
+    threads: Annotated[int | None, typer.Option(min=1, help="Threads to use; by default one a core.")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar and no summary.")] = False,
+) -> int:
+    """Measure the pose of ring targets in every frame, with its uncertainty.
+
+    One row a frame and target: status, translation in mm, rotation vector in rad (target to camera), their standard
+    deviations, reprojection RMS in px, number of markers.
+    """
+    from torchpose.camera import Camera
+    from torchpose.cli.terminal import native_stderr_silenced
+    from torchpose.io.sources import find_sources
+    from torchpose.io.writers import check_table_path
+    from torchpose.target import Target
+
+    for path, option in ((out, "--out"), (detections, "--detections")):
+        if path is not None:
+            check_table_path(path, option)
+    camera_model = Camera.load(camera)
+    targets = [Target.load(name) for name in target]
+    sources = find_sources(inputs)
+    calibration = _load_hand_eye(hand_eye, sources)
+    _check_outputs(inputs, sources, targets, [p for p in (out, detections) if p is not None], overlay)
+    with native_stderr_silenced():
+        return _run(
+            camera_model,
+            targets,
+            sources,
+            out,
+            detections=detections,
+            overlay=overlay,
+            resume=resume,
+            hand_eye=calibration,
+            batch=batch,
+            threads=threads or _cores(),
+            quiet=quiet,
+        )
+
+
+def _run(
+    camera: Camera,
+    targets: list[Target],
+    sources: list[Source],
+    out: Path,
+    *,
+    detections: Path | None,
+    overlay: Path | None,
+    resume: bool,
+    hand_eye: HandEye | None,
+    batch: int | None,
+    threads: int,
+    quiet: bool,
+) -> int:
+    """Estimates what is not done yet and writes the tables; returns the exit code."""
+    import cv2
+    import torch
+
+    from torchpose.cli.terminal import FrameProgress
+    from torchpose.io.reader import FrameReader, default_batch
+    from torchpose.io.rows import BASE_SCHEMA, POSE_SCHEMA
+    from torchpose.io.store import ResultStore
+    from torchpose.pipeline import PoseEstimator
+    from torchpose.report.overlay import Overlay
+
+    cv2.setNumThreads(1)  # frames are decoded side by side; threads inside of one would only compete
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    torch.set_num_threads(threads)
+    estimator = PoseEstimator(camera, targets)
+    painter = None if overlay is None else Overlay(camera, targets, overlay, threads=threads)
+    store = ResultStore(
+        out,
+        detections,
+        schema=POSE_SCHEMA | (BASE_SCHEMA if hand_eye else {}),
+        targets=len(targets),
+        origin=_origin(camera, targets, sources, hand_eye, detections is not None),
+        resume=resume,
+    )
+    pending = [source for source in sources if source.name not in store]
+    reader = FrameReader(
+        pending, camera.width, camera.height, batch=batch or default_batch(camera.width, camera.height), threads=threads
+    )
+    try:
+        with FrameProgress(len(sources), len(sources) - len(pending), quiet=quiet) as progress, torch.inference_mode():
+            for frames in reader:
+                store.append(_records(frames, estimator, targets, hand_eye, painter))
+                progress.advance(len(frames.sources), store.counts)
+        store.finish([source.name for source in sources])
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"{len(store)} of {len(sources)} frames are kept; add --resume to go on") from None
+    finally:
+        store.close()
+    progress.summary(store.counts, out)
+    if store.unreadable:
+        _report_unreadable(store.unreadable)
+        return 1
+    return 0
+
+
+def _records(
+    batch: Batch,
+    estimator: PoseEstimator,
+    targets: list[Target],
+    hand_eye: HandEye | None,
+    painter: Overlay | None,
+) -> list[Row]:
+    """Rows and detections of every frame of a batch, see `ResultStore.append`."""
+    from torchpose.io.rows import detection_rows, fault_row, pose_rows
+
+    names = [target.name for target in targets]
+    records: list[Row] = [{"frame": source.name, "rows": [], "detections": []} for source in batch.sources]
+    for position, fault in batch.faults.items():
+        frame = batch.sources[position].name
+        records[position]["rows"] = [fault_row(frame, name, fault.status, fault.reason) for name in names]
+    by_name = {record["frame"]: record for record in records}
+    for positions, frames in batch.groups:
+        sources = [batch.sources[position] for position in positions]
+        frame_names = [source.name for source in sources]
+        poses = estimator(frames).cpu()
+        if painter is not None:
+            painter.write(frames, poses, frame_names)
+        given = _of_parts(poses, targets)
+        rows = pose_rows(given, frame_names, names)
+        if hand_eye is not None:
+            _add_base_cells(rows, given, sources, hand_eye)
+        for row in rows:
+            by_name[row["frame"]]["rows"].append(row)
+        for row in detection_rows(poses.detections, frame_names, names):
+            by_name[row["frame"]]["detections"].append(row)
+    return records
+
+
+def _of_parts(poses: Poses, targets: list[Target]) -> Poses:
+    """Poses of the parts, for the targets that say where their part is."""
+    import torch
+
+    parts = [target.part_from_target for target in targets]
+    if not any(parts):
+        return poses
+    still = (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    rotation, translation = (torch.stack(tensors) for tensors in zip(*(part or still for part in parts), strict=True))
+    return poses.moved(rotation[poses.target], translation[poses.target])
+
+
+def _add_base_cells(rows: list[Row], poses: Poses, sources: Sequence[Source], hand_eye: HandEye) -> None:
+    """Adds the poses in the robot base; cells stay empty where a camera on the tool has no robot pose."""
+    import torch
+
+    from torchpose.geometry import rotations
+    from torchpose.io.rows import base_cells
+
+    robot = None
+    if hand_eye.mount == "tool":
+        unknown = (float("nan"),) * 6
+        tool = torch.tensor([source.robot_pose or unknown for source in sources], dtype=torch.float64)[poses.frame]
+        robot = (rotations.exp(tool[:, 3:]), tool[:, :3])
+    cells = base_cells(poses.seen_from(*hand_eye.base_from_camera(robot)))
+    for row, extra in zip(rows, cells, strict=True):
+        row.update(extra)
+
+
+def _load_hand_eye(path: Path | None, sources: Sequence[Source]) -> HandEye | None:
+    if path is None:
+        return None
+    from torchpose.handeye import HandEye
+
+    hand_eye = HandEye.load(path)
+    without = [source for source in sources if source.robot_pose is None]
+    if hand_eye.mount == "tool" and without:
+        raise ConfigError(
+            f"{without[0].path}: robot_pose: missing for {len(without)} of {len(sources)} frames, but the camera of "
+            f"{path} is on the tool; give a capture manifest with robot poses as INPUT"
+        )
+    return hand_eye
+
+
+def _check_outputs(
+    inputs: Sequence[Path],
+    sources: Sequence[Source],
+    targets: Sequence[Target],
+    tables: list[Path],
+    overlay: Path | None,
+) -> None:
+    """Refuses outputs that would overwrite or mingle with inputs, and targets that rows could not tell apart."""
+    names = [target.name for target in targets]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise ConfigError(f"--target: name: {twice!r} is given twice; name the targets differently")
+    read = {path.resolve() for path in inputs}
+    for table in tables:
+        if table.resolve() in read:
+            raise ConfigError(f"{table}: --out: is an INPUT too; choose another file")
+    if overlay is None:
+        return
+    place = overlay.resolve()
+    folder = next((path for path in inputs if path.is_dir() and place.is_relative_to(path.resolve())), None)
+    if folder is not None:
+        raise ConfigError(
+            f"{overlay}: --overlay: lies inside INPUT {folder}, where its pictures would be taken for frames; "
+            "choose a folder outside"
+        )
+    from torchpose.report.overlay import picture_path
+
+    frames = {source.path.resolve() for source in sources}
+    if any(picture_path(place, source.name) in frames for source in sources):
+        raise ConfigError(f"{overlay}: --overlay: its pictures would overwrite the frames; choose another folder")
+
+
+def _origin(
+    camera: Camera, targets: Sequence[Target], sources: Sequence[Source], hand_eye: HandEye | None, detections: bool
+) -> dict[str, Any]:
+    """What the rows depend on, for `ResultStore`. Names are those that its error messages shall say."""
+    from importlib.metadata import version
+
+    return {
+        "torchpose version": version("torchpose"),
+        "--camera": _digest(camera),
+        "--target": [[target.name, _digest(target)] for target in targets],
+        "--hand-eye": None if hand_eye is None else _digest(hand_eye),
+        "--detections": detections,
+        "INPUT": sorted({str(source.root) for source in sources}),
+    }
+
+
+def _digest(model: Any) -> str:
+    """SHA-256 of the values of a dataclass: the same for the same numbers, however the file is laid out."""
+    import hashlib
+    from dataclasses import fields
+
+    values = [(field.name, getattr(model, field.name)) for field in fields(model) if field.name != "source"]
+    plain = [(name, value.tolist() if hasattr(value, "tolist") else value) for name, value in values]
+    return hashlib.sha256(repr(plain).encode()).hexdigest()
+
+
+def _cores() -> int:
+    """Cores that this process may use, where the system tells."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _report_unreadable(unreadable: dict[str, str]) -> None:
+    shown = [f"{frame} ({reason})" for frame, reason in list(unreadable.items())[:5]]
+    more = [f"and {len(unreadable) - 5} more"] if len(unreadable) > 5 else []
+    typer.echo(
+        f"torchpose: error: {', '.join(shown + more)}: INPUT: {len(unreadable)} could not be read; "
+        "replace the files and run again",
+        err=True,
+    )

@@ -1,0 +1,83 @@
+"""Entry point: ``torchpose COMMAND ...``. Errors of the user end in one line on stderr and the exit code 2."""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from collections.abc import Sequence
+from importlib.metadata import version
+from typing import Annotated, NoReturn
+
+import typer
+
+from torchpose.cli import estimate
+from torchpose.errors import TorchposeError
+
+INTERNAL_ERROR = 70  # EX_SOFTWARE of sysexits.h: none of the codes that say something about the input
+
+app = typer.Typer(
+    name="torchpose",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="markdown",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"torchpose {version('torchpose')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _torchpose(
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Pose of flat concentric-ring targets from camera frames, to microns, with its uncertainty."""
+
+
+app.command(epilog=estimate.EPILOG)(estimate.estimate)
+
+
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Runs the command line and exits.
+
+    Args:
+        arguments: of the command line, without the program's name; those of the process by default.
+    """
+    command = typer.main.get_command(app)
+    try:
+        code = command.main(
+            args=None if arguments is None else list(arguments), prog_name="torchpose", standalone_mode=False
+        )
+    except TorchposeError as error:
+        _fail(str(error))
+    except (KeyboardInterrupt, typer.Abort):
+        _fail("interrupted", 130)
+    except Exception as error:
+        # typer brings its own copy of click or depends on click, by version: known by what its errors can do
+        if hasattr(error, "format_message"):
+            _fail_usage(error.format_message(), sys.argv[1:] if arguments is None else arguments)
+        traceback.print_exc()
+        _fail(f"internal: {type(error).__name__}: {error}; please report it with the lines above", INTERNAL_ERROR)
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _fail_usage(message: str, arguments: Sequence[str]) -> NoReturn:
+    if not message:  # no command was given and the help has been shown
+        sys.exit(2)
+    known = [command.callback.__name__ for command in app.registered_commands if command.callback]
+    command = next((f"{word} " for word in arguments[:1] if word in known), "")
+    _fail(f"{message.rstrip('.')}; see torchpose {command}--help")
+
+
+def _fail(message: str, code: int = 2) -> NoReturn:
+    print(f"torchpose: error: {' '.join(message.split())}", file=sys.stderr)
+    sys.exit(code)
+
+
+if __name__ == "__main__":
+    main()

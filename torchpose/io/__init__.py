@@ -1,0 +1,1 @@
+"""Frames in, rows out: streaming readers and result tables that survive a killed run."""

@@ -1,0 +1,84 @@
+"""Decoding of one image file to grey values, or the reason why it cannot be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+_JPEG = b"\xff\xd8"
+_KNOWN = (_PNG, _JPEG, b"BM", b"II*\0", b"MM\0*", b"II+\0", b"MM\0+", b"P2", b"P5")
+# A camera file describes the sensor's rows and columns: the orientation that a phone notes in EXIF must not turn them.
+_FLAGS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+
+
+class UnreadableImageError(Exception):
+    """An image cannot be decoded; `reason` is one word for the results.
+
+    ``missing``, ``unreadable_file``, ``empty``, ``not_an_image``, ``truncated``, ``corrupt`` or ``unsupported_depth``.
+    """
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(reason)
+        self.reason = reason
+
+
+def decode(path: Path) -> np.ndarray:
+    """Grey values (H, W) of an image file, uint8 or uint16 as stored. Colour is reduced to luma, alpha is ignored.
+
+    Of a file with several pages the first is read.
+
+    Raises:
+        UnreadableImageError: with the reason. A file that ends early is refused, never filled up.
+    """
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise UnreadableImageError("missing") from None
+    except OSError:
+        raise UnreadableImageError("unreadable_file") from None
+    if not data:
+        raise UnreadableImageError("empty")
+    if not data.startswith(_KNOWN):
+        raise UnreadableImageError("not_an_image")
+    if (data.startswith(_PNG) and not _png_ends(data)) or (data.startswith(_JPEG) and not _jpeg_ends(data)):
+        raise UnreadableImageError("truncated")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), _FLAGS)
+    except cv2.error:  # more pixels than OpenCV accepts, or a header that contradicts itself
+        image = None
+    if image is None:
+        raise UnreadableImageError("corrupt")
+    if image.dtype not in (np.uint8, np.uint16):
+        raise UnreadableImageError("unsupported_depth")
+    return image
+
+
+def _png_ends(data: bytes) -> bool:
+    """Whether the chunks of a PNG file lead to its IEND chunk. Their checksums are the decoder's business."""
+    position = len(_PNG)
+    while position + 12 <= len(data):
+        if data[position + 4 : position + 8] == b"IEND":
+            return True
+        position += 12 + int.from_bytes(data[position : position + 4], "big")
+    return False
+
+
+def _jpeg_ends(data: bytes) -> bool:
+    """Whether an end marker follows the first scan of a JPEG file.
+
+    Decoders fill the missing rest of a scan with grey. The segments before it are skipped by their length, because a
+    preview in them has an end marker of its own; inside a scan the marker's two bytes cannot occur.
+    """
+    position = len(_JPEG)
+    while position + 4 <= len(data) and data[position] == 0xFF:
+        marker = data[position + 1]
+        if marker == 0xFF:  # fill byte
+            position += 1
+        elif marker == 0xDA:
+            return data.find(b"\xff\xd9", position) >= 0
+        else:
+            position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
+    return False

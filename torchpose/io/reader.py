@@ -1,0 +1,121 @@
+"""Frames from disk in batches: decoding runs ahead in threads, memory is two batches however many frames there are."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchpose.io.images import UnreadableImageError, decode
+from torchpose.io.sources import Source
+from torchpose.results import Status
+
+_TORCH_DTYPE = {np.dtype(np.uint8): torch.uint8, np.dtype(np.uint16): torch.uint16}
+_BATCH_PIXELS = 160_000_000  # of one batch: 8 frames of 20 megapixels
+_BATCH_FRAMES = 32
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Why a source gave no frame: `Status.UNREADABLE` or `Status.WRONG_SIZE`, and the reason in a word."""
+
+    status: Status
+    reason: str
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Consecutive sources, decoded.
+
+    Attributes:
+        sources: the sources of the batch, in order.
+        faults: position in ``sources`` to fault, for those without a frame.
+        groups: pairs of positions (n,) and frames (n, H, W), one pair for each pixel type (uint8, uint16) that occurs.
+            Every position is in ``faults`` or in exactly one group. The frames are views of a buffer that is
+            overwritten once the next-but-one batch is asked for.
+    """
+
+    sources: Sequence[Source]
+    faults: dict[int, Fault]
+    groups: list[tuple[list[int], Tensor]]
+
+
+def default_batch(width: int, height: int) -> int:
+    """Frames a batch: many enough to share the cost of a call, few enough to keep memory small."""
+    return max(1, min(_BATCH_FRAMES, _BATCH_PIXELS // (width * height)))
+
+
+class FrameReader:
+    """Iterates over `Batch` in the order of the sources.
+
+    Two buffers take turns: while one batch is worked on, threads decode the next one into the other.
+
+    Args:
+        sources: the frames, see `torchpose.io.sources.find_sources`.
+        width, height: of the camera, px. Frames of another size are `Status.WRONG_SIZE`.
+        batch: frames a batch. threads: decoding threads.
+    """
+
+    def __init__(self, sources: Sequence[Source], width: int, height: int, *, batch: int, threads: int) -> None:
+        self._sources = sources
+        self._shape = (height, width)
+        self._batch = batch
+        self._threads = threads
+
+    def __iter__(self) -> Iterator[Batch]:
+        chunks = [self._sources[i : i + self._batch] for i in range(0, len(self._sources), self._batch)]
+        frames_a_buffer = min(self._batch, len(self._sources))
+        buffers = [_Buffer(frames_a_buffer, self._shape) for _ in range(min(2, len(chunks)))]
+        pool = ThreadPoolExecutor(self._threads, thread_name_prefix="decode")
+
+        def submit(number: int) -> list[Future[Fault | np.dtype]]:
+            buffer = buffers[number % 2]
+            return [pool.submit(buffer.load, slot, source) for slot, source in enumerate(chunks[number])]
+
+        try:
+            ahead = submit(0) if chunks else []
+            for number, chunk in enumerate(chunks):
+                outcomes = [future.result() for future in ahead]
+                if number + 1 < len(chunks):
+                    ahead = submit(number + 1)
+                yield buffers[number % 2].batch(chunk, outcomes)
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+class _Buffer:
+    """Memory of one batch for each pixel type, allocated when the first frame of the type arrives."""
+
+    def __init__(self, frames: int, shape: tuple[int, int]) -> None:
+        self._size = (frames, *shape)
+        self._planes: dict[np.dtype, Tensor] = {}
+        self._lock = threading.Lock()
+
+    def load(self, slot: int, source: Source) -> Fault | np.dtype:
+        """Decodes a source into a slot; returns its pixel type, or what is wrong with it."""
+        try:
+            image = decode(source.path)
+        except UnreadableImageError as error:
+            return Fault(Status.UNREADABLE, error.reason)
+        if image.shape != self._size[1:]:
+            return Fault(Status.WRONG_SIZE, f"{image.shape[1]}x{image.shape[0]}")
+        with self._lock:
+            if image.dtype not in self._planes:
+                self._planes[image.dtype] = torch.empty(self._size, dtype=_TORCH_DTYPE[image.dtype])
+        np.copyto(self._planes[image.dtype][slot].numpy(), image)
+        return image.dtype
+
+    def batch(self, sources: Sequence[Source], outcomes: Sequence[Fault | np.dtype]) -> Batch:
+        faults = {i: outcome for i, outcome in enumerate(outcomes) if isinstance(outcome, Fault)}
+        groups = []
+        for dtype, plane in self._planes.items():
+            positions = [i for i, outcome in enumerate(outcomes) if i not in faults and outcome == dtype]
+            if positions:
+                contiguous = positions == list(range(len(positions)))
+                groups.append((positions, plane[: len(positions)] if contiguous else plane[positions]))
+        return Batch(sources, faults, groups)

@@ -1,0 +1,205 @@
+"""The rows of a run, safe against being killed at any moment.
+
+While a run goes on, each finished batch is appended to a journal beside the output (``poses.csv.partial``): one JSON
+line a frame with its rows and its detections, a batch in one write, then fsync. The first line says what the rows were
+made from. At the end the tables are written whole and moved into place, what they were made from is kept beside them
+(``poses.csv.run.json``), and the journal is removed. A killed run therefore leaves the journal, with at most its last
+line torn; a resumed one drops that line and goes on. A finished table is resumed by turning it into a journal again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from torchpose.errors import ConfigError
+from torchpose.io.rows import DETECTION_SCHEMA, Row, Schema
+from torchpose.io.writers import atomic_path, check_table_path, read_rows, write_rows
+
+Origin = Mapping[str, Any]
+"""What rows are made from (versions, digests of the files, inputs), as JSON values by name."""
+
+
+class ResultStore:
+    """Collects the rows of a run frame by frame and writes its tables.
+
+    Args:
+        out: table of the poses. detections: table of the markers, or None.
+        schema: columns of ``out``.
+        targets: rows that every frame has in ``out``.
+        origin: what the rows are made from; a resumed run must agree.
+        resume: whether to keep the frames that an earlier run finished, instead of starting over.
+
+    Attributes:
+        counts: number of rows by status, those of an earlier run included.
+        unreadable: frames that could not be read, with their reason.
+
+    Raises:
+        ConfigError: a place cannot be written, another run is writing there, or there is an earlier run that cannot be
+            resumed because it was made from something else.
+    """
+
+    def __init__(
+        self, out: Path, detections: Path | None, *, schema: Schema, targets: int, origin: Origin, resume: bool
+    ) -> None:
+        check_table_path(out, "--out")
+        if detections is not None:
+            check_table_path(detections, "--detections")
+            if detections.resolve() == out.resolve():
+                raise ConfigError(f"{detections}: --detections: is the file of --out too; give another")
+        self.counts: Counter[str] = Counter()
+        self.unreadable: dict[str, str] = {}
+        self._out, self._detections = out, detections
+        self._schema, self._targets = schema, targets
+        self._origin = json.loads(json.dumps(origin))
+        self._journal_path = out.with_name(out.name + ".partial")
+        self._origin_path = out.with_name(out.name + ".run.json")
+        self._places: dict[str, tuple[int, int]] = {}  # frame -> offset and length of its line in the journal
+        resumable = resume and self._journal_path.exists()
+        finished = list(self._finished()) if resume and not resumable and out.exists() else []
+        try:
+            self._journal: BinaryIO = self._journal_path.open("a+b")
+            _lock(self._journal, self._journal_path)
+            if not (resumable and self._load()):
+                self._journal.truncate(0)
+                self._write([{"origin": self._origin}])
+                self.append(finished)
+        except OSError as error:
+            raise ConfigError(
+                f"{self._journal_path}: --out: cannot be written ({error.strerror}); choose another place"
+            ) from None
+
+    def __contains__(self, frame: str) -> bool:
+        return frame in self._places
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def append(self, records: Sequence[Row]) -> None:
+        """Makes finished frames permanent.
+
+        Args:
+            records: ``{"frame": name, "rows": [...], "detections": [...]}``, one a frame.
+
+        Raises:
+            ConfigError: the disk is full or gone; what was appended before is safe.
+        """
+        try:
+            places = self._write(records)
+        except OSError as error:
+            raise ConfigError(
+                f"{self._journal_path}: cannot be written ({error.strerror}); free some space and add --resume to go on"
+            ) from None
+        for record, place in zip(records, places, strict=True):
+            self._note(record, place)
+
+    def finish(self, order: Sequence[str]) -> None:
+        """Writes the tables and removes the journal.
+
+        Args:
+            order: frames in the order of the rows. Frames of an earlier run that are not in it come first.
+        """
+        listed = set(order)
+        frames = [frame for frame in self._places if frame not in listed] + [f for f in order if f in self._places]
+        if self._detections is not None:
+            rows = (row for record in self._records(frames) for row in record["detections"])
+            write_rows(self._detections, rows, DETECTION_SCHEMA)
+        write_rows(self._out, (row for record in self._records(frames) for row in record["rows"]), self._schema)
+        with atomic_path(self._origin_path) as path:
+            path.write_text(json.dumps(self._origin, indent=2) + "\n", encoding="utf-8")
+        self.close()
+        self._journal_path.unlink()
+
+    def close(self) -> None:
+        """Leaves the journal for a later run with ``resume``."""
+        self._journal.close()
+
+    def _write(self, records: Sequence[Row]) -> list[tuple[int, int]]:
+        lines = [json.dumps(record, allow_nan=False).encode() + b"\n" for record in records]
+        offset = self._journal.seek(0, os.SEEK_END)
+        self._journal.write(b"".join(lines))
+        self._journal.flush()
+        os.fsync(self._journal.fileno())
+        places = []
+        for line in lines:
+            places.append((offset, len(line)))
+            offset += len(line)
+        return places
+
+    def _note(self, record: Row, place: tuple[int, int]) -> None:
+        self._places[record["frame"]] = place
+        self.counts.update(row["status"] for row in record["rows"])
+        if record["rows"][0]["status"] == "unreadable":
+            self.unreadable[record["frame"]] = record["rows"][0]["reason"]
+
+    def _load(self) -> bool:
+        """Reads the journal of a killed run and drops a torn end; False if not even its first line is whole."""
+        self._journal.seek(0)
+        offset = 0
+        for line in self._journal:
+            if not line.endswith(b"\n"):
+                break
+            try:
+                record = json.loads(line)
+            except ValueError:  # a crash of the machine may leave blocks of zeros
+                break
+            if offset == 0:
+                self._check_origin(record.get("origin"), self._journal_path)
+            else:
+                self._note(record, (offset, len(line)))
+            offset += len(line)
+        self._journal.truncate(offset)
+        return offset > 0
+
+    def _records(self, frames: Sequence[str]) -> Iterator[Row]:
+        for frame in frames:
+            offset, length = self._places[frame]
+            self._journal.seek(offset)
+            yield json.loads(self._journal.read(length))
+
+    def _finished(self) -> Iterator[Row]:
+        """Records of the tables of a run that was completed."""
+        try:
+            origin = json.loads(self._origin_path.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            raise ConfigError(
+                f"{self._origin_path}: --resume: missing or damaged, so what {self._out.name} was made from is not "
+                "known; run without --resume"
+            ) from None
+        self._check_origin(origin, self._out)
+        records: dict[str, Row] = {}
+        for row in read_rows(self._out, self._schema):
+            record = records.setdefault(row["frame"], {"frame": row["frame"], "rows": [], "detections": []})
+            record["rows"].append(row)
+        if self._detections is not None:
+            for row in read_rows(self._detections, DETECTION_SCHEMA):
+                if row["frame"] in records:
+                    records[row["frame"]]["detections"].append(row)
+        yield from (record for record in records.values() if len(record["rows"]) == self._targets)
+
+    def _check_origin(self, origin: Any, path: Path) -> None:
+        if not isinstance(origin, dict):
+            raise ConfigError(f"{path}: --resume: not written by torchpose; run without --resume")
+        changed = [name for name in self._origin if origin.get(name) != self._origin[name]]
+        if changed:
+            raise ConfigError(
+                f"{path}: --resume: the rows there were made with another {' and '.join(changed)}; "
+                "run without --resume to start over"
+            )
+
+
+def _lock(file: BinaryIO, path: Path) -> None:
+    """Keeps a second run from writing the same journal; the system releases it however the run ends."""
+    try:
+        import fcntl
+    except ImportError:  # not on Windows, where this guard is missing
+        return
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        file.close()
+        raise ConfigError(f"{path}: --out: another run is writing it; wait for it or choose another file") from None

@@ -1,0 +1,169 @@
+"""Result tables as CSV, JSON lines or Parquet, by suffix: written beside their place, then moved there whole."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import json
+import os
+from collections.abc import Callable, Iterable, Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from torchpose.errors import ConfigError
+from torchpose.io.rows import Row, Schema
+
+TABLE_SUFFIXES = (".csv", ".jsonl", ".parquet")
+_ROW_GROUP = 4096
+
+
+def check_table_path(path: Path, option: str) -> None:
+    """Raises ConfigError unless a table can be written to ``path``, the argument of ``option``."""
+    if path.suffix.lower() not in TABLE_SUFFIXES:
+        raise ConfigError(f"{path}: {option}: of an unknown type; give a file that ends in {', '.join(TABLE_SUFFIXES)}")
+    if path.is_dir():
+        raise ConfigError(f"{path}: {option}: is a folder; give a file")
+    if not path.parent.is_dir():
+        raise ConfigError(f"{path}: {option}: folder {path.parent} does not exist; create it or choose another")
+    probe = _temporary(path)
+    try:
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise ConfigError(f"{path}: {option}: cannot be written ({error.strerror}); choose another place") from None
+
+
+def write_rows(path: Path, rows: Iterable[Row], schema: Schema) -> None:
+    """Writes a table; ``path`` holds either what it held before or all of the rows.
+
+    CSV and Parquet have the columns of the schema (CSV without those of type list), JSON lines the same as keys.
+
+    Raises:
+        ConfigError: the place cannot be written, for example because the disk is full.
+    """
+    with atomic_path(path) as temporary:
+        _WRITERS[path.suffix.lower()](temporary, rows, schema)
+
+
+def read_rows(path: Path, schema: Schema) -> Iterator[Row]:
+    """Rows of a table that `write_rows` wrote.
+
+    Raises:
+        ConfigError: the file is not such a table.
+    """
+    try:
+        yield from _READERS[path.suffix.lower()](path, schema)
+    except (ValueError, KeyError, TypeError, OSError, csv.Error):
+        raise ConfigError(
+            f"{path}: --resume: not a table that torchpose wrote for these options; run without --resume"
+        ) from None
+
+
+@contextlib.contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """A place beside ``path`` to write to. It is moved to ``path`` when the block ends, removed when it fails.
+
+    Raises:
+        ConfigError: an operating-system error on the way.
+    """
+    temporary = _temporary(path)
+    try:
+        yield temporary
+        with temporary.open("rb") as file:
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written ({error.strerror}); free some space or choose another") from None
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def _temporary(path: Path) -> Path:
+    return path.with_name(f".{path.name}.tmp")
+
+
+def _cells(schema: Schema) -> list[str]:
+    return [column for column, kind in schema.items() if kind is not list]
+
+
+def _write_csv(path: Path, rows: Iterable[Row], schema: Schema) -> None:
+    columns = _cells(schema)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")  # floats are written by repr, which reads back to the same bits
+        writer.writerow(columns)
+        writer.writerows([row.get(column) for column in columns] for row in rows)
+
+
+def _read_csv(path: Path, schema: Schema) -> Iterator[Row]:
+    columns = _cells(schema)
+    with path.open(newline="", encoding="utf-8") as file:
+        reader = csv.reader(file)
+        if next(reader, None) != columns:
+            raise ValueError("columns")
+        for cells in reader:
+            yield {c: schema[c](v) if v else None for c, v in zip(columns, cells, strict=True)}
+
+
+def _write_jsonl(path: Path, rows: Iterable[Row], schema: Schema) -> None:
+    with path.open("w", encoding="utf-8") as file:
+        file.writelines(
+            json.dumps({column: row.get(column) for column in schema}, allow_nan=False) + "\n" for row in rows
+        )
+
+
+def _read_jsonl(path: Path, schema: Schema) -> Iterator[Row]:
+    with path.open(encoding="utf-8") as file:
+        for line in file:
+            row = json.loads(line)
+            yield {column: row[column] for column in schema}
+
+
+def _write_parquet(path: Path, rows: Iterable[Row], schema: Schema) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    solution = pa.struct(
+        {
+            "translation": pa.list_(pa.float64(), 3),
+            "rotation": pa.list_(pa.float64(), 3),
+            "quaternion": pa.list_(pa.float64(), 4),
+            "rms_px": pa.float64(),
+            "chi2": pa.float64(),
+        }
+    )
+    plain = {str: pa.string(), int: pa.int64(), float: pa.float64()}
+    nested = {
+        "covariance": pa.list_(pa.list_(pa.float64())),
+        "base_covariance": pa.list_(pa.list_(pa.float64())),
+        "quaternion": pa.list_(pa.float64()),
+        "solutions": pa.list_(solution),
+    }
+    arrow = pa.schema({c: nested[c] if kind is list else plain[kind] for c, kind in schema.items()})
+    remaining = iter(rows)
+    with pq.ParquetWriter(path, arrow) as writer:
+        while group := list(islice(remaining, _ROW_GROUP)):
+            writer.write_table(pa.Table.from_pylist(group, arrow))
+
+
+def _read_parquet(path: Path, schema: Schema) -> Iterator[Row]:
+    import pyarrow.parquet as pq
+
+    with pq.ParquetFile(path) as file:
+        if file.schema_arrow.names != list(schema):
+            raise ValueError("columns")
+        for group in file.iter_batches(_ROW_GROUP):
+            yield from group.to_pylist()
+
+
+_WRITERS: dict[str, Callable[[Path, Iterable[Row], Schema], None]] = {
+    ".csv": _write_csv,
+    ".jsonl": _write_jsonl,
+    ".parquet": _write_parquet,
+}
+_READERS: dict[str, Callable[[Path, Schema], Iterator[dict[str, Any]]]] = {
+    ".csv": _read_csv,
+    ".jsonl": _read_jsonl,
+    ".parquet": _read_parquet,
+}

@@ -1,0 +1,203 @@
+"""Pictures that show at once what was found in a frame: fitted ellipses, ids, axes, status."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchpose.camera import Camera
+from torchpose.errors import ConfigError
+from torchpose.results import Poses, Reason, Status
+from torchpose.target import Target
+
+Colour = tuple[int, int, int]
+
+_GREEN, _AMBER, _RED = (60, 170, 40), (0, 150, 240), (50, 50, 220)  # blue, green, red, as OpenCV has them
+_STATUS_COLOUR: dict[Status, Colour] = {Status.OK: _GREEN, Status.AMBIGUOUS: _AMBER}
+_OUTER, _INNER, _CENTRE = (255, 200, 0), (255, 0, 220), (0, 230, 255)
+_AXES: tuple[Colour, ...] = ((40, 40, 255), (40, 220, 40), (255, 110, 30))
+_AXIS_POINTS = 33  # along an axis, so that distortion bends it
+_SHIFT = 6  # OpenCV draws at 1/64 px
+_PNG = (
+    cv2.IMWRITE_PNG_COMPRESSION,
+    1,
+)  # lossless, so that a line of a pixel stays one; low effort, as noise packs badly
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+
+
+def picture_path(folder: Path, frame: str) -> Path:
+    """Where the picture of a frame lies: the frame's relative path, with ``.png`` appended unless it ends so."""
+    return folder / (frame if frame.lower().endswith(".png") else f"{frame}.png")
+
+
+class Overlay:
+    """Draws and writes the picture of each frame.
+
+    Args:
+        camera, targets: as for `PoseEstimator`. folder: where the pictures go, created if missing.
+        threads: pictures that are drawn and written side by side.
+
+    Raises:
+        ConfigError: the folder cannot be created or written.
+    """
+
+    def __init__(self, camera: Camera, targets: Sequence[Target], folder: Path, *, threads: int = 1) -> None:
+        self._camera = camera
+        self._names = [target.name for target in targets]
+        self._folder = folder
+        self._threads = threads
+        centers = [target.centers for target in targets]
+        middle = torch.stack([c.mean(0) for c in centers])
+        extent = torch.stack([(c - m).norm(dim=-1).max() for c, m in zip(centers, middle, strict=True)])
+        steps = torch.linspace(0, 1, _AXIS_POINTS, dtype=torch.float64)
+        # (T, 3 axes, points, 3): from the target's origin, about as long as the target is wide
+        self._axes = extent[:, None, None, None] * torch.eye(3, dtype=torch.float64)[:, None] * steps[:, None]
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            probe = folder / ".probe.tmp"
+            probe.touch()
+            probe.unlink()
+        except OSError as error:
+            raise ConfigError(
+                f"{folder}: --overlay: cannot be written ({error.strerror}); choose another place"
+            ) from None
+
+    def write(self, frames: Tensor, poses: Poses, names: Sequence[str]) -> None:
+        """Writes one picture a frame.
+
+        Args:
+            frames: (B, H, W) uint8 or uint16. poses: of these frames, targets to camera. names: of the frames.
+
+        Raises:
+            ConfigError: a picture cannot be written.
+        """
+        lines = self._project_axes(poses)
+        with ThreadPoolExecutor(self._threads) as pool:
+            for _ in pool.map(lambda b: self._write_one(frames[b], b, poses, lines, names[b]), range(len(names))):
+                pass
+
+    def draw(self, frame: Tensor, poses: Poses, name: str) -> np.ndarray:
+        """Picture (H, W, 3) uint8, blue-green-red, of one frame (H, W) with the poses of a batch of one."""
+        return self._draw(frame, 0, poses, self._project_axes(poses), name)
+
+    def _project_axes(self, poses: Poses) -> np.ndarray:
+        """Pixels (N, 3, points, 2) of the axes of each pose, NaN where there is none or it is behind the camera."""
+        points = self._axes[poses.target] @ poses.R[:, None].mT + poses.t[:, None, None]
+        pixels = self._camera.project(points)
+        return torch.where(points[..., 2:] > 0, pixels, torch.nan).numpy()
+
+    def _write_one(self, frame: Tensor, index: int, poses: Poses, lines: np.ndarray, name: str) -> None:
+        picture = self._draw(frame, index, poses, lines, name)
+        path = picture_path(self._folder, name)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            temporary = path.with_name(f".{path.name}.tmp")
+            temporary.write_bytes(cv2.imencode(".png", picture, _PNG)[1].tobytes())
+            temporary.replace(path)
+        except OSError as error:
+            raise ConfigError(f"{path}: --overlay: cannot be written ({error.strerror}); free some space") from None
+
+    def _draw(self, frame: Tensor, index: int, poses: Poses, lines: np.ndarray, name: str) -> np.ndarray:
+        picture = cv2.cvtColor(_eight_bit(frame.numpy()), cv2.COLOR_GRAY2BGR)
+        unit = max(picture.shape[:2]) / 1000  # everything is drawn in thousandths of the picture's longer side
+        found = poses.detections[poses.detections.frame == index]
+        for outer, inner, center, marker in zip(
+            found.outer.tolist(), found.inner.tolist(), found.center.tolist(), found.marker.tolist(), strict=True
+        ):
+            _ellipse(picture, outer, _OUTER)
+            _ellipse(picture, inner, _INNER)
+            _cross(picture, center, max(0.2 * inner[3], 3.0))
+            _text(picture, str(marker), (center[0] + 0.75 * outer[2], center[1] - 0.75 * outer[2]), 1.0 * unit, _CENTRE)
+        rows = (poses.frame == index).nonzero()[:, 0].tolist()
+        for row in rows:
+            for axis, colour in zip(lines[row], _AXES, strict=True):
+                _polyline(picture, axis, colour, max(1, round(1.5 * unit)))
+        _banners(picture, [self._banner(poses, row) for row in rows], name, unit)
+        return picture
+
+    def _banner(self, poses: Poses, row: int) -> tuple[str, Colour]:
+        """Text and colour of the plate of one pose."""
+        status = Status(int(poses.status[row]))
+        words = [f"{self._names[int(poses.target[row])]}: {status.name.lower().replace('_', ' ')}"]
+        if int(poses.reason[row]):
+            words.append(f"({Reason(int(poses.reason[row])).name.lower().replace('_', ' ')})")
+        words.append(f" {int(poses.markers[row])} markers")
+        if bool(poses.t[row].isfinite().all()):
+            t, r, s = poses.t[row].tolist(), poses.rotation_vector[row].rad2deg().tolist(), poses.std[row].tolist()
+            words.append("  t " + " ".join(f"{v:.3f}" for v in t) + " mm")
+            words.append("  +- " + " ".join(f"{1000 * v:.1f}" for v in s[:3]) + " um")
+            words.append("  r " + " ".join(f"{v:.3f}" for v in r) + " deg")
+            words.append(f"  rms {float(poses.rms[row]):.4f} px")
+        return " ".join(words), _STATUS_COLOUR.get(status, _RED)
+
+
+def _eight_bit(frame: np.ndarray) -> np.ndarray:
+    """The frame for the eye: 16-bit grey values are stretched to their range."""
+    if frame.dtype == np.uint8:
+        return frame
+    low, high = int(frame.min()), int(frame.max())
+    return cv2.convertScaleAbs(frame, alpha=255 / max(high - low, 1), beta=-255 * low / max(high - low, 1))
+
+
+def _fixed(values: Sequence[float] | np.ndarray) -> tuple[int, ...]:
+    """Pixels as OpenCV's fixed-point coordinates."""
+    return tuple(round(v * (1 << _SHIFT)) for v in values)
+
+
+def _ellipse(picture: np.ndarray, ellipse: Sequence[float], colour: Colour) -> None:
+    cx, cy, a, b, theta = ellipse
+    turn = float(np.rad2deg(theta))
+    cv2.ellipse(picture, _fixed((cx, cy)), _fixed((a, b)), turn, 0, 360, colour, 1, lineType=cv2.LINE_AA, shift=_SHIFT)
+
+
+def _cross(picture: np.ndarray, center: Sequence[float], arm: float) -> None:
+    u, v = center
+    for start, end in (((u - arm, v), (u + arm, v)), ((u, v - arm), (u, v + arm))):
+        cv2.line(picture, _fixed(start), _fixed(end), _CENTRE, 1, cv2.LINE_AA, _SHIFT)
+
+
+def _polyline(picture: np.ndarray, points: np.ndarray, colour: Colour, width: int) -> None:
+    height, wide = picture.shape[:2]
+    # OpenCV's fixed point overflows far outside of the picture
+    near = np.isfinite(points).all(-1) & (np.abs(points) < 10 * max(height, wide)).all(-1)
+    chain = np.round(points[: int(near.argmin()) if not near.all() else None] * (1 << _SHIFT)).astype(np.int32)
+    if len(chain) > 1:
+        cv2.polylines(picture, [chain], False, colour, width, cv2.LINE_AA, _SHIFT)
+
+
+def _text(picture: np.ndarray, text: str, place: tuple[float, float], size: float, colour: Colour) -> None:
+    """Text with a dark rim, readable on any ground."""
+    at = (round(place[0]), round(place[1]))
+    width = max(1, round(1.5 * size))
+    cv2.putText(picture, text, at, _FONT, size, (0, 0, 0), 3 * width, cv2.LINE_AA)
+    cv2.putText(picture, text, at, _FONT, size, colour, width, cv2.LINE_AA)
+
+
+def _banners(picture: np.ndarray, banners: Sequence[tuple[str, Colour]], name: str, unit: float) -> None:
+    """One coloured plate a target along the top, the frame's name at the bottom."""
+    top = 0
+    for text, colour in banners:
+        size = 0.55 * unit
+        (wide, high), below = cv2.getTextSize(text, _FONT, size, max(1, round(1.4 * size)))
+        fit = min(1.0, 0.97 * picture.shape[1] / wide)
+        size, line = size * fit, round((high + below) * 1.7)
+        cv2.rectangle(picture, (0, top), (picture.shape[1] - 1, top + line), colour, cv2.FILLED)
+        baseline = top + round((line + high * fit) / 2)
+        cv2.putText(
+            picture,
+            text,
+            (round(6 * unit), baseline),
+            _FONT,
+            size,
+            (255, 255, 255),
+            max(1, round(1.4 * size)),
+            cv2.LINE_AA,
+        )
+        top += line + 1
+    _text(picture, name, (6 * unit, picture.shape[0] - 8 * unit), 0.5 * unit, (255, 255, 255))
