@@ -104,7 +104,7 @@ def render(
     sigma = check_blur(psf_sigma, t)
     dark_, light_, around = (per_frame(x, t) for x in (dark, light, surround))
     ink, paper = (light_, dark_) if target.background == "dark" else (dark_, light_)
-    frames = max(1, _CHUNK_PIXELS // (camera.width * camera.height))
+    frames = _frames_at_once(camera.width * camera.height)
     out = []
     for a in range(0, batch, frames):
         s = slice(a, min(a + frames, batch))
@@ -268,11 +268,19 @@ def add_noise(
     """
     if not 1 <= bits <= 16:
         raise ConfigError(f"bits: {bits} is not a bit depth of this camera model; give 1 to 16")
-    top = 2**bits - 1
+    top, dtype = 2**bits - 1, torch.uint8 if bits <= 8 else torch.uint16
     number = torch.arange(frames.shape[0], device=frames.device) if index is None else index.to(frames.device)
-    noise = _normal(seed, number, frames.shape[1] * frames.shape[2]).view_as(frames)
-    level = (frames + per_frame(sigma, noise)[:, None, None] * noise) * (top / GREY_MAX)
-    return level.round().clamp(0, top).to(torch.uint8 if bits <= 8 else torch.uint16)
+    size = frames.shape[1] * frames.shape[2]
+    sigma = torch.as_tensor(sigma, dtype=torch.float64, device=frames.device).expand(frames.shape[0])
+    out = []
+    for some, which, amplitude in zip(*(x.split(_frames_at_once(size)) for x in (frames, number, sigma)), strict=True):
+        level = some + amplitude[:, None, None] * _normal(seed, which, size).view_as(some)
+        out.append((level * (top / GREY_MAX)).round().clamp(0, top).to(dtype))
+    return torch.cat(out) if out else torch.empty_like(frames, dtype=dtype)
+
+
+def _frames_at_once(pixels: int) -> int:
+    return max(1, _CHUNK_PIXELS // max(1, pixels))
 
 
 def _normal(seed: int, number: Tensor, count: int) -> Tensor:
@@ -322,7 +330,7 @@ def _normal_loss(a: Tensor) -> Tensor:
 
 
 def _plane_axes(normals: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit vectors (M, 3), (M, 3) at right angles to unit normals (M, 3) and each other (Duff et al. 2017); x, y for z."""
+    """Unit vectors (M, 3), (M, 3) that complete unit normals (M, 3) to orthonormal frames (Duff et al. 2017)."""
     x, y, z = normals.unbind(-1)
     sign = torch.where(z < 0, -1.0, 1.0).to(z)
     a = -1 / (sign + z)
