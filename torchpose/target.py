@@ -35,7 +35,7 @@ class RigidTransformFile(BaseModel):
 
 class _MarkerFile(BaseModel):
     model_config = _FROZEN
-    id: int
+    id: Annotated[int, Field(le=2**63 - 1)]
     center: list[FiniteFloat]
     outer_radius: FiniteFloat
     inner_radius: FiniteFloat
@@ -74,8 +74,8 @@ class Target:
         background: tone around the rings and in their holes; the rings themselves are of the other one.
         ids: (M,) int64, unique, not negative.
         centers: (M, 3) float64, mm.
-        normals: (M, 3) float64, unit, perpendicular to each ring and away from whoever sees its printed side: the default
-            [0, 0, 1] is seen by a camera with R = I, whose z axis points at the target.
+        normals: (M, 3) float64, unit, perpendicular to each ring and away from whoever sees its printed side: a
+            camera with R = I, whose z axis points at the target, sees the default [0, 0, 1].
         radii: (M, 2) float64, outer and inner radius, mm.
         part_rotation, part_translation: (3,) float64 rotation vector in rad and translation in mm that map target
             coordinates to those of the part, both or neither.
@@ -125,7 +125,7 @@ class Target:
                 raise ConfigError(
                     f"markers[{i}].inner_radius: {inner:g} is not below the outer {outer:g}; swap or shrink"
                 )
-            if not RATIO_RANGE[0] - 1e-9 <= inner / outer <= RATIO_RANGE[1] + 1e-9:
+            if not RATIO_RANGE[0] - 1e-6 <= inner / outer <= RATIO_RANGE[1] + 1e-6:
                 raise ConfigError(
                     f"markers[{i}].inner_radius: inner/outer is {inner / outer:.3g}; "
                     f"rings are readable from {RATIO_RANGE[0]} to {RATIO_RANGE[1]}"
@@ -136,7 +136,7 @@ class Target:
                 raise ConfigError(f"markers[{i}].normal: has length {length:.3g}; give a unit vector")
         ratio, order = (self.radii[:, 1] / self.radii[:, 0]).sort()
         gap, k = ratio.diff().min(0)
-        if float(gap) < MIN_RATIO_GAP - 1e-9:
+        if float(gap) < MIN_RATIO_GAP - 1e-6:
             a, b = sorted((ids[int(order[k])], ids[int(order[k + 1])]))
             raise ConfigError(
                 f"markers: ids {a} and {b} cannot be told apart (inner/outer differ by {float(gap):.3g}); "
@@ -154,7 +154,7 @@ class Target:
             (offset * self.normals[:, None]).sum(-1).abs() < 1e-3 * self.radii[:, 0, None]
         )
         reach = self.radii[:, None, 0] + self.radii[None, :, 0]
-        overlap = (same_plane & (offset.norm(dim=-1) < reach * (1 - 1e-9))).triu(1).nonzero().tolist()
+        overlap = (same_plane & (offset.norm(dim=-1) < reach * (1 - 1e-6))).triu(1).nonzero().tolist()
         if overlap:
             a, b = overlap[0]
             raise ConfigError(f"markers: ids {ids[a]} and {ids[b]} overlap; move them apart or shrink outer_radius")
@@ -176,11 +176,11 @@ class Target:
 
     @property
     def coplanar(self) -> bool:
-        """Whether all rings lie in one plane and face the same way, to 1e-9 of the target's extent."""
+        """Whether all rings lie in one plane and face the same way, to 1e-6 of the target's extent."""
         offset = self.centers - self.centers[0]
         scale = offset.norm(dim=-1).max()
-        one_normal = (self.normals - self.normals[0]).norm(dim=-1).max() < 1e-9
-        return bool(one_normal & ((offset @ self.normals[0]).abs().max() < 1e-9 * scale))
+        one_normal = (self.normals - self.normals[0]).norm(dim=-1).max() < 1e-6
+        return bool(one_normal & ((offset @ self.normals[0]).abs().max() < 1e-6 * scale))
 
     def to(self, *args: Any, **kwargs: Any) -> Target:
         """Same as `Tensor.to` on every tensor; ids keep their dtype."""

@@ -235,7 +235,7 @@ def _size(value: Any, field: str) -> int:
 
 
 def _model(name: Any) -> Model:
-    if name not in MODELS:
+    if not isinstance(name, str) or name not in MODELS:
         raise ConfigError(f"distortion_model: {name!r} is not supported; use one of {', '.join(MODELS)}")
     return MODELS[name]
 

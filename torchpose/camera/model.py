@@ -273,9 +273,10 @@ class Camera:
 
 
 def _first_positive_root(polynomial: np.polynomial.Polynomial) -> float:
-    roots = polynomial.trim().roots()
+    # its constant term is 1, so the reciprocals of the roots are those of a monic polynomial, however small the others
+    roots = np.roots(polynomial.coef)
     positive = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0)]
-    return float(positive.min()) if positive.size else math.inf
+    return 1 / float(positive.max()) if positive.size else math.inf
 
 
 def _solve2(matrix: Tensor, rhs: Tensor) -> Tensor:

@@ -1,0 +1,117 @@
+"""Hand-eye files: both mounts, both spellings of a pose, and one line for every mistake."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from torchpose.errors import ConfigError
+from torchpose.handeye import HandEye
+
+VECTOR = [0.3, -1.2, 2.0]
+MATRIX = np.eye(4)
+MATRIX[:3, :3] = Rotation.from_rotvec(VECTOR).as_matrix()
+MATRIX[:3, 3] = [100.5, -20.0, 812.25]
+
+
+def load(tmp_path: Path, text: str) -> HandEye:
+    path = tmp_path / "handeye.yaml"
+    path.write_text(text)
+    return HandEye.load(path)
+
+
+@pytest.mark.parametrize(
+    "pose",
+    [
+        f"{{rotation: {VECTOR}, translation: [100.5, -20, 812.25]}}",
+        f"{{matrix: {MATRIX.tolist()}}}",
+        f"{{matrix: {MATRIX.round(7).tolist()}}}",  # a file with few digits
+    ],
+)
+def test_camera_on_the_base(tmp_path: Path, pose: str) -> None:
+    handeye = load(tmp_path, f"base_from_camera: {pose}\n")
+    assert handeye.mount == "base"
+    r, t = handeye.base_from_camera()
+    np.testing.assert_allclose(r.numpy(), MATRIX[:3, :3], rtol=0, atol=1e-7)
+    np.testing.assert_allclose((r.T @ r).numpy(), np.eye(3), rtol=0, atol=1e-14)
+    np.testing.assert_array_equal(t.numpy(), MATRIX[:3, 3])
+    robot = torch.eye(3, dtype=torch.float64).repeat(2, 1, 1), torch.ones(2, 3, dtype=torch.float64)
+    assert torch.equal(handeye.base_from_camera(robot)[1], t)
+
+
+def test_camera_on_the_tool_follows_the_robot(tmp_path: Path) -> None:
+    handeye = load(tmp_path, f"tool_from_camera: {{matrix: {MATRIX.tolist()}}}\n")
+    assert handeye.mount == "tool"
+    tools = np.tile(np.eye(4), (5, 1, 1))
+    tools[:, :3, :3] = Rotation.random(5, random_state=1).as_matrix()
+    tools[:, :3, 3] = np.random.default_rng(1).normal(0, 300, (5, 3))
+    r, t = handeye.base_from_camera((torch.tensor(tools[:, :3, :3]), torch.tensor(tools[:, :3, 3])))
+    expected = tools @ MATRIX
+    np.testing.assert_allclose(r.numpy(), expected[:, :3, :3], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(t.numpy(), expected[:, :3, 3], rtol=0, atol=1e-11)
+    with pytest.raises(ConfigError, match=r"handeye\.yaml: tool_from_camera: needs the robot's pose at each frame; "):
+        handeye.base_from_camera()
+
+
+def matrix_with(row: int, column: int, value: float) -> str:
+    rows = MATRIX.tolist()
+    rows[row][column] = float(value)
+    return f"base_from_camera: {{matrix: {rows}}}"
+
+
+POSE = "{rotation: [0, 0, 0], translation: [1, 2, 3]}"
+TRAPS = {
+    "both": (f"base_from_camera: {POSE}\ntool_from_camera: {POSE}\n", "file: does not say where the camera is; give "),
+    "neither": ("{}", "file: does not say where the camera is; give base_from_camera or tool_from_camera"),
+    "unknown mount": (f"base_from_cam: {POSE}\n", r"base_from_cam: unknown key; did you mean base_from_camera\?"),
+    "unknown key": (
+        "base_from_camera: {rotatoin: [0, 0, 0], translation: [1, 2, 3]}",
+        r"base_from_camera\.rotatoin: unknown key; did you mean rotation\?",
+    ),
+    "half": ("base_from_camera: {rotation: [0, 0, 0]}", "base_from_camera: is not one pose; give rotation and "),
+    "nothing": ("base_from_camera: {}", "base_from_camera: is not one pose; "),
+    "two spellings": (
+        f"base_from_camera: {{rotation: [0, 0, 0], translation: [1, 2, 3], matrix: {MATRIX.tolist()}}}",
+        "base_from_camera: is not one pose; ",
+    ),
+    "short": (
+        "base_from_camera: {rotation: [0, 0, 0, 1], translation: [1, 2, 3]}",
+        r"base_from_camera\.rotation: has 4 entries; give 3",
+    ),
+    "nan": ("base_from_camera: {rotation: [0, 0, .nan], translation: [1, 2, 3]}", r".*rotation\[2\]: is not finite; "),
+    "3x4": (f"base_from_camera: {{matrix: {MATRIX[:3].tolist()}}}", "base_from_camera: matrix is not 4 x 4; "),
+    "last row": (matrix_with(3, 0, 1.0), "base_from_camera: matrix has the last row "),
+    "skewed": (
+        matrix_with(0, 0, MATRIX[0, 0] + 1e-5),
+        "base_from_camera: matrix has a rotation part off orthonormal by ",
+    ),
+    "reflection": (
+        "base_from_camera: {matrix: [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}",
+        "base_from_camera: matrix is a reflection ",
+    ),
+    "scalar": ("base_from_camera: 5", "base_from_camera: is not a mapping; "),
+    "twice": (f"base_from_camera: {POSE}\nbase_from_camera: {POSE}\n", r"base_from_camera: given twice \(line 2\); "),
+}
+
+
+@pytest.mark.parametrize("trap", TRAPS)
+def test_traps_name_file_field_and_fix(tmp_path: Path, trap: str) -> None:
+    text, message = TRAPS[trap]
+    with pytest.raises(ConfigError, match=f"^{tmp_path / 'handeye.yaml'}: {message}") as caught:
+        load(tmp_path, text)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"none\.yaml: file: does not exist; "):
+        HandEye.load(tmp_path / "none.yaml")
+
+
+def test_rotation_of_half_a_turn(tmp_path: Path) -> None:
+    handeye = load(tmp_path, f"base_from_camera: {{rotation: [{math.pi!r}, 0, 0], translation: [0, 0, 0]}}")
+    np.testing.assert_allclose(handeye.rotation.numpy(), np.diag([1.0, -1, -1]), rtol=0, atol=1e-15)
