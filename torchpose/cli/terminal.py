@@ -8,7 +8,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -82,9 +82,9 @@ def native_stderr_silenced() -> Iterator[None]:
     except OSError:  # the process was started without a stderr
         yield
         return
-    python_stderr = sys.stderr
+    python_stderr: Any = sys.stderr
     try:
-        if python_stderr and python_stderr is sys.__stderr__:
+        if python_stderr and python_stderr == sys.__stderr__:
             python_stderr.flush()
             sys.stderr = os.fdopen(
                 screen, "w", buffering=1, encoding=python_stderr.encoding, errors="backslashreplace", closefd=False

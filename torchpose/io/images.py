@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
-_KNOWN = (_PNG, _JPEG, b"BM", b"II*\0", b"MM\0*", b"II+\0", b"MM\0+", b"P2", b"P5")
+_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # little and big endian; + is BigTIFF
+_KNOWN = (_PNG, _JPEG, *_TIFF, b"BM", b"P2", b"P5")
 # A camera file describes the sensor's rows and columns: the orientation that a phone notes in EXIF must not turn them.
 _FLAGS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
@@ -43,7 +46,7 @@ def decode(path: Path) -> np.ndarray:
         raise UnreadableImageError("empty")
     if not data.startswith(_KNOWN):
         raise UnreadableImageError("not_an_image")
-    if (data.startswith(_PNG) and not _png_ends(data)) or (data.startswith(_JPEG) and not _jpeg_ends(data)):
+    if not next((ends(data) for start, ends in _ENDS if data.startswith(start)), True):
         raise UnreadableImageError("truncated")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), _FLAGS)
@@ -82,3 +85,23 @@ def _jpeg_ends(data: bytes) -> bool:
         else:
             position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
     return False
+
+
+def _tiff_ends(data: bytes) -> bool:
+    """Whether the first directory of a TIFF file lies within it.
+
+    libtiff goes on without the entries that are cut off. Pixels that are cut off it reports.
+    """
+    order: Literal["little", "big"] = "little" if data.startswith(b"II") else "big"
+    big = data[2:4] in (b"+\0", b"\0+")
+    at, offset_size, count_size, entry_size = (8, 8, 8, 20) if big else (4, 4, 2, 12)
+    directory = int.from_bytes(data[at : at + offset_size], order)
+    entries = int.from_bytes(data[directory : directory + count_size], order)
+    return directory > 0 and directory + count_size + entries * entry_size + offset_size <= len(data)
+
+
+_ENDS: tuple[tuple[bytes | tuple[bytes, ...], Callable[[bytes], bool]], ...] = (
+    (_PNG, _png_ends),
+    (_JPEG, _jpeg_ends),
+    (_TIFF, _tiff_ends),
+)

@@ -1,0 +1,61 @@
+"""Capture manifests: torn ends are tolerated, everything else that is wrong is refused by line and field."""
+
+import json
+
+import pytest
+
+from torchpose.errors import ConfigError
+from torchpose.io.manifest import read_manifest
+
+SESSION = {"record": "session", "schema": 1, "units": {"length": "mm"}}
+FRAME = {"record": "frame", "id": 0, "image": "0.png", "robot_pose": [1, 2, 3, 0.1, 0.2, 0.3], "sha256": "ignored"}
+
+
+def write(path, *records, end="\n"):
+    path.write_text("\n".join(r if isinstance(r, str) else json.dumps(r) for r in records) + end)
+    return path
+
+
+def test_frames_without_image_other_records_and_blank_lines_are_passed_over(tmp_path):
+    failed = FRAME | {"id": 1, "image": None}
+    path = write(tmp_path / "m.jsonl", SESSION, FRAME, "", {"record": "note", "text": "x"}, failed, {"record": "end"})
+    (frame,) = read_manifest(path)
+    assert frame.image == "0.png"
+    assert frame.robot_pose == (1, 2, 3, 0.1, 0.2, 0.3)
+
+
+@pytest.mark.parametrize("kept", range(1, len(json.dumps(FRAME))))
+def test_a_torn_last_line_is_dropped_wherever_it_was_cut(tmp_path, kept):
+    torn = json.dumps(FRAME | {"id": 1, "image": "1.png"})[:kept]
+    path = write(tmp_path / "m.jsonl", SESSION, FRAME, torn, end="")
+    assert [frame.image for frame in read_manifest(path)] == ["0.png"]
+
+
+def test_a_whole_last_line_counts_without_its_newline(tmp_path):
+    path = write(tmp_path / "m.jsonl", SESSION, FRAME, FRAME | {"id": 1, "image": "1.png"}, end="")
+    assert [frame.image for frame in read_manifest(path)] == ["0.png", "1.png"]
+
+
+@pytest.mark.parametrize(
+    ("records", "field"),
+    [
+        ([SESSION, '{"record": "frame", "id"', FRAME], "line 2: not JSON"),
+        ([SESSION, "[1, 2]"], "line 2: not an object"),
+        ([SESSION, {"record": "frame", "image": "a.png"}], "line 2: id"),
+        ([SESSION, {"record": "frame", "id": 1}], "line 2: image"),
+        ([SESSION, {"record": "frame", "id": 1, "image": 5}], "line 2: image"),
+        ([SESSION, FRAME, FRAME | {"image": "1.png"}], "line 3: id"),
+        ([SESSION, FRAME, FRAME | {"id": 1}], "line 3: image"),
+        ([{"record": "session"}, FRAME], "line 2: robot_pose: in unknown units"),
+        ([{"record": "session", "units": {"length": "inch"}}], "line 1: units"),
+        ([SESSION, FRAME | {"robot_pose": [1, 2, 3, 4, 5]}], "line 2: robot_pose"),
+        ([SESSION, FRAME | {"robot_pose": [1, 2, 3, 4, 5, float("nan")]}], "line 2: robot_pose"),
+        ([SESSION, FRAME | {"robot_pose": "home"}], "line 2: robot_pose"),
+    ],
+)
+def test_broken_records_are_refused_by_line_and_field(tmp_path, records, field):
+    path = write(tmp_path / "m.jsonl", *records)
+    with pytest.raises(ConfigError, match=field) as caught:
+        read_manifest(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,97 @@
+"""Inputs to frames: order, names, what is passed over, what is refused."""
+
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from torchpose.errors import ConfigError
+from torchpose.io.sources import find_sources, natural_key
+
+
+def touch(*paths: Path) -> None:
+    for path in paths:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+
+
+def names(*inputs: Path) -> list[str]:
+    return [source.name for source in find_sources(inputs)]
+
+
+def test_folders_are_searched_recursively_in_natural_order(tmp_path):
+    expected = ["a/2.png", "a/10.png", "a10/1.png", "b.png", "frame_1.PNG", "frame_02.tiff", "frame_10.jpeg", "z.pgm"]
+    touch(*(tmp_path / name for name in reversed(expected)))
+    assert names(tmp_path) == expected
+
+
+def test_hidden_files_other_files_folders_and_pipes_are_passed_over(tmp_path):
+    touch(
+        tmp_path / "a.png",
+        tmp_path / ".b.png",
+        tmp_path / ".c" / "d.png",
+        tmp_path / "notes.txt",
+        tmp_path / "Thumbs.db",
+    )
+    (tmp_path / "folder.png").mkdir()
+    os.mkfifo(tmp_path / "pipe.png")
+    assert names(tmp_path) == ["a.png"]
+
+
+def test_linked_folders_are_followed_once_and_dangling_links_are_frames(tmp_path):
+    touch(tmp_path / "real" / "1.png")
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "link").symlink_to(tmp_path / "real")
+    (tmp_path / "real" / "loop").symlink_to(tmp_path / "in")
+    (tmp_path / "in" / "gone.png").symlink_to(tmp_path / "nothing.png")
+    assert names(tmp_path / "in") == ["gone.png", "link/1.png"]
+
+
+def test_files_are_named_without_their_folder_and_keep_the_order_given(tmp_path):
+    touch(tmp_path / "x" / "2.png", tmp_path / "y" / "1.png")
+    assert names(tmp_path / "x" / "2.png", tmp_path / "y" / "1.png") == ["2.png", "1.png"]
+
+
+def test_names_that_are_not_utf8_become_valid_text(tmp_path):
+    touch(Path(os.fsdecode(os.fsencode(tmp_path) + b"/f\xff.png")))
+    (source,) = find_sources([tmp_path])
+    assert source.name == "f\\xff.png"
+    assert source.path.exists()
+
+
+def test_manifest_frames_come_in_the_order_of_capture_with_their_robot_pose(tmp_path):
+    manifest = tmp_path / "run.jsonl"
+    manifest.write_text(
+        '{"record": "session", "units": {"length": "m"}}\n'
+        '{"record": "frame", "id": 10, "image": "i/10.png", "robot_pose": [0.1, 0, -1, 0, 0.5, 0]}\n'
+        '{"record": "frame", "id": 2, "image": "i/2.png"}\n'
+    )
+    first, second = find_sources([manifest])
+    assert (first.name, first.path, first.robot_pose) == ("i/10.png", tmp_path / "i/10.png", (100, 0, -1000, 0, 0.5, 0))
+    assert (second.name, second.robot_pose) == ("i/2.png", None)
+
+
+@pytest.mark.parametrize("kind", ["missing", "empty folder", "no image", "unknown suffix", "same name", "same file"])
+def test_unusable_inputs_are_refused_in_one_line_that_names_them(tmp_path, kind):
+    touch(tmp_path / "a" / "1.png", tmp_path / "b" / "1.png", tmp_path / "c" / "notes.txt", tmp_path / "d.raw")
+    (tmp_path / "e").mkdir()
+    inputs, named = {
+        "missing": ([tmp_path / "gone"], "gone"),
+        "empty folder": ([tmp_path / "e"], "e: INPUT: holds no image"),
+        "no image": ([tmp_path / "a", tmp_path / "c"], "c: INPUT: holds no image"),
+        "unknown suffix": ([tmp_path / "d.raw"], "d.raw"),
+        "same name": ([tmp_path / "a", tmp_path / "b"], "b/1.png: INPUT: has the same name"),
+        "same file": ([tmp_path / "a", tmp_path / "a" / "1.png"], "same name"),
+    }[kind]
+    with pytest.raises(ConfigError) as caught:
+        find_sources(inputs)
+    assert named in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@given(st.lists(st.tuples(st.sampled_from(["f", "img_", "F"]), st.integers(0, 10**12)), unique=True))
+def test_natural_order_sorts_equal_prefixes_by_the_value_of_the_number(pairs):
+    ordered = sorted(pairs, key=lambda pair: natural_key(f"{pair[0]}{pair[1]}.png"))
+    assert ordered == sorted(pairs, key=lambda pair: (pair[0].casefold(), pair[1], f"{pair[0]}{pair[1]}"))
