@@ -63,15 +63,20 @@ class ResultStore:
         finished = list(self._finished()) if resume and not resumable and out.exists() else []
         try:
             self._journal: BinaryIO = self._journal_path.open("a+b")
+        except OSError as error:
+            raise self._unwritable(error) from None
+        try:
             _lock(self._journal, self._journal_path)
             if not (resumable and self._load()):
                 self._journal.truncate(0)
                 self._write([{"origin": self._origin}])
                 self.append(finished)
         except OSError as error:
-            raise ConfigError(
-                f"{self._journal_path}: --out: cannot be written ({error.strerror}); choose another place"
-            ) from None
+            self.close()
+            raise self._unwritable(error) from None
+        except ConfigError:
+            self.close()
+            raise
 
     def __contains__(self, frame: str) -> bool:
         return frame in self._places
@@ -91,9 +96,7 @@ class ResultStore:
         try:
             places = self._write(records)
         except OSError as error:
-            raise ConfigError(
-                f"{self._journal_path}: cannot be written ({error.strerror}); free some space and add --resume to go on"
-            ) from None
+            raise self._unwritable(error) from None
         for record, place in zip(records, places, strict=True):
             self._note(record, place)
 
@@ -117,6 +120,12 @@ class ResultStore:
     def close(self) -> None:
         """Leaves the journal for a later run with ``resume``."""
         self._journal.close()
+
+    def _unwritable(self, error: OSError) -> ConfigError:
+        return ConfigError(
+            f"{self._journal_path}: --out: cannot be written ({error.strerror}); free some space or choose another "
+            "place, with --resume to keep what is there"
+        )
 
     def _write(self, records: Sequence[Row]) -> list[tuple[int, int]]:
         lines = [json.dumps(record, allow_nan=False).encode() + b"\n" for record in records]
@@ -201,5 +210,4 @@ def _lock(file: BinaryIO, path: Path) -> None:
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        file.close()
         raise ConfigError(f"{path}: --out: another run is writing it; wait for it or choose another file") from None
