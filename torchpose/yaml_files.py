@@ -121,7 +121,7 @@ def parse_mapping(text: str, path: str | os.PathLike[str]) -> dict[str, Any]:
         raise ConfigError(
             f"{path}: {where}: is not YAML ({_one_line(str(error.problem))}); correct the syntax"
         ) from None
-    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
+    except (yaml.YAMLError, ValueError, TypeError, AttributeError, RecursionError) as error:  # from PyYAML's tags
         first = _one_line(str(error))[:120]
         raise ConfigError(f"{path}: file: is not YAML ({first}); give a YAML or JSON file") from None
     if not isinstance(data, dict):

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Mapping
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +69,7 @@ def load(path: str | os.PathLike[str]) -> Camera:
         if len(readers) < len(rows):
             raise ConfigError(f"{name}: CAMERA_ID: given twice; keep one line for each camera")
     else:
-        if text.lstrip().startswith("<"):
+        if text.lstrip().startswith(("<?xml", "<opencv_storage")):
             raise ConfigError(f"{name}: file: is XML; save it as YAML (cv2.FileStorage with the suffix .yaml)")
         if all(line.lstrip().startswith("#") for line in text.splitlines() if line.strip()):
             raise ConfigError(f"{name}: file: holds only comments; write the fields into it")
@@ -206,7 +206,7 @@ def _colmap_reader(row: list[str]) -> Callable[[str], Camera]:
             params = [Decimal(p) for p in row[4:]]
             fx, fy = float(params[0]), float(params[focals - 1])
             cx, cy = (float(p - Decimal("0.5")) for p in params[focals : focals + 2])
-        except InvalidOperation:
+        except (ArithmeticError, ValueError):
             raise ConfigError(f"camera {key}: PARAMS: not all are numbers; write numbers only") from None
         distortion = [0.0] * count
         for slot, value in zip(slots, params[focals + 2 :], strict=True):

@@ -184,11 +184,13 @@ class Camera:
     def distort(self, xy: Tensor) -> Tensor:
         """Pixels (..., 2) of undistorted normalised coordinates (..., 2), x = X/Z, y = Y/Z."""
         focal, center = self._intrinsics(xy)
-        return self._distort(xy)[0] * focal + center
+        x_distorted, y_distorted, *_ = self._warp(*xy.unbind(-1))
+        return torch.stack([x_distorted, y_distorted], -1) * focal + center
 
     def J_distort(self, xy: Tensor) -> Tensor:
         """Jacobian (..., 2, 2) of `distort`: d(u, v)/d(x, y), px per unit of normalised coordinates."""
-        return self._distort(xy)[1] * self._intrinsics(xy)[0][:, None]
+        _, _, j_xx, j_xy, j_yy = self._warp(*xy.unbind(-1))
+        return torch.stack([j_xx, j_xy, j_xy, j_yy], -1).unflatten(-1, (2, 2)) * self._intrinsics(xy)[0][:, None]
 
     def undistort_points(self, uv: Tensor) -> Tensor:
         """Undistorted normalised coordinates (..., 2) of pixels (..., 2): the inverse of `distort`, to rounding.
@@ -201,48 +203,53 @@ class Camera:
         xy_distorted = (uv - center) / focal
         if len(self.distortion) == 0:
             return xy_distorted
+        u, v = xy_distorted.unbind(-1)
         with torch.no_grad():
-            xy = self._invert(xy_distorted.detach())
-        # one more Newton step, differentiable: d xy = J^-1 (d xy_distorted - d distortion terms)
-        distorted, jacobian = self._distort(xy)
-        return xy - _solve2(jacobian.detach(), distorted - xy_distorted)
+            x, y = self._invert(u.detach().contiguous(), v.detach().contiguous())
+        # one more Newton step, differentiable: d(x, y) = J^-1 (d(u, v) - what the coefficients move)
+        x_distorted, y_distorted, *jacobian = self._warp(x, y)
+        dx, dy = _newton_step(x_distorted - u, y_distorted - v, *(j.detach() for j in jacobian))
+        return torch.stack([x - dx, y - dy], -1)
 
-    def _invert(self, target: Tensor) -> Tensor:
-        eps = torch.finfo(target.dtype).eps
+    def _invert(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        eps = torch.finfo(u.dtype).eps
         limit = self.fold_radius
-        scale = 1 + target.norm(dim=-1)
-        x = target * (0.99 * limit / target.norm(dim=-1, keepdim=True).clamp_min(eps)).clamp_max(1)
-        distorted, jacobian = self._distort(x)
-        residual = distorted - target
-        error = residual.norm(dim=-1)
+        radius = torch.hypot(u, v)
+        scale = 1 + radius
+        inside = (0.99 * limit / radius.clamp_min(eps)).clamp_max(1)
+        x, y = inside * u, inside * v
+        x_distorted, y_distorted, *jacobian = self._warp(x, y)
+        ex, ey = x_distorted - u, y_distorted - v
+        error = torch.hypot(ex, ey)
         fraction = torch.ones_like(error)
         for _ in range(_MAX_ITERATIONS):
             if bool(((error <= 4 * eps * scale) | ~error.isfinite() | (fraction < 1e-6)).all()):
                 break
-            trial = x - fraction[..., None] * _solve2(jacobian, residual)
-            distorted, trial_jacobian = self._distort(trial)
-            trial_residual = distorted - target
-            trial_error = trial_residual.norm(dim=-1)
-            better = (trial_error < error) & (trial.norm(dim=-1) < limit)
-            x = torch.where(better[..., None], trial, x)
-            residual = torch.where(better[..., None], trial_residual, residual)
-            jacobian = torch.where(better[..., None, None], trial_jacobian, jacobian)
-            error = torch.where(better, trial_error, error)
+            dx, dy = _newton_step(ex, ey, *jacobian)
+            x_trial, y_trial = x - fraction * dx, y - fraction * dy
+            x_distorted, y_distorted, *trial_jacobian = self._warp(x_trial, y_trial)
+            ex_trial, ey_trial = x_distorted - u, y_distorted - v
+            trial_error = torch.hypot(ex_trial, ey_trial)
+            better = (trial_error < error) & (torch.hypot(x_trial, y_trial) < limit)
+            old, new = (
+                (x, y, ex, ey, error, *jacobian),
+                (x_trial, y_trial, ex_trial, ey_trial, trial_error, *trial_jacobian),
+            )
+            x, y, ex, ey, error, *jacobian = (torch.where(better, b, a) for a, b in zip(old, new, strict=True))
             fraction = torch.where(better, 1.0, 0.5 * fraction)
-        determinant = jacobian[..., 0, 0] * jacobian[..., 1, 1] - jacobian[..., 0, 1] * jacobian[..., 1, 0]
-        valid = (error <= 1e4 * eps * scale) & (determinant > 0)
-        return torch.where(valid[..., None], x, torch.nan)
+        j_xx, j_xy, j_yy = jacobian
+        valid = (error <= 1e4 * eps * scale) & (j_xx * j_yy - j_xy * j_xy > 0)
+        return torch.where(valid, x, torch.nan), torch.where(valid, y, torch.nan)
 
     def _intrinsics(self, like: Tensor) -> tuple[Tensor, Tensor]:
         m = self.matrix.to(like)
         return m.diagonal()[:2], m[:2, 2]
 
-    def _distort(self, xy: Tensor) -> tuple[Tensor, Tensor]:
-        """Distorted normalised coordinates (..., 2) and their Jacobian (..., 2, 2)."""
-        x, y = xy.unbind(-1)
+    def _warp(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Distorted normalised x, y and the entries xx, xy, yy of their Jacobian, which is symmetric in both models."""
         r2 = x * x + y * y
         if self.model == "kannala_brandt":
-            k1, k2, k3, k4 = self.distortion.to(xy).unbind()
+            k1, k2, k3, k4 = self.distortion.to(x).unbind()
             small = r2 < 1e-6
             r2_safe = torch.where(small, torch.ones_like(r2), r2)
             r = r2_safe.sqrt()
@@ -250,26 +257,27 @@ class Camera:
             t2 = theta_over_r * theta_over_r * r2
             s = theta_over_r * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
             growth = (1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))) / (1 + r2)
-            # 2 ds/d(r^2); its series at the axis
+            # 2 ds/d(r^2), and its series at the axis
             slope = torch.where(small, 2 * (k1 - 1 / 3) + r2 * (4 * k2 - 4 * k1 + 0.8), (growth - s) / r2_safe)
-            tangential_x = tangential_y = mixed = j_xx = j_yy = torch.zeros_like(x)
-        else:
-            d = self.distortion.to(xy)
-            k1, k2, p1, p2, k3, k4, k5, k6 = pad(d, (0, 8 - len(d))).unbind()
-            numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+            return s * x, s * y, s + slope * x * x, slope * x * y, s + slope * y * y
+        d = self.distortion.to(x)
+        k1, k2, p1, p2, k3, k4, k5, k6 = pad(d, (0, 8 - len(d))).unbind()
+        s = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
+        if len(d) == 8:
             denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-            s = numerator / denominator
-            d_numerator = k1 + r2 * (2 * k2 + r2 * 3 * k3)
-            d_denominator = k4 + r2 * (2 * k5 + r2 * 3 * k6)
-            slope = 2 * (d_numerator - s * d_denominator) / denominator
-            tangential_x = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-            tangential_y = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-            mixed = 2 * (p1 * x + p2 * y)
-            j_xx, j_yy = 2 * p1 * y + 6 * p2 * x, 6 * p1 * y + 2 * p2 * x
-        distorted = torch.stack([s * x + tangential_x, s * y + tangential_y], -1)
-        off = slope * x * y + mixed
-        jacobian = torch.stack([s + slope * x * x + j_xx, off, off, s + slope * y * y + j_yy], -1)
-        return distorted, jacobian.unflatten(-1, (2, 2))
+            s = s / denominator
+            slope = (slope - 2 * s * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / denominator
+        # 2 (p1 y + p2 x) x + p2 r^2 is OpenCV's 2 p1 x y + p2 (r^2 + 2 x^2)
+        shear = 2 * (p2 * x + p1 * y)
+        s_tangential = s + shear
+        return (
+            s_tangential * x + p2 * r2,
+            s_tangential * y + p1 * r2,
+            s_tangential + slope * x * x + 4 * p2 * x,
+            slope * x * y + 2 * (p1 * x + p2 * y),
+            s_tangential + slope * y * y + 4 * p1 * y,
+        )
 
 
 def _first_positive_root(polynomial: np.polynomial.Polynomial) -> float:
@@ -279,8 +287,7 @@ def _first_positive_root(polynomial: np.polynomial.Polynomial) -> float:
     return 1 / float(positive.max()) if positive.size else math.inf
 
 
-def _solve2(matrix: Tensor, rhs: Tensor) -> Tensor:
-    """Cramer's rule for matrices (..., 2, 2) and right-hand sides (..., 2)."""
-    a, b, c, d = matrix.flatten(-2).unbind(-1)
-    e, f = rhs.unbind(-1)
-    return torch.stack([d * e - b * f, a * f - c * e], -1) / (a * d - b * c)[..., None]
+def _newton_step(ex: Tensor, ey: Tensor, j_xx: Tensor, j_xy: Tensor, j_yy: Tensor) -> tuple[Tensor, Tensor]:
+    """J^-1 e by Cramer's rule."""
+    determinant = j_xx * j_yy - j_xy * j_xy
+    return (j_yy * ex - j_xy * ey) / determinant, (j_xx * ey - j_xy * ex) / determinant
