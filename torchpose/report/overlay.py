@@ -112,7 +112,7 @@ class Overlay:
         ):
             _ellipse(picture, outer, _OUTER)
             _ellipse(picture, inner, _INNER)
-            _cross(picture, center, max(0.2 * inner[3], 3.0))
+            _cross(picture, center, max(0.4 * inner[3], 3.0))
             _text(picture, str(marker), (center[0] + 0.75 * outer[2], center[1] - 0.75 * outer[2]), 1.0 * unit, _CENTRE)
         rows = (poses.frame == index).nonzero()[:, 0].tolist()
         for row in rows:
@@ -173,10 +173,11 @@ def _polyline(picture: np.ndarray, points: np.ndarray, colour: Colour, width: in
 
 def _text(picture: np.ndarray, text: str, place: tuple[float, float], size: float, colour: Colour) -> None:
     """Text with a dark rim, readable on any ground."""
-    at = (round(place[0]), round(place[1]))
-    width = max(1, round(1.5 * size))
-    cv2.putText(picture, text, at, _FONT, size, (0, 0, 0), 3 * width, cv2.LINE_AA)
-    cv2.putText(picture, text, at, _FONT, size, colour, width, cv2.LINE_AA)
+    x, y = round(place[0]), round(place[1])
+    rim = max(1, round(1.5 * size))
+    for dx, dy in ((-rim, -rim), (-rim, rim), (rim, -rim), (rim, rim)):
+        cv2.putText(picture, text, (x + dx, y + dy), _FONT, size, (0, 0, 0), rim, cv2.LINE_AA)
+    cv2.putText(picture, text, (x, y), _FONT, size, colour, rim, cv2.LINE_AA)
 
 
 def _banners(picture: np.ndarray, banners: Sequence[tuple[str, Colour]], name: str, unit: float) -> None:
