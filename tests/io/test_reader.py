@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchpose.io import reader as reader_module
-from torchpose.io.reader import FrameReader, default_batch
+from torchpose.io.reader import FrameReader, default_batch, in_batches
 from torchpose.io.sources import find_sources
 from torchpose.results import Status
 
@@ -22,7 +22,7 @@ def image(number, dtype=np.uint8):
 def read(folder, batch, threads=3):
     """Every frame by name, copied, with the size of each batch."""
     frames, faults, sizes = {}, {}, []
-    for step in FrameReader(find_sources([folder]), SIZE[1], SIZE[0], batch=batch, threads=threads):
+    for step in FrameReader(in_batches(find_sources([folder]), batch), SIZE[1], SIZE[0], threads=threads):
         sizes.append(len(step.sources))
         faults |= {step.sources[i].name: fault for i, fault in step.faults.items()}
         for positions, tensor in step.groups:
@@ -46,7 +46,7 @@ def test_every_frame_arrives_once_with_its_own_pixels(tmp_path, batch, threads):
 def test_depths_are_kept_and_groups_are_of_one_depth(tmp_path):
     for i in range(9):
         cv2.imwrite(str(tmp_path / f"{i}.png"), image(1000 + i, np.uint16) if i % 3 else image(i))
-    (step,) = FrameReader(find_sources([tmp_path]), SIZE[1], SIZE[0], batch=16, threads=2)
+    (step,) = FrameReader([find_sources([tmp_path])], SIZE[1], SIZE[0], threads=2)
     groups = {tensor.dtype: (positions, tensor) for positions, tensor in step.groups}
     assert groups[torch.uint8][0] == [0, 3, 6]
     assert groups[torch.uint16][0] == [1, 2, 4, 5, 7, 8]
@@ -81,7 +81,7 @@ def test_decoding_runs_one_batch_ahead_and_no_further(tmp_path, monkeypatch):
         return decode(path)
 
     monkeypatch.setattr(reader_module, "decode", counting)
-    steps = iter(FrameReader(find_sources([tmp_path]), SIZE[1], SIZE[0], batch=5, threads=2))
+    steps = iter(FrameReader(in_batches(find_sources([tmp_path]), 5), SIZE[1], SIZE[0], threads=2))
     for done in range(1, 4):
         next(steps)
         while started.acquire(timeout=0.2):  # until no further decode starts by itself

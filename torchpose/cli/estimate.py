@@ -125,7 +125,7 @@ def _run(
     import torch
 
     from torchpose.cli.terminal import FrameProgress
-    from torchpose.io.reader import FrameReader, default_batch
+    from torchpose.io.reader import FrameReader, default_batch, in_batches
     from torchpose.io.rows import BASE_SCHEMA, POSE_SCHEMA
     from torchpose.io.store import ResultStore
     from torchpose.pipeline import PoseEstimator
@@ -144,15 +144,17 @@ def _run(
         origin=_origin(camera, targets, sources, hand_eye, detections is not None),
         resume=resume,
     )
-    pending = [source for source in sources if source.name not in store]
-    reader = FrameReader(
-        pending, camera.width, camera.height, batch=batch or default_batch(camera.width, camera.height), threads=threads
-    )
+    # a resumed run works on the same batches as one that was not interrupted, so that rows agree to the last bit
+    batches = in_batches(sources, batch or default_batch(camera.width, camera.height))
+    pending = [sources for sources in batches if any(source.name not in store for source in sources)]
+    reader = FrameReader(pending, camera.width, camera.height, threads=threads)
     try:
-        with FrameProgress(len(sources), len(sources) - len(pending), quiet=quiet) as progress, torch.inference_mode():
+        with FrameProgress(len(sources), len(store), quiet=quiet) as progress, torch.inference_mode():
             for frames in reader:
-                store.append(_records(frames, estimator, targets, hand_eye, painter))
-                progress.advance(len(frames.sources), store.counts)
+                records = _records(frames, estimator, targets, hand_eye, painter)
+                new = [record for record in records if record["frame"] not in store]
+                store.append(new)
+                progress.advance(len(new), store.counts)
         store.finish([source.name for source in sources])
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"{len(store)} of {len(sources)} frames are kept; add --resume to go on") from None

@@ -50,40 +50,43 @@ def default_batch(width: int, height: int) -> int:
     return max(1, min(_BATCH_FRAMES, _BATCH_PIXELS // (width * height)))
 
 
+def in_batches(sources: Sequence[Source], size: int) -> list[Sequence[Source]]:
+    """The sources in runs of ``size``; the last may be shorter."""
+    return [sources[i : i + size] for i in range(0, len(sources), size)]
+
+
 class FrameReader:
-    """Iterates over `Batch` in the order of the sources.
+    """Iterates over `Batch` in the order given.
 
     Two buffers take turns: while one batch is worked on, threads decode the next one into the other.
 
     Args:
-        sources: the frames, see `torchpose.io.sources.find_sources`.
+        batches: what to read, see `in_batches`.
         width, height: of the camera, px. Frames of another size are `Status.WRONG_SIZE`.
-        batch: frames a batch. threads: decoding threads.
+        threads: decoding threads.
     """
 
-    def __init__(self, sources: Sequence[Source], width: int, height: int, *, batch: int, threads: int) -> None:
-        self._sources = sources
+    def __init__(self, batches: Sequence[Sequence[Source]], width: int, height: int, *, threads: int) -> None:
+        self._batches = batches
         self._shape = (height, width)
-        self._batch = batch
         self._threads = threads
 
     def __iter__(self) -> Iterator[Batch]:
-        chunks = [self._sources[i : i + self._batch] for i in range(0, len(self._sources), self._batch)]
-        frames_a_buffer = min(self._batch, len(self._sources))
-        buffers = [_Buffer(frames_a_buffer, self._shape) for _ in range(min(2, len(chunks)))]
+        largest = max((len(batch) for batch in self._batches), default=0)
+        buffers = [_Buffer(largest, self._shape) for _ in range(2)]
         pool = ThreadPoolExecutor(self._threads, thread_name_prefix="decode")
 
         def submit(number: int) -> list[Future[Fault | np.dtype]]:
             buffer = buffers[number % 2]
-            return [pool.submit(buffer.load, slot, source) for slot, source in enumerate(chunks[number])]
+            return [pool.submit(buffer.load, slot, source) for slot, source in enumerate(self._batches[number])]
 
         try:
-            ahead = submit(0) if chunks else []
-            for number, chunk in enumerate(chunks):
+            ahead = submit(0) if self._batches else []
+            for number, sources in enumerate(self._batches):
                 outcomes = [future.result() for future in ahead]
-                if number + 1 < len(chunks):
+                if number + 1 < len(self._batches):
                     ahead = submit(number + 1)
-                yield buffers[number % 2].batch(chunk, outcomes)
+                yield buffers[number % 2].batch(sources, outcomes)
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
 
