@@ -1,0 +1,203 @@
+"""Stage: batched direct least-squares ellipses over flat points.
+
+Every function takes points as flat (E, 2) with the ellipse index (E,), so thousands of rings of all frames of a batch are
+fitted by one sequence of tensor operations. Ellipses are (cx, cy, a >= b, theta in [0, pi) from +u towards +v).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchpose.geometry import conics
+from torchpose.geometry.segments import segment_mean, segment_sum
+
+_SOLVABLE_POINTS = 6  # five parameters and one point to spare
+
+
+@dataclass(frozen=True, eq=False)
+class EllipseFit:
+    """Fitted ellipses with their uncertainty.
+
+    Attributes:
+        params: (M, 5) float64, cx, cy, a, b (px), theta (rad); NaN where the points define no ellipse.
+        covariance: (M, 5, 5), of (cx, cy, e11, e12, e22): the centre, and the symmetric change E of the shape matrix
+            diag(a, b) in the ellipse's own axes. var(a) = var(e11), var(b) = var(e22), var(theta) =
+            var(e12) / (a - b)^2. Unlike theta, e12 stays defined for a circle.
+        sigma: (M,), RMS distance of the points (weighted), px.
+        points: (M,), sum of the weights: number of points that count.
+    """
+
+    params: Tensor
+    covariance: Tensor
+    sigma: Tensor
+    points: Tensor
+
+    @property
+    def center_covariance(self) -> Tensor:
+        """(M, 2, 2) covariance of the centre, px^2."""
+        return self.covariance[:, :2, :2]
+
+
+def fit(points: Tensor, index: Tensor, count: int, weights: Tensor | None = None) -> Tensor:
+    """Direct least-squares ellipses (Fitzgibbon 1999 in the stable form of Halir and Flusser 1998).
+
+    Minimises the weighted sum of squared algebraic distances subject to 4AC - B^2 = 1, on coordinates that are centred
+    and scaled for each ellipse. The 3x3 eigenproblem is solved in closed form.
+
+    Args:
+        points: (E, 2) px, any float dtype; computed in float64. index: (E,) int64, ellipse of each point.
+        count: number M of ellipses. weights: (E,) or None.
+
+    Returns:
+        (M, 5) float64; rows with fewer than 6 points of weight, or whose points lie on a line, are NaN.
+    """
+    points = points.double()
+    w = torch.ones(points.shape[0], dtype=points.dtype, device=points.device) if weights is None else weights.double()
+    center = segment_mean(points, index, count, w)
+    local = points - center[index]
+    scale = segment_mean(local.square().sum(-1), index, count, w).sqrt()
+    x, y = (local / scale[index, None]).unbind(-1)
+    xx, xy, yy = x * x, x * y, y * y
+    # the moments of order 2 to 4; those of order 1 vanish by centring
+    rows = torch.stack(
+        [xx, xy, yy, xx * x, xx * y, xy * y, yy * y, xx * xx, xx * xy, xx * yy, xy * yy, yy * yy, torch.ones_like(x)], -1
+    )
+    m20, m11, m02, m30, m21, m12, m03, m40, m31, m22, m13, m04, n = segment_sum(rows * w[:, None], index, count).unbind(-1)
+
+    # scatter matrix of (x^2, xy, y^2) after eliminating the linear part (x, y, 1)
+    det = m20 * m02 - m11 * m11
+    i11, i12, i22 = m02 / det, -m11 / det, m20 / det
+
+    def reduced(mab: Tensor, pa: Tensor, qa: Tensor, na: Tensor, pb: Tensor, qb: Tensor, nb: Tensor) -> Tensor:
+        return mab - (pa * (i11 * pb + i12 * qb) + qa * (i12 * pb + i22 * qb)) - na * nb / n
+
+    s11 = reduced(m40, m30, m21, m20, m30, m21, m20)
+    s12 = reduced(m31, m30, m21, m20, m21, m12, m11)
+    s13 = reduced(m22, m30, m21, m20, m12, m03, m02)
+    s22 = reduced(m22, m21, m12, m11, m21, m12, m11)
+    s23 = reduced(m13, m21, m12, m11, m12, m03, m02)
+    s33 = reduced(m04, m12, m03, m02, m12, m03, m02)
+    # M = C^-1 S with the constraint matrix C of 4AC - B^2
+    matrix = torch.stack(
+        [0.5 * s13, 0.5 * s23, 0.5 * s33, -s12, -s22, -s23, 0.5 * s11, 0.5 * s12, 0.5 * s13], -1
+    ).unflatten(-1, (3, 3))
+    a, b, c = _positive_eigenvector(matrix).unbind(-1)
+    # back-substitute the linear part
+    p, q = a * m30 + b * m21 + c * m12, a * m21 + b * m12 + c * m03
+    d, e = -(i11 * p + i12 * q), -(i12 * p + i22 * q)
+    f = -(a * m20 + b * m11 + c * m02) / n
+    ellipse = conics.ellipse_from_conic(torch.stack([a, b, c, d, e, f], -1))
+    size = torch.stack([scale, scale, scale, scale, torch.ones_like(scale)], -1)
+    shift = torch.nn.functional.pad(center, (0, 3))
+    return torch.where((n >= _SOLVABLE_POINTS)[:, None], ellipse * size + shift, torch.nan)
+
+
+def _positive_eigenvector(matrix: Tensor) -> Tensor:
+    """Eigenvector (M, 3) of the one non-negative eigenvalue of C^-1 S (M, 3, 3), the largest of three real ones."""
+    m = matrix
+    mean = m.diagonal(dim1=-2, dim2=-1).sum(-1) / 3
+    k = m - mean[:, None, None] * torch.eye(3, dtype=m.dtype, device=m.device)
+    p = (k @ k).diagonal(dim1=-2, dim2=-1).sum(-1).clamp_min(0) / 6
+    det = (k[:, 0] * torch.linalg.cross(k[:, 1], k[:, 2])).sum(-1)
+    root = p.sqrt()
+    ratio = (det / (2 * p * root)).clamp(-1, 1)
+    largest = 2 * root * (ratio.acos() / 3).cos()
+    shifted = k - largest[:, None, None] * torch.eye(3, dtype=m.dtype, device=m.device)
+    # the null vector is the cross product of any two independent rows: take the longest of the three
+    products = torch.stack(
+        [torch.linalg.cross(shifted[:, i], shifted[:, j]) for i, j in ((0, 1), (1, 2), (2, 0))], 1
+    )
+    best = products.square().sum(-1).nan_to_num(nan=0.0).argmax(-1)
+    return products.gather(1, best[:, None, None].expand(-1, 1, 3)).squeeze(1)
+
+
+def distance(points: Tensor, index: Tensor, ellipses: Tensor) -> Tensor:
+    """Signed first-order distances (E,) in px of points to their ellipses, positive outside (Sampson)."""
+    value, gradient = _radial(points, index, ellipses)
+    return value / torch.linalg.vector_norm(gradient, dim=-1)
+
+
+def _radial(points: Tensor, index: Tensor, ellipses: Tensor) -> tuple[Tensor, Tensor]:
+    """rho - 1 (E,) and its gradient (E, 2), rho = |S^-1 (x - c)| the elliptic radius."""
+    shape = conics.shape_matrix(ellipses)
+    det = shape[:, 0, 0] * shape[:, 1, 1] - shape[:, 0, 1].square()
+    i11, i12, i22 = (shape[:, 1, 1] / det)[index], (-shape[:, 0, 1] / det)[index], (shape[:, 0, 0] / det)[index]
+    dx, dy = (points.double() - ellipses[index, :2]).unbind(-1)
+    u, v = i11 * dx + i12 * dy, i12 * dx + i22 * dy
+    rho = torch.hypot(u, v)
+    return rho - 1, torch.stack([i11 * u + i12 * v, i12 * u + i22 * v], -1) / rho[:, None]
+
+
+def fit_robust(
+    points: Tensor, index: Tensor, count: int, *, start: Tensor, scales: tuple[float, ...] = (2.0, 1.0, 0.5), cut: float = 4.0
+) -> tuple[Tensor, Tensor]:
+    """Ellipses from points of which some lie elsewhere (cover, glare, neighbouring edges).
+
+    Iteratively reweighted direct fits from ``start``: first with Geman-McClure weights of falling scale, then with the
+    points within ``cut`` robust standard deviations only, unweighted, so that what remains is a plain least-squares fit.
+
+    Args:
+        points, index, count: as in `fit`. start: (M, 5), a rough ellipse to start from.
+        scales: px, scales of the weights, from the error of ``start`` down to a few times the edge noise.
+
+    Returns:
+        (M, 5) ellipses and (E,) bool, the points kept.
+    """
+    ellipses = start.double()
+    for scale in scales:
+        r = distance(points, index, ellipses)
+        w = (1 + (r / scale).square()).reciprocal().square().nan_to_num(nan=0.0)
+        refit = fit(points, index, count, w)
+        ellipses = torch.where(refit.isfinite().all(-1, keepdim=True), refit, ellipses)
+    keep = torch.ones_like(index, dtype=torch.bool)
+    for _ in range(3):
+        r = distance(points, index, ellipses)
+        # the weighted RMS under Geman-McClure weights is a scale that outliers hardly move
+        w = (1 + (r / scales[-1]).square()).reciprocal().square().nan_to_num(nan=0.0)
+        sigma = segment_mean(r.square().nan_to_num(nan=0.0), index, count, w).sqrt()
+        keep = r.abs() <= (cut * sigma + 0.02)[index]
+        ellipses = fit(points, index, count, keep.double())
+    return ellipses, keep
+
+
+def with_covariance(
+    points: Tensor, index: Tensor, ellipses: Tensor, weights: Tensor | None = None, *, correlation: float = 1.0
+) -> EllipseFit:
+    """First-order covariance of fitted ellipses from the scatter of their own points.
+
+    Near the optimum the algebraic fit of points all around equals the geometric one, so the covariance is
+    sigma^2 (J^T J)^-1 of the normal distances, sigma estimated with E - 5 degrees of freedom.
+
+    Args:
+        points, index, weights: as in `fit`. ellipses: (M, 5) as fitted.
+        correlation: variance inflation for points whose errors are correlated along the edge
+            (`zernike.edge_correlation`).
+    """
+    count = ellipses.shape[0]
+    w = torch.ones_like(points[:, 0], dtype=torch.float64) if weights is None else weights.double()
+    value, gradient = _radial(points, index, ellipses)
+    norm = torch.linalg.vector_norm(gradient, dim=-1)
+    r = (value / norm).nan_to_num(nan=0.0)
+    normal = (gradient / norm[:, None]).nan_to_num(nan=0.0)
+    theta = ellipses[index, 4]
+    cos, sin = theta.cos().nan_to_num(nan=1.0), theta.sin().nan_to_num(nan=0.0)
+    n1, n2 = normal[:, 0] * cos + normal[:, 1] * sin, normal[:, 1] * cos - normal[:, 0] * sin
+    # unit circle coordinates (s1, s2) of the point: the boundary moves by n . (dc + E s)
+    a, b = ellipses[index, 2], ellipses[index, 3]
+    s1, s2 = a * n1, b * n2
+    s = torch.hypot(s1, s2)
+    s1, s2 = (s1 / s).nan_to_num(nan=0.0), (s2 / s).nan_to_num(nan=0.0)
+    jac = torch.stack([normal[:, 0], normal[:, 1], n1 * s1, n1 * s2 + n2 * s1, n2 * s2], -1)
+    rows = torch.cat([(jac[:, :, None] * jac[:, None, :]).flatten(1), r.square()[:, None], torch.ones_like(r)[:, None]], -1)
+    sums = segment_sum(rows * w[:, None], index, count)
+    normal_matrix, chi2, n = sums[:, :25].unflatten(-1, (5, 5)), sums[:, 25], sums[:, 26]
+    sigma = (chi2 / (n - 5).clamp_min(1)).sqrt()
+    solvable = (n >= _SOLVABLE_POINTS) & ellipses.isfinite().all(-1)
+    eye = torch.eye(5, dtype=torch.float64, device=points.device)
+    inverse, info = torch.linalg.inv_ex(torch.where(solvable[:, None, None], normal_matrix, eye))
+    solvable = solvable & (info == 0)
+    covariance = torch.where(solvable[:, None, None], inverse * (correlation * sigma.square())[:, None, None], torch.nan)
+    return EllipseFit(ellipses, covariance, sigma, n)

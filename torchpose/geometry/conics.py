@@ -1,0 +1,131 @@
+"""Ellipses and conics: conversions, circles under perspective. Batched over leading dimensions.
+
+An ellipse is (cx, cy, a, b, theta): centre, semi-axes a >= b, angle of the major axis in [0, pi) from +u towards +v.
+A conic is the coefficient vector (A, B, C, D, E, F) of A x^2 + B xy + C y^2 + D x + E y + F = 0, or its symmetric
+(3, 3) matrix.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def to_matrix(conic: Tensor) -> Tensor:
+    """Symmetric matrices (..., 3, 3) of conic coefficients (..., 6)."""
+    a, b, c, d, e, f = conic.unbind(-1)
+    b, d, e = b / 2, d / 2, e / 2
+    return torch.stack([a, b, d, b, c, e, d, e, f], -1).unflatten(-1, (3, 3))
+
+
+def from_matrix(matrix: Tensor) -> Tensor:
+    """Conic coefficients (..., 6) of symmetric matrices (..., 3, 3)."""
+    m = matrix
+    return torch.stack(
+        [m[..., 0, 0], 2 * m[..., 0, 1], m[..., 1, 1], 2 * m[..., 0, 2], 2 * m[..., 1, 2], m[..., 2, 2]], -1
+    )
+
+
+def ellipse_from_conic(conic: Tensor) -> Tensor:
+    """Ellipses (..., 5) of conic coefficients (..., 6); NaN where the conic is no real ellipse."""
+    a, b, c, d, e, f = conic.unbind(-1)
+    disc = 4 * a * c - b * b
+    cx, cy = (b * e - 2 * c * d) / disc, (b * d - 2 * a * e) / disc
+    f0 = f + 0.5 * (d * cx + e * cy)  # value at the centre
+    mean, diff = 0.5 * (a + c), torch.hypot(0.5 * (a - c), 0.5 * b)
+    sign = torch.where(mean < 0, -1.0, 1.0)
+    mean, f0 = mean * sign, f0 * sign
+    # the smaller eigenvalue as a quotient: mean - diff cancels for slender ellipses
+    large = mean + diff
+    small = 0.25 * disc / large
+    major, minor = (-f0 / small).sqrt(), (-f0 / large).sqrt()
+    theta = 0.5 * torch.atan2(-b * sign, (c - a) * sign)
+    theta = torch.remainder(theta, torch.pi)
+    # remainder may round a tiny negative angle up to pi itself
+    theta = torch.where(theta >= torch.pi, torch.zeros_like(theta), theta)
+    ellipse = torch.stack([cx, cy, major, minor, theta], -1)
+    valid = (disc > 0) & (f0 < 0) & ellipse.isfinite().all(-1)
+    return torch.where(valid[..., None], ellipse, torch.nan)
+
+
+def conic_from_ellipse(ellipse: Tensor) -> Tensor:
+    """Conic coefficients (..., 6), negative inside, of ellipses (..., 5); scaled to -1 at the centre."""
+    cx, cy, a, b, theta = ellipse.unbind(-1)
+    cos, sin = theta.cos(), theta.sin()
+    p, q = (cos / a).square() + (sin / b).square(), (sin / a).square() + (cos / b).square()
+    r = 2 * cos * sin * (1 / a.square() - 1 / b.square())
+    d, e = -2 * p * cx - r * cy, -r * cx - 2 * q * cy
+    f = p * cx * cx + r * cx * cy + q * cy * cy - 1
+    return torch.stack([p, r, q, d, e, f], -1)
+
+
+def shape_matrix(ellipse: Tensor) -> Tensor:
+    """Symmetric (..., 2, 2) S = R diag(a, b) R^T: the ellipse is centre + S (cos s, sin s). Smooth also at a circle."""
+    _, _, a, b, theta = ellipse.unbind(-1)
+    mean, diff = 0.5 * (a + b), 0.5 * (a - b)
+    c, s = diff * (2 * theta).cos(), diff * (2 * theta).sin()
+    return torch.stack([mean + c, s, s, mean - c], -1).unflatten(-1, (2, 2))
+
+
+def points_on(ellipse: Tensor, angle: Tensor) -> Tensor:
+    """Points (..., 2) of ellipses (..., 5) at eccentric anomaly ``angle`` (...), counted from the major axis."""
+    cx, cy, a, b, theta = ellipse.unbind(-1)
+    x, y = a * angle.cos(), b * angle.sin()
+    cos, sin = theta.cos(), theta.sin()
+    return torch.stack([cx + cos * x - sin * y, cy + sin * x + cos * y], -1)
+
+
+def perimeter(ellipse: Tensor) -> Tensor:
+    """Perimeters (...) of ellipses (..., 5) (Ramanujan's second formula; relative error below 4e-4 at b/a = 0.1)."""
+    a, b = ellipse[..., 2], ellipse[..., 3]
+    h = ((a - b) / (a + b)).square()
+    return torch.pi * (a + b) * (1 + 3 * h / (10 + (4 - 3 * h).sqrt()))
+
+
+def circle_image(rotation: Tensor, center: Tensor, normal: Tensor, radius: Tensor) -> Tensor:
+    """Image conic matrix (..., 3, 3) on the normalised plane of a circle in space.
+
+    Q = H^-T diag(1, 1, -r^2) H^-1 with H = [e1 e2 c], written without the inverse through the adjugate of H.
+
+    Args:
+        rotation: (..., 3, 3), target to camera. center: (..., 3), circle centre in the camera frame.
+        normal: (..., 3), unit normal in the target frame. radius: (...).
+    """
+    n = (rotation @ normal[..., None]).squeeze(-1)
+    # any unit vector not near n starts the in-plane basis
+    axis = torch.nn.functional.one_hot(n.abs().argmin(-1), 3).to(n.dtype)
+    e1 = torch.linalg.cross(n, axis)
+    e1 = e1 / torch.linalg.vector_norm(e1, dim=-1, keepdim=True)
+    e2 = torch.linalg.cross(n, e1)
+    adj = torch.stack(
+        [torch.linalg.cross(e2, center), torch.linalg.cross(center, e1), torch.linalg.cross(e1, e2)], -2
+    )
+    weight = torch.stack([torch.ones_like(radius), torch.ones_like(radius), -radius.square()], -1)
+    return adj.mT @ (weight[..., None] * adj)
+
+
+def circle_poses(conic: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
+    """Both poses of a circle of known radius from its image (Forsyth et al. 1991, by the cone's eigenvectors).
+
+    Args:
+        conic: (..., 3, 3) symmetric, on the normalised plane. radius: (...).
+
+    Returns:
+        centers (..., 2, 3) in front of the camera and unit normals (..., 2, 3) that point away from it.
+    """
+    # orient so that two eigenvalues are positive; eigh sorts ascending: l3 < 0 < l2 <= l1
+    det_sign = torch.linalg.det(conic).sign()
+    q = -conic * det_sign[..., None, None]
+    values, vectors = torch.linalg.eigh(q)
+    l3, l2, l1 = values.unbind(-1)
+    v3, v1 = vectors[..., :, 0], vectors[..., :, 2]
+    v3 = torch.where(v3[..., 2:] < 0, -v3, v3)  # the cone's axis, forwards
+    span = l1 - l3
+    g, h = ((l1 - l2) / span).clamp_min(0).sqrt(), ((l2 - l3) / span).clamp_min(0).sqrt()
+    sign = torch.tensor([1.0, -1.0], dtype=conic.dtype, device=conic.device)[:, None]
+    g, h, v1, v3 = g[..., None, None], h[..., None, None], v1[..., None, :], v3[..., None, :]
+    normals = sign * g * v1 + h * v3
+    # the plane sg x + hz = p cuts the cone l1 x^2 + l2 y^2 + l3 z^2 = 0 in a circle of radius p sqrt(-l1 l3) / l2
+    ratio = (-l3 / l1).sqrt()[..., None, None]
+    centers = radius[..., None, None] * (h / ratio * v3 - sign * g * ratio * v1)
+    return centers, normals

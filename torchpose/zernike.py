@@ -1,0 +1,144 @@
+"""Stage: sub-pixel edges from Zernike moments (Ghosal and Mehrotra 1993; paper, section III-B-2).
+
+The moments A_nm up to order 4 of the N x N window around a pixel are correlations with fixed kernels. They come as a
+convolution layer for dense use, and evaluated at a list of edge pixels only (gather and one matrix product), which
+gives the same numbers at a hundredth of the cost on a large frame; tests/test_zernike.py shows both equal.
+
+Model: a straight step of height k at distance l (in units of the mask radius N/2) from the pixel's centre, along the
+direction phi of increasing grey. Then A'_11 = (2/3) k (1 - l^2)^(3/2) and A_20 = l A'_11.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from torch import Tensor, nn
+
+ORDERS = ((0, 0), (1, 1), (2, 0), (2, 2), (3, 1), (3, 3), (4, 0), (4, 2), (4, 4))
+EDGE_ORDERS = ((1, 1), (2, 0))  # all that the edge position needs
+MASK = 7
+_SUBSAMPLES = 128
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """Sub-pixel edges, flat.
+
+    Attributes:
+        points: (E, 2) float64, u, v of the edge point, px.
+        normal: (E, 2) float64, unit direction of increasing grey.
+        offset: (E,) float64, signed distance of the edge from the pixel's centre along the normal, px.
+        step: (E,) float64, height of the grey step.
+        inside: (E,) bool, the edge runs through its own pixel: |du| and |dv| at most 0.5 px. Where it is False the
+            window saw an edge of a neighbouring pixel, or none.
+    """
+
+    points: Tensor
+    normal: Tensor
+    offset: Tensor
+    step: Tensor
+    inside: Tensor
+
+
+@lru_cache(maxsize=8)
+def kernels(size: int = MASK, orders: tuple[tuple[int, int], ...] = ORDERS) -> Tensor:
+    """Correlation kernels (K, N, N) float64: for each (n, m) the real part R_nm cos(m theta) and, if m > 0, R_nm sin(m theta).
+
+    Each weight is the integral of the Zernike function over the part of the pixel's square inside the unit disc (mask
+    radius N/2), by the midpoint rule on a 128 x 128 sub-grid. Raises ValueError unless ``size`` is odd and at least 3.
+    """
+    if size < 3 or size % 2 == 0:
+        raise ValueError(f"Zernike mask size must be odd and at least 3, not {size}")
+    n = size * _SUBSAMPLES
+    axis = (torch.arange(n, dtype=torch.float64) + 0.5) * (2.0 / n) - 1.0
+    y, x = axis[:, None], axis[None, :]
+    rho2 = x * x + y * y
+    rho, theta = rho2.sqrt(), torch.atan2(y, x)
+    disc = (rho2 <= 1.0).double() * (2.0 / n) ** 2
+    planes = []
+    for order, repetition in orders:
+        radial = _radial_polynomial(order, repetition, rho) * disc
+        planes.append(radial * (repetition * theta).cos())
+        if repetition:
+            planes.append(radial * (repetition * theta).sin())
+    return torch.stack([p.unflatten(0, (size, -1)).unflatten(2, (size, -1)).sum((1, 3)) for p in planes])
+
+
+def _radial_polynomial(n: int, m: int, rho: Tensor) -> Tensor:
+    """Zernike radial polynomial R_nm."""
+    out = torch.zeros_like(rho)
+    for s in range((n - m) // 2 + 1):
+        c = (-1) ** s * math.factorial(n - s)
+        c //= math.factorial(s) * math.factorial((n + m) // 2 - s) * math.factorial((n - m) // 2 - s)
+        out = out + c * rho ** (n - 2 * s)
+    return out
+
+
+class ZernikeMoments(nn.Module):
+    """Dense Zernike moments as a convolution layer with fixed weights.
+
+    ``forward(frames (B, 1, H, W)) -> (B, K, H - N + 1, W - N + 1)``, the channels as in `kernels`; output pixel (v, u)
+    belongs to the window centred at (v + N // 2, u + N // 2).
+    """
+
+    weight: Tensor
+
+    def __init__(self, size: int = MASK, orders: tuple[tuple[int, int], ...] = ORDERS, dtype: torch.dtype = torch.float32) -> None:
+        super().__init__()
+        self.register_buffer("weight", kernels(size, orders)[:, None].to(dtype))
+
+    def forward(self, frames: Tensor) -> Tensor:
+        return nn.functional.conv2d(frames.to(self.weight.dtype), self.weight)
+
+
+def moments_at(
+    frames: Tensor, frame: Tensor, pixels: Tensor, size: int = MASK, orders: tuple[tuple[int, int], ...] = EDGE_ORDERS
+) -> Tensor:
+    """Zernike moments (E, K) float32 of the windows at given pixels only; the columns as in `kernels`.
+
+    Args:
+        frames: (B, H, W), any real dtype, contiguous. frame: (E,) int64.
+        pixels: (E, 2) int64 u, v of the window centres, at least N // 2 from the border.
+    """
+    height, width = frames.shape[-2:]
+    half = size // 2
+    d = torch.arange(-half, half + 1, device=frames.device)
+    window = (d[:, None] * width + d[None, :]).flatten()
+    base = (frame * height + pixels[:, 1]) * width + pixels[:, 0]
+    values = frames.reshape(-1)[base[:, None] + window].float()
+    # centring on the middle grey keeps float32 exact to rounding: every kernel but A_00 sums to zero up to the disc's rim
+    middle = values[:, size * size // 2, None]
+    weight = kernels(size, orders).flatten(1).to(values)
+    return (values - middle) @ weight.T + middle * weight.sum(1)
+
+
+def locate(frames: Tensor, frame: Tensor, pixels: Tensor, size: int = MASK) -> Edges:
+    """Sub-pixel edge in the window of each given pixel: phi from A_11, then l = A_20 / A'_11.
+
+    Args:
+        frames: (B, H, W) grey. frame: (E,) int64. pixels: (E, 2) int64 u, v, at least N // 2 from the border.
+    """
+    c, s, a20 = moments_at(frames, frame, pixels, size).double().unbind(-1)
+    a11 = torch.hypot(c, s)
+    normal = torch.stack([c, s], -1) / a11[:, None]
+    length = a20 / a11
+    offset = length * (size / 2)
+    shift = offset[:, None] * normal
+    step = 1.5 * a11 / (1 - length.square()).clamp_min(1e-3).pow(1.5)
+    inside = (shift.abs() <= 0.5).all(-1)
+    return Edges(pixels.double() + shift, normal, offset, step, inside)
+
+
+@lru_cache(maxsize=8)
+def edge_correlation(size: int = MASK) -> float:
+    """Variance inflation of means along an edge: windows of neighbouring edge pixels share their noise.
+
+    For white pixel noise the error of l at an edge pixel is the noise correlated with the A_20 kernel, so the errors of
+    a row of edge pixels have the autocorrelation of that kernel; the factor is its sum (derived; checked by Monte-Carlo
+    in tests/test_zernike.py).
+    """
+    kernel = kernels(size, ((2, 0),))[0]
+    return float(kernel.sum(1).square().sum() / kernel.square().sum())
