@@ -1,0 +1,133 @@
+"""Stage: concentric pairs. From candidate ellipses to rings with both circles measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchpose import ellipse, zernike
+from torchpose.camera import Camera
+from torchpose.detect import Candidates
+from torchpose.edges import REACH, ring_edges
+from torchpose.ellipse import EllipseFit
+from torchpose.geometry import conics
+from torchpose.geometry.segments import segment_mean, segment_sum
+
+_ANGLES = 64
+_RADII = 72
+_INNERMOST, _OUTERMOST = 0.08, 1.12  # of the outer ellipse, the range of the radial profile
+_RATIO_RANGE = (0.12, 0.93)  # of inner to outer radius
+_LEAST_PEAK = 0.25  # of the outer edge's slope in the mean radial profile
+_LEAST_COVER = 0.4  # of the perimeter with edge points, for either circle
+_STEP_RANGE = (0.4, 2.5)  # inner to outer grey step
+
+
+@dataclass(frozen=True, eq=False)
+class Rings:
+    """K rings with both circles measured, flat.
+
+    Attributes:
+        frame: (K,) int64. polarity: (K,) float64, +1 dark ring on light, -1 light on dark.
+        outer_raw, inner_raw: (K, 5) float64, ellipses in the pixels of the frame.
+        outer, inner: fits in ideal pixels, that is of the same camera without lens distortion.
+    """
+
+    frame: Tensor
+    polarity: Tensor
+    outer_raw: Tensor
+    inner_raw: Tensor
+    outer: EllipseFit
+    inner: EllipseFit
+
+    def __len__(self) -> int:
+        return self.frame.shape[0]
+
+    @property
+    def ratio(self) -> Tensor:
+        """(K,) inner to outer radius: the square root of the paper's ring-area code."""
+        i, o = self.inner.params, self.outer.params
+        return (i[:, 2] * i[:, 3] / (o[:, 2] * o[:, 3])).sqrt()
+
+
+def find_inner(frames: Tensor, candidates: Candidates) -> tuple[Tensor, Tensor]:
+    """Radius ratio of the circle inside each candidate, from the mean radial profile of grey.
+
+    The profile is taken along radii scaled by the candidate's own ellipse, so it averages over the whole ring: an inner
+    circle of two pixels that no region growing would hold together still stands out.
+
+    Returns:
+        ratio (M,) float64 and found (M,) bool.
+    """
+    height, width = frames.shape[-2:]
+    device = frames.device
+    rho = torch.linspace(_INNERMOST, _OUTERMOST, _RADII, dtype=torch.float64, device=device)
+    angle = torch.arange(_ANGLES, dtype=torch.float64, device=device) * (2 * torch.pi / _ANGLES)
+    circle = torch.stack([angle.cos(), angle.sin()])
+    shape = conics.shape_matrix(candidates.ellipse)
+    uv = (shape @ circle)[:, :, None, :] * rho[:, None] + candidates.ellipse[:, :2, None, None]
+    u, v = uv.round().long().unbind(1)
+    cell = (candidates.frame[:, None, None] * height + v.clamp(0, height - 1)) * width + u.clamp(0, width - 1)
+    profile = frames.reshape(-1)[cell].float().mean(-1).double()
+    rise = (profile[:, 2:] - profile[:, :-2]) * candidates.polarity[:, None]
+    at = rho[1:-1]
+    outer = rise.masked_fill(at < _RATIO_RANGE[1], -torch.inf).amax(-1)
+    fall = (-rise).masked_fill((at < _RATIO_RANGE[0]) | (at > _RATIO_RANGE[1]), -torch.inf)
+    peak, best = fall.max(-1)
+    return at[best], (outer > 0) & (peak > _LEAST_PEAK * outer)
+
+
+def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera) -> Rings:
+    """Measures outer and inner circle of every candidate that has both, each fitted separately.
+
+    Args:
+        frames: (B, H, W) grey, any real dtype. candidates: with the polarity of the rings looked for.
+        camera: its distortion is taken off the sub-pixel points before the final fit.
+    """
+    ratio, found = find_inner(frames, candidates)
+    candidates, ratio = candidates[found], ratio[found]
+    count = len(candidates)
+    outer = candidates.ellipse
+    inner = torch.cat([outer[:, :2], outer[:, 2:4] * ratio[:, None], outer[:, 4:]], -1)
+    # no search band may reach the other circle, nor the centre
+    gap = torch.minimum(0.5 * (1 - ratio), 0.6 * ratio) * outer[:, 3]
+    rough = torch.cat([outer, inner])
+    frame = candidates.frame.repeat(2)
+    reach = torch.cat([gap, gap]).clamp(1.0, REACH)
+    edges = ring_edges(frames, frame, rough, torch.cat([candidates.polarity, -candidates.polarity]), reach)
+
+    raw, keep = ellipse.fit_robust(edges.points, edges.ring, 2 * count, start=rough)
+    ring, points = edges.ring[keep], edges.points[keep]
+    ideal_points = ideal_pixels(camera, points)
+    ideal = ellipse.fit(ideal_points, ring, 2 * count)
+    fit = ellipse.with_covariance(ideal_points, ring, ideal, correlation=zernike.edge_correlation())
+
+    one = torch.ones_like(ring, dtype=torch.float64)
+    cover = segment_sum(one, ring, 2 * count) / conics.perimeter(raw)
+    step = segment_mean(edges.step[keep], ring, 2 * count)
+    step_ratio = step[count:] / step[:count]
+    offset = torch.linalg.vector_norm(raw[count:, :2] - raw[:count, :2], dim=-1)
+    good = (
+        fit.covariance.isfinite().all(-1).all(-1).view(2, count).all(0)
+        & (cover.view(2, count) > _LEAST_COVER).all(0)
+        & (step_ratio > _STEP_RANGE[0])
+        & (step_ratio < _STEP_RANGE[1])
+        & (offset < 0.25 * raw[:count, 3])  # concentric up to perspective
+        & (raw[count:, 2] < raw[:count, 2])
+    )
+    index = good.nonzero()[:, 0]
+
+    def rows(start: int) -> EllipseFit:
+        i = index + start
+        return EllipseFit(fit.params[i], fit.covariance[i], fit.sigma[i], fit.points[i])
+
+    return Rings(
+        candidates.frame[index], candidates.polarity[index], raw[index], raw[index + count], rows(0), rows(count)
+    )
+
+
+def ideal_pixels(camera: Camera, points: Tensor) -> Tensor:
+    """Pixels (..., 2) that a camera with the same matrix and no distortion would see; float64."""
+    k = camera.matrix.to(points.device)
+    return camera.undistort_points(points.double()) * k.diagonal()[:2] + k[:2, 2]
