@@ -99,8 +99,10 @@ def _fisher(camera: Camera, target: Target, R: Tensor, t: Tensor, sigma: Tensor,
 
 
 def _invert(information: Tensor) -> Tensor:
-    """Inverse of symmetric matrices (B, n, n) whose unknowns differ in scale; NaN where they are singular."""
+    """Inverse of positive semidefinite (B, n, n), whatever the units of the unknowns; NaN where it is singular."""
     scale = information.diagonal(dim1=-2, dim2=-1).clamp_min(torch.finfo(information.dtype).tiny).rsqrt()
-    factor, failed = torch.linalg.cholesky_ex(information * scale[:, :, None] * scale[:, None])
-    inverse = torch.cholesky_inverse(factor) * scale[:, :, None] * scale[:, None]
-    return torch.where((failed > 0)[:, None, None], torch.nan, inverse)
+    values, vectors = torch.linalg.eigh(information * scale[:, :, None] * scale[:, None])
+    # a direction that the frame does not show has an eigenvalue at the square of the renderer's accuracy
+    values = torch.where(values[:, :1] > 1e-12, values, torch.nan)
+    vectors = scale[:, :, None] * vectors
+    return (vectors / values[:, None]) @ vectors.mT

@@ -276,7 +276,7 @@ def add_noise(
     for some, which, amplitude in zip(*(x.split(_frames_at_once(size)) for x in (frames, number, sigma)), strict=True):
         level = some + amplitude[:, None, None] * _normal(seed, which, size).view_as(some)
         out.append((level * (top / GREY_MAX)).round().clamp(0, top).to(dtype))
-    return torch.cat(out) if out else torch.empty_like(frames, dtype=dtype)
+    return torch.cat(out)
 
 
 def _frames_at_once(pixels: int) -> int:

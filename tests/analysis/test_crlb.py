@@ -1,0 +1,148 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchpose.analysis import pose_crlb
+from torchpose.camera import Camera
+from torchpose.errors import ConfigError
+from torchpose.geometry import rotations
+from torchpose.sim import render
+from torchpose.target import Target
+
+# torch's forward mode loads a module that warns of torch's own use of torch.jit.script
+pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is:DeprecationWarning")
+
+F64 = torch.float64
+
+
+def camera(distortion: tuple[float, ...] = ()) -> Camera:
+    matrix = torch.tensor([[400.0, 0, 150], [0, 400.0, 150], [0, 0, 1]], dtype=F64)
+    return Camera(301, 301, matrix, torch.tensor(distortion, dtype=F64))
+
+
+def tilted() -> tuple[Tensor, Tensor]:
+    return rotations.exp(torch.tensor([[0.5, -0.3, 0.7]], dtype=F64)), torch.tensor([[2.0, -3.0, 190.0]], dtype=F64)
+
+
+def test_is_the_inverse_fisher_information_of_whole_frames():
+    cam, target = camera((-0.2, 0.05, 1e-3, -1e-3)), Target.load("quad40")
+    R, t = tilted()
+    psf, dark, light, noise = 0.8, 40.0, 200.0, 2.0
+
+    def frame(x: Tensor) -> Tensor:
+        image = render(
+            cam, target, rotations.exp(x[3:6]) @ R, t + x[:3], psf_sigma=psf + x[6], dark=dark, light=light
+        )  # fmt: skip
+        return image[0].double().flatten()
+
+    # central differences, fourth order; steps that move edges by some hundredths of a pixel
+    steps = torch.tensor([2e-2, 2e-2, 2e-1, 1e-3, 1e-3, 1e-3, 1e-2], dtype=F64)
+    columns = [
+        (8 * (frame(d) - frame(-d)) - (frame(2 * d) - frame(-2 * d))) / (12 * d.sum()) for d in torch.diag(steps)
+    ]
+    # the pixels nearest to a marker share its two grey levels
+    zero = frame(torch.zeros(7, dtype=F64))
+    centers = cam.project(target.centers @ R[0].T + t)
+    v, u = torch.meshgrid(torch.arange(301.0), torch.arange(301.0), indexing="ij")
+    grid = torch.stack([u, v], -1).reshape(-1, 1, 2)
+    nearest = (grid - centers).norm(dim=-1).argmin(1)
+    darkness = (light - zero) / (light - dark)
+    for marker in range(4):
+        own = (nearest == marker).double()
+        columns += [own * darkness, own * (1 - darkness)]
+    jacobian = torch.stack(columns, 1)
+    information = jacobian.T @ jacobian / (noise**2 + 1 / 12)
+    expected = torch.linalg.inv(information)[:6, :6]
+
+    found = pose_crlb(cam, target, R, t, psf_sigma=psf, dark=dark, light=light, noise_sigma=noise)[0]
+    # paper far from the markers tells a little more of the light levels: the reason for 1e-3
+    std, expected_std = found.diagonal().sqrt(), expected.diagonal().sqrt()
+    torch.testing.assert_close(std, expected_std, rtol=1e-3, atol=0)
+    torch.testing.assert_close(
+        found / (std * std[:, None]), expected / (expected_std * expected_std[:, None]), rtol=0, atol=1e-3
+    )
+
+
+def test_lateral_information_is_that_of_straight_edges():
+    # derived: a blurred edge of contrast h and length L fixes its offset with information
+    # h^2 L / (2 sqrt(pi) s noise^2); a circle of radius r px seen frontally has pi r px of it along each axis
+    cam, target = camera(), Target.load("quad40")
+    R, t = torch.eye(3, dtype=F64)[None], torch.tensor([[0.0, 0.0, 120.0]], dtype=F64)
+    psf, contrast, noise = 0.8, 190.0, 3.0
+    bound = pose_crlb(cam, target, R, t, psf_sigma=psf, dark=30.0, light=220.0, noise_sigma=noise, bits=16)
+    scale = 400.0 / 120.0  # px/mm
+    blur = math.sqrt(psf**2 + 1 / 12)
+    length = math.pi * scale * float(target.radii.sum())
+    expected = contrast**2 * length * scale**2 / (2 * math.sqrt(math.pi) * blur * noise**2)
+    information = torch.linalg.inv(bound[0])
+    assert information[0, 0].item() == pytest.approx(expected, rel=0.01)
+    assert information[1, 1].item() == pytest.approx(expected, rel=0.01)
+
+
+def test_turns_with_the_camera():
+    # a quarter turn of the whole scene about the optical axis maps pixels onto pixels and rotates the covariance
+    cam, target = camera(), Target.load("quad40")
+    R, t = tilted()
+    quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=F64)
+    bound = pose_crlb(cam, target, R, t)[0]
+    turned = pose_crlb(cam, target, quarter @ R, t @ quarter.T)[0]
+    turn = torch.block_diag(quarter, quarter)
+    scale = turned.diagonal().sqrt()
+    difference = (turned - turn @ bound @ turn.T) / (scale * scale[:, None])
+    assert difference.abs().max() < 1e-6
+
+
+def test_scales_with_noise_and_contrast():
+    cam, target = camera(), Target.load("quad40")
+    R, t = tilted()
+    R, t = R.expand(4, 3, 3), t.expand(4, 3)
+    noise, light = torch.tensor([1.0, 3.0, 1.0, 1.0]), torch.tensor([130.0, 130.0, 230.0, 130.0])
+    bound = pose_crlb(cam, target, R, t, dark=30.0, light=light, noise_sigma=noise, bits=16)
+    torch.testing.assert_close(bound[1], 9 * bound[0], rtol=1e-5, atol=0)
+    torch.testing.assert_close(bound[2], bound[0] / 4, rtol=1e-5, atol=0)
+    torch.testing.assert_close(bound[3], bound[0], rtol=1e-12, atol=0)
+    eight = pose_crlb(cam, target, R[:1], t[:1], dark=30.0, light=130.0, noise_sigma=0.0)
+    torch.testing.assert_close(eight[0], bound[0] / 12, rtol=1e-5, atol=0)
+
+
+def test_batch_equals_single_poses_beyond_one_chunk():
+    cam, target = camera(), Target.load("quad40")
+    w = torch.linspace(-0.5, 0.5, 18, dtype=F64)
+    R = rotations.exp(torch.stack([w, -w, 2 * w], 1))
+    t = torch.stack([w, w, 180 + 20 * w], 1)
+    together = pose_crlb(cam, target, R, t)
+    for i in (0, 17):
+        torch.testing.assert_close(
+            together[i : i + 1], pose_crlb(cam, target, R[i : i + 1], t[i : i + 1]), rtol=1e-4, atol=0
+        )
+
+
+def test_no_pose_without_markers_in_view():
+    target = Target.load("quad40")
+    R = torch.eye(3, dtype=F64).expand(2, 3, 3)
+    t = torch.tensor([[0.0, 0.0, 150.0], [0.0, 0.0, -150.0]], dtype=F64)
+    bound = pose_crlb(camera(), target, R, t)
+    assert bound[0].isfinite().all()
+    assert bound[1].isnan().all()
+    assert pose_crlb(camera(), target, R[1:], t[1:]).isnan().all()
+
+
+def test_no_pose_from_one_ring():
+    # a ring looks the same after a turn about its axis
+    target = Target.load("quad40")
+    R, _ = tilted()
+    center = R[0] @ target.centers[0]
+    one = torch.tensor([[0.0, 0.0, 25.0]], dtype=F64) - center
+    assert pose_crlb(camera(), target, R, one).isnan().all()
+    # at a distance the others come into view
+    assert pose_crlb(camera(), target, R, one + torch.tensor([0.0, 0.0, 200.0])).isfinite().all()
+
+
+def test_blur_must_be_positive():
+    R, t = tilted()
+    with pytest.raises(ConfigError, match="psf_sigma"):
+        pose_crlb(camera(), Target.load("quad40"), R, t, psf_sigma=-1.0)
