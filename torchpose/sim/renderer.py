@@ -96,18 +96,17 @@ def render(
         (B, H, W) float32.
 
     Raises:
-        ConfigError: ``psf_sigma`` is not above 0.
+        ConfigError: ``psf_sigma`` is not above 0, or the plate reaches behind the camera.
         FrameError: shapes of R and t disagree.
     """
     R, t = check_poses(R, t)
-    batch = t.shape[0]
     sigma = check_blur(psf_sigma, t)
     dark_, light_, around = (per_frame(x, t) for x in (dark, light, surround))
     ink, paper = (light_, dark_) if target.background == "dark" else (dark_, light_)
     frames = _frames_at_once(camera.width * camera.height)
     out = []
-    for a in range(0, batch, frames):
-        s = slice(a, min(a + frames, batch))
+    for a in range(0, t.shape[0], frames):
+        s = slice(a, a + frames)
         edges = ring_boundary(camera, target, R[s], t[s], sigma[s])
         contrast = (ink - paper)[s][edges.frame]
         base = paper[s]
