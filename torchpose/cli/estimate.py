@@ -22,6 +22,8 @@ if TYPE_CHECKING:  # imported where they are used: torch takes more than a secon
     from torchpose.results import Poses
     from torchpose.target import Target
 
+INTERRUPTED = 130  # as shells have it: 128 + SIGINT
+
 EPILOG = """
 Examples:
 
@@ -146,7 +148,7 @@ def _run(
     )
     # a resumed run works on the same batches as one that was not interrupted, so that rows agree to the last bit
     batches = in_batches(sources, batch or default_batch(camera.width, camera.height))
-    pending = [sources for sources in batches if any(source.name not in store for source in sources)]
+    pending = [one for one in batches if any(source.name not in store for source in one)]
     reader = FrameReader(pending, camera.width, camera.height, threads=threads)
     try:
         with FrameProgress(len(sources), len(store), quiet=quiet) as progress, torch.inference_mode():
@@ -157,7 +159,9 @@ def _run(
                 progress.advance(len(new), store.counts)
         store.finish([source.name for source in sources])
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"{len(store)} of {len(sources)} frames are kept; add --resume to go on") from None
+        kept = f"{len(store)} of {len(sources)} frames are kept"
+        typer.echo(f"torchpose: error: interrupted: {kept}; add --resume to go on", err=True)
+        return INTERRUPTED
     finally:
         store.close()
     progress.summary(store.counts, out)

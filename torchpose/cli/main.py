@@ -56,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     except TorchposeError as error:
         _fail(str(error))
     except (KeyboardInterrupt, typer.Abort):
-        _fail("interrupted", 130)
+        _fail("interrupted before anything was computed", estimate.INTERRUPTED)
     except Exception as error:
         # typer brings its own copy of click or depends on click, by version: known by what its errors can do
         if hasattr(error, "format_message"):
