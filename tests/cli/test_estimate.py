@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import random
+import resource
 import signal
 import subprocess
 import sys
@@ -556,6 +557,28 @@ def test_an_interrupted_run_says_how_to_go_on_and_prints_nothing_else():
         "torchpose: error: 5.png (truncated): INPUT: 1 could not be read; replace the files and run again\n",
     )
     assert [row["frame"] for row in table()] == [f"{i}.png" for i in range(40)]
+
+
+@pytest.mark.usefixtures("many")
+def test_a_full_disk_ends_in_one_line_and_loses_nothing():
+    def small_files():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (30000, 30000))
+
+    process = subprocess.Popen(
+        [*COMMAND, "estimate", "f", *OPTIONS, "--batch", "4", "--out", "poses.csv"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=small_files,
+    )
+    code, error = finish(process)
+    assert code == 2
+    assert error.startswith("torchpose: error: poses.csv.partial: --out: cannot be written (File too large)")
+    assert error.count("\n") == 1
+    assert Path("poses.csv.partial").read_bytes().count(b"\n") > 8
+    assert finish(start("--out", "whole.csv", "--batch", "4"))[0] == 1
+    assert finish(start("--out", "poses.csv", "--batch", "4", "--resume"))[0] == 1
+    assert Path("poses.csv").read_bytes() == Path("whole.csv").read_bytes()
 
 
 @pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs a pseudo-terminal")

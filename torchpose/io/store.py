@@ -13,8 +13,9 @@ import json
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from io import FileIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from torchpose.errors import ConfigError
 from torchpose.io.rows import DETECTION_SCHEMA, Row, Schema
@@ -62,7 +63,8 @@ class ResultStore:
         resumable = resume and self._journal_path.exists()
         finished = list(self._finished()) if resume and not resumable and out.exists() else []
         try:
-            self._journal: BinaryIO = self._journal_path.open("a+b")
+            # unbuffered: what a full disk refuses must not be tried again when the file is closed
+            self._journal: FileIO = self._journal_path.open("ab", buffering=0)
         except OSError as error:
             raise self._unwritable(error) from None
         try:
@@ -130,8 +132,9 @@ class ResultStore:
     def _write(self, records: Sequence[Row]) -> list[tuple[int, int]]:
         lines = [json.dumps(record, allow_nan=False).encode() + b"\n" for record in records]
         offset = self._journal.seek(0, os.SEEK_END)
-        self._journal.write(b"".join(lines))
-        self._journal.flush()
+        rest = memoryview(b"".join(lines))
+        while rest:
+            rest = rest[self._journal.write(rest) :]
         os.fsync(self._journal.fileno())
         places = []
         for line in lines:
@@ -147,28 +150,29 @@ class ResultStore:
 
     def _load(self) -> bool:
         """Reads the journal of a killed run and drops a torn end; False if not even its first line is whole."""
-        self._journal.seek(0)
         offset = 0
-        for line in self._journal:
-            if not line.endswith(b"\n"):
-                break
-            try:
-                record = json.loads(line)
-            except ValueError:  # a crash of the machine may leave blocks of zeros
-                break
-            if offset == 0:
-                self._check_origin(record.get("origin"), self._journal_path)
-            else:
-                self._note(record, (offset, len(line)))
-            offset += len(line)
+        with self._journal_path.open("rb") as lines:
+            for line in lines:
+                if not line.endswith(b"\n"):
+                    break
+                try:
+                    record = json.loads(line)
+                except ValueError:  # a crash of the machine may leave blocks of zeros
+                    break
+                if offset == 0:
+                    self._check_origin(record.get("origin"), self._journal_path)
+                else:
+                    self._note(record, (offset, len(line)))
+                offset += len(line)
         self._journal.truncate(offset)
         return offset > 0
 
     def _records(self, frames: Sequence[str]) -> Iterator[Row]:
-        for frame in frames:
-            offset, length = self._places[frame]
-            self._journal.seek(offset)
-            yield json.loads(self._journal.read(length))
+        with self._journal_path.open("rb") as journal:
+            for frame in frames:
+                offset, length = self._places[frame]
+                journal.seek(offset)
+                yield json.loads(journal.read(length))
 
     def _finished(self) -> Iterator[Row]:
         """Records of the tables of a run that was completed."""
@@ -201,7 +205,7 @@ class ResultStore:
             )
 
 
-def _lock(file: BinaryIO, path: Path) -> None:
+def _lock(file: FileIO, path: Path) -> None:
     """Keeps a second run from writing the same journal; the system releases it however the run ends."""
     try:
         import fcntl
