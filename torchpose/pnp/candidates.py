@@ -1,0 +1,83 @@
+"""The calling convention of every solver: points in, up to S candidate poses out; and the layout they share.
+
+Public tensors have the batch first. Inside the solvers everything is a structure of arrays with the batch last, so that
+each scalar of a formula is one contiguous vector over the poses (docs/decisions/0004-pnp-layout.md). The public tensors
+are permuted views of those arrays: handing them from one solver to the next copies nothing.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Candidates(NamedTuple):
+    """S poses for each of B sets of points, best first; NaN where a solution does not exist.
+
+    Attributes:
+        R: (B, S, 3, 3), object to camera: X_cam = R X + t.
+        t: (B, S, 3), in the unit of the object points.
+        rms: (B, S), root mean square distance of the projections from the normalised image points.
+    """
+
+    R: Tensor
+    t: Tensor
+    rms: Tensor
+
+
+def batch_last(
+    object_points: Tensor, image_points: Tensor, mask: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Object points (3, N, B) or (3, N, 1) where shared, image points (2, N, B) and weights 0 or 1 (N, B) or None.
+
+    Points that the mask leaves out become zero, so that whatever they hold (NaN included) drops out of every sum.
+
+    Raises:
+        ValueError: the shapes do not fit (N, 3) or (B, N, 3), (B, N, 2) and (B, N).
+    """
+    if image_points.ndim != 3 or image_points.shape[-1] != 2:
+        raise ValueError(f"image_points has shape {tuple(image_points.shape)}; expected (B, N, 2)")
+    batch, count = image_points.shape[:2]
+    if object_points.shape not in ((count, 3), (batch, count, 3)):
+        raise ValueError(
+            f"object_points has shape {tuple(object_points.shape)}; expected ({count}, 3) or ({batch}, {count}, 3)"
+        )
+    if mask is not None and mask.shape != (batch, count):
+        raise ValueError(f"mask has shape {tuple(mask.shape)}; expected ({batch}, {count})")
+    points = object_points.to(image_points).reshape(-1, count, 3).permute(2, 1, 0)
+    xy = image_points.permute(2, 1, 0).contiguous()
+    if mask is None:
+        return points.contiguous(), xy, None
+    keep = mask.T
+    return torch.where(keep, points, 0.0), torch.where(keep, xy, 0.0), keep.to(xy.dtype)
+
+
+def weighted_mean(x: Tensor, weight: Tensor | None) -> Tensor:
+    """Mean over the points: (k, N, B) -> (k, B), of those with weight 1."""
+    return x.mean(1) if weight is None else (x * weight).sum(1) / weight.sum(0)
+
+
+def rank(r: Tensor, t: Tensor, points: Tensor, xy: Tensor, weight: Tensor | None) -> Candidates:
+    """Sorts poses R (3, 3, S, B), t (3, S, B) by their reprojection error; poses with a point behind become NaN."""
+    s, b = r.shape[2:]
+    x, y, z = points[:, :, None]
+    camera = r[:, 0, None] * x + r[:, 1, None] * y + r[:, 2, None] * z + t[:, None]  # (3, N, S, B)
+    error = (camera[:2] / camera[2] - xy[:, :, None]).square().sum(0)
+    ahead = camera[2] > 0
+    if weight is not None:
+        error, ahead = error * weight[:, None], ahead | (weight[:, None] == 0)
+        rms = (error.sum(0) / weight.sum(0)).sqrt()
+    else:
+        rms = error.mean(0).sqrt()
+    valid = ahead.all(0) & rms.isfinite()
+    rms = torch.where(valid, rms, torch.inf)
+    if s > 1:
+        order = rms.argsort(0)
+        rms = rms.gather(0, order)
+        r = r.gather(2, order.expand(3, 3, s, b))
+        t = t.gather(1, order.expand(3, s, b))
+    valid = rms.isfinite()
+    r, t, rms = (torch.where(valid, v, torch.nan) for v in (r, t, rms))
+    return Candidates(r.permute(3, 2, 0, 1), t.permute(2, 1, 0), rms.T)

@@ -1,0 +1,223 @@
+"""Maximum-likelihood pose by Levenberg-Marquardt on reprojection errors, through the full camera model.
+
+The state is the pose about the centroid of the points; a step is a translation and a rotation from the left,
+X_cam = C(w) R (X - c) + t, with Cayley's C(w) = exp([w]x) to third order. The Jacobian is analytic; damping, acceptance
+and convergence are per pose. The iterations run in float32 on undistorted points first and finish in float64 on the
+pixels themselves.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchpose.camera import Camera
+from torchpose.geometry.small_linalg import cayley, inverse_spd, matmul3, solve_spd
+
+# upper triangle of the 6 x 7 matrix [J^T J | J^T r] row by row, and the squared length of r, packed in 28 numbers
+_STARTS = (0, 7, 13, 18, 22, 25)
+_UNPACK = [[_STARTS[min(i, j)] + abs(i - j) for j in range(6)] + [_STARTS[i] + 6 - i] for i in range(6)]
+# columns of the Jacobian are kept with these signs: it saves their negation
+SIGNS = (1.0, 1.0, -1.0, -1.0, 1.0, 1.0)
+
+
+class Observations(NamedTuple):
+    """Image points of B poses and what they weigh; batch last.
+
+    Attributes:
+        points: (3, N, B) or (3, N, 1), object points about their centroid in units of their extent.
+        xy: (2, N, B) normalised image points, or pixels where there is a ``camera``.
+        whitening: (2, N, B) or broadcastable to it, or (2, 2, N, B): takes a difference of ``xy`` to units of its
+            standard deviation; zero for a point that was not seen.
+        camera: distorted camera through which the poses are projected; None: the pinhole of normalised coordinates.
+        huber: residual in standard deviations above which the cost grows linearly; inf: least squares.
+    """
+
+    points: Tensor
+    xy: Tensor
+    whitening: Tensor
+    camera: Camera | None = None
+    huber: float = float("inf")
+
+    def select(self, index: Tensor) -> Observations:
+        """The poses ``index``."""
+
+        def pick(x: Tensor) -> Tensor:
+            return x if x.shape[-1] == 1 else x.index_select(-1, index)
+
+        return self._replace(points=pick(self.points), xy=pick(self.xy), whitening=pick(self.whitening))
+
+    def repeat(self, count: int) -> Observations:
+        """``count`` copies one after the other."""
+        if count == 1:
+            return self
+
+        def tile(x: Tensor) -> Tensor:
+            return x if x.shape[-1] == 1 else torch.cat([x] * count, -1)
+
+        return self._replace(points=tile(self.points), xy=tile(self.xy), whitening=tile(self.whitening))
+
+    def to(self, dtype: torch.dtype) -> Observations:
+        return self._replace(points=self.points.to(dtype), xy=self.xy.to(dtype), whitening=self.whitening.to(dtype))
+
+
+class Estimate(NamedTuple):
+    """B minimisations: R (3, 3, B), t (3, B), packed normal equations (28, B), iterations and converged (B,)."""
+
+    r: Tensor
+    t: Tensor
+    normal: Tensor
+    iterations: Tensor
+    converged: Tensor
+
+
+def residuals(obs: Observations, uv: Tensor) -> Tensor:
+    """Whitened residuals (2, N, B) of projections ``uv`` (2, N, B) in normalised coordinates."""
+    if obs.camera is not None:
+        uv = obs.camera.distort(uv.movedim(0, -1)).movedim(-1, 0)
+    difference = uv - obs.xy
+    if obs.whitening.ndim == 3:
+        return difference * obs.whitening
+    return obs.whitening[:, 0] * difference[0] + obs.whitening[:, 1] * difference[1]
+
+
+def linearise(obs: Observations, r: Tensor, t: Tensor) -> tuple[list[Tensor], list[Tensor], Tensor]:
+    """Rows of [J | r] for u and for v, seven (N, B) each, and the cost (B,), infinite where a point is behind."""
+    px, py, pz = rotated = r[:, 0, None] * obs.points[0] + r[:, 1, None] * obs.points[1] + r[:, 2, None] * obs.points[2]
+    camera_points = rotated + t[:, None]
+    z = camera_points[2]
+    d = 1 / z
+    uv = camera_points[:2] * d
+    residual = residuals(obs, uv)
+    weight = obs.whitening
+    if obs.camera is not None:
+        slope = obs.camera.J_distort(uv.movedim(0, -1)).movedim((-2, -1), (0, 1))
+        weight = weight[:, None] * slope if weight.ndim == 3 else product2(weight, slope)
+    full = weight.ndim == 4
+    e = d.expand_as(uv) if full else d * weight
+    f = e * uv
+    zero = torch.zeros_like(d)
+    (ex, ey), (fx, fy) = e, f
+    u_row = [ex, zero, fx, fx * py, ex * pz + fx * px, -ex * py]
+    v_row = [zero, ey, fy, ey * pz + fy * py, fy * px, ey * px]
+    if full:
+        pairs = list(zip(u_row, v_row, strict=True))
+        u_row = [weight[0, 0] * a + weight[0, 1] * b for a, b in pairs]
+        v_row = [weight[1, 0] * a + weight[1, 1] * b for a, b in pairs]
+    u_row.append(residual[0])
+    v_row.append(residual[1])
+    cost = residual.square().sum(0)
+    if obs.huber != float("inf"):
+        length = cost.sqrt()
+        outside = length > obs.huber
+        scale = torch.where(outside, obs.huber / torch.where(outside, length, 1), 1).sqrt()
+        u_row, v_row = [a * scale for a in u_row], [a * scale for a in v_row]
+        cost = torch.where(outside, obs.huber * (2 * length - obs.huber), cost)
+    return u_row, v_row, torch.where(z.amin(0) > 0, cost.sum(0), torch.inf)
+
+
+def product2(a: Tensor, b: Tensor) -> Tensor:
+    """Products of matrices (2, 2, ...)."""
+    return a[:, 0, None] * b[0] + a[:, 1, None] * b[1]
+
+
+def normal_equations(obs: Observations, r: Tensor, t: Tensor) -> Tensor:
+    """Packed J^T J, J^T r and cost (28, B) at the poses R (3, 3, B), t (3, B)."""
+    u_row, v_row, cost = linearise(obs, r, t)
+    if torch.compiler.is_compiling():
+        sums = [(u_row[i] * u_row[j] + v_row[i] * v_row[j]).sum(0) for i in range(6) for j in range(i, 7)]
+        return torch.stack([*sums, cost])
+    rows = (
+        torch.stack([row for pair in zip(u_row, v_row, strict=True) for row in pair]).unflatten(0, (7, 2)).flatten(1, 2)
+    )
+    return torch.cat([*((rows[i] * rows[i:]).sum(1) for i in range(6)), cost[None]])  # rows: (7, 2N, B)
+
+
+def unpack(normal: Tensor) -> Tensor:
+    """[J^T J | J^T r] (6, 7, B)."""
+    if torch.compiler.is_compiling():
+        return torch.stack([torch.stack([normal[k] for k in row]) for row in _UNPACK])
+    index = torch.tensor(_UNPACK, device=normal.device).flatten()
+    return normal.index_select(0, index).unflatten(0, (6, 7))
+
+
+def covariance(normal: Tensor) -> tuple[Tensor, Tensor]:
+    """(J^T J)^-1 (6, 6, B), translation first, and how independent the parameters are (B,): 0 where one is not fixed.
+
+    The latter is the least pivot over its diagonal entry, that is the least 1 - (multiple correlation)^2.
+    """
+    information = unpack(normal)[:, :6]
+    inverse, pivots = inverse_spd(information)
+    signs = torch.tensor(SIGNS, dtype=normal.dtype, device=normal.device)
+    inverse = inverse * (signs[:, None] * signs)[..., None]
+    return inverse, (pivots / information.diagonal().T).amin(0)
+
+
+def lm_step(
+    obs: Observations, r: Tensor, t: Tensor, normal: Tensor, damping: Tensor, rtol: float, floor: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """One damped step of every pose: new R, t, normal equations, damping, and which poses are at their minimum."""
+    system = unpack(normal)
+    eye = torch.eye(6, 7, dtype=r.dtype, device=r.device)[..., None]
+    damped = system * (1 + damping * eye)
+    step = solve_spd(damped[:, :6], system[:, 6:])[0].squeeze(1)
+    decrease = (step * system[:, 6]).sum(0)
+    cost = normal[27]
+    done = (decrease <= rtol * cost + floor) & (damping <= 1)
+    signs = torch.tensor(SIGNS, dtype=r.dtype, device=r.device)[:, None]
+    step = -signs * step
+    r_new = matmul3(cayley(step[3:]), r)
+    t_new = t + step[:3]
+    normal_new = normal_equations(obs, r_new, t_new)
+    accept = normal_new[27] <= cost * (1 + 1e-12) + floor
+    r, t, normal = (torch.where(accept, a, b) for a, b in ((r_new, r), (t_new, t), (normal_new, normal)))
+    return r, t, normal, torch.where(accept, 0.1 * damping, 10 * damping), done
+
+
+def minimise(
+    obs: Observations, r: Tensor, t: Tensor, *, max_iterations: int, rtol: float, damping: float = 1e-3
+) -> Estimate:
+    """Levenberg-Marquardt from R (3, 3, B), t (3, B) in the dtype of ``obs``.
+
+    A pose has converged when the undamped step promises to lower its cost by no more than ``rtol`` of it, or than
+    rounding could; that step is still taken. Converged poses leave the batch.
+    """
+    eps = torch.finfo(r.dtype).eps
+    scale = obs.whitening.square().amax(0) if obs.whitening.ndim == 3 else obs.whitening.square().amax((0, 1))
+    scale = scale * obs.xy.square().amax(0) if obs.camera is not None else scale * (1 + obs.xy.square().sum(0))
+    floor = (4 * eps) ** 2 * scale.sum(0)
+    normal = normal_equations(obs, r, t)
+    count = r.shape[-1]
+    lam = torch.full((count,), damping, dtype=r.dtype, device=r.device)
+    result = Estimate(
+        r, t, normal, torch.zeros(count, dtype=torch.int64, device=r.device), torch.zeros_like(floor, dtype=torch.bool)
+    )
+    index: Tensor | None = None  # of the poses still under way, None: all
+
+    def record(iteration: int, r: Tensor, t: Tensor, normal: Tensor, done: Tensor) -> Estimate:
+        if index is None:
+            return Estimate(r, t, normal, torch.full_like(result.iterations, iteration), done)
+        return Estimate(
+            result.r.index_copy(-1, index, r),
+            result.t.index_copy(-1, index, t),
+            result.normal.index_copy(-1, index, normal),
+            result.iterations.index_fill(0, index, iteration),
+            result.converged.index_copy(0, index, done),
+        )
+
+    for iteration in range(1, max_iterations + 1):
+        r, t, normal, lam, done = lm_step(obs, r, t, normal, lam, rtol, floor)
+        # neither a pose without numbers nor one whose steps have shrunk to nothing will come to an end
+        over = done | ~(lam < 1e8) | ~normal[27].isfinite()
+        remaining = (~over).nonzero().squeeze(1)
+        if iteration == max_iterations or len(remaining) == 0:
+            return record(iteration, r, t, normal, done)
+        if len(over) > 64 and 2 * len(remaining) <= len(over):
+            result = record(iteration, r, t, normal, done)
+            index = remaining if index is None else index[remaining]
+            obs = obs.select(remaining)
+            r, t, normal = (v.index_select(-1, remaining) for v in (r, t, normal))
+            lam, floor = lam[remaining], floor[remaining]
+    return result

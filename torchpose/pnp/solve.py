@@ -1,0 +1,373 @@
+"""`solve`: poses from points in pixels, by any method of this package, with covariance and a code for every pose."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from torchpose.camera import Camera
+from torchpose.geometry.small_linalg import cross, matmul3, orthonormalise
+from torchpose.pnp.iterative import (
+    SIGNS,
+    Estimate,
+    Observations,
+    covariance,
+    minimise,
+    normal_equations,
+    product2,
+    residuals,
+    unpack,
+)
+from torchpose.pnp.planar import COLLINEARITY, FLATNESS, ippe, plane_frame
+from torchpose.pnp.result import PnPCode, PnPError, PnPResult
+
+Method = Literal["iterative", "planar"]
+# chi-squared difference below which two minima are called ambiguous
+DECISION = 20.0
+# squared Mahalanobis distance below which two minima are one
+COINCIDENCE = 1.0
+# least 1 - (multiple correlation)^2 of a parameter below which the points do not fix the pose
+INDEPENDENCE = 1e-11
+_CHUNK = 4096
+
+
+def solve(
+    object_points: Tensor,
+    image_points: Tensor,
+    camera: Camera | Tensor,
+    *,
+    method: Method = "iterative",
+    sigma_px: float = 1.0,
+    covariances: Tensor | None = None,
+    weights: Tensor | None = None,
+    mask: Tensor | None = None,
+    initial: tuple[Tensor, Tensor] | None = None,
+    huber: float = float("inf"),
+    max_iterations: int = 30,
+    raise_on_failure: bool = False,
+) -> PnPResult:
+    """Poses of B sets of N points.
+
+    Args:
+        object_points: (N, 3) shared by all poses, or (B, N, 3).
+        image_points: (B, N, 2) px.
+        camera: `Camera`, or the pinhole matrix (3, 3) or (B, 3, 3).
+        method: "iterative" is the maximum-likelihood estimate (Levenberg-Marquardt through the full camera model from
+            every start that a closed form finds); the others return their closed form as it is, with the covariance
+            that the maximum-likelihood estimate would have there.
+        sigma_px: standard deviation of the image points, per axis.
+        covariances: (N, 2, 2) or (B, N, 2, 2) px^2, of the image points; replace ``sigma_px``.
+        weights: (N,) or (B, N), factors on the information of the points.
+        mask: (B, N) bool, True where the point was seen; what a missing point holds is ignored.
+        initial: R (B, 3, 3), t (B, 3) to start from, with method "iterative"; only its own minimum is then found.
+        huber: residual, in standard deviations, above which the cost of a point grows linearly.
+        max_iterations: of Levenberg-Marquardt, float32 and float64 together about.
+        raise_on_failure: raise instead of returning codes other than CONVERGED and AMBIGUOUS.
+
+    Returns:
+        `PnPResult`, float64, on the device of ``image_points``.
+
+    Raises:
+        ValueError: shapes do not fit, or an unknown method.
+        PnPError: with ``raise_on_failure``.
+    """
+    if image_points.ndim != 3 or image_points.shape[-1] != 2:
+        raise ValueError(f"image_points has shape {tuple(image_points.shape)}; expected (B, N, 2)")
+    batch, count = image_points.shape[:2]
+    pixels = image_points.double()
+    points = object_points.to(pixels)
+    _expect("object_points", points, (count, 3), batch)
+    options = {"covariances": ((count, 2, 2), covariances), "weights": ((count,), weights), "mask": ((count,), mask)}
+    for name, (shape, value) in options.items():
+        if value is not None:
+            _expect(name, value, shape, batch)
+    if method not in ("iterative", "planar"):
+        raise ValueError(f"method is {method!r}; choose one of iterative, planar")
+    if initial is not None and (initial[0].shape != (batch, 3, 3) or initial[1].shape != (batch, 3)):
+        raise ValueError(f"initial has shapes {[tuple(v.shape) for v in initial]}; expected (B, 3, 3) and (B, 3)")
+    if isinstance(camera, Tensor):
+        camera = camera.to(pixels)
+        _expect("camera", camera, (3, 3), batch)
+
+    def part(value: Tensor | None, shape_ndim: int, rows: slice) -> Tensor | None:
+        return value if value is None or value.ndim == shape_ndim else value[rows]
+
+    parts = []
+    for start in range(0, max(batch, 1), _CHUNK):
+        rows = slice(start, min(start + _CHUNK, batch))
+        parts.append(
+            _solve_chunk(
+                part(points, 2, rows),
+                pixels[rows],
+                part(camera, 2, rows) if isinstance(camera, Tensor) else camera,
+                method,
+                sigma_px,
+                part(covariances, 3, rows),
+                part(weights, 1, rows),
+                part(mask, 1, rows),
+                None if initial is None else (initial[0][rows].to(pixels), initial[1][rows].to(pixels)),
+                huber,
+                max_iterations,
+            )
+        )
+    result = (
+        parts[0]
+        if len(parts) == 1
+        else PnPResult(**{f.name: torch.cat([getattr(p, f.name) for p in parts]) for f in fields(PnPResult)})
+    )
+    if raise_on_failure:
+        failed = result.code > PnPCode.AMBIGUOUS
+        if bool(failed.any()):
+            first = int(failed.nonzero()[0])
+            code = PnPCode(int(result.code[first])).name
+            raise PnPError(f"pose {first}: {code}; {int(failed.sum())} of {batch} poses failed")
+    return result
+
+
+def _expect(name: str, value: Tensor, shape: tuple[int, ...], batch: int) -> None:
+    if value.shape not in (shape, (batch, *shape)):
+        raise ValueError(f"{name} has shape {tuple(value.shape)}; expected {shape} or {(batch, *shape)}")
+
+
+def _whitening(
+    shape: tuple[int, int],
+    sigma_px: float,
+    covariances: Tensor | None,
+    weights: Tensor | None,
+    keep: Tensor | None,
+    like: Tensor,
+) -> Tensor:
+    """Square root of the information of the image points, 1/px: (1|2, N|1, B|1) diagonal or (2, 2, N, B|1) lower."""
+    factor = None if weights is None else weights.to(like).reshape(-1, shape[0]).T.sqrt()
+    if keep is not None:
+        factor = keep.to(like.dtype) if factor is None else torch.where(keep, factor, 0.0)
+    if covariances is None:
+        unit = like.new_full((1, 1, 1), 1 / sigma_px)
+        return unit if factor is None else unit * factor
+    c = covariances.to(like).reshape(-1, shape[0], 2, 2).permute(2, 3, 1, 0)
+    if keep is not None:
+        c = torch.where(keep, c, torch.eye(2, dtype=c.dtype, device=c.device)[..., None, None])
+    l00 = c[0, 0].sqrt()
+    l10 = c[1, 0] / l00
+    l11 = (c[1, 1] - l10.square()).sqrt()
+    root = torch.stack([1 / l00, torch.zeros_like(l00), -l10 / (l00 * l11), 1 / l11]).unflatten(0, (2, 2))
+    return root if factor is None else root * factor
+
+
+def _solve_chunk(
+    object_points: Tensor,
+    pixels: Tensor,
+    camera: Camera | Tensor,
+    method: Method,
+    sigma_px: float,
+    covariances: Tensor | None,
+    weights: Tensor | None,
+    mask: Tensor | None,
+    initial: tuple[Tensor, Tensor] | None,
+    huber: float,
+    max_iterations: int,
+) -> PnPResult:
+    batch, count = pixels.shape[:2]
+    points = object_points.reshape(-1, count, 3).permute(2, 1, 0).contiguous()
+    image = pixels.permute(2, 1, 0).contiguous()
+    keep = None if mask is None else mask.reshape(-1, count).T.expand(count, batch)
+    whitening = _whitening((count, batch), sigma_px, covariances, weights, keep, pixels)
+    xy, slope = _rays(camera, pixels, image)
+    if slope.ndim == 3 and whitening.shape[0] == 1:
+        linear = whitening * slope
+    else:
+        full = slope if slope.ndim == 4 else torch.stack([slope, slope]) * torch.eye(2).to(slope)[..., None, None]
+        linear = whitening * full if whitening.ndim == 3 else product2(whitening, full)
+
+    seen = torch.full((batch,), count, device=pixels.device) if keep is None else keep.sum(0)
+    finite = _all_finite(points, keep) & _all_finite(xy, keep) & _all_finite(linear, keep)
+    finite = finite.expand(batch)
+    weight = None
+    if keep is not None or not bool(finite.all()):
+        usable = finite if keep is None else keep & finite
+        points, xy, image = (torch.where(usable, v, 0.0) for v in (points, xy, image))
+        linear, whitening = torch.where(usable, linear, 0.0), torch.where(usable, whitening, 0.0)
+        if keep is not None:
+            weight = keep.to(xy)
+
+    frame, center, extent = plane_frame(points, weight)
+    unit = torch.where(extent[2] > 0, extent[2], 1)
+    local = (points - center[:, None]) / unit
+    if weight is not None:
+        local = torch.where(weight > 0, local, 0.0)
+    flat = extent[0] <= FLATNESS * extent[2]
+    line = (extent[1] <= COLLINEARITY * extent[2]) | (extent[2] <= 1e-12 * center.abs().amax(0))
+
+    observed = Observations(local, xy, linear, None, huber)
+    if initial is not None:
+        minimum, options = 3, 1
+        r0 = initial[0].permute(1, 2, 0)
+        t0 = (initial[1].T + (r0 * center).sum(1)) / unit
+    else:
+        minimum, options = 4, 2
+        low = observed.to(torch.float32) if method == "iterative" else observed
+        weight_low = None if weight is None else weight.to(low.xy)
+        r0, t0 = ippe(low.points, low.xy, weight_low, frame.to(low.xy), torch.zeros_like(center).to(low.xy))
+        r0 = torch.where(flat & ~line, r0, torch.nan).flatten(2)
+        t0 = t0.flatten(1)
+    started = (r0.isfinite().all(0).all(0) & t0.isfinite().all(0)).unflatten(0, (options, batch)).any(0)
+
+    final = observed
+    if isinstance(camera, Camera) and bool(camera.distortion.any()):
+        final = Observations(local, image, whitening, camera, huber)
+    state = _refine(observed, final, r0, t0, options, max_iterations if method == "iterative" else 0)
+    pixel = final._replace(whitening=torch.ones_like(whitening) if final is not observed else slope)
+    bad = (
+        (~started, PnPCode.DEGENERATE),
+        (line, PnPCode.DEGENERATE),
+        (~finite, PnPCode.NOT_FINITE),
+        (seen < minimum, PnPCode.TOO_FEW),
+    )
+    return _report(state, options, center, unit, pixel, weight, bad)
+
+
+def _rays(camera: Camera | Tensor, pixels: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
+    """Normalised points (2, N, B) and d(pixel)/d(normalised), (2, 1, B|1) where diagonal, else (2, 2, N|1, B|1)."""
+    matrix = camera if isinstance(camera, Tensor) else camera.matrix.to(pixels)
+    if isinstance(camera, Camera) and bool(camera.distortion.any()):
+        xy = camera.undistort_points(pixels)
+        slope = camera.J_distort(xy).permute(2, 3, 1, 0)
+        return xy.permute(2, 1, 0).contiguous(), slope.contiguous()
+    k = matrix.reshape(-1, 3, 3).permute(1, 2, 0)[:, :, None]  # (3, 3, 1, B)
+    y = (image[1] - k[1, 2]) / k[1, 1]
+    x = (image[0] - k[0, 2] - k[0, 1] * y) / k[0, 0]
+    diagonal = torch.stack([k[0, 0], k[1, 1]])
+    if bool((k[0, 1] == 0).all()):
+        return torch.stack([x, y]), diagonal
+    zero = torch.zeros_like(k[0, 0])
+    return torch.stack([x, y]), torch.stack([k[0, 0], k[0, 1], zero, k[1, 1]]).unflatten(0, (2, 2))
+
+
+def _all_finite(value: Tensor, keep: Tensor | None) -> Tensor:
+    """(B,) or (1,): are all numbers (..., N, B) of the points seen finite?"""
+    finite = value.isfinite().flatten(0, -3).all(0)
+    return (finite if keep is None else finite | ~keep).all(0)
+
+
+def _refine(
+    observed: Observations, final: Observations, r: Tensor, t: Tensor, options: int, max_iterations: int
+) -> Estimate:
+    """Minima reached from R (3, 3, S B), t (3, S B): float32 first, then float64 where it can matter."""
+    final = final.repeat(options)
+    if max_iterations == 0:
+        r, t = orthonormalise(r.double()), t.double()
+        normal = normal_equations(final, r, t)
+        return Estimate(r, t, normal, torch.zeros_like(normal[0], dtype=torch.int64), normal[27].isfinite())
+    single = observed.to(torch.float32).repeat(options)
+    first = minimise(single, r.float(), t.float(), max_iterations=max_iterations, rtol=1e-4)
+    r, t = orthonormalise(first.r.double()), first.t.double()
+    # a minimum that is far worse than the other one needs no further digits
+    chi2 = first.normal[27].unflatten(0, (options, -1))
+    index = (chi2 <= 4 * chi2.amin(0) + 50 * DECISION).flatten().nonzero().squeeze(1)
+    if len(index) == r.shape[-1]:
+        last = minimise(final, r, t, max_iterations=max_iterations, rtol=1e-10, damping=1e-6)
+        return last._replace(iterations=first.iterations + last.iterations)
+    last = minimise(
+        final.select(index), r[..., index], t[:, index], max_iterations=max_iterations, rtol=1e-10, damping=1e-6
+    )
+    return Estimate(
+        r.index_copy(2, index, last.r),
+        t.index_copy(1, index, last.t),
+        first.normal.double().index_copy(1, index, last.normal),
+        first.iterations.index_add(0, index, last.iterations),
+        first.converged.index_copy(0, index, last.converged),
+    )
+
+
+def _pixel_rms(pixel: Observations, weight: Tensor | None, pose: Estimate) -> Tensor:
+    x, y, z = matmul3(pose.r, pixel.points.expand(3, -1, pose.t.shape[-1])) + pose.t[:, None]
+    square = residuals(pixel, torch.stack([x / z, y / z])).square().sum(0)
+    return (square.mean(0) if weight is None else (square * weight).sum(0) / weight.sum(0)).sqrt()
+
+
+def _coincide(a: Estimate, b: Estimate) -> Tensor:
+    """(B,): are two poses within a standard deviation of each other, by the information of ``a``?"""
+    relative = matmul3(b.r, a.r.transpose(0, 1))
+    axis = torch.stack(
+        [relative[2, 1] - relative[1, 2], relative[0, 2] - relative[2, 0], relative[1, 0] - relative[0, 1]]
+    )
+    trace = relative[0, 0] + relative[1, 1] + relative[2, 2]
+    # twice the tangent of half the angle; Cayley's vector, as in the steps of the minimiser
+    step = torch.cat([b.t - a.t, 2 * axis / (1 + trace).clamp_min(1e-12)])
+    step = step * torch.tensor(SIGNS, dtype=step.dtype, device=step.device)[:, None]
+    return (step[:, None] * step * unpack(a.normal)[:, :6]).sum((0, 1)) < COINCIDENCE
+
+
+def _report(
+    state: Estimate,
+    options: int,
+    center: Tensor,
+    unit: Tensor,
+    pixel: Observations,
+    weight: Tensor | None,
+    bad: tuple[tuple[Tensor, PnPCode], ...],
+) -> PnPResult:
+    batch = state.t.shape[-1] // options
+    split = Estimate(*(v.unflatten(-1, (options, batch)) for v in state))
+    chi2 = torch.where(split.normal[27].isnan(), torch.inf, split.normal[27])
+    chi2, order = chi2.sort(0)
+
+    def pick(k: int) -> Estimate:
+        return Estimate(*(v.gather(-2, order[k].expand(*v.shape[:-2], 1, batch)).squeeze(-2) for v in split))
+
+    best = pick(0)
+    cov, independence = covariance(best.normal)
+    other, other_chi2, different = best, torch.full_like(chi2[0], torch.nan), torch.zeros_like(best.converged)
+    for k in range(1, options):
+        candidate = pick(k)
+        new = chi2[k].isfinite() & ~_coincide(best, candidate) & ~different
+        other = Estimate(*(torch.where(new, a, b) for a, b in zip(candidate, other, strict=True)))
+        other_chi2 = torch.where(new, chi2[k], other_chi2)
+        different = different | new
+
+    code = torch.zeros_like(best.iterations)
+    verdicts = (
+        (different & (other_chi2 - chi2[0] < DECISION), PnPCode.AMBIGUOUS),
+        (~best.converged, PnPCode.NOT_CONVERGED),
+        (~chi2[0].isfinite(), PnPCode.BEHIND_CAMERA),
+        (~(independence > INDEPENDENCE) & chi2[0].isfinite(), PnPCode.DEGENERATE),
+        *bad,
+    )
+    for failed, verdict in verdicts:
+        code = torch.where(failed, int(verdict), code)
+    good = code <= PnPCode.AMBIGUOUS
+
+    def place(e: Estimate, valid: Tensor) -> tuple[Tensor, Tensor]:
+        t = e.t * unit - (e.r * center).sum(1)
+        return torch.where(valid, e.r, torch.nan).permute(2, 0, 1), torch.where(valid, t, torch.nan).T
+
+    r, t = place(best, good)
+    r_alt, t_alt = place(other, good & different)
+    # from the centroid in units of the extent to the origin of the object: t = unit t' - R c
+    arm = (best.r * center).sum(1)[:, None]
+    cov = torch.cat([unit * cov[:3] + cross(arm, cov[3:]), cov[3:]])
+    cov = torch.cat([unit * cov[:, :3] + cross(arm, cov[:, 3:].transpose(0, 1)).transpose(0, 1), cov[:, 3:]], 1)
+    rms = _pixel_rms(pixel, weight, best)
+    rms_alt = _pixel_rms(pixel, weight, other)
+
+    def fill(value: Tensor, valid: Tensor) -> Tensor:
+        return torch.where(valid, value, torch.nan)
+
+    rms, rms_alt = fill(rms, good), fill(rms_alt, good & different)
+    return PnPResult(
+        r,
+        t,
+        fill(cov, good).permute(2, 0, 1),
+        rms,
+        fill(chi2[0], good),
+        best.iterations,
+        code,
+        r_alt,
+        t_alt,
+        rms_alt,
+        fill(other_chi2, good & different),
+        rms_alt / rms,
+    )
