@@ -35,6 +35,9 @@ class EllipseFit:
     sigma: Tensor
     points: Tensor
 
+    def __getitem__(self, index: Tensor) -> EllipseFit:
+        return EllipseFit(self.params[index], self.covariance[index], self.sigma[index], self.points[index])
+
     @property
     def center_covariance(self) -> Tensor:
         """(M, 2, 2) covariance of the centre, px^2."""

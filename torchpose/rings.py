@@ -117,13 +117,9 @@ def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera) -> Rin
         & (raw[count:, 2] < raw[:count, 2])
     )
     index = good.nonzero()[:, 0]
-
-    def rows(start: int) -> EllipseFit:
-        i = index + start
-        return EllipseFit(fit.params[i], fit.covariance[i], fit.sigma[i], fit.points[i])
-
+    second = index + count
     return Rings(
-        candidates.frame[index], candidates.polarity[index], raw[index], raw[index + count], rows(0), rows(count)
+        candidates.frame[index], candidates.polarity[index], raw[index], raw[second], fit[index], fit[second]
     )
 
 

@@ -1,0 +1,171 @@
+"""PoseEstimator: frames in, poses out. The only file that knows the order of the stages."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor, nn
+
+from torchpose.camera import Camera
+from torchpose.centers import compensate
+from torchpose.detect import find_candidates
+from torchpose.errors import ConfigError, FrameError
+from torchpose.markers import Identified, MarkerTable, identify
+from torchpose.pose import Evidence, Solutions, gather_evidence, intrinsics_covariance, solve_poses
+from torchpose.results import Detections, Poses, Reason, Status
+from torchpose.rings import Rings, measure_rings
+from torchpose.target import Target
+
+_FRAME_TYPES = (torch.uint8, torch.uint16, torch.float16, torch.bfloat16, torch.float32, torch.float64)
+MIN_MARKERS = 3
+
+
+class PoseEstimator(nn.Module):
+    """Poses of one or more targets in batches of frames (paper, Algorithm 1).
+
+    Args:
+        camera: intrinsics and distortion; frames must have its size.
+        target: one target or several; each gets a row for every frame.
+        float_range: grey value of white in floating-point frames: 1.0 or 255.0.
+
+    Raises:
+        ConfigError: no target, or two of one name.
+    """
+
+    def __init__(self, camera: Camera, target: Target | Sequence[Target], *, float_range: float = 1.0) -> None:
+        super().__init__()
+        self.camera = camera
+        self.targets = (target,) if isinstance(target, Target) else tuple(target)
+        if not self.targets:
+            raise ConfigError("target: none given; pass at least one Target")
+        names = [t.name for t in self.targets]
+        twice = sorted({n for n in names if names.count(n) > 1})
+        if twice:
+            raise ConfigError(f"target: name {twice[0]!r} given twice; rename one, rows are told apart by it")
+        if not float_range > 0:
+            raise ConfigError(f"float_range: {float_range} is not positive; use 1.0 or 255.0")
+        self.float_range = float_range
+        self._table = MarkerTable.of(self.targets)
+
+    def extra_repr(self) -> str:
+        names = ", ".join(t.name for t in self.targets)
+        return f"camera={self.camera.width}x{self.camera.height}, targets=[{names}]"
+
+    @torch.no_grad()
+    def forward(self, frames: Tensor) -> Poses:
+        """Poses of every target in every frame.
+
+        Args:
+            frames: (B, H, W) or (B, 1, H, W) grey; uint8, uint16, or floating point with white at ``float_range``.
+
+        Returns:
+            B * T rows, frame-major, on the device of the frames.
+
+        Raises:
+            FrameError: wrong shape, size or dtype.
+        """
+        frames = self._checked(frames)
+        table = self._table.to(frames.device)
+        camera = self.camera.to(frames.device)
+        batch, count = frames.shape[0], len(self.targets)
+        candidates = find_candidates(frames)
+        candidates = candidates[torch.isin(candidates.polarity, table.polarity)]
+        rings = measure_rings(frames, candidates, camera)
+        identified = identify(rings, table, camera, batch)
+        target = torch.arange(batch * count, device=frames.device) % count
+        evidence = self._evidence(rings, identified, table, target, camera)
+
+        markers = evidence.mask.sum(-1)
+        solvable = (markers >= MIN_MARKERS).nonzero()[:, 0]
+        some = evidence[solvable]
+        solutions = solve_poses(some, (identified.R[solvable], identified.t[solvable]))
+        if camera.covariance is not None:
+            wider = solutions.covariance + intrinsics_covariance(some, solutions, camera.covariance)
+            solutions = replace(solutions, covariance=wider)
+        return self._poses(batch, target, solvable, solutions, evidence, identified, rings, table, camera)
+
+    def _checked(self, frames: Tensor) -> Tensor:
+        if frames.ndim == 4 and frames.shape[1] == 1:
+            frames = frames[:, 0]
+        if frames.ndim != 3:
+            raise FrameError(f"frames: shape {tuple(frames.shape)}; pass grey frames (B, H, W) or (B, 1, H, W)")
+        if frames.dtype not in _FRAME_TYPES:
+            raise FrameError(f"frames: dtype {frames.dtype}; pass uint8, uint16 or floating point")
+        size = (self.camera.height, self.camera.width)
+        if tuple(frames.shape[1:]) != size:
+            got, need = f"{frames.shape[2]} x {frames.shape[1]}", f"{size[1]} x {size[0]}"
+            raise FrameError(f"frames: size {got}, but the camera has {need}; use the camera file of these frames")
+        if frames.is_floating_point():
+            # the detector's least contrast counts in 1/255 of white
+            frames = (frames.float() * (255.0 / self.float_range)).nan_to_num(nan=0.0)
+        return frames.contiguous()
+
+    def _evidence(
+        self, rings: Rings, identified: Identified, table: MarkerTable, target: Tensor, camera: Camera
+    ) -> Evidence:
+        ring, mask = identified.ring, identified.ring >= 0
+        row, marker = mask.nonzero().unbind(-1)
+        radii = table.radii[target]
+        index = ring[row, marker]
+        center, covariance = compensate(rings.outer[index], rings.inner[index], radii[row, marker])
+        centers = torch.full((*ring.shape, 2), torch.nan, dtype=torch.float64, device=ring.device)
+        covariances = torch.full((*ring.shape, 2, 2), torch.nan, dtype=torch.float64, device=ring.device)
+        centers[row, marker], covariances[row, marker] = center, covariance
+        return gather_evidence(
+            rings, ring, centers, covariances, table.centers[target], table.normals[target], radii,
+            table.coplanar[target], camera.matrix,
+        )
+
+    def _poses(
+        self, batch: int, target: Tensor, solvable: Tensor, s: Solutions, e: Evidence, identified: Identified,
+        rings: Rings, table: MarkerTable, camera: Camera,
+    ) -> Poses:
+        rows = target.numel()
+        device = target.device
+        frame = torch.arange(rows, device=device) // len(self.targets)
+
+        def spread(values: Tensor, fill: float = torch.nan) -> Tensor:
+            out = torch.full((rows, *values.shape[1:]), fill, dtype=values.dtype, device=device)
+            out[solvable] = values
+            return out
+
+        proposed = identified.proposed
+        status = torch.where(proposed == 0, int(Status.NO_TARGET), int(Status.TOO_FEW_MARKERS))
+        # three codes or more were read, but they do not lie as in the target
+        mixed = proposed >= MIN_MARKERS
+        status = torch.where(mixed, int(Status.REJECTED), status)
+        reason = torch.where(mixed, int(Reason.RESIDUAL), int(Reason.NONE))
+        status[solvable], reason[solvable] = s.status, s.reason
+        mask = e.mask.clone()
+        mask[solvable] = s.mask
+        without = torch.isin(s.status, torch.tensor([Status.REJECTED], device=device))
+        used = torch.where(mixed | (proposed == 0) | (mask.sum(-1) > 0), mask.sum(-1), proposed)
+
+        def poseless(values: Tensor) -> Tensor:
+            return torch.where(without.view(-1, *[1] * (values.ndim - 1)), torch.nan, values)
+
+        row, marker = mask.nonzero().unbind(-1)
+        ring = identified.ring[row, marker]
+        center, center_cov = raw_centers(camera, e.center[row, marker], e.covariance[row, marker])
+        detections = Detections(
+            frame[row], target[row], table.ids[target[row], marker], center, center_cov,
+            rings.outer_raw[ring], rings.inner_raw[ring],
+        )
+        values = {
+            n: spread(poseless(getattr(s, n)))
+            for n in ("R", "t", "covariance", "rms", "chi2", "R_alt", "t_alt", "rms_alt", "chi2_alt")
+        }
+        return Poses(
+            frame=frame, target=target, status=status, reason=reason, markers=used, detections=detections, **values
+        )
+
+
+def raw_centers(camera: Camera, ideal: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
+    """Centres (K, 2) and covariances (K, 2, 2) of ideal pixels as pixels of the distorted frame."""
+    k = camera.matrix
+    focal = k.diagonal()[:2]
+    xy = (ideal - k[:2, 2]) / focal
+    jacobian = camera.J_distort(xy) / focal
+    return camera.distort(xy), jacobian @ covariance @ jacobian.mT

@@ -1,0 +1,277 @@
+"""Stage: from identified markers to one pose a row, its covariance, and an honest status.
+
+Every row is solved from several starts (both planar solutions, the rough pose of the identification and its mirror
+image), each refined by batched Levenberg-Marquardt. The solution that explains all evidence best wins: the centres by
+their covariances, and the shapes of the rings' own ellipses, which decide alone where only three markers are seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchpose import pnp
+from torchpose.geometry import conics, rotations
+from torchpose.results import Reason, Status
+from torchpose.rings import Rings
+
+AMBIGUOUS_CHI2 = 20.0  # contract: two poses are ambiguous where their chi-squared differs by less
+_DISTINCT_CHI2 = 30.0  # squared Mahalanobis distance of two rotations that makes them different poses
+_SHAPE_FLOOR = (0.03, 0.5)  # px, and times the curvature a / b^2: what blur and mask do to an ellipse's shape
+_SHAPE_LIMIT = 16.0  # mean chi-squared a shape component above which the rings contradict the pose
+_CENTER_LIMIT = (30.0, 10.0)  # chi-squared, and per degree of freedom, above which the centres contradict each other
+_CENTER_RMS = 0.3  # px, below which they do not: small errors of calibration or print are no mix-up
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What was measured of the M markers of N rows; padded, see ``mask``.
+
+    Attributes:
+        points, normals: (N, M, 3) float64 in the target frame. radii: (N, M, 2).
+        center, covariance: (N, M, 2) ideal px and (N, M, 2, 2): compensated centres.
+        shape: (N, M, 2, 5) fitted ellipses, outer and inner, ideal px. shape_covariance: (N, M, 2, 5, 5), see
+            `ellipse.EllipseFit`.
+        mask: (N, M) bool, marker seen. coplanar: (N,) bool.
+        matrix: (3, 3) camera matrix.
+    """
+
+    points: Tensor
+    normals: Tensor
+    radii: Tensor
+    center: Tensor
+    covariance: Tensor
+    shape: Tensor
+    shape_covariance: Tensor
+    mask: Tensor
+    coplanar: Tensor
+    matrix: Tensor
+
+    def __getitem__(self, index: Tensor) -> Evidence:
+        rows = {n: getattr(self, n)[index] for n in self.__dataclass_fields__ if n != "matrix"}
+        return Evidence(**rows, matrix=self.matrix)
+
+    def without(self, marker: Tensor) -> Evidence:
+        """The same rows with one marker each, (N,) int64, taken as not seen."""
+        mask = self.mask.clone()
+        mask[torch.arange(mask.shape[0], device=mask.device), marker] = False
+        fields = {n: getattr(self, n) for n in self.__dataclass_fields__}
+        return Evidence(**{**fields, "mask": mask})
+
+
+@dataclass(frozen=True, eq=False)
+class Solutions:
+    """Chosen pose of N rows; the fields as in `results.Poses`."""
+
+    R: Tensor
+    t: Tensor
+    covariance: Tensor
+    rms: Tensor
+    chi2: Tensor
+    R_alt: Tensor
+    t_alt: Tensor
+    rms_alt: Tensor
+    chi2_alt: Tensor
+    status: Tensor
+    reason: Tensor
+    mask: Tensor
+
+    def __getitem__(self, index: Tensor) -> Solutions:
+        return Solutions(*(getattr(self, n)[index] for n in self.__dataclass_fields__))
+
+    def replaced(self, index: Tensor, other: Solutions) -> Solutions:
+        """These rows, with the rows ``index`` taken from ``other``."""
+        return Solutions(
+            *(getattr(self, n).index_copy(0, index, getattr(other, n)) for n in self.__dataclass_fields__)
+        )
+
+
+def gather_evidence(
+    rings: Rings, ring: Tensor, centers: Tensor, covariances: Tensor, points: Tensor, normals: Tensor, radii: Tensor,
+    coplanar: Tensor, matrix: Tensor,
+) -> Evidence:
+    """Lays the measurements of flat rings out by row and marker.
+
+    Args:
+        rings: K rings. ring: (N, M) int64, -1 where not seen. centers, covariances: (N, M, 2), (N, M, 2, 2).
+        points, normals, radii, coplanar: of the target of each row, (N, M, ...) and (N,). matrix: (3, 3).
+    """
+    mask = ring >= 0
+    at = ring.clamp_min(0)
+    shape = torch.stack([rings.outer.params, rings.inner.params], 1)
+    covariance = torch.stack([rings.outer.covariance, rings.inner.covariance], 1)
+    if len(rings) == 0:  # nothing to index: any row will do, the mask hides it
+        shape, covariance = shape.new_ones(1, 2, 5), covariance.new_ones(1, 2, 5, 5)
+    return Evidence(
+        points, normals, radii, centers, covariances, shape[at], covariance[at], mask, coplanar, matrix
+    )
+
+
+def solve_poses(evidence: Evidence, rough: tuple[Tensor, Tensor]) -> Solutions:
+    """Pose, alternative, covariance and status of N rows with three markers or more.
+
+    A row whose centres contradict each other is solved again without each of its markers in turn; if one of these fits,
+    that marker is left out.
+
+    Args:
+        evidence: N rows. rough: R (N, 3, 3), t (N, 3) to start from.
+    """
+    solved = _solve(evidence, rough)
+    bad = (solved.status == Status.REJECTED) & (evidence.mask.sum(-1) >= 4)
+    row, marker = (bad[:, None] & evidence.mask).nonzero().unbind(-1)
+    retry = _solve(evidence[row].without(marker), (rough[0][row], rough[1][row]))
+    # of the subsets that fit, the one with the least chi-squared
+    count = bad.shape[0]
+    cost = torch.where(retry.status == Status.REJECTED, torch.inf, retry.chi2.nan_to_num(nan=torch.inf))
+    least = torch.full((count,), torch.inf, dtype=cost.dtype, device=cost.device).scatter_reduce(0, row, cost, "amin")
+    winner = (cost.isfinite() & (cost == least[row])).nonzero()[:, 0]
+    return solved.replaced(row[winner], retry[winner])
+
+
+def _solve(e: Evidence, rough: tuple[Tensor, Tensor]) -> Solutions:
+    count = e.mask.shape[0]
+    seen = e.mask.sum(-1)
+    start_r, start_t = _starts(e, rough)
+    starts = start_r.shape[1]
+
+    def each(x: Tensor) -> Tensor:
+        return x.repeat_interleave(starts, 0)
+
+    center = torch.where(e.mask[..., None], e.center, 0.0)
+    result = pnp.solve(
+        each(e.points),
+        each(center),
+        e.matrix,
+        method="iterative",
+        covariances=each(_visible(e.covariance, e.mask)),
+        mask=each(e.mask),
+        initial=(start_r.flatten(0, 1), start_t.flatten(0, 1)),
+    )
+    each_r, each_t = result.R.unflatten(0, (count, starts)), result.t.unflatten(0, (count, starts))
+    chi2_center = result.chi2.view(count, starts)
+    chi2_shape = _shape_chi2(e, each_r, each_t)
+    total = (chi2_center + chi2_shape).nan_to_num(nan=torch.inf)  # NaN: did not converge
+    best = total.argmin(1)
+    flat = torch.arange(count, device=best.device) * starts + best
+    r, t, covariance = result.R[flat], result.t[flat], result.covariance[flat]
+
+    # the best of those solutions that are another pose
+    turn = rotations.log(each_r @ r[:, None].mT)
+    weight = torch.linalg.pinv(covariance[:, 3:, 3:].nan_to_num(nan=1.0), hermitian=True)
+    apart = (turn[:, :, None] @ weight[:, None] @ turn[..., None]).squeeze(-1).squeeze(-1) > _DISTINCT_CHI2
+    other_cost = torch.where(apart, total, torch.inf)
+    other = other_cost.argmin(1)
+    exists = other_cost.gather(1, other[:, None]).squeeze(1).isfinite()
+    flat_other = torch.arange(count, device=best.device) * starts + other
+
+    def alternative(x: Tensor) -> Tensor:
+        chosen = x[flat_other]
+        return torch.where(exists.view(-1, *[1] * (chosen.ndim - 1)), chosen, torch.nan)
+
+    chi2 = total.gather(1, best[:, None]).squeeze(1)
+    chi2_alt = torch.where(exists, other_cost.gather(1, other[:, None]).squeeze(1), torch.nan)
+    center_best = chi2_center.gather(1, best[:, None]).squeeze(1)
+    shape_best = chi2_shape.gather(1, best[:, None]).squeeze(1)
+    rms = result.rms[flat]
+    freedom = 2 * seen - 6
+    contradicts = (center_best > _CENTER_LIMIT[0] + _CENTER_LIMIT[1] * freedom) & (rms > _CENTER_RMS)
+    code = result.code[flat]
+    reason = torch.full_like(seen, Reason.NONE)
+    for condition, why in (
+        (chi2_alt - chi2 < AMBIGUOUS_CHI2, Reason.TWO_SOLUTIONS),
+        (shape_best > 4 * _SHAPE_LIMIT * seen, Reason.RING_SHAPE),
+        (contradicts, Reason.RESIDUAL),
+        (~chi2.isfinite(), Reason.NOT_CONVERGED),
+        (code == pnp.PnPCode.BEHIND_CAMERA, Reason.BEHIND_CAMERA),
+        (code == pnp.PnPCode.DEGENERATE, Reason.DEGENERATE),
+    ):
+        reason = torch.where(condition, int(why), reason)  # the last that holds
+    status = torch.where(reason == Reason.NONE, int(Status.OK), int(Status.REJECTED))
+    status = torch.where(reason == Reason.TWO_SOLUTIONS, int(Status.AMBIGUOUS), status)
+    return Solutions(
+        r, t, covariance, rms, chi2, alternative(result.R), alternative(result.t), alternative(result.rms), chi2_alt,
+        status, reason, e.mask,
+    )
+
+
+def _starts(e: Evidence, rough: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """Poses (N, 4, 3, 3), (N, 4, 3) to start from: the rough one, its mirror image, both planar solutions."""
+    r, t = rough
+    # depth mirrored along the line of sight, the plane turned back on itself: the same weak-perspective image
+    weight = e.mask.double() / e.mask.sum(-1, keepdim=True)
+    middle = (e.points * weight[..., None]).sum(1)
+    at = (r @ middle[..., None]).squeeze(-1) + t
+    first = e.mask.int().argmax(-1)
+    normal = e.normals[torch.arange(first.numel(), device=first.device), first]
+    mirrored = _reflection(at) @ r @ _reflection(normal)
+    mirrored_t = at - (mirrored @ middle[..., None]).squeeze(-1)
+    focal, principal = e.matrix.diagonal()[:2], e.matrix[:2, 2]
+    xy = torch.where(e.mask[..., None], (e.center - principal) / focal, 0.0)
+    flat = pnp.planar(e.points, xy, mask=e.mask)
+    planar = (e.coplanar & (e.mask.sum(-1) >= 4))[:, None]
+    planar = planar & flat.R.isfinite().all(-1).all(-1)
+    fill_r, fill_t = torch.stack([r, mirrored], 1), torch.stack([t, mirrored_t], 1)
+    both_r = torch.where(planar[..., None, None], flat.R, fill_r)
+    both_t = torch.where(planar[..., None], flat.t, fill_t)
+    return torch.cat([fill_r, both_r], 1), torch.cat([fill_t, both_t], 1)
+
+
+def _reflection(direction: Tensor) -> Tensor:
+    """Householder matrices (N, 3, 3) that turn ``direction`` (N, 3) round."""
+    unit = direction / torch.linalg.vector_norm(direction, dim=-1, keepdim=True)
+    eye = torch.eye(3, dtype=unit.dtype, device=unit.device)
+    return eye - 2 * unit[..., :, None] * unit[..., None, :]
+
+
+def _visible(covariance: Tensor, mask: Tensor) -> Tensor:
+    """Covariances with the identity where nothing was seen."""
+    eye = torch.eye(2, dtype=covariance.dtype, device=covariance.device)
+    return torch.where(mask[..., None, None], covariance, eye)
+
+
+def _shape_chi2(e: Evidence, r: Tensor, t: Tensor) -> Tensor:
+    """Chi-squared (N, S) of the rings' shapes: elongation and its direction, which blur and threshold hardly touch."""
+    x = (r[:, :, None] @ e.points[:, None, ..., None]).squeeze(-1) + t[:, :, None]  # (N, S, M, 3)
+    conic = conics.circle_image(
+        r[:, :, None, None], x[..., None, :], e.normals[:, None, :, None], e.radii[:, None]
+    )  # (N, S, M, 2, 3, 3)
+    to_px = torch.linalg.inv(e.matrix)
+    predicted = conics.ellipse_from_conic(conics.from_matrix(to_px.T @ conic @ to_px))
+    difference = conics.shape_matrix(e.shape)[:, None] - conics.shape_matrix(predicted)
+    theta = e.shape[..., 4]
+    cos, sin = theta.cos(), theta.sin()
+    axes = torch.stack([cos, -sin, sin, cos], -1).unflatten(-1, (2, 2))[:, None]
+    d = axes.mT @ difference @ axes
+    v = torch.stack([d[..., 0, 0] - d[..., 1, 1], 2 * d[..., 0, 1]], -1)
+    pick = torch.tensor([[0, 0, 1, 0, -1], [0, 0, 0, 2, 0]], dtype=v.dtype, device=v.device)
+    floor = _SHAPE_FLOOR[0] + _SHAPE_FLOOR[1] * e.shape[..., 2] / e.shape[..., 3].square()
+    eye = torch.eye(2, dtype=v.dtype, device=v.device)
+    covariance = pick @ e.shape_covariance @ pick.T + floor.square()[..., None, None] * eye
+    seen = e.mask[..., None, None, None]
+    weight = torch.linalg.inv(torch.where(seen, covariance, eye))[:, None]
+    chi2 = (v[..., None, :] @ weight @ v[..., None]).squeeze(-1).squeeze(-1)
+    return torch.where(e.mask[:, None, :, None], chi2, 0.0).sum((-1, -2))
+
+
+def intrinsics_covariance(e: Evidence, s: Solutions, intrinsics: Tensor) -> Tensor:
+    """What uncertain intrinsics add to the pose covariance (N, 6, 6): G Sigma_K G^T, G = d pose / d (fx, fy, cx, cy).
+
+    At the least-squares optimum G = -(J^T W J)^-1 J^T W J_K, J and J_K the Jacobians of the projections.
+
+    Args:
+        intrinsics: (4, 4) covariance of fx, fy, cx, cy, px^2 (`Camera.covariance`).
+    """
+    turned = (s.R[:, None] @ e.points[..., None]).squeeze(-1)
+    x = turned + s.t[:, None]
+    f = e.matrix.diagonal()[:2]
+    n = x[..., :2] / x[..., 2:]
+    zero, one = torch.zeros_like(n[..., 0]), torch.ones_like(n[..., 0])
+    by_point = torch.stack([one, zero, -n[..., 0], zero, one, -n[..., 1]], -1).unflatten(-1, (2, 3))
+    by_point = by_point * (f[:, None] / x[..., 2, None, None])
+    jac = torch.cat([by_point, -by_point @ rotations.skew(turned)], -1)  # (N, M, 2, 6)
+    jac_k = torch.stack([n[..., 0], zero, one, zero, zero, n[..., 1], zero, one], -1).unflatten(-1, (2, 4))
+    weight = torch.linalg.inv(_visible(e.covariance, s.mask)) * s.mask[..., None, None]
+    gain = -s.covariance @ (jac.mT @ weight @ jac_k).sum(1)
+    return gain @ intrinsics.to(gain) @ gain.mT
