@@ -91,7 +91,7 @@ def estimate(
     targets = [Target.load(name) for name in target]
     sources = find_sources(inputs)
     calibration = _load_hand_eye(hand_eye, sources)
-    _check_outputs(inputs, sources, targets, [p for p in (out, detections) if p is not None], overlay)
+    _check_outputs(inputs, sources, [p for p in (out, detections) if p is not None], overlay)
     with native_stderr_silenced():
         return _run(
             camera_model,
@@ -251,15 +251,10 @@ def _load_hand_eye(path: Path | None, sources: Sequence[Source]) -> HandEye | No
 def _check_outputs(
     inputs: Sequence[Path],
     sources: Sequence[Source],
-    targets: Sequence[Target],
     tables: list[Path],
     overlay: Path | None,
 ) -> None:
-    """Refuses outputs that would overwrite or mingle with inputs, and targets that rows could not tell apart."""
-    names = [target.name for target in targets]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise ConfigError(f"--target: name: {twice!r} is given twice; name the targets differently")
+    """Refuses outputs that would overwrite or mingle with inputs."""
     read = {path.resolve() for path in inputs}
     for table in tables:
         if table.resolve() in read:
