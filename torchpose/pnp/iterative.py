@@ -195,6 +195,7 @@ def minimise(
         r, t, normal, torch.zeros(count, dtype=torch.int64, device=r.device), torch.zeros_like(floor, dtype=torch.bool)
     )
     index: Tensor | None = None  # of the poses still under way, None: all
+    reached = result.converged  # latched: rounding may reject the idle steps of a pose that waits for the others
 
     def record(iteration: int, r: Tensor, t: Tensor, normal: Tensor, done: Tensor) -> Estimate:
         if index is None:
@@ -209,6 +210,7 @@ def minimise(
 
     for iteration in range(1, max_iterations + 1):
         r, t, normal, lam, done = lm_step(obs, r, t, normal, lam, rtol, floor)
+        done = reached = done | reached
         # neither a pose without numbers nor one whose steps have shrunk to nothing will come to an end
         over = done | ~(lam < 1e8) | ~normal[27].isfinite()
         remaining = (~over).nonzero().squeeze(1)
@@ -219,5 +221,5 @@ def minimise(
             index = remaining if index is None else index[remaining]
             obs = obs.select(remaining)
             r, t, normal = (v.index_select(-1, remaining) for v in (r, t, normal))
-            lam, floor = lam[remaining], floor[remaining]
+            lam, floor, reached = lam[remaining], floor[remaining], reached[remaining]
     return result
