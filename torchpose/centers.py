@@ -28,21 +28,3 @@ def compensate(outer: EllipseFit, inner: EllipseFit, radii: Tensor) -> tuple[Ten
         k1.square()[:, None, None] * inner.center_covariance + k2.square()[:, None, None] * outer.center_covariance
     )
     return center, covariance
-
-
-def eccentricity(rotation: Tensor, center: Tensor, normal: Tensor, radius: Tensor) -> Tensor:
-    """Distance vector (..., 2) from the image of a circle's centre to the centre of its image, on the normalised plane.
-
-    Exact: the ellipse's centre is the pole of the line at infinity, e ~ h33 h3 - r^2 a with a = n n^T-projected z axis
-    (derivation in docs/methods.md).
-
-    Args:
-        rotation: (..., 3, 3) target to camera. center: (..., 3) in the camera frame. normal: (..., 3) in the target
-            frame. radius: (...).
-    """
-    n = (rotation @ normal[..., None]).squeeze(-1)
-    z = torch.zeros_like(n)
-    z[..., 2] = 1
-    a = z - n * n[..., 2:]  # (I - n n^T) z
-    e = center[..., 2:] * center - radius.square()[..., None] * a
-    return e[..., :2] / e[..., 2:] - center[..., :2] / center[..., 2:]

@@ -27,11 +27,16 @@ class RingEdges:
     """Edge points of M rings, flat, sorted by ring.
 
     Attributes:
-        ring: (E,) int64. points: (E, 2) float64, px. step: (E,) float64, grey step across the edge.
+        ring: (E,) int64. points: (E, 2) float64, px.
+        normal: (E, 2) float64, unit, towards increasing grey.
+        offset: (E,) float64, px along the normal from the centre of the edge's pixel, as measured.
+        step: (E,) float64, grey step across the edge.
     """
 
     ring: Tensor
     points: Tensor
+    normal: Tensor
+    offset: Tensor
     step: Tensor
 
 
@@ -85,16 +90,16 @@ def ring_edges(frames: Tensor, frame: Tensor, ellipses: Tensor, outward: Tensor,
     moved, moved_ring = moved[fresh], moved_ring[fresh]
     second = zernike.locate(frames, frame[moved_ring], moved)
 
-    ring = torch.cat([ring[keep], moved_ring[second.inside]])
-    points = torch.cat([found.points[keep], second.points[second.inside]])
-    direction = torch.cat([found.normal[keep], second.normal[second.inside]])
-    step = torch.cat([found.step[keep], second.step[second.inside]])
+    def both(name: str) -> Tensor:
+        return torch.cat([getattr(found, name)[keep], getattr(second, name)[second.inside]])
 
-    aligned = (direction * _normal(ellipses, ring, points)).sum(-1) * outward[ring] > _NORMAL_COS
+    ring = torch.cat([ring[keep], moved_ring[second.inside]])
+    points, normal, offset, step = both("points"), both("normal"), both("offset"), both("step")
+    aligned = (normal * _normal(ellipses, ring, points)).sum(-1) * outward[ring] > _NORMAL_COS
     mean_step = segment_mean(step, ring, ellipses.shape[0], aligned.double())
-    keep = aligned & (step > _LEAST_STEP * mean_step[ring])
-    order = torch.argsort(ring[keep], stable=True)
-    return RingEdges(ring[keep][order], points[keep][order], step[keep][order])
+    good = (aligned & (step > _LEAST_STEP * mean_step[ring])).nonzero()[:, 0]
+    order = good[torch.argsort(ring[good], stable=True)]
+    return RingEdges(ring[order], points[order], normal[order], offset[order], step[order])
 
 
 def _normal(ellipses: Tensor, ring: Tensor, points: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchpose import ellipse, zernike
 from torchpose.camera import Camera
 from torchpose.detect import Candidates
-from torchpose.edges import REACH, ring_edges
+from torchpose.edges import REACH, RingEdges, ring_edges
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import conics
 from torchpose.geometry.segments import segment_mean, segment_sum
@@ -69,7 +69,7 @@ def find_inner(frames: Tensor, candidates: Candidates) -> tuple[Tensor, Tensor]:
     uv = (shape @ circle)[:, :, None, :] * rho[:, None] + candidates.ellipse[:, :2, None, None]
     u, v = uv.round().long().unbind(1)
     cell = (candidates.frame[:, None, None] * height + v.clamp(0, height - 1)) * width + u.clamp(0, width - 1)
-    profile = frames.reshape(-1)[cell].float().mean(-1).double()
+    profile = frames.reshape(-1)[cell].float().nanmean(-1).double()
     rise = (profile[:, 2:] - profile[:, :-2]) * candidates.polarity[:, None]
     at = rho[1:-1]
     outer = rise.masked_fill(at < _RATIO_RANGE[1], -torch.inf).amax(-1)
@@ -95,10 +95,13 @@ def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera) -> Rin
     rough = torch.cat([outer, inner])
     frame = candidates.frame.repeat(2)
     reach = torch.cat([gap, gap]).clamp(1.0, REACH)
-    edges = ring_edges(frames, frame, rough, torch.cat([candidates.polarity, -candidates.polarity]), reach)
+    outward = torch.cat([candidates.polarity, -candidates.polarity])
+    edges = ring_edges(frames, frame, rough, outward, reach)
 
     raw, keep = ellipse.fit_robust(edges.points, edges.ring, 2 * count, start=rough)
-    ring, points = edges.ring[keep], edges.points[keep]
+    points = _deblurred(edges, raw, keep, outward, frame, frames.shape[0])
+    raw, keep = ellipse.fit_robust(points, edges.ring, 2 * count, start=raw, scales=(0.5,))
+    ring, points = edges.ring[keep], points[keep]
     ideal_points = ideal_pixels(camera, points)
     ideal = ellipse.fit(ideal_points, ring, 2 * count)
     fit = ellipse.with_covariance(ideal_points, ring, ideal, correlation=zernike.edge_correlation())
@@ -121,6 +124,17 @@ def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera) -> Rin
     return Rings(
         candidates.frame[index], candidates.polarity[index], raw[index], raw[second], fit[index], fit[second]
     )
+
+
+def _deblurred(
+    edges: RingEdges, fitted: Tensor, keep: Tensor, outward: Tensor, frame: Tensor, frames: int
+) -> Tensor:
+    """Edge points (E, 2) with the effect of each frame's blur on their offsets taken off."""
+    distance = edges.offset - ellipse.distance(edges.points, edges.ring, fitted) * outward[edges.ring]
+    group = frame[edges.ring]
+    slope = zernike.blur_slope(edges.offset[keep], distance[keep], group[keep], frames)
+    change = zernike.deblur(edges.offset, slope[group]) - edges.offset
+    return edges.points + change[:, None] * edges.normal
 
 
 def ideal_pixels(camera: Camera, points: Tensor) -> Tensor:
