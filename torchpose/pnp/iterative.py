@@ -155,25 +155,33 @@ def covariance(normal: Tensor) -> tuple[Tensor, Tensor]:
     return inverse, (pivots / information.diagonal().T).amin(0)
 
 
-def lm_step(
-    obs: Observations, r: Tensor, t: Tensor, normal: Tensor, damping: Tensor, rtol: float, floor: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """One damped step of every pose: new R, t, normal equations, damping, and which poses are at their minimum."""
+class _State(NamedTuple):
+    """Poses under way: the best so far with its normal equations and damping, and the trial that comes next."""
+
+    r: Tensor
+    t: Tensor
+    normal: Tensor
+    damping: Tensor
+    r_trial: Tensor
+    t_trial: Tensor
+    decrease: Tensor
+    done: Tensor
+
+
+def _advance(obs: Observations, state: _State, rtol: float, floor: Tensor) -> _State:
+    """Evaluates the trial poses, accepts those that lower the cost, and proposes the next damped step."""
+    normal = normal_equations(obs, state.r_trial, state.t_trial)
+    accept = normal[27] <= state.normal[27] * (1 + 1e-12) + floor
+    r, t = torch.where(accept, state.r_trial, state.r), torch.where(accept, state.t_trial, state.t)
+    normal = torch.where(accept, normal, state.normal)
+    damping = torch.where(accept, 0.1 * state.damping, 10 * state.damping)
     system = unpack(normal)
-    eye = torch.eye(6, 7, dtype=r.dtype, device=r.device)[..., None]
-    damped = system * (1 + damping * eye)
-    step = solve_spd(damped[:, :6], system[:, 6:])[0].squeeze(1)
+    damped = system[:, :6] * (1 + damping * torch.eye(6, dtype=r.dtype, device=r.device)[..., None])
+    step = solve_spd(damped, system[:, 6:])[0].squeeze(1)
     decrease = (step * system[:, 6]).sum(0)
-    cost = normal[27]
-    done = (decrease <= rtol * cost + floor) & (damping <= 1)
-    signs = torch.tensor(SIGNS, dtype=r.dtype, device=r.device)[:, None]
-    step = -signs * step
-    r_new = matmul3(cayley(step[3:]), r)
-    t_new = t + step[:3]
-    normal_new = normal_equations(obs, r_new, t_new)
-    accept = normal_new[27] <= cost * (1 + 1e-12) + floor
-    r, t, normal = (torch.where(accept, a, b) for a, b in ((r_new, r), (t_new, t), (normal_new, normal)))
-    return r, t, normal, torch.where(accept, 0.1 * damping, 10 * damping), done
+    done = (decrease <= rtol * normal[27] + floor) & (damping <= 1) & normal[27].isfinite()
+    step = step * -torch.tensor(SIGNS, dtype=r.dtype, device=r.device)[:, None]
+    return _State(r, t, normal, damping, matmul3(cayley(step[3:]), r), t + step[:3], decrease, done)
 
 
 def minimise(
@@ -181,45 +189,43 @@ def minimise(
 ) -> Estimate:
     """Levenberg-Marquardt from R (3, 3, B), t (3, B) in the dtype of ``obs``.
 
-    A pose has converged when the undamped step promises to lower its cost by no more than ``rtol`` of it, or than
-    rounding could; that step is still taken. Converged poses leave the batch.
+    A pose has converged when the step promises to lower its cost by no more than ``rtol`` of it, or than rounding
+    could; that step is still taken, but not evaluated. Converged poses leave the batch.
     """
     eps = torch.finfo(r.dtype).eps
     scale = obs.whitening.square().amax(0) if obs.whitening.ndim == 3 else obs.whitening.square().amax((0, 1))
-    scale = scale * obs.xy.square().amax(0) if obs.camera is not None else scale * (1 + obs.xy.square().sum(0))
-    floor = (4 * eps) ** 2 * scale.sum(0)
-    normal = normal_equations(obs, r, t)
-    count = r.shape[-1]
-    lam = torch.full((count,), damping, dtype=r.dtype, device=r.device)
-    result = Estimate(
-        r, t, normal, torch.zeros(count, dtype=torch.int64, device=r.device), torch.zeros_like(floor, dtype=torch.bool)
-    )
-    index: Tensor | None = None  # of the poses still under way, None: all
-    reached = result.converged  # latched: rounding may reject the idle steps of a pose that waits for the others
-
-    def record(iteration: int, r: Tensor, t: Tensor, normal: Tensor, done: Tensor) -> Estimate:
-        if index is None:
-            return Estimate(r, t, normal, torch.full_like(result.iterations, iteration), done)
-        return Estimate(
-            result.r.index_copy(-1, index, r),
-            result.t.index_copy(-1, index, t),
-            result.normal.index_copy(-1, index, normal),
-            result.iterations.index_fill(0, index, iteration),
-            result.converged.index_copy(0, index, done),
-        )
+    magnitude = obs.xy.square().sum(0)
+    floor = (4 * eps) ** 2 * (scale * (magnitude if obs.camera is not None else 1 + magnitude)).sum(0)
+    unknown = r.new_full((28, r.shape[-1]), torch.inf)
+    lam = torch.full_like(unknown[0], 10 * damping)
+    state = _State(r, t, unknown, lam, r, t, lam, lam < 0)
+    result: Estimate | None = None
+    index: Tensor | None = None  # of the poses still under way; None: all
 
     for iteration in range(1, max_iterations + 1):
-        r, t, normal, lam, done = lm_step(obs, r, t, normal, lam, rtol, floor)
-        done = reached = done | reached
+        state = _advance(obs, state, rtol, floor)
         # neither a pose without numbers nor one whose steps have shrunk to nothing will come to an end
-        over = done | ~(lam < 1e8) | ~normal[27].isfinite()
+        over = state.done | ~((state.damping < 1e8) & state.normal[27].isfinite())
         remaining = (~over).nonzero().squeeze(1)
-        if iteration == max_iterations or len(remaining) == 0:
-            return record(iteration, r, t, normal, done)
-        if len(over) > 64 and 2 * len(remaining) <= len(over):
-            result = record(iteration, r, t, normal, done)
+        last = iteration == max_iterations or len(remaining) == 0
+        if last or (len(over) > 64 and 2 * len(remaining) <= len(over)):
+            r, t = torch.where(state.done, state.r_trial, state.r), torch.where(state.done, state.t_trial, state.t)
+            cost = (state.normal[27] - torch.where(state.done, state.decrease, 0)).clamp_min(0)
+            normal = torch.cat([state.normal[:27], cost[None]])
+            if result is None or index is None:
+                count = torch.full_like(over, iteration, dtype=torch.int64)
+                result = Estimate(r, t, normal, count, state.done)
+            else:
+                result = Estimate(
+                    result.r.index_copy(-1, index, r),
+                    result.t.index_copy(-1, index, t),
+                    result.normal.index_copy(-1, index, normal),
+                    result.iterations.index_fill(0, index, iteration),
+                    result.converged.index_copy(0, index, state.done),
+                )
+            if last:
+                return result
             index = remaining if index is None else index[remaining]
-            obs = obs.select(remaining)
-            r, t, normal = (v.index_select(-1, remaining) for v in (r, t, normal))
-            lam, floor, reached = lam[remaining], floor[remaining], reached[remaining]
-    return result
+            obs, floor = obs.select(remaining), floor[remaining]
+            state = _State(*(v.index_select(-1, remaining) for v in state))
+    raise ValueError(f"max_iterations is {max_iterations}; expected 1 or more")
