@@ -1,7 +1,7 @@
 """Stage: batched direct least-squares ellipses over flat points.
 
-Every function takes points as flat (E, 2) with the ellipse index (E,), so thousands of rings of all frames of a batch are
-fitted by one sequence of tensor operations. Ellipses are (cx, cy, a >= b, theta in [0, pi) from +u towards +v).
+Every function takes points as flat (E, 2) with the ellipse index (E,), so thousands of rings of all frames of a batch
+are fitted by one sequence of tensor operations. Ellipses are (cx, cy, a >= b, theta in [0, pi) from +u towards +v).
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from torchpose.geometry import conics
 from torchpose.geometry.segments import segment_mean, segment_sum
 
 _SOLVABLE_POINTS = 6  # five parameters and one point to spare
+_FLAT = 1e-12  # squared ratio of the extents of a point set across and along, below which it is a line
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,23 +53,26 @@ def fit(points: Tensor, index: Tensor, count: int, weights: Tensor | None = None
 
     Args:
         points: (E, 2) px, any float dtype; computed in float64. index: (E,) int64, ellipse of each point.
-        count: number M of ellipses. weights: (E,) or None.
+        count: number M of ellipses. weights: (E,) not negative, or None; points of weight 0 may be NaN.
 
     Returns:
-        (M, 5) float64; rows with fewer than 6 points of weight, or whose points lie on a line, are NaN.
+        (M, 5) float64; rows with fewer than 6 points of weight above 0, whose points lie on a line, or with a NaN among
+        them are NaN.
     """
     points = points.double()
-    w = torch.ones(points.shape[0], dtype=points.dtype, device=points.device) if weights is None else weights.double()
+    w = torch.ones_like(points[:, 0]) if weights is None else weights.double()
+    counts = w > 0
+    points = torch.where(counts[:, None], points, 0.0)
     center = segment_mean(points, index, count, w)
     local = points - center[index]
     scale = segment_mean(local.square().sum(-1), index, count, w).sqrt()
     x, y = (local / scale[index, None]).unbind(-1)
     xx, xy, yy = x * x, x * y, y * y
     # the moments of order 2 to 4; those of order 1 vanish by centring
-    rows = torch.stack(
-        [xx, xy, yy, xx * x, xx * y, xy * y, yy * y, xx * xx, xx * xy, xx * yy, xy * yy, yy * yy, torch.ones_like(x)], -1
-    )
-    m20, m11, m02, m30, m21, m12, m03, m40, m31, m22, m13, m04, n = segment_sum(rows * w[:, None], index, count).unbind(-1)
+    one = torch.ones_like(x)
+    rows = [xx, xy, yy, xx * x, xx * y, xy * y, yy * y, xx * xx, xx * xy, xx * yy, xy * yy, yy * yy, one]
+    sums = segment_sum(torch.stack(rows, -1) * w[:, None], index, count)
+    m20, m11, m02, m30, m21, m12, m03, m40, m31, m22, m13, m04, n = sums.unbind(-1)
 
     # scatter matrix of (x^2, xy, y^2) after eliminating the linear part (x, y, 1)
     det = m20 * m02 - m11 * m11
@@ -95,7 +99,9 @@ def fit(points: Tensor, index: Tensor, count: int, weights: Tensor | None = None
     ellipse = conics.ellipse_from_conic(torch.stack([a, b, c, d, e, f], -1))
     size = torch.stack([scale, scale, scale, scale, torch.ones_like(scale)], -1)
     shift = torch.nn.functional.pad(center, (0, 3))
-    return torch.where((n >= _SOLVABLE_POINTS)[:, None], ellipse * size + shift, torch.nan)
+    enough = segment_sum(counts.to(w), index, count) >= _SOLVABLE_POINTS
+    spread = det > _FLAT * n.square()  # m20 + m02 = n by the scaling, so det / n^2 is the squared ratio of the extents
+    return torch.where((enough & spread)[:, None], ellipse * size + shift, torch.nan)
 
 
 def _positive_eigenvector(matrix: Tensor) -> Tensor:
@@ -110,9 +116,7 @@ def _positive_eigenvector(matrix: Tensor) -> Tensor:
     largest = 2 * root * (ratio.acos() / 3).cos()
     shifted = k - largest[:, None, None] * torch.eye(3, dtype=m.dtype, device=m.device)
     # the null vector is the cross product of any two independent rows: take the longest of the three
-    products = torch.stack(
-        [torch.linalg.cross(shifted[:, i], shifted[:, j]) for i, j in ((0, 1), (1, 2), (2, 0))], 1
-    )
+    products = torch.stack([torch.linalg.cross(shifted[:, i], shifted[:, j]) for i, j in ((0, 1), (1, 2), (2, 0))], 1)
     best = products.square().sum(-1).nan_to_num(nan=0.0).argmax(-1)
     return products.gather(1, best[:, None, None].expand(-1, 1, 3)).squeeze(1)
 
@@ -135,12 +139,18 @@ def _radial(points: Tensor, index: Tensor, ellipses: Tensor) -> tuple[Tensor, Te
 
 
 def fit_robust(
-    points: Tensor, index: Tensor, count: int, *, start: Tensor, scales: tuple[float, ...] = (2.0, 1.0, 0.5), cut: float = 4.0
+    points: Tensor,
+    index: Tensor,
+    count: int,
+    *,
+    start: Tensor,
+    scales: tuple[float, ...] = (2.0, 1.0, 0.5),
+    cut: float = 4.0,
 ) -> tuple[Tensor, Tensor]:
     """Ellipses from points of which some lie elsewhere (cover, glare, neighbouring edges).
 
     Iteratively reweighted direct fits from ``start``: first with Geman-McClure weights of falling scale, then with the
-    points within ``cut`` robust standard deviations only, unweighted, so that what remains is a plain least-squares fit.
+    points within ``cut`` robust standard deviations only, unweighted, so that the result is a plain least-squares fit.
 
     Args:
         points, index, count: as in `fit`. start: (M, 5), a rough ellipse to start from.
@@ -194,7 +204,8 @@ def with_covariance(
     s = torch.hypot(s1, s2)
     s1, s2 = (s1 / s).nan_to_num(nan=0.0), (s2 / s).nan_to_num(nan=0.0)
     jac = torch.stack([normal[:, 0], normal[:, 1], n1 * s1, n1 * s2 + n2 * s1, n2 * s2], -1)
-    rows = torch.cat([(jac[:, :, None] * jac[:, None, :]).flatten(1), r.square()[:, None], torch.ones_like(r)[:, None]], -1)
+    outer_product = (jac[:, :, None] * jac[:, None, :]).flatten(1)
+    rows = torch.cat([outer_product, r.square()[:, None], torch.ones_like(r)[:, None]], -1)
     sums = segment_sum(rows * w[:, None], index, count)
     normal_matrix, chi2, n = sums[:, :25].unflatten(-1, (5, 5)), sums[:, 25], sums[:, 26]
     sigma = (chi2 / (n - 5).clamp_min(1)).sqrt()
@@ -202,5 +213,6 @@ def with_covariance(
     eye = torch.eye(5, dtype=torch.float64, device=points.device)
     inverse, info = torch.linalg.inv_ex(torch.where(solvable[:, None, None], normal_matrix, eye))
     solvable = solvable & (info == 0)
-    covariance = torch.where(solvable[:, None, None], inverse * (correlation * sigma.square())[:, None, None], torch.nan)
+    covariance = inverse * (correlation * sigma.square())[:, None, None]
+    covariance = torch.where(solvable[:, None, None], covariance, torch.nan)
     return EllipseFit(ellipses, covariance, sigma, n)

@@ -1,4 +1,4 @@
-"""What the pipeline returns: `Status`, `Reason`, `Detections`, `Poses`. Plain tensors, ragged results flat with an index."""
+"""What the pipeline returns: `Status`, `Reason`, `Detections`, `Poses`. Tensors; ragged results flat with an index."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Reason(IntEnum):
     """Why a status is not OK."""
 
     NONE = 0
-    RESIDUAL = 1  # the marker centres do not fit any pose within their noise (mix-up, damage, wrong camera or target file)
+    RESIDUAL = 1  # no pose fits the marker centres within their noise (mix-up, damage, wrong camera or target file)
     RING_SHAPE = 2  # the centres fit, the rings' ellipses contradict the pose (motion blur, mix-up)
     DEGENERATE = 3  # the markers seen lie on one line, or the view is edge-on
     NOT_CONVERGED = 4
@@ -40,13 +40,16 @@ class _TensorBundle:
     """Common operations of the dataclasses of tensors below."""
 
     def to(self, *args: Any, **kwargs: Any) -> Self:
-        """Same as `Tensor.to` on every tensor; integer tensors keep their dtype."""
-        moved = {}
+        """Same as `Tensor.to` on every tensor, nested ones too; integer tensors keep their dtype."""
+        moved: dict[str, Any] = {}
         for f in fields(self):  # type: ignore[arg-type]
             value = getattr(self, f.name)
             if isinstance(value, Tensor):
                 target = value.to(*args, **kwargs)
-                moved[f.name] = target if value.is_floating_point() else target.to(value.dtype)
+                # integers go to the device only: a large id would not survive the way through a float
+                moved[f.name] = target if value.is_floating_point() else value.to(target.device)
+            elif isinstance(value, _TensorBundle):
+                moved[f.name] = value.to(*args, **kwargs)
         return replace(self, **moved)  # type: ignore[type-var]
 
     def cpu(self) -> Self:
@@ -107,7 +110,8 @@ class Poses(_TensorBundle):
         chi2: (N,) float64, of all evidence (centres and ring shapes) at the pose.
         R_alt, t_alt, rms_alt, chi2_alt: the other minimum of the same evidence (the second planar solution); NaN
             where both coincide or there is none.
-        detections: the markers behind the poses.
+        detections: the markers of the whole batch; selecting rows leaves them alone, their `frame` and `target` say
+            whose they are.
     """
 
     frame: Tensor

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -44,9 +45,11 @@ class Candidates:
 
 
 def find_candidates(frames: Tensor, factor: int | None = None) -> Candidates:
-    """Ellipses in grey frames (B, H, W), any real dtype, one pass for the whole batch.
+    """Ellipses in grey frames (B, H, W), one pass for the whole batch.
 
     Args:
+        frames: any real dtype, in grey levels: 0..255 for float frames, up to 65535 for uint16. Steps below 1.5 levels
+            are taken for quantisation. NaN pixels are ignored.
         factor: integer reduction before the search; by default the smallest that gives at most 1.3 megapixels. The
             smallest semi-minor axis found is 2 reduced pixels.
     """
@@ -68,7 +71,7 @@ def fit_regions(grad: Gradient, regions: Regions) -> tuple[Tensor, Tensor, Tenso
     count = regions.frame.numel()
     magnitude = torch.linalg.vector_norm(regions.gradient, dim=-1).double()
     params = ellipse.fit(xy, regions.region, count, magnitude)
-    # once more with the pixels that lie on the ellipse and point along its normal
+    # once more with the pixels near the ellipse only
     r = ellipse.distance(xy, regions.region, params)
     params = ellipse.fit(xy, regions.region, count, magnitude * (r.abs() < 1.5))
     a, b = params[:, 2], params[:, 3]
@@ -91,7 +94,7 @@ def validate(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor) 
     the sum k of n of them is below its value with probability at most k^n / n!. The number of tests is the number of
     distinguishable ellipses, (h w)^(5/2): five parameters, each with as many values as the frame has pixels on a side.
     """
-    batch, height, width = grad.diag.shape
+    _, height, width = grad.diag.shape
     n = conics.perimeter(ellipses).ceil().long()
     which, position = ragged_arange(n)
     angle = position.double() * (2 * torch.pi) / n[which]
@@ -109,8 +112,8 @@ def validate(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor) 
     count = ellipses.shape[0]
     k = segment_sum(error, which, count)
     cover = segment_sum((error < 0.125).double(), which, count) / n
-    log_tests = 2.5 * torch.log10(torch.tensor(float(height * width), dtype=torch.float64, device=k.device))
+    log_tests = 2.5 * math.log10(max(1, height * width))
     size = n.double()
-    log10_nfa = log_tests + size * k.clamp_min(1e-12).log10() - torch.lgamma(size + 1) / torch.log(torch.tensor(10.0))
+    log10_nfa = log_tests + size * k.clamp_min(1e-12).log10() - torch.lgamma(size + 1) / math.log(10)
     keep = log10_nfa < 0
     return Candidates(frame[keep], ellipses[keep], polarity[keep], log10_nfa[keep], cover[keep])

@@ -30,8 +30,11 @@ def area_reduce(frames: Tensor, factor: int) -> Tensor:
         return frames.float()
     batch, height, width = frames.shape
     h, w = height // factor, width // factor
+    if 0 in (batch, h, w):
+        return torch.zeros(batch, h, w, device=frames.device)
     cropped = frames[:, : h * factor, : w * factor]
     if frames.device.type == "cpu" and frames.dtype in (torch.uint8, torch.uint16):
         tall = cropped.reshape(batch * h * factor, w * factor).numpy()  # a view unless rows were cropped
-        return torch.from_numpy(cv2.resize(tall, (w, batch * h), interpolation=cv2.INTER_AREA)).view(batch, h, w).float()
+        reduced = cv2.resize(tall, (w, batch * h), interpolation=cv2.INTER_AREA)
+        return torch.from_numpy(reduced).view(batch, h, w).float()
     return torch.nn.functional.avg_pool2d(cropped[:, None].float(), factor)[:, 0]

@@ -7,6 +7,7 @@ connected components are found by parallel min-hooking and pointer jumping (Shil
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -28,7 +29,7 @@ class Gradient:
     Attributes:
         diag, anti: (B, h, w) float32, I(x+1, y+1) - I(x, y) and I(x+1, y) - I(x, y+1); zero in the last row and column.
             The gradient is gx = (diag + anti) / 2, gy = (diag - anti) / 2.
-        threshold: (B,) float32, magnitude that pure noise exceeds in one cell of a thousand.
+        threshold: (B,) float32, magnitude that pure white noise exceeds in one cell of a thousand at most.
     """
 
     diag: Tensor
@@ -57,21 +58,30 @@ class Regions:
 
 
 def gradient(frames: Tensor) -> Gradient:
-    """Gradient and noise threshold of frames (B, h, w) float32, in any grey unit.
+    """Gradient and noise threshold of frames (B, h, w) float32 in grey levels (0..255 or more).
 
-    The noise is estimated from the median squared gradient, which edges hardly touch.
+    The noise is estimated from the median squared gradient, which edges hardly touch. Cells at a pixel that is NaN or
+    infinite have no gradient.
     """
     batch, height, width = frames.shape
     diag, anti = torch.zeros_like(frames), torch.zeros_like(frames)
+    if frames.numel() == 0:
+        return Gradient(diag, anti, frames.new_full((batch,), _LEAST_LEVEL))
     torch.sub(frames[:, 1:, 1:], frames[:, :-1, :-1], out=diag[:, :-1, :-1])
     torch.sub(frames[:, :-1, 1:], frames[:, 1:, :-1], out=anti[:, :-1, :-1])
+    flat = frames.flatten(1)
+    low, high = flat.aminmax(dim=-1)
+    if not bool((high - low).isfinite().all()):
+        for difference in (diag, anti):
+            difference.nan_to_num_(nan=0.0, posinf=0.0, neginf=0.0)
+        finite = flat.isfinite()
+        low, high = flat.where(finite, torch.inf).amin(-1), flat.where(finite, -torch.inf).amax(-1)
     stride = max(1, height * width // _NOISE_SAMPLES)
-    p, q = diag.view(batch, -1)[:, ::stride], anti.view(batch, -1)[:, ::stride]
+    p, q = diag.flatten(1)[:, ::stride], anti.flatten(1)[:, ::stride]
     # (diag^2 + anti^2) / 2 is sigma^2 chi^2_2, whose median is 2 ln 2 sigma^2
-    sigma = ((p.square() + q.square()).median(-1).values / (4 * torch.log(torch.tensor(2.0)))).sqrt()
-    flat = frames.reshape(batch, -1)
-    span = flat.amax(-1) - flat.amin(-1)
-    return Gradient(diag, anti, torch.maximum(_NOISE_SIGMAS * sigma, _RANGE_FRACTION * span).clamp_min(_LEAST_LEVEL))
+    sigma = ((p.square() + q.square()).median(-1).values / (4 * math.log(2))).sqrt()
+    threshold = torch.maximum(_NOISE_SIGMAS * sigma, _RANGE_FRACTION * (high - low)).clamp_min(_LEAST_LEVEL)
+    return Gradient(diag, anti, threshold)
 
 
 def level_line_regions(grad: Gradient, min_pixels: int) -> Regions:
@@ -119,7 +129,7 @@ def connected_components(a: Tensor, b: Tensor, count: int) -> Tensor:
 
 
 def region_polarity(regions: Regions, center: Tensor, cells_xy: Tensor) -> Tensor:
-    """Mean cosine (count,) between gradient and outward direction from ``center`` (count, 2): +1 dark inside, -1 light."""
+    """Mean cosine (count,) of the gradient with the way out of ``center`` (count, 2): +1 dark inside, -1 light."""
     count = center.shape[0]
     out = cells_xy - center[regions.region]
     cos = (out * regions.gradient).sum(-1) / (

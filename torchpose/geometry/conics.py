@@ -35,9 +35,9 @@ def ellipse_from_conic(conic: Tensor) -> Tensor:
     mean, diff = 0.5 * (a + c), torch.hypot(0.5 * (a - c), 0.5 * b)
     sign = torch.where(mean < 0, -1.0, 1.0)
     mean, f0 = mean * sign, f0 * sign
-    # the smaller eigenvalue as a quotient: mean - diff cancels for slender ellipses
+    # the smaller eigenvalue as a quotient: mean - diff cancels for slender ellipses; rounding must not exchange a and b
     large = mean + diff
-    small = 0.25 * disc / large
+    small = torch.minimum(0.25 * disc / large, large)
     major, minor = (-f0 / small).sqrt(), (-f0 / large).sqrt()
     theta = 0.5 * torch.atan2(-b * sign, (c - a) * sign)
     theta = torch.remainder(theta, torch.pi)
@@ -97,9 +97,7 @@ def circle_image(rotation: Tensor, center: Tensor, normal: Tensor, radius: Tenso
     e1 = torch.linalg.cross(n, axis)
     e1 = e1 / torch.linalg.vector_norm(e1, dim=-1, keepdim=True)
     e2 = torch.linalg.cross(n, e1)
-    adj = torch.stack(
-        [torch.linalg.cross(e2, center), torch.linalg.cross(center, e1), torch.linalg.cross(e1, e2)], -2
-    )
+    adj = torch.stack([torch.linalg.cross(e2, center), torch.linalg.cross(center, e1), torch.linalg.cross(e1, e2)], -2)
     weight = torch.stack([torch.ones_like(radius), torch.ones_like(radius), -radius.square()], -1)
     return adj.mT @ (weight[..., None] * adj)
 

@@ -9,7 +9,7 @@ from torch import Tensor
 def segment_sum(values: Tensor, index: Tensor, count: int) -> Tensor:
     """Sums (count, ...) of the rows of ``values`` (E, ...) that share an ``index`` (E,) in [0, count)."""
     out = torch.zeros(count, *values.shape[1:], dtype=values.dtype, device=values.device)
-    return out.index_add_(0, index, values) if not values.requires_grad else out.index_add(0, index, values)
+    return out.index_add(0, index, values)
 
 
 def segment_mean(values: Tensor, index: Tensor, count: int, weights: Tensor | None = None) -> Tensor:
