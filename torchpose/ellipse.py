@@ -181,8 +181,9 @@ def with_covariance(
 ) -> EllipseFit:
     """First-order covariance of fitted ellipses from the scatter of their own points.
 
-    Near the optimum the algebraic fit of points all around equals the geometric one, so the covariance is
-    sigma^2 (J^T J)^-1 of the normal distances, sigma estimated with E - 5 degrees of freedom.
+    To first order the direct fit is least squares of the normal distances with weights W = w |grad rho|^2, rho the
+    elliptic radius: algebraic distances count points near the ends of the major axis less. So the covariance is
+    sigma^2 (J^T W J)^-1 J^T W^2 J (J^T W J)^-1, sigma from the distances with E - 5 degrees of freedom.
 
     Args:
         points, index, weights: as in `fit`. ellipses: (M, 5) as fitted.
@@ -204,15 +205,18 @@ def with_covariance(
     s = torch.hypot(s1, s2)
     s1, s2 = (s1 / s).nan_to_num(nan=0.0), (s2 / s).nan_to_num(nan=0.0)
     jac = torch.stack([normal[:, 0], normal[:, 1], n1 * s1, n1 * s2 + n2 * s1, n2 * s2], -1)
-    outer_product = (jac[:, :, None] * jac[:, None, :]).flatten(1)
-    rows = torch.cat([outer_product, r.square()[:, None], torch.ones_like(r)[:, None]], -1)
-    sums = segment_sum(rows * w[:, None], index, count)
-    normal_matrix, chi2, n = sums[:, :25].unflatten(-1, (5, 5)), sums[:, 25], sums[:, 26]
+    # times b, so that it is 1 where the ellipse is steepest
+    algebraic = (w * (b * norm).square()).nan_to_num(nan=0.0)[:, None]
+    outer_product = algebraic * (jac[:, :, None] * jac[:, None, :]).flatten(1)
+    rows = torch.cat([outer_product, algebraic * outer_product, (w * r.square())[:, None], w[:, None]], -1)
+    sums = segment_sum(rows, index, count)
+    normal_matrix, scatter = sums[:, :50].unflatten(-1, (2, 5, 5)).unbind(1)
+    chi2, n = sums[:, 50:].unbind(-1)
     sigma = (chi2 / (n - 5).clamp_min(1)).sqrt()
     solvable = (n >= _SOLVABLE_POINTS) & ellipses.isfinite().all(-1)
     eye = torch.eye(5, dtype=torch.float64, device=points.device)
     inverse, info = torch.linalg.inv_ex(torch.where(solvable[:, None, None], normal_matrix, eye))
     solvable = solvable & (info == 0)
-    covariance = inverse * (correlation * sigma.square())[:, None, None]
+    covariance = (inverse @ scatter @ inverse) * (correlation * sigma.square())[:, None, None]
     covariance = torch.where(solvable[:, None, None], covariance, torch.nan)
     return EllipseFit(ellipses, covariance, sigma, n)

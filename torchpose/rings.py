@@ -121,14 +121,10 @@ def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera) -> Rin
     )
     index = good.nonzero()[:, 0]
     second = index + count
-    return Rings(
-        candidates.frame[index], candidates.polarity[index], raw[index], raw[second], fit[index], fit[second]
-    )
+    return Rings(candidates.frame[index], candidates.polarity[index], raw[index], raw[second], fit[index], fit[second])
 
 
-def _deblurred(
-    edges: RingEdges, fitted: Tensor, keep: Tensor, outward: Tensor, frame: Tensor, frames: int
-) -> Tensor:
+def _deblurred(edges: RingEdges, fitted: Tensor, keep: Tensor, outward: Tensor, frame: Tensor, frames: int) -> Tensor:
     """Edge points (E, 2) with the effect of each frame's blur on their offsets taken off."""
     distance = edges.offset - ellipse.distance(edges.points, edges.ring, fitted) * outward[edges.ring]
     group = frame[edges.ring]

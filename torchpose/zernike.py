@@ -48,7 +48,7 @@ class Edges:
 
 @lru_cache(maxsize=8)
 def kernels(size: int = MASK, orders: tuple[tuple[int, int], ...] = ORDERS) -> Tensor:
-    """Correlation kernels (K, N, N) float64: for each (n, m) the real part R_nm cos(m theta) and, if m > 0, R_nm sin(m theta).
+    """Correlation kernels (K, N, N) float64: for each (n, m) R_nm cos(m theta) and, if m > 0, R_nm sin(m theta).
 
     Each weight is the integral of the Zernike function over the part of the pixel's square inside the unit disc (mask
     radius N/2), by the midpoint rule on a 128 x 128 sub-grid. Raises ValueError unless ``size`` is odd and at least 3.
@@ -89,7 +89,9 @@ class ZernikeMoments(nn.Module):
 
     weight: Tensor
 
-    def __init__(self, size: int = MASK, orders: tuple[tuple[int, int], ...] = ORDERS, dtype: torch.dtype = torch.float32) -> None:
+    def __init__(
+        self, size: int = MASK, orders: tuple[tuple[int, int], ...] = ORDERS, dtype: torch.dtype = torch.float32
+    ) -> None:
         super().__init__()
         self.register_buffer("weight", kernels(size, orders)[:, None].to(dtype))
 
@@ -112,7 +114,7 @@ def moments_at(
     window = (d[:, None] * width + d[None, :]).flatten()
     base = (frame * height + pixels[:, 1]) * width + pixels[:, 0]
     values = frames.reshape(-1)[base[:, None] + window].float()
-    # centring on the middle grey keeps float32 exact to rounding: every kernel but A_00 sums to zero up to the disc's rim
+    # every kernel but A_00 sums to nearly zero: taking the middle grey off first keeps float32 exact to rounding
     middle = values[:, size * size // 2, None]
     weight = kernels(size, orders).flatten(1).to(values)
     return (values - middle) @ weight.T + middle * weight.sum(1)
