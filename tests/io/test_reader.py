@@ -92,6 +92,6 @@ def test_decoding_runs_one_batch_ahead_and_no_further(tmp_path, monkeypatch):
 
 
 def test_default_batch_bounds_the_pixels_of_a_batch():
-    assert default_batch(640, 480) == 32
-    assert default_batch(5472, 3648) == 8
+    assert default_batch(640, 480) == 16
+    assert default_batch(5472, 3648) == 4
     assert default_batch(20000, 20000) == 1

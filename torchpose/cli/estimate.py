@@ -135,7 +135,8 @@ def _run(
 
     cv2.setNumThreads(1)  # frames are decoded side by side; threads inside of one would only compete
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    torch.set_num_threads(threads)
+    # decoding is the larger part of the work; torch's threads wait actively and would take its cores away
+    torch.set_num_threads(max(1, threads // 2))
     estimator = PoseEstimator(camera, targets)
     painter = None if overlay is None else Overlay(camera, targets, overlay, threads=threads)
     store = ResultStore(

@@ -16,8 +16,8 @@ from torchpose.io.sources import Source
 from torchpose.results import Status
 
 _TORCH_DTYPE = {np.dtype(np.uint8): torch.uint8, np.dtype(np.uint16): torch.uint16}
-_BATCH_PIXELS = 160_000_000  # of one batch: 8 frames of 20 megapixels
-_BATCH_FRAMES = 32
+_BATCH_PIXELS = 80_000_000  # of one batch: 4 frames of 20 megapixels
+_BATCH_FRAMES = 16
 
 
 @dataclass(frozen=True)
