@@ -1,72 +1,49 @@
 """Batched linear algebra of 2 x 2 to 6 x 6 matrices as structures of arrays: the batch is the last dimension.
 
 `torch.linalg` treats a batch of small matrices one LAPACK call at a time. Here every scalar of the textbook algorithm
-is a contiguous vector over the batch, so an elimination is a few dozen elementwise calls whatever the batch size. In
-eager mode the calls run over rows and blocks (few calls: a small batch is bound by their number); while
-`torch.compile` traces they run over scalars, which fuse into one kernel. All functions are differentiable and keep
-dtype and device.
+is a contiguous vector over the batch, so an elimination is a few dozen elementwise calls whatever the batch size; under
+`torch.compile` they fuse. All functions are differentiable and keep dtype and device.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 
-def solve_spd(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """Solves a x = b for symmetric positive definite matrices by L D L^T without pivoting (Golub, Van Loan, ch. 4.1).
+def solve_rows(rows: Sequence[Tensor], damping: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Solves a x = b for symmetric positive definite a by L D L^T without pivoting (Golub, Van Loan, section 4.1).
 
     Args:
-        a: (n, n, B), only the upper triangle is used.
-        b: (n, m, B).
+        rows: n tensors; the i-th holds row i of [a | b] from the diagonal on, (n - i + m, B).
+        damping: (B,), the diagonal of a is multiplied by one plus this (Marquardt).
 
     Returns:
         x (n, m, B) and the pivots D (n, B); a pivot that is not clearly positive says that the matrix is singular.
     """
-    n = a.shape[0]
-    if torch.compiler.is_compiling():
-        return _solve_spd_scalars(a, b)
-    block = torch.cat([a, b], 1)
-    rows = []
+    n = len(rows)
+    block = list(rows)
+    pivots = []
     for k in range(n):
-        row = block[0]
-        rows.append(row)
-        if k + 1 < n:
-            factor = row[1 : n - k] / row[0]
-            block = torch.addcmul(block[1:, 1:], factor[:, None], row[None, 1:], value=-1)
-    pivots = torch.stack([row[0] for row in rows])
-    x = (rows[-1][1:] / rows[-1][0])[None]
-    for k in range(n - 2, -1, -1):
-        row = rows[k]
-        known = (row[1 : n - k, None] * x).sum(0)
-        x = torch.cat([((row[n - k :] - known) / row[0])[None], x])
-    return x, pivots
-
-
-def _solve_spd_scalars(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    n, m = a.shape[0], b.shape[1]
-    rows = [[a[i, j] for j in range(i, n)] + [b[i, j] for j in range(m)] for i in range(n)]
-    for k in range(n):
-        inverse = 1 / rows[k][0]
+        pivot = block[k][0] if damping is None else torch.addcmul(block[k][0], damping, rows[k][0])
+        pivots.append(pivot)
+        factors = block[k][1 : n - k] / pivot
         for i in range(k + 1, n):
-            factor = rows[k][i - k] * inverse
-            rows[i] = [v - factor * u for v, u in zip(rows[i], rows[k][i - k :], strict=True)]
-    x: list[list[Tensor]] = [[] for _ in range(n)]
-    for k in range(n - 1, -1, -1):
-        inverse = 1 / rows[k][0]
-        for j in range(m):
-            value = rows[k][n - k + j]
-            for i in range(k + 1, n):
-                value = value - rows[k][i - k] * x[i][j]
-            x[k].append(value * inverse)
-    return torch.stack([torch.stack(row) for row in x]), torch.stack([row[0] for row in rows])
+            block[i] = torch.addcmul(block[i], factors[i - k - 1], block[k][i - k :], value=-1)
+    x = [block[-1][1:] / pivots[-1]]
+    for k in range(n - 2, -1, -1):
+        value = block[k][n - k :]
+        for i in range(k + 1, n):
+            value = torch.addcmul(value, block[k][i - k], x[n - 1 - i], value=-1)
+        x.append(value / pivots[k])
+    return torch.stack(x[::-1]), torch.stack(pivots)
 
 
-def inverse_spd(a: Tensor) -> tuple[Tensor, Tensor]:
-    """Inverse (n, n, B) of symmetric positive definite matrices (n, n, B), and the pivots (n, B) of `solve_spd`."""
-    n = a.shape[0]
-    eye = torch.eye(n, dtype=a.dtype, device=a.device)[..., None].expand(n, n, a.shape[-1])
-    return solve_spd(a, eye)
+def solve_spd(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """`solve_rows` of matrices (n, n, B), of which the upper triangle is used, and right-hand sides (n, m, B)."""
+    return solve_rows([torch.cat([a[i, i:], b[i]]) for i in range(a.shape[0])])
 
 
 def cross(a: Tensor, b: Tensor) -> Tensor:

@@ -8,17 +8,17 @@ pixels themselves.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchpose.camera import Camera
-from torchpose.geometry.small_linalg import cayley, inverse_spd, matmul3, solve_spd
+from torchpose.geometry.small_linalg import cayley, matmul3, solve_rows
 
 # upper triangle of the 6 x 7 matrix [J^T J | J^T r] row by row, and the squared length of r, packed in 28 numbers
-_STARTS = (0, 7, 13, 18, 22, 25)
-_UNPACK = [[_STARTS[min(i, j)] + abs(i - j) for j in range(6)] + [_STARTS[i] + 6 - i] for i in range(6)]
+_STARTS = (0, 7, 13, 18, 22, 25, 27)
 # columns of the Jacobian are kept with these signs: it saves their negation
 SIGNS = (1.0, 1.0, -1.0, -1.0, 1.0, 1.0)
 
@@ -135,12 +135,16 @@ def normal_equations(obs: Observations, r: Tensor, t: Tensor) -> Tensor:
     return torch.cat([*((rows[i] * rows[i:]).sum(1) for i in range(6)), cost[None]])  # rows: (7, 2N, B)
 
 
-def unpack(normal: Tensor) -> Tensor:
-    """[J^T J | J^T r] (6, 7, B)."""
-    if torch.compiler.is_compiling():
-        return torch.stack([torch.stack([normal[k] for k in row]) for row in _UNPACK])
-    index = torch.tensor(_UNPACK, device=normal.device).flatten()
-    return normal.index_select(0, index).unflatten(0, (6, 7))
+def _rows(normal: Tensor) -> list[Tensor]:
+    """Rows of [J^T J | J^T r] from the diagonal on."""
+    return [normal[a:b] for a, b in pairwise(_STARTS)]
+
+
+def distance(normal: Tensor, step: Tensor) -> Tensor:
+    """Squared Mahalanobis length (B,) of steps (6, B), translation first, by the information J^T J."""
+    step = step * torch.tensor(SIGNS, dtype=step.dtype, device=step.device)[:, None]
+    twice = [(row[:-1] * step[i:]).sum(0) - 0.5 * row[0] * step[i] for i, row in enumerate(_rows(normal))]
+    return 2 * (torch.stack(twice) * step).sum(0)
 
 
 def covariance(normal: Tensor) -> tuple[Tensor, Tensor]:
@@ -148,11 +152,11 @@ def covariance(normal: Tensor) -> tuple[Tensor, Tensor]:
 
     The latter is the least pivot over its diagonal entry, that is the least 1 - (multiple correlation)^2.
     """
-    information = unpack(normal)[:, :6]
-    inverse, pivots = inverse_spd(information)
-    signs = torch.tensor(SIGNS, dtype=normal.dtype, device=normal.device)
-    inverse = inverse * (signs[:, None] * signs)[..., None]
-    return inverse, (pivots / information.diagonal().T).amin(0)
+    signed = torch.diag(torch.tensor(SIGNS, dtype=normal.dtype, device=normal.device))[..., None]
+    rows = _rows(normal)
+    eye = signed.expand(6, 6, normal.shape[-1])
+    inverse, pivots = solve_rows([torch.cat([row[:-1], eye[i]]) for i, row in enumerate(rows)])
+    return inverse * signed.sum(1)[:, None], (pivots / torch.stack([row[0] for row in rows])).amin(0)
 
 
 class _State(NamedTuple):
@@ -170,15 +174,16 @@ class _State(NamedTuple):
 
 def _advance(obs: Observations, state: _State, rtol: float, floor: Tensor) -> _State:
     """Evaluates the trial poses, accepts those that lower the cost, and proposes the next damped step."""
-    normal = normal_equations(obs, state.r_trial, state.t_trial)
+    r, t = state.r_trial, state.t_trial
+    normal = normal_equations(obs, r, t)
     accept = normal[27] <= state.normal[27] * (1 + 1e-12) + floor
-    r, t = torch.where(accept, state.r_trial, state.r), torch.where(accept, state.t_trial, state.t)
-    normal = torch.where(accept, normal, state.normal)
-    damping = torch.where(accept, 0.1 * state.damping, 10 * state.damping)
-    system = unpack(normal)
-    damped = system[:, :6] * (1 + damping * torch.eye(6, dtype=r.dtype, device=r.device)[..., None])
-    step = solve_spd(damped, system[:, 6:])[0].squeeze(1)
-    decrease = (step * system[:, 6]).sum(0)
+    if torch.compiler.is_compiling() or not bool(accept.all()):
+        r, t = torch.where(accept, r, state.r), torch.where(accept, t, state.t)
+        normal = torch.where(accept, normal, state.normal)
+    damping = state.damping * torch.where(accept, 0.1, 10.0)
+    rows = _rows(normal)
+    step = solve_rows(rows, damping)[0].squeeze(1)
+    decrease = sum((step[i] * row[-1] for i, row in enumerate(rows)), start=torch.zeros_like(damping))
     done = (decrease <= rtol * normal[27] + floor) & (damping <= 1) & normal[27].isfinite()
     step = step * -torch.tensor(SIGNS, dtype=r.dtype, device=r.device)[:, None]
     return _State(r, t, normal, damping, matmul3(cayley(step[3:]), r), t + step[:3], decrease, done)

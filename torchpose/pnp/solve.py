@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from functools import partial
 from typing import Literal
 
 import torch
@@ -11,15 +12,14 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.geometry.small_linalg import cross, matmul3, orthonormalise
 from torchpose.pnp.iterative import (
-    SIGNS,
     Estimate,
     Observations,
     covariance,
+    distance,
     minimise,
     normal_equations,
     product2,
     residuals,
-    unpack,
 )
 from torchpose.pnp.planar import COLLINEARITY, FLATNESS, ippe, plane_frame
 from torchpose.pnp.result import PnPCode, PnPError, PnPResult
@@ -31,7 +31,10 @@ DECISION = 20.0
 COINCIDENCE = 1.0
 # least 1 - (multiple correlation)^2 of a parameter below which the points do not fix the pose
 INDEPENDENCE = 1e-11
+# poses whose working set fits the cache of one core
 _CHUNK = 4096
+# iterations after which a pose is put off, where there are many
+_FIRST_PASS = 3
 
 
 def solve(
@@ -92,32 +95,37 @@ def solve(
         camera = camera.to(pixels)
         _expect("camera", camera, (3, 3), batch)
 
-    def part(value: Tensor | None, shape_ndim: int, rows: slice) -> Tensor | None:
-        return value if value is None or value.ndim == shape_ndim else value[rows]
+    def run(rows: slice | Tensor, limit: int) -> tuple[PnPResult, Tensor]:
+        def part(value: Tensor, shared: int) -> Tensor:
+            return value if value.ndim == shared else value[rows]
 
-    parts = []
-    for start in range(0, max(batch, 1), _CHUNK):
-        rows = slice(start, min(start + _CHUNK, batch))
-        parts.append(
-            _solve_chunk(
-                part(points, 2, rows),
-                pixels[rows],
-                part(camera, 2, rows) if isinstance(camera, Tensor) else camera,
-                method,
-                sigma_px,
-                part(covariances, 3, rows),
-                part(weights, 1, rows),
-                part(mask, 1, rows),
-                None if initial is None else (initial[0][rows].to(pixels), initial[1][rows].to(pixels)),
-                huber,
-                max_iterations,
-            )
+        return _solve_chunk(
+            part(points, 2),
+            pixels[rows],
+            part(camera, 2) if isinstance(camera, Tensor) else camera,
+            method,
+            sigma_px,
+            None if covariances is None else part(covariances, 3),
+            None if weights is None else part(weights, 1),
+            None if mask is None else part(mask, 1),
+            None if initial is None else (initial[0][rows].to(pixels), initial[1][rows].to(pixels)),
+            huber,
+            limit,
         )
-    result = (
-        parts[0]
-        if len(parts) == 1
-        else PnPResult(**{f.name: torch.cat([getattr(p, f.name) for p in parts]) for f in fields(PnPResult)})
-    )
+
+    if batch <= _CHUNK:
+        result, _ = run(slice(None), max_iterations)
+    else:
+        # the few poses that need many iterations are put off and solved together
+        chunks = [slice(start, start + _CHUNK) for start in range(0, batch, _CHUNK)]
+        parts = [run(rows, min(_FIRST_PASS, max_iterations)) for rows in chunks]
+        result = _join([p for p, _ in parts])
+        late = torch.cat([unfinished for _, unfinished in parts]).nonzero().squeeze(1)
+        if max_iterations > _FIRST_PASS and len(late) > 0:
+            again = _join([run(rows, max_iterations)[0] for rows in late.split(_CHUNK)])
+            result = PnPResult(
+                **{f.name: getattr(result, f.name).index_copy(0, late, getattr(again, f.name)) for f in fields(again)}
+            )
     if raise_on_failure:
         failed = result.code > PnPCode.AMBIGUOUS
         if bool(failed.any()):
@@ -125,6 +133,10 @@ def solve(
             code = PnPCode(int(result.code[first])).name
             raise PnPError(f"pose {first}: {code}; {int(failed.sum())} of {batch} poses failed")
     return result
+
+
+def _join(parts: list[PnPResult]) -> PnPResult:
+    return PnPResult(**{f.name: torch.cat([getattr(p, f.name) for p in parts]) for f in fields(PnPResult)})
 
 
 def _expect(name: str, value: Tensor, shape: tuple[int, ...], batch: int) -> None:
@@ -169,7 +181,8 @@ def _solve_chunk(
     initial: tuple[Tensor, Tensor] | None,
     huber: float,
     max_iterations: int,
-) -> PnPResult:
+) -> tuple[PnPResult, Tensor]:
+    """The poses of one chunk, and (B,) bool where more iterations are needed."""
     batch, count = pixels.shape[:2]
     points = object_points.reshape(-1, count, 3).permute(2, 1, 0).contiguous()
     image = pixels.permute(2, 1, 0).contiguous()
@@ -226,7 +239,14 @@ def _solve_chunk(
         (~finite, PnPCode.NOT_FINITE),
         (seen < minimum, PnPCode.TOO_FEW),
     )
-    return _report(state, options, center, unit, pixel, weight, bad)
+    cost = state.normal[27].unflatten(0, (options, batch))
+    late = ~state.converged.unflatten(0, (options, batch)) & (cost <= _relevant(cost))
+    return _report(state, options, center, unit, pixel, weight, bad), late.any(0)
+
+
+def _relevant(chi2: Tensor) -> Tensor:
+    """Chi-squared above which one of several minima (S, B) needs no further digits."""
+    return 2 * chi2.amin(0) + 2 * DECISION
 
 
 def _rays(camera: Camera | Tensor, pixels: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
@@ -264,9 +284,8 @@ def _refine(
     single = observed.to(torch.float32).repeat(options)
     first = minimise(single, r.float(), t.float(), max_iterations=max_iterations, rtol=1e-4)
     r, t = orthonormalise(first.r.double()), first.t.double()
-    # a minimum that is far worse than the other one needs no further digits
     chi2 = first.normal[27].unflatten(0, (options, -1))
-    index = (chi2 <= 4 * chi2.amin(0) + 50 * DECISION).flatten().nonzero().squeeze(1)
+    index = (chi2 <= _relevant(chi2)).flatten().nonzero().squeeze(1)
     if len(index) == r.shape[-1]:
         last = minimise(final, r, t, max_iterations=max_iterations, rtol=1e-10, damping=1e-6)
         return last._replace(iterations=first.iterations + last.iterations)
@@ -297,8 +316,7 @@ def _coincide(a: Estimate, b: Estimate) -> Tensor:
     trace = relative[0, 0] + relative[1, 1] + relative[2, 2]
     # twice the tangent of half the angle; Cayley's vector, as in the steps of the minimiser
     step = torch.cat([b.t - a.t, 2 * axis / (1 + trace).clamp_min(1e-12)])
-    step = step * torch.tensor(SIGNS, dtype=step.dtype, device=step.device)[:, None]
-    return (step[:, None] * step * unpack(a.normal)[:, :6]).sum((0, 1)) < COINCIDENCE
+    return distance(a.normal, step) < COINCIDENCE
 
 
 def _report(
@@ -316,6 +334,10 @@ def _report(
     chi2, order = chi2.sort(0)
 
     def pick(k: int) -> Estimate:
+        if options == 1:
+            return Estimate(*(v.squeeze(-2) for v in split))
+        if options == 2:
+            return Estimate(*(torch.where(order[k] == 0, v[..., 0, :], v[..., 1, :]) for v in split))
         return Estimate(*(v.gather(-2, order[k].expand(*v.shape[:-2], 1, batch)).squeeze(-2) for v in split))
 
     best = pick(0)
@@ -324,7 +346,7 @@ def _report(
     for k in range(1, options):
         candidate = pick(k)
         new = chi2[k].isfinite() & ~_coincide(best, candidate) & ~different
-        other = Estimate(*(torch.where(new, a, b) for a, b in zip(candidate, other, strict=True)))
+        other = candidate if options == 2 else Estimate(*map(partial(torch.where, new), candidate, other))
         other_chi2 = torch.where(new, chi2[k], other_chi2)
         different = different | new
 
