@@ -107,13 +107,20 @@ class Overlay:
         picture = cv2.cvtColor(_eight_bit(frame.numpy()), cv2.COLOR_GRAY2BGR)
         unit = max(picture.shape[:2]) / 1000  # everything is drawn in thousandths of the picture's longer side
         found = poses.detections[poses.detections.frame == index]
-        for outer, inner, center, marker in zip(
-            found.outer.tolist(), found.inner.tolist(), found.center.tolist(), found.marker.tolist(), strict=True
+        for outer, inner, center, marker, target in zip(
+            found.outer.tolist(),
+            found.inner.tolist(),
+            found.center.tolist(),
+            found.marker.tolist(),
+            found.target.tolist(),
+            strict=True,
         ):
             _ellipse(picture, outer, _OUTER)
             _ellipse(picture, inner, _INNER)
             _cross(picture, center, max(0.4 * inner[3], 3.0))
-            _text(picture, str(marker), (center[0] + 0.75 * outer[2], center[1] - 0.75 * outer[2]), 1.0 * unit, _CENTRE)
+            # a ring that two targets claim shows both ids, one below the other
+            place = (center[0] + 0.75 * outer[2], center[1] - 0.75 * outer[2] + 32 * unit * target)
+            _text(picture, str(marker), place, unit, _CENTRE)
         rows = (poses.frame == index).nonzero()[:, 0].tolist()
         for row in rows:
             for axis, colour in zip(lines[row], _AXES, strict=True):
