@@ -74,14 +74,22 @@ class Identified:
 
     Attributes:
         ring: (N, M) int64, index into the rings, -1 where the marker was not found.
-        proposed: (N,) int64, number of different markers whose code was seen, whether or not they fit together.
+        proposal: (A, 3) int64, row, marker and ring of every ring with the code of a marker, whether or not it fits.
         R, t: (N, 3, 3), (N, 3), the rough pose that the rings were assigned under; NaN without one.
     """
 
     ring: Tensor
-    proposed: Tensor
+    proposal: Tensor
     R: Tensor
     t: Tensor
+
+    def proposed(self, unclaimed: Tensor) -> Tensor:
+        """Number (N,) of different markers whose code was read from rings that are ``unclaimed`` (K,) bool."""
+        row, marker, ring = self.proposal.unbind(-1)
+        seen = torch.zeros_like(self.ring, dtype=torch.bool)
+        free = unclaimed[ring]
+        seen[row[free], marker[free]] = True
+        return seen.sum(-1)
 
 
 def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int) -> Identified:
@@ -106,8 +114,6 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int) -> I
     order = torch.argsort(row, stable=True)
     ring, target, marker, row = ring[order], target[order], marker[order], row[order]
     mismatch = mismatch[ring, target, marker]
-    seen = torch.zeros(rows, markers, dtype=torch.bool, device=device)
-    seen[row, marker] = True
 
     # 2. every ring alone has two poses of its plane
     conic = k_matrix.T @ conics.to_matrix(conics.conic_from_ellipse(outer[ring])) @ k_matrix
@@ -154,10 +160,12 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int) -> I
     assigned = torch.full((rows, markers), -1, dtype=torch.int64, device=device)
     assigned[row[member[chosen]], marker[member[chosen]]] = ring[member[chosen]]
     has = best < count
+    alone = ~has[row]  # no pair, no pose: the code is all there is
+    assigned[row[alone], marker[alone]] = ring[alone]
     pose_r = torch.full((rows, 3, 3), torch.nan, dtype=torch.float64, device=device)
     pose_t = torch.full((rows, 3), torch.nan, dtype=torch.float64, device=device)
     pose_r[has], pose_t[has] = rotation[best[has]], translation[best[has]]
-    return Identified(assigned, seen.sum(-1), pose_r, pose_t)
+    return Identified(assigned, torch.stack([row, marker, ring], -1), pose_r, pose_t)
 
 
 def _best_in_row(value: Tensor, row: Tensor, rows: int) -> Tensor:

@@ -77,14 +77,12 @@ class PoseEstimator(nn.Module):
         target = torch.arange(batch * count, device=frames.device) % count
         evidence = self._evidence(rings, identified, table, target, camera)
 
-        markers = evidence.mask.sum(-1)
-        solvable = (markers >= MIN_MARKERS).nonzero()[:, 0]
-        some = evidence[solvable]
-        solutions = solve_poses(some, (identified.R[solvable], identified.t[solvable]))
+        solvable = (evidence.mask.sum(-1) >= MIN_MARKERS).nonzero()[:, 0]
+        solutions = solve_poses(evidence[solvable], (identified.R[solvable], identified.t[solvable]))
         if camera.covariance is not None:
-            wider = solutions.covariance + intrinsics_covariance(some, solutions, camera.covariance)
-            solutions = replace(solutions, covariance=wider)
-        return self._poses(batch, target, solvable, solutions, evidence, identified, rings, table, camera)
+            wider = intrinsics_covariance(evidence[solvable], solutions, camera.covariance)
+            solutions = replace(solutions, covariance=solutions.covariance + wider)
+        return self._poses(target, solvable, solutions, evidence, identified, rings, table, camera)
 
     def _checked(self, frames: Tensor) -> Tensor:
         if frames.ndim == 4 and frames.shape[1] == 1:
@@ -119,32 +117,41 @@ class PoseEstimator(nn.Module):
         )
 
     def _poses(
-        self, batch: int, target: Tensor, solvable: Tensor, s: Solutions, e: Evidence, identified: Identified,
+        self, target: Tensor, solvable: Tensor, s: Solutions, e: Evidence, identified: Identified,
         rings: Rings, table: MarkerTable, camera: Camera,
     ) -> Poses:
-        rows = target.numel()
-        device = target.device
+        """Rows of every frame and target from the solutions of the ``solvable`` ones."""
+        rows, device = target.numel(), target.device
         frame = torch.arange(rows, device=device) // len(self.targets)
-
-        def spread(values: Tensor, fill: float = torch.nan) -> Tensor:
-            out = torch.full((rows, *values.shape[1:]), fill, dtype=values.dtype, device=device)
-            out[solvable] = values
-            return out
-
-        proposed = identified.proposed
-        status = torch.where(proposed == 0, int(Status.NO_TARGET), int(Status.TOO_FEW_MARKERS))
-        # three codes or more were read, but they do not lie as in the target
-        mixed = proposed >= MIN_MARKERS
-        status = torch.where(mixed, int(Status.REJECTED), status)
-        reason = torch.where(mixed, int(Reason.RESIDUAL), int(Reason.NONE))
-        status[solvable], reason[solvable] = s.status, s.reason
         mask = e.mask.clone()
         mask[solvable] = s.mask
-        without = torch.isin(s.status, torch.tensor([Status.REJECTED], device=device))
-        used = torch.where(mixed | (proposed == 0) | (mask.sum(-1) > 0), mask.sum(-1), proposed)
+        status = torch.full((rows,), int(Status.REJECTED), device=device)
+        reason = torch.full((rows,), int(Reason.RESIDUAL), device=device)
+        status[solvable], reason[solvable] = s.status, s.reason
 
-        def poseless(values: Tensor) -> Tensor:
-            return torch.where(without.view(-1, *[1] * (values.ndim - 1)), torch.nan, values)
+        # a ring belongs to one target: where two claim it, to the one that explains more rings
+        support = torch.where(status == Status.REJECTED, 0, mask.sum(-1))
+        row, marker = (mask & (support > 0)[:, None]).nonzero().unbind(-1)
+        ring = identified.ring[row, marker]
+        best = torch.zeros(len(rings), dtype=support.dtype, device=device)
+        best.scatter_reduce_(0, ring, support[row], "amax")
+        outdone = torch.zeros_like(support).index_add_(0, row, (support[row] < best[ring]).to(support.dtype)) > 0
+        claimed = torch.zeros(len(rings), dtype=torch.bool, device=device)
+        claimed[ring[~outdone[row]]] = True
+        found = (support > 0) & ~outdone
+
+        # without a pose: the rings that nobody else explains tell why
+        proposed = identified.proposed(~claimed)
+        mask &= found[:, None] | ~torch.cat([claimed, claimed.new_ones(1)])[identified.ring]
+        few = ~found & (proposed < MIN_MARKERS)
+        few_status = torch.where(proposed == 0, int(Status.NO_TARGET), int(Status.TOO_FEW_MARKERS))
+        status = torch.where(few, few_status, status)
+        reason = torch.where(few, int(Reason.NONE), reason)
+
+        def spread(values: Tensor) -> Tensor:
+            out = torch.full((rows, *values.shape[1:]), torch.nan, dtype=values.dtype, device=device)
+            out[solvable] = values
+            return torch.where(found.view(-1, *[1] * (values.ndim - 1)), out, torch.nan)
 
         row, marker = mask.nonzero().unbind(-1)
         ring = identified.ring[row, marker]
@@ -153,12 +160,15 @@ class PoseEstimator(nn.Module):
             frame[row], target[row], table.ids[target[row], marker], center, center_cov,
             rings.outer_raw[ring], rings.inner_raw[ring],
         )
-        values = {
-            n: spread(poseless(getattr(s, n)))
-            for n in ("R", "t", "covariance", "rms", "chi2", "R_alt", "t_alt", "rms_alt", "chi2_alt")
-        }
+        names = ("R", "t", "covariance", "rms", "chi2", "R_alt", "t_alt", "rms_alt", "chi2_alt")
         return Poses(
-            frame=frame, target=target, status=status, reason=reason, markers=used, detections=detections, **values
+            frame=frame,
+            target=target,
+            status=status,
+            reason=reason,
+            markers=torch.where(few, proposed, mask.sum(-1)),
+            detections=detections,
+            **{n: spread(getattr(s, n)) for n in names},
         )
 
 

@@ -1,7 +1,7 @@
 """Stage: from identified markers to one pose a row, its covariance, and an honest status.
 
-Every row is solved from several starts (both planar solutions, the rough pose of the identification and its mirror
-image), each refined by batched Levenberg-Marquardt. The solution that explains all evidence best wins: the centres by
+Every row is solved from two starts (both planar solutions; with three markers the rough pose of the identification and
+its mirror image), each refined by batched Levenberg-Marquardt. The solution that explains all evidence best wins: the centres by
 their covariances, and the shapes of the rings' own ellipses, which decide alone where only three markers are seen.
 """
 
@@ -197,7 +197,7 @@ def _solve(e: Evidence, rough: tuple[Tensor, Tensor]) -> Solutions:
 
 
 def _starts(e: Evidence, rough: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """Poses (N, 4, 3, 3), (N, 4, 3) to start from: the rough one, its mirror image, both planar solutions."""
+    """Two poses (N, 2, 3, 3), (N, 2, 3) to start from: both planar solutions, or the rough pose and its mirror image."""
     r, t = rough
     # depth mirrored along the line of sight, the plane turned back on itself: the same weak-perspective image
     weight = e.mask.double() / e.mask.sum(-1, keepdim=True)
@@ -210,12 +210,11 @@ def _starts(e: Evidence, rough: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     focal, principal = e.matrix.diagonal()[:2], e.matrix[:2, 2]
     xy = torch.where(e.mask[..., None], (e.center - principal) / focal, 0.0)
     flat = pnp.planar(e.points, xy, mask=e.mask)
-    planar = (e.coplanar & (e.mask.sum(-1) >= 4))[:, None]
-    planar = planar & flat.R.isfinite().all(-1).all(-1)
-    fill_r, fill_t = torch.stack([r, mirrored], 1), torch.stack([t, mirrored_t], 1)
-    both_r = torch.where(planar[..., None, None], flat.R, fill_r)
-    both_t = torch.where(planar[..., None], flat.t, fill_t)
-    return torch.cat([fill_r, both_r], 1), torch.cat([fill_t, both_t], 1)
+    both = flat.R.isfinite().all(-1).all(-1).all(-1)  # else a marker behind the camera, or no plane
+    planar = (e.coplanar & (e.mask.sum(-1) >= 4) & both)[:, None]
+    start_r = torch.where(planar[..., None, None], flat.R, torch.stack([r, mirrored], 1))
+    start_t = torch.where(planar[..., None], flat.t, torch.stack([t, mirrored_t], 1))
+    return start_r, start_t
 
 
 def _reflection(direction: Tensor) -> Tensor:

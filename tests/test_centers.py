@@ -1,0 +1,66 @@
+"""Eq. (7) against the exact image of the common centre."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from torchpose.centers import compensate
+from torchpose.ellipse import EllipseFit
+from torchpose.geometry import conics, rotations
+
+F64 = torch.float64
+FOCAL, DISTANCE = 3333.33, 160.0
+RADII = torch.tensor([[5.0, 2.5]], dtype=F64)  # the paper's Table IV: diameters 10 and 5 mm
+
+
+def circle_fit(tilt_deg: float, radius: float) -> tuple[EllipseFit, torch.Tensor]:
+    """Exact ellipse of a tilted circle on the optical axis, and the image of its centre, px."""
+    rotation = rotations.exp(torch.tensor([[math.radians(tilt_deg), 0.0, 0.0]], dtype=F64))
+    center = torch.tensor([[0.0, 0.0, DISTANCE]], dtype=F64)
+    normal = torch.tensor([[0.0, 0.0, 1.0]], dtype=F64)
+    conic = conics.circle_image(rotation, center, normal, torch.tensor([radius], dtype=F64))
+    to_normalised = torch.diag(torch.tensor([1 / FOCAL, 1 / FOCAL, 1.0], dtype=F64))
+    params = conics.ellipse_from_conic(conics.from_matrix(to_normalised @ conic @ to_normalised))
+    one = torch.ones(1, dtype=F64)
+    return EllipseFit(params, 0.01 * torch.eye(5, dtype=F64)[None], one, one), torch.zeros(1, 2, dtype=F64)
+
+
+@pytest.mark.parametrize("tilt_deg", [5.0, 10.0])
+def test_table_four(tilt_deg: float) -> None:
+    """At the paper's Table IV the outer centre is off by tenths of a pixel, the compensated one by less than 1e-3."""
+    outer, truth = circle_fit(tilt_deg, 5.0)
+    inner, _ = circle_fit(tilt_deg, 2.5)
+    center, _ = compensate(outer, inner, RADII)
+    raw = torch.linalg.vector_norm(outer.params[:, :2] - truth)
+    tilt = math.radians(tilt_deg)
+    assert raw == pytest.approx(FOCAL * 25 * math.sin(tilt) * math.cos(tilt) / DISTANCE**2, rel=0.01)
+    assert torch.linalg.vector_norm(center - truth) < 1e-3
+
+
+def test_residual_is_of_higher_order() -> None:
+    """Eq. (7) is first order in r^2: halving both radii divides what it leaves by 16."""
+    left = []
+    for scale in (1.0, 0.5):
+        outer, truth = circle_fit(60.0, 5.0 * scale)
+        inner, _ = circle_fit(60.0, 2.5 * scale)
+        left.append(torch.linalg.vector_norm(compensate(outer, inner, RADII)[0] - truth))
+    assert left[0] / left[1] == pytest.approx(16, rel=0.05)
+
+
+def test_covariance_is_that_of_the_linear_combination() -> None:
+    outer, _ = circle_fit(10.0, 5.0)
+    inner, _ = circle_fit(10.0, 2.5)
+    _, covariance = compensate(outer, inner, RADII)
+    k1, k2 = 25 / (25 - 6.25), 6.25 / (25 - 6.25)
+    torch.testing.assert_close(covariance[0], 0.01 * (k1**2 + k2**2) * torch.eye(2, dtype=F64))
+
+
+def test_no_ring() -> None:
+    outer, _ = circle_fit(0.0, 5.0)
+    none = torch.zeros(0, dtype=torch.int64)
+    center, covariance = compensate(outer[none], outer[none], RADII[none])
+    assert center.shape == (0, 2)
+    assert covariance.shape == (0, 2, 2)
