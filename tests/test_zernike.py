@@ -61,7 +61,7 @@ def test_orthogonality():
     unit = kernels / (2 / size) / torch.tensor(norm, dtype=torch.float64).sqrt()[:, None]
     gram = unit @ unit.T
     assert ((gram.diagonal() > 0.75) & (gram.diagonal() < 1)).all()
-    assert (gram - gram.diagonal().diag()).abs().max() < 0.12
+    assert (gram - gram.diagonal().diag()).abs().max() < 0.14
 
 
 @pytest.mark.parametrize("size", [1, 2, 6, -3])
