@@ -1,0 +1,229 @@
+"""PoseEstimator on rendered frames: accuracy, honesty of the covariance, and the shape of a batched pipeline."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import cv2
+import pytest
+import torch
+from exact import F64, pinhole, random_poses
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+import torchpose as tp
+from torchpose.geometry import rotations
+from torchpose.sim import add_noise, read_truth, render
+
+SAMPLE = Path(__file__).parent.parent / "data" / "sample"
+QUAD = tp.Target.load("quad40")
+
+
+@pytest.fixture(scope="module")
+def sample() -> tuple[tp.PoseEstimator, Tensor]:
+    """Estimator and the 12 frames of the sample."""
+    camera = tp.Camera.load(SAMPLE / "camera.yaml")
+    files = sorted((SAMPLE / "frames").glob("*.png"))
+    frames = torch.stack([torch.from_numpy(cv2.imread(str(f), cv2.IMREAD_UNCHANGED)) for f in files])
+    return tp.PoseEstimator(camera, tp.Target.load(SAMPLE / "target.yaml")), frames
+
+
+@pytest.fixture(scope="module")
+def poses(sample: tuple[tp.PoseEstimator, Tensor]) -> tp.Poses:
+    estimator, frames = sample
+    return estimator(frames)
+
+
+def errors(poses: tp.Poses, r: Tensor, t: Tensor) -> Tensor:
+    return torch.cat([poses.t - t, rotations.log(poses.R @ r.mT)], -1)
+
+
+def test_sample_is_accurate(poses: tp.Poses) -> None:
+    """RMS over the frames within 2 um lateral, 6 um depth, 0.01 degrees."""
+    truth = read_truth(SAMPLE / "truth.csv")
+    assert poses.ok.all()
+    assert (poses.markers == 4).all()
+    rms = errors(poses, truth.R, truth.t).square().mean(0).sqrt()
+    assert rms[:2].max() < 2e-3
+    assert rms[2] < 6e-3
+    assert rms[3:].norm() < math.radians(0.01)
+
+
+def test_each_frame_is_the_same_alone(sample: tuple[tp.PoseEstimator, Tensor], poses: tp.Poses) -> None:
+    estimator, frames = sample
+    for i in range(len(frames)):
+        alone = estimator(frames[i : i + 1])
+        assert (alone.t[0] - poses.t[i]).abs().max() < 1e-9
+        assert (alone.R[0] - poses.R[i]).abs().max() < 1e-9
+        assert alone.status[0] == poses.status[i]
+
+
+class OpCount(TorchDispatchMode):
+    """Counts dispatched tensor operations."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):  # type: ignore[no-untyped-def]
+        self.count += 1
+        return func(*args, **(kwargs or {}))
+
+
+def test_no_loop_over_frames(sample: tuple[tp.PoseEstimator, Tensor]) -> None:
+    """Thirty-two frames cost as many tensor operations as one; only the solvers' iterations vary with the data."""
+    estimator, frames = sample
+    counts = {}
+    for batch in (1, 32):
+        some = frames[(torch.arange(batch) + 5) % len(frames)].contiguous()
+        estimator(some)
+        with OpCount() as ops:
+            estimator(some)
+        counts[batch] = ops.count
+    assert counts[32] < 1.5 * counts[1]
+
+
+@pytest.mark.parametrize("hidden", range(4))
+def test_three_markers(sample: tuple[tp.PoseEstimator, Tensor], poses: tp.Poses, hidden: int) -> None:
+    estimator, frames = sample
+    frames = frames.clone()
+    seen = poses.detections[poses.detections.marker == hidden]
+    for f, (u, v), a in zip(seen.frame, seen.center.round().int(), seen.outer[:, 2], strict=True):
+        reach = int(a) + 6
+        frames[f, v - reach : v + reach, u - reach : u + reach] = 200
+    result = estimator(frames)
+    assert result.ok.all()
+    assert (result.markers == 3).all()
+    distance = errors(result, poses.R, poses.t)
+    assert (distance.abs() < 6 * result.std).all()
+
+
+def test_frames_without_a_target(sample: tuple[tp.PoseEstimator, Tensor]) -> None:
+    estimator, frames = sample
+    g = torch.Generator().manual_seed(0)
+    blank = torch.zeros(4, *frames.shape[1:], dtype=torch.uint8)
+    blank[1] = 255
+    blank[2] = torch.randint(0, 256, frames.shape[1:], generator=g, dtype=torch.uint8)
+    blank[3] = (128 + 8 * torch.randn(frames.shape[1:], generator=g)).clamp(0, 255).byte()
+    result = estimator(blank)
+    assert (result.status == tp.Status.NO_TARGET).all()
+    assert result.R.isnan().all()
+    assert len(result.detections) == 0
+
+
+def test_same_poses_in_every_type(sample: tuple[tp.PoseEstimator, Tensor], poses: tp.Poses) -> None:
+    """uint8, 16-bit and floating-point frames, with or without the channel of Kornia's convention."""
+    estimator, frames = sample
+    few = frames[:3]
+    unit = few.float() / 255
+    scaled = tp.PoseEstimator(estimator.camera, QUAD, float_range=255.0)
+    for result in (
+        estimator((few.int() * 257).to(torch.uint16)),
+        estimator(unit),
+        estimator(unit[:, None].double()),
+        scaled(few.float()),
+    ):
+        assert result.ok.all()
+        assert ((result.t - poses.t[:3]).abs() < 0.5 * poses.std[:3, :3]).all()
+
+
+def test_wrong_frames_are_refused(sample: tuple[tp.PoseEstimator, Tensor]) -> None:
+    estimator, _ = sample
+    with pytest.raises(tp.FrameError, match="640 x 480"):
+        estimator(torch.zeros(1, 480, 640, dtype=torch.uint8))
+    with pytest.raises(tp.FrameError, match="shape"):
+        estimator(torch.zeros(1, 3, 1216, 1824, dtype=torch.uint8))
+    with pytest.raises(tp.FrameError, match="dtype"):
+        estimator(torch.zeros(1, 1216, 1824, dtype=torch.int64))
+
+
+def test_empty_batch(sample: tuple[tp.PoseEstimator, Tensor]) -> None:
+    estimator, frames = sample
+    assert len(estimator(frames[:0])) == 0
+
+
+def test_covariance_is_honest() -> None:
+    """NEES of 64 rendered frames, tilt to 50 degrees, noise 1 to 5, blur 0.6 to 1.2 px: mean 6, deviation 0.43."""
+    camera = pinhole()
+    estimator = tp.PoseEstimator(camera, QUAD)
+    r, t = random_poses(64, 50, (140, 190), seed=3)
+    g = torch.Generator().manual_seed(4)
+    blur = 0.6 + 0.6 * torch.rand(64, generator=g, dtype=F64)
+    noise = 1 + 4 * torch.rand(64, generator=g, dtype=F64)
+    nees = []
+    for i in range(0, 64, 16):
+        s = slice(i, i + 16)
+        frames = render(camera, QUAD, r[s], t[s], psf_sigma=blur[s], plate=(70.0, 70.0))
+        result = estimator(add_noise(frames, noise[s], seed=i))
+        assert result.ok.all()
+        e = errors(result, r[s], t[s])
+        nees.append((e[:, None] @ torch.linalg.inv(result.covariance) @ e[..., None]).flatten())
+    assert 4.5 < torch.cat(nees).mean() < 7.5
+
+
+def test_uncertain_intrinsics_widen_the_covariance(sample: tuple[tp.PoseEstimator, Tensor], poses: tp.Poses) -> None:
+    """A focal length known to 0.25 % leaves the depth known to 0.25 %: the paper's eq. (5)."""
+    estimator, frames = sample
+    focal = estimator.camera.matrix[0, 0]
+    spread = (0.0025 * focal) ** 2
+    covariance = torch.zeros(4, 4, dtype=F64)
+    covariance[:2, :2] = spread  # fx and fy err together
+    camera = dataclasses.replace(estimator.camera, covariance=covariance)
+    result = tp.PoseEstimator(camera, QUAD)(frames[:1])
+    assert result.std[0, 2] == pytest.approx(0.0025 * result.t[0, 2].item(), rel=0.02)
+    assert result.std[0, 0] < 3 * poses.std[0, 0]
+
+
+def test_several_targets_in_one_frame(sample: tuple[tp.PoseEstimator, Tensor], poses: tp.Poses) -> None:
+    """A target that is not there gets no pose from another one's rings, though it has some of their codes."""
+    estimator, frames = sample
+    both = tp.PoseEstimator(estimator.camera, [tp.Target.load("hexa50"), QUAD])(frames[:3])
+    assert both.target.tolist() == [0, 1] * 3
+    assert (both.status[0::2] == tp.Status.NO_TARGET).all()
+    torch.testing.assert_close(both.t[1::2], poses.t[:3], rtol=0, atol=1e-9)
+
+
+def test_two_targets_both_there() -> None:
+    """A dark and a light target side by side, joined in one frame by the darker and the lighter half."""
+    camera = pinhole()
+    dark = tp.Target.load("quad40_dark")
+    r = rotations.exp(torch.tensor([[0.1, 0.2, 0.3]], dtype=F64))
+    left, right = torch.tensor([[-45.0, 0.0, 200.0]], dtype=F64), torch.tensor([[45.0, 5.0, 200.0]], dtype=F64)
+    a = render(camera, QUAD, r, left, plate=(70.0, 70.0))
+    b = render(camera, dark, r, right, plate=(70.0, 70.0), dark=30.0, light=220.0)
+    half = camera.width // 2
+    frame = torch.cat([a[..., :half], b[..., half:]], -1)
+    result = tp.PoseEstimator(camera, [QUAD, dark])(add_noise(frame, 1.0))
+    assert result.ok.all()
+    assert (result.t - torch.cat([left, right])).abs().max() < 0.02
+
+
+def test_names_must_differ(sample: tuple[tp.PoseEstimator, Tensor]) -> None:
+    with pytest.raises(tp.ConfigError, match="twice"):
+        tp.PoseEstimator(sample[0].camera, [QUAD, QUAD])
+
+
+def test_wrong_target_is_rejected(sample: tuple[tp.PoseEstimator, Tensor]) -> None:
+    estimator, frames = sample
+    swapped = dataclasses.replace(QUAD, centers=QUAD.centers[[1, 0, 2, 3]])
+    stretched = dataclasses.replace(QUAD, centers=QUAD.centers * torch.tensor([1.0, 1.05, 1.0], dtype=F64))
+    for target in (swapped, stretched):
+        result = tp.PoseEstimator(estimator.camera, target)(frames[:4])
+        assert (result.status == tp.Status.REJECTED).all()
+        assert (result.reason == tp.Reason.RESIDUAL).all()
+        assert result.t.isnan().all()
+
+
+def test_detections_in_raw_pixels(sample: tuple[tp.PoseEstimator, Tensor], poses: tp.Poses) -> None:
+    """The compensated centres are where the distorted camera sees the marker's centre."""
+    estimator, _ = sample
+    d = poses.detections
+    truth = read_truth(SAMPLE / "truth.csv")
+    position = QUAD.centers[d.marker]
+    uv = estimator.camera.project((truth.R[d.frame] @ position[..., None]).squeeze(-1) + truth.t[d.frame])
+    e = d.center - uv
+    assert e.square().mean().sqrt() < 0.02
+    nees = (e[:, None] @ torch.linalg.inv(d.center_cov) @ e[..., None]).mean()
+    assert 1.0 < nees < 3.5
