@@ -1,0 +1,135 @@
+"""Gradient, noise threshold and region growing against SciPy and single frames."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components as scipy_components
+
+from torchpose.detect.regions import connected_components, gradient, level_line_regions, region_polarity
+
+
+def discs(count=3, size=64, noise=2.0):
+    """Blurred dark discs of random place and radius on light ground, one a frame."""
+    generator = torch.Generator().manual_seed(1)
+    center = 24 + 16 * torch.rand(count, 2, generator=generator)
+    radius = 6 + 12 * torch.rand(count, generator=generator)
+    y, x = torch.meshgrid(torch.arange(size), torch.arange(size), indexing="ij")
+    distance = torch.hypot(x - center[:, 0, None, None], y - center[:, 1, None, None]) - radius[:, None, None]
+    frames = 40 + 160 * torch.sigmoid(2 * distance) + noise * torch.randn(count, size, size, generator=generator)
+    return frames, center, radius
+
+
+@settings(deadline=None)
+@given(st.integers(0, 60), st.integers(0, 120), st.integers(0, 2**31))
+def test_components_equal_scipy(nodes, edges, seed):
+    edges = edges if nodes else 0
+    generator = torch.Generator().manual_seed(seed)
+    a, b = torch.randint(0, max(nodes, 1), (2, edges), generator=generator)
+    label = connected_components(a, b, nodes)
+    expected = torch.zeros(0, dtype=torch.int64)
+    if nodes:
+        graph = coo_matrix((np.ones(edges), (a.numpy(), b.numpy())), (nodes, nodes))
+        number, member = scipy_components(graph, directed=False)
+        smallest = torch.tensor([np.flatnonzero(member == k)[0] for k in range(number)])
+        expected = smallest[torch.from_numpy(member).long()]
+    assert torch.equal(label, expected)
+
+
+@pytest.mark.parametrize("shuffled", [False, True])
+def test_long_chain(shuffled):
+    n = 5000
+    order = torch.randperm(n, generator=torch.Generator().manual_seed(2)) if shuffled else torch.arange(n)
+    assert not connected_components(order[:-1], order[1:], n).any()
+
+
+def test_gradient_of_a_ramp():
+    y, x = torch.meshgrid(torch.arange(9.0), torch.arange(11.0), indexing="ij")
+    grad = gradient((3 * x - 2 * y)[None])
+    cells = (torch.arange(8)[:, None] * 11 + torch.arange(10)).flatten()
+    torch.testing.assert_close(grad.at(cells), torch.tensor([3.0, -2.0]).expand(80, 2))
+    assert not grad.diag[:, -1].any()
+    assert not grad.anti[:, :, -1].any()
+
+
+def test_threshold_follows_the_noise():
+    generator = torch.Generator().manual_seed(4)
+    sigma = torch.tensor([1.0, 4.0, 16.0])
+    noise = sigma[:, None, None] * torch.randn(3, 300, 300, generator=generator)
+    grad = gradient(noise)
+    torch.testing.assert_close(grad.threshold, 3.7 * sigma, rtol=0.03, atol=0)
+    strong = ((grad.diag.square() + grad.anti.square()) / 2).sqrt() > grad.threshold[:, None, None]
+    # exp(-3.7^2 / 2) = 1.06e-3 of a Rayleigh distribution
+    assert strong.double().mean() == pytest.approx(1.06e-3, rel=0.2)
+
+
+@pytest.mark.parametrize(("gain", "offset"), [(1.0, 500.0), (4.0, 0.0), (257.0, -30.0)])
+def test_gain_and_offset_change_nothing(gain, offset):
+    frames, _, _ = discs(noise=3.0)
+    one, other = gradient(frames), gradient(gain * frames + offset)
+    torch.testing.assert_close(other.threshold, gain * one.threshold, rtol=1e-3, atol=0)
+    a, b = level_line_regions(one, 10), level_line_regions(other, 10)
+    assert torch.equal(a.cell, b.cell)
+    assert torch.equal(a.region, b.region)
+
+
+def test_quantisation_is_no_region():
+    y, x = torch.meshgrid(torch.arange(100.0), torch.arange(100.0), indexing="ij")
+    frames = (100 + 0.05 * x + 0.02 * y).round()[None]
+    assert level_line_regions(gradient(frames), 10).cell.numel() == 0
+
+
+def test_discs_are_one_region_each():
+    frames, center, radius = discs()
+    regions = level_line_regions(gradient(frames), 10)
+    assert regions.frame.tolist() == [0, 1, 2]
+    assert torch.equal(torch.bincount(regions.region), torch.bincount(regions.frame[regions.region]))
+    inside = regions.cell % (64 * 64)
+    xy = torch.stack([inside % 64, inside // 64], -1) + 0.5
+    distance = (xy - center[regions.region]).norm(dim=-1) - radius[regions.region]
+    assert distance.abs().max() < 3
+    assert (region_polarity(regions, center, xy) > 0.9).all()
+    inverse = level_line_regions(gradient(255 - frames), 10)
+    assert (region_polarity(inverse, center, xy) < -0.9).all()
+
+
+def test_batch_equals_single_frames():
+    frames, _, _ = discs()
+    together = level_line_regions(gradient(frames), 5)
+    for k in range(3):
+        alone = level_line_regions(gradient(frames[k : k + 1]), 5)
+        mine = together.frame[together.region] == k
+        assert torch.equal(together.cell[mine] - k * 64 * 64, alone.cell)
+        assert torch.equal(together.region[mine] - together.region[mine].min(), alone.region)
+        assert torch.equal(together.gradient[mine], alone.gradient)
+
+
+def test_edges_at_the_border_do_not_wrap_around():
+    """A step in the last column and one in the first of the next row are neighbours in memory only."""
+    frames = torch.full((2, 40, 40), 50.0)
+    frames[:, :, -1] = 200
+    frames[:, :, 0] = 200
+    regions = level_line_regions(gradient(frames), 5)
+    assert regions.frame.tolist() == [0, 0, 1, 1]
+    for k in range(4):
+        assert torch.unique(regions.cell[regions.region == k] % 40).numel() == 1
+
+
+@pytest.mark.parametrize("shape", [(0, 8, 8), (2, 0, 8), (2, 1, 8), (2, 8, 1), (1, 1, 1), (2, 2, 2)])
+def test_tiny_frames(shape):
+    regions = level_line_regions(gradient(torch.rand(shape) * 255), 3)
+    assert regions.cell.numel() == regions.frame.numel() == 0
+
+
+def test_broken_pixels_only_lose_their_own_cells():
+    frames, _, _ = discs()
+    whole = level_line_regions(gradient(frames), 10)
+    frames[0, 2, 3], frames[1, 4, 4], frames[2, 60, 60] = torch.nan, torch.inf, -torch.inf
+    broken = gradient(frames)
+    assert broken.threshold.isfinite().all()
+    assert torch.equal(level_line_regions(broken, 10).cell, whole.cell)
+    assert gradient(torch.full((1, 5, 5), torch.nan)).threshold.isfinite().all()

@@ -1,0 +1,139 @@
+"""Poses moved to other frames, against composed transforms and propagated covariance."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import pytest
+import torch
+
+from torchpose.geometry import rotations
+from torchpose.results import Detections, Poses, Status
+
+
+def detections(count=3):
+    generator = torch.Generator().manual_seed(3)
+
+    def floats(*shape):
+        return torch.randn(count, *shape, generator=generator, dtype=torch.float64)
+
+    index = torch.arange(count)
+    return Detections(index % 2, 0 * index, index + 2**40, floats(2), floats(2, 2), floats(5), floats(5))
+
+
+@pytest.fixture
+def poses():
+    generator = torch.Generator().manual_seed(8)
+
+    def floats(*shape):
+        return torch.randn(4, *shape, generator=generator, dtype=torch.float64)
+
+    root = floats(6, 6)
+    status = torch.tensor([Status.OK, Status.AMBIGUOUS, Status.OK, Status.NO_TARGET])
+    result = Poses(
+        frame=torch.arange(4),
+        target=torch.zeros(4, dtype=torch.int64),
+        R=rotations.exp(floats(3)),
+        t=100 * floats(3),
+        covariance=root @ root.mT,
+        rms=floats().abs(),
+        status=status,
+        reason=torch.zeros(4, dtype=torch.int64),
+        markers=torch.full((4,), 4),
+        chi2=floats().abs(),
+        R_alt=rotations.exp(floats(3)),
+        t_alt=floats(3),
+        rms_alt=floats().abs(),
+        chi2_alt=floats().abs(),
+        detections=detections(),
+    )
+    for name in ("R", "t", "covariance"):
+        getattr(result, name)[3] = torch.nan
+    return result
+
+
+TRANSFORM = rotations.exp(torch.tensor([0.3, -1.1, 0.4]).double()), torch.tensor([5.0, -20, 70]).double()
+
+
+def numeric_covariance(poses, change):
+    """Covariance of the changed pose from central differences of the left-multiplied state (t, w)."""
+    step, columns = 1e-6, []
+    base = change(poses)
+    for k in range(6):
+        ends = []
+        for sign in (1, -1):
+            d = torch.zeros(6, dtype=torch.float64)
+            d[k] = sign * step
+            R, t = rotations.exp(d[3:]) @ poses.R, poses.t + d[:3]
+            moved = change(Poses(**{**{f.name: getattr(poses, f.name) for f in fields(poses)}, "R": R, "t": t}))
+            ends.append(torch.cat([moved.t, rotations.log(moved.R @ base.R.mT)], -1))
+        columns.append((ends[0] - ends[1]) / (2 * step))
+    jacobian = torch.stack(columns, -1)
+    return jacobian @ poses.covariance @ jacobian.mT
+
+
+def test_moved(poses):
+    r, t = TRANSFORM
+    x_target = torch.randn(3, dtype=torch.float64)
+    x_part = r @ x_target + t
+    moved = poses.moved(r, t)
+    torch.testing.assert_close((moved.R @ x_part + moved.t)[:3], (poses.R @ x_target + poses.t)[:3])
+    torch.testing.assert_close(moved.R_alt @ x_part + moved.t_alt, poses.R_alt @ x_target + poses.t_alt)
+    expected = numeric_covariance(poses[:3], lambda p: p.moved(r, t))
+    torch.testing.assert_close(moved.covariance[:3], expected, rtol=1e-6, atol=1e-5)
+    assert moved.t[3].isnan().all()
+
+
+@pytest.mark.parametrize("batched", [False, True])
+def test_seen_from(poses, batched):
+    r, t = TRANSFORM
+    if batched:
+        r, t = r.expand(4, 3, 3), t.expand(4, 3)
+    x = torch.randn(3, dtype=torch.float64)
+    seen = poses.seen_from(r, t)
+    x_camera = poses.R @ x + poses.t
+    torch.testing.assert_close((seen.R @ x + seen.t)[:3], (x_camera @ TRANSFORM[0].mT + TRANSFORM[1])[:3])
+    expected = numeric_covariance(poses[:3], lambda p: p.seen_from(TRANSFORM[0], TRANSFORM[1]))
+    torch.testing.assert_close(seen.covariance[:3], expected, rtol=1e-6, atol=1e-6)
+
+
+def test_moving_back(poses):
+    r, t = TRANSFORM
+    back = poses.moved(r, t).moved(*rotations.inverse(r, t))
+    for name in ("R", "t", "covariance", "R_alt", "t_alt"):
+        torch.testing.assert_close(getattr(back, name), getattr(poses, name), equal_nan=True, rtol=1e-9, atol=1e-9)
+
+
+def test_columns(poses):
+    assert len(poses) == 4
+    assert poses.ok.tolist() == [True, False, True, False]
+    torch.testing.assert_close(rotations.exp(poses.rotation_vector[:3]), poses.R[:3])
+    torch.testing.assert_close(poses.std[:3].square(), poses.covariance[:3].diagonal(dim1=1, dim2=2))
+    assert poses.rotation_vector[3].isnan().all()
+    assert poses.std[3].isnan().all()
+
+
+def test_selection_keeps_the_detections(poses):
+    picked = poses[poses.ok]
+    assert picked.frame.tolist() == [0, 2]
+    assert torch.equal(picked.t, poses.t[[0, 2]])
+    assert picked.detections is poses.detections
+    assert len(poses[:0]) == 0
+    assert poses.detections[torch.tensor([2, 0])].frame.tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("target", [torch.float32, "meta"])
+def test_to_reaches_everything(poses, target):
+    moved = poses.to(target)
+    for bundle, original in ((moved, poses), (moved.detections, poses.detections)):
+        for f in fields(bundle):
+            value, before = getattr(bundle, f.name), getattr(original, f.name)
+            if not isinstance(value, torch.Tensor):
+                continue
+            if target == "meta":
+                assert (value.device.type, value.dtype) == ("meta", before.dtype)
+            else:
+                assert value.dtype == (torch.float32 if before.is_floating_point() else before.dtype)
+    if target == torch.float32:
+        # ids beyond the 24 bits of a float32 survive
+        assert torch.equal(moved.detections.marker, poses.detections.marker)
