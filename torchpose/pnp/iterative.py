@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.geometry.small_linalg import cayley, matmul3, solve_rows
+from torchpose.pnp._compile import compiled
 
 # upper triangle of the 6 x 7 matrix [J^T J | J^T r] row by row, and the squared length of r, packed in 28 numbers
 _STARTS = (0, 7, 13, 18, 22, 25, 27)
@@ -190,13 +191,22 @@ def _advance(obs: Observations, state: _State, rtol: float, floor: Tensor) -> _S
 
 
 def minimise(
-    obs: Observations, r: Tensor, t: Tensor, *, max_iterations: int, rtol: float, damping: float = 1e-3
+    obs: Observations,
+    r: Tensor,
+    t: Tensor,
+    *,
+    max_iterations: int,
+    rtol: float,
+    damping: float = 1e-3,
+    compile: bool = False,
 ) -> Estimate:
     """Levenberg-Marquardt from R (3, 3, B), t (3, B) in the dtype of ``obs``.
 
     A pose has converged when the step promises to lower its cost by no more than ``rtol`` of it, or than rounding
     could; that step is still taken, but not evaluated. Converged poses leave the batch.
     """
+    # the distortion model is left to eager mode: its Python would be traced anew for every camera
+    advance = compiled(_advance) if compile and obs.camera is None else _advance
     eps = torch.finfo(r.dtype).eps
     scale = obs.whitening.square().amax(0) if obs.whitening.ndim == 3 else obs.whitening.square().amax((0, 1))
     magnitude = obs.xy.square().sum(0)
@@ -208,7 +218,7 @@ def minimise(
     index: Tensor | None = None  # of the poses still under way; None: all
 
     for iteration in range(1, max_iterations + 1):
-        state = _advance(obs, state, rtol, floor)
+        state = _State(*advance(obs, state, rtol, floor))
         # neither a pose without numbers nor one whose steps have shrunk to nothing will come to an end
         over = state.done | ~((state.damping < 1e8) & state.normal[27].isfinite())
         remaining = (~over).nonzero().squeeze(1)

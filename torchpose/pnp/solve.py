@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
-from functools import partial
-from typing import Literal
+from typing import Literal, TypeVar
 
 import torch
 from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.geometry.small_linalg import cross, matmul3, orthonormalise
+from torchpose.pnp._compile import compiled
 from torchpose.pnp.iterative import (
     Estimate,
     Observations,
@@ -25,6 +27,10 @@ from torchpose.pnp.planar import COLLINEARITY, FLATNESS, ippe, plane_frame
 from torchpose.pnp.result import PnPCode, PnPError, PnPResult
 
 Method = Literal["iterative", "planar"]
+_T = TypeVar("_T")
+# bytes; the most that glibc lets the threshold grow to is 32 MiB
+_KEPT = 30 << 20
+_Rows = TypeVar("_Rows", slice, Tensor)
 # chi-squared difference below which two minima are called ambiguous
 DECISION = 20.0
 # squared Mahalanobis distance below which two minima are one
@@ -50,6 +56,7 @@ def solve(
     initial: tuple[Tensor, Tensor] | None = None,
     huber: float = float("inf"),
     max_iterations: int = 30,
+    compile: bool = False,
     raise_on_failure: bool = False,
 ) -> PnPResult:
     """Poses of B sets of N points.
@@ -65,9 +72,11 @@ def solve(
         covariances: (N, 2, 2) or (B, N, 2, 2) px^2, of the image points; replace ``sigma_px``.
         weights: (N,) or (B, N), factors on the information of the points.
         mask: (B, N) bool, True where the point was seen; what a missing point holds is ignored.
-        initial: R (B, 3, 3), t (B, 3) to start from, with method "iterative"; only its own minimum is then found.
+        initial: R (B, 3, 3), t (B, 3) to start from, with method "iterative", or S starts (B, S, 3, 3), (B, S, 3) each;
+            only their own minima are then found.
         huber: residual, in standard deviations, above which the cost of a point grows linearly.
         max_iterations: of Levenberg-Marquardt, float32 and float64 together about.
+        compile: run the inner functions through torch.compile (first call with a new number of points: many seconds).
         raise_on_failure: raise instead of returning codes other than CONVERGED and AMBIGUOUS.
 
     Returns:
@@ -76,6 +85,7 @@ def solve(
     Raises:
         ValueError: shapes do not fit, or an unknown method.
         PnPError: with ``raise_on_failure``.
+        ConfigError: ``compile`` without a C++ compiler.
     """
     if image_points.ndim != 3 or image_points.shape[-1] != 2:
         raise ValueError(f"image_points has shape {tuple(image_points.shape)}; expected (B, N, 2)")
@@ -89,8 +99,13 @@ def solve(
             _expect(name, value, shape, batch)
     if method not in ("iterative", "planar"):
         raise ValueError(f"method is {method!r}; choose one of iterative, planar")
-    if initial is not None and (initial[0].shape != (batch, 3, 3) or initial[1].shape != (batch, 3)):
-        raise ValueError(f"initial has shapes {[tuple(v.shape) for v in initial]}; expected (B, 3, 3) and (B, 3)")
+    if initial is not None:
+        rotation, translation = initial
+        if rotation.shape[0] != batch or rotation.shape[-2:] != (3, 3) or translation.shape != rotation.shape[:-1]:
+            shapes = [tuple(v.shape) for v in initial]
+            raise ValueError(
+                f"initial has shapes {shapes}; expected (B, 3, 3) and (B, 3), or (B, S, 3, 3) and (B, S, 3)"
+            )
     if isinstance(camera, Tensor):
         camera = camera.to(pixels)
         _expect("camera", camera, (3, 3), batch)
@@ -111,18 +126,21 @@ def solve(
             None if initial is None else (initial[0][rows].to(pixels), initial[1][rows].to(pixels)),
             huber,
             limit,
+            compile,
         )
 
     if batch <= _CHUNK:
         result, _ = run(slice(None), max_iterations)
     else:
         # the few poses that need many iterations are put off and solved together
-        chunks = [slice(start, start + _CHUNK) for start in range(0, batch, _CHUNK)]
-        parts = [run(rows, min(_FIRST_PASS, max_iterations)) for rows in chunks]
-        result = _join([p for p, _ in parts])
+        first = min(_FIRST_PASS, max_iterations)
+        parts = _map(lambda rows: run(rows, first), [slice(k, k + _CHUNK) for k in range(0, batch, _CHUNK)], pixels)
+        result = _join([part for part, _ in parts])
         late = torch.cat([unfinished for _, unfinished in parts]).nonzero().squeeze(1)
-        if max_iterations > _FIRST_PASS and len(late) > 0:
-            again = _join([run(rows, max_iterations)[0] for rows in late.split(_CHUNK)])
+        if max_iterations > first and len(late) > 0:
+            again = _join(
+                [part for part, _ in _map(lambda rows: run(rows, max_iterations), late.split(_CHUNK), pixels)]
+            )
             result = PnPResult(
                 **{f.name: getattr(result, f.name).index_copy(0, late, getattr(again, f.name)) for f in fields(again)}
             )
@@ -133,6 +151,27 @@ def solve(
             code = PnPCode(int(result.code[first])).name
             raise PnPError(f"pose {first}: {code}; {int(failed.sum())} of {batch} poses failed")
     return result
+
+
+def _map(function: Callable[[_Rows], _T], chunks: Sequence[_Rows], like: Tensor) -> list[_T]:
+    """The function of every chunk, in parallel on the CPU; the first one alone, as it may compile."""
+    threads = min(torch.get_num_threads(), len(chunks) - 1)
+    if like.device.type != "cpu" or threads < 2:
+        return [function(rows) for rows in chunks]
+    # glibc gives freed memory above a threshold back to the system, and every chunk would fault it in again; freeing one
+    # large block raises that threshold to its size. Not touched, it costs nothing.
+    torch.empty(_KEPT, dtype=torch.uint8)
+    grad = torch.is_grad_enabled()
+
+    def work(rows: _Rows) -> _T:
+        # threads are of no use inside: a chunk is made to fit the cache of one core
+        with torch.set_grad_enabled(grad):
+            return function(rows)
+
+    results = [function(chunks[0])]
+    with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        results.extend(pool.map(work, chunks[1:]))
+    return results
 
 
 def _join(parts: list[PnPResult]) -> PnPResult:
@@ -181,6 +220,7 @@ def _solve_chunk(
     initial: tuple[Tensor, Tensor] | None,
     huber: float,
     max_iterations: int,
+    compile: bool,
 ) -> tuple[PnPResult, Tensor]:
     """The poses of one chunk, and (B,) bool where more iterations are needed."""
     batch, count = pixels.shape[:2]
@@ -216,14 +256,17 @@ def _solve_chunk(
 
     observed = Observations(local, xy, linear, None, huber)
     if initial is not None:
-        minimum, options = 3, 1
-        r0 = initial[0].permute(1, 2, 0)
-        t0 = (initial[1].T + (r0 * center).sum(1)) / unit
+        starts, shifts = (v if v.ndim == n else v[:, None] for v, n in zip(initial, (4, 3), strict=True))
+        starts = starts.permute(2, 3, 1, 0)
+        minimum, options = 3, starts.shape[2]
+        t0 = (shifts.permute(2, 1, 0) + (starts * center[:, None]).sum(1)) / unit
+        r0, t0 = starts.flatten(2), t0.flatten(1)
     else:
         minimum, options = 4, 2
         low = observed.to(torch.float32) if method == "iterative" else observed
         weight_low = None if weight is None else weight.to(low.xy)
-        r0, t0 = ippe(low.points, low.xy, weight_low, frame.to(low.xy), torch.zeros_like(center).to(low.xy))
+        start = compiled(ippe) if compile else ippe
+        r0, t0 = start(low.points, low.xy, weight_low, frame.to(low.xy), torch.zeros_like(center).to(low.xy))
         r0 = torch.where(flat & ~line, r0, torch.nan).flatten(2)
         t0 = t0.flatten(1)
     started = (r0.isfinite().all(0).all(0) & t0.isfinite().all(0)).unflatten(0, (options, batch)).any(0)
@@ -231,7 +274,7 @@ def _solve_chunk(
     final = observed
     if isinstance(camera, Camera) and bool(camera.distortion.any()):
         final = Observations(local, image, whitening, camera, huber)
-    state = _refine(observed, final, r0, t0, options, max_iterations if method == "iterative" else 0)
+    state = _refine(observed, final, r0, t0, options, max_iterations if method == "iterative" else 0, compile)
     pixel = final._replace(whitening=torch.ones_like(whitening) if final is not observed else slope)
     bad = (
         (~started, PnPCode.DEGENERATE),
@@ -241,7 +284,7 @@ def _solve_chunk(
     )
     cost = state.normal[27].unflatten(0, (options, batch))
     late = ~state.converged.unflatten(0, (options, batch)) & (cost <= _relevant(cost))
-    return _report(state, options, center, unit, pixel, weight, bad), late.any(0)
+    return _report(state, options, center, unit, pixel, weight, bad, compile), late.any(0)
 
 
 def _relevant(chi2: Tensor) -> Tensor:
@@ -273,7 +316,13 @@ def _all_finite(value: Tensor, keep: Tensor | None) -> Tensor:
 
 
 def _refine(
-    observed: Observations, final: Observations, r: Tensor, t: Tensor, options: int, max_iterations: int
+    observed: Observations,
+    final: Observations,
+    r: Tensor,
+    t: Tensor,
+    options: int,
+    max_iterations: int,
+    compile: bool,
 ) -> Estimate:
     """Minima reached from R (3, 3, S B), t (3, S B): float32 first, then float64 where it can matter."""
     final = final.repeat(options)
@@ -282,16 +331,15 @@ def _refine(
         normal = normal_equations(final, r, t)
         return Estimate(r, t, normal, torch.zeros_like(normal[0], dtype=torch.int64), normal[27].isfinite())
     single = observed.to(torch.float32).repeat(options)
-    first = minimise(single, r.float(), t.float(), max_iterations=max_iterations, rtol=1e-4)
+    first = minimise(single, r.float(), t.float(), max_iterations=max_iterations, rtol=1e-4, compile=compile)
     r, t = orthonormalise(first.r.double()), first.t.double()
     chi2 = first.normal[27].unflatten(0, (options, -1))
     index = (chi2 <= _relevant(chi2)).flatten().nonzero().squeeze(1)
-    if len(index) == r.shape[-1]:
-        last = minimise(final, r, t, max_iterations=max_iterations, rtol=1e-10, damping=1e-6)
+    every = len(index) == r.shape[-1]
+    part = (final, r, t) if every else (final.select(index), r[..., index], t[:, index])
+    last = minimise(*part, max_iterations=max_iterations, rtol=1e-10, damping=1e-6, compile=compile)
+    if every:
         return last._replace(iterations=first.iterations + last.iterations)
-    last = minimise(
-        final.select(index), r[..., index], t[:, index], max_iterations=max_iterations, rtol=1e-10, damping=1e-6
-    )
     return Estimate(
         r.index_copy(2, index, last.r),
         t.index_copy(1, index, last.t),
@@ -327,6 +375,7 @@ def _report(
     pixel: Observations,
     weight: Tensor | None,
     bad: tuple[tuple[Tensor, PnPCode], ...],
+    compile: bool,
 ) -> PnPResult:
     batch = state.t.shape[-1] // options
     split = Estimate(*(v.unflatten(-1, (options, batch)) for v in state))
@@ -341,12 +390,16 @@ def _report(
         return Estimate(*(v.gather(-2, order[k].expand(*v.shape[:-2], 1, batch)).squeeze(-2) for v in split))
 
     best = pick(0)
-    cov, independence = covariance(best.normal)
+    cov, independence = (compiled(covariance) if compile else covariance)(best.normal)
     other, other_chi2, different = best, torch.full_like(chi2[0], torch.nan), torch.zeros_like(best.converged)
     for k in range(1, options):
         candidate = pick(k)
         new = chi2[k].isfinite() & ~_coincide(best, candidate) & ~different
-        other = candidate if options == 2 else Estimate(*map(partial(torch.where, new), candidate, other))
+        other = (
+            candidate
+            if options == 2
+            else Estimate(*(torch.where(new, a, b) for a, b in zip(candidate, other, strict=True)))
+        )
         other_chi2 = torch.where(new, chi2[k], other_chi2)
         different = different | new
 
