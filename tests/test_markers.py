@@ -56,8 +56,12 @@ def test_order_of_the_rings_does_not_matter() -> None:
     rings, _, _ = scene(QUAD, 20)
     shuffle = torch.randperm(80, generator=torch.Generator().manual_seed(1))
     shuffled = Rings(
-        rings.frame[shuffle], rings.polarity[shuffle], rings.outer_raw[shuffle], rings.inner_raw[shuffle],
-        rings.outer[shuffle], rings.inner[shuffle],
+        rings.frame[shuffle],
+        rings.polarity[shuffle],
+        rings.outer_raw[shuffle],
+        rings.inner_raw[shuffle],
+        rings.outer[shuffle],
+        rings.inner[shuffle],
     )
     result = found(shuffled, [QUAD], 20)
     assert torch.equal(shuffle[result.ring], torch.arange(80).view(20, 4))
@@ -66,7 +70,9 @@ def test_order_of_the_rings_does_not_matter() -> None:
 def test_strays_with_a_marker_s_code_are_left_out() -> None:
     """One stray a frame copies the code of a marker, elsewhere in the frame and of another size."""
     rings, _, _ = scene(QUAD, 100)
-    stray = torch.stack([rings.outer.params, rings.inner.params], 1).view(100, 4, 2, 5)[torch.arange(100), torch.arange(100) % 4]
+    stray = torch.stack([rings.outer.params, rings.inner.params], 1).view(100, 4, 2, 5)[
+        torch.arange(100), torch.arange(100) % 4
+    ]
     stray = stray.clone()
     stray[..., 0] = stray[..., 0].mean(-1, keepdim=True) + 150.0
     stray[..., 2:4] *= 0.7
@@ -89,7 +95,11 @@ def test_hidden_markers() -> None:
     keep[torch.arange(40), torch.arange(40) % 4] = False
     index = keep.flatten().nonzero()[:, 0]
     some = Rings(
-        rings.frame[index], rings.polarity[index], rings.outer_raw[index], rings.inner_raw[index], rings.outer[index],
+        rings.frame[index],
+        rings.polarity[index],
+        rings.outer_raw[index],
+        rings.inner_raw[index],
+        rings.outer[index],
         rings.inner[index],
     )
     result = found(some, [QUAD], 40)
@@ -107,14 +117,25 @@ def test_polarity_separates_targets_of_one_code() -> None:
 def test_one_ring_alone_and_none() -> None:
     rings, _, _ = scene(QUAD, 2)
     one = torch.tensor([2])
-    single = Rings(rings.frame[one], rings.polarity[one], rings.outer_raw[one], rings.inner_raw[one], rings.outer[one], rings.inner[one])
+    single = Rings(
+        rings.frame[one],
+        rings.polarity[one],
+        rings.outer_raw[one],
+        rings.inner_raw[one],
+        rings.outer[one],
+        rings.inner[one],
+    )
     result = found(single, [QUAD], 2)
     assert result.ring.tolist() == [[-1, -1, 0, -1], [-1, -1, -1, -1]]
     assert result.R.isnan().all()
     nothing = torch.zeros(0, dtype=torch.int64)
     none = Rings(
-        rings.frame[nothing], rings.polarity[nothing], rings.outer_raw[nothing], rings.inner_raw[nothing],
-        rings.outer[nothing], rings.inner[nothing],
+        rings.frame[nothing],
+        rings.polarity[nothing],
+        rings.outer_raw[nothing],
+        rings.inner_raw[nothing],
+        rings.outer[nothing],
+        rings.inner[nothing],
     )
     assert (found(none, [QUAD], 2).ring == -1).all()
 

@@ -23,7 +23,13 @@ HEXA = Target.load("hexa50")
 
 
 def evidence(
-    target: Target, r: Tensor, t: Tensor, camera: Camera = CAMERA, sigma: float = 0.005, seed: int = 0, shift: Tensor | None = None
+    target: Target,
+    r: Tensor,
+    t: Tensor,
+    camera: Camera = CAMERA,
+    sigma: float = 0.005,
+    seed: int = 0,
+    shift: Tensor | None = None,
 ) -> Evidence:
     """Noisy measurements of all markers; ``shift`` (B, M, 2) px moves rings away."""
     count, markers = len(r), len(target)
@@ -38,9 +44,15 @@ def evidence(
         return x.expand(count, *x.shape)
 
     return gather_evidence(
-        rings, torch.arange(count * markers).view(count, markers), center.view(count, markers, 2),
-        covariance.view(count, markers, 2, 2), rows(target.centers), rows(target.normals), rows(target.radii),
-        torch.full((count,), target.coplanar), camera.matrix,
+        rings,
+        torch.arange(count * markers).view(count, markers),
+        center.view(count, markers, 2),
+        covariance.view(count, markers, 2, 2),
+        rows(target.centers),
+        rows(target.normals),
+        rows(target.radii),
+        torch.full((count,), target.coplanar),
+        camera.matrix,
     )
 
 

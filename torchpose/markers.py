@@ -1,9 +1,9 @@
 """Stage: which ring is which marker. The ring-area code proposes, the geometry of the target decides.
 
 Noise, a neighbour's reflection or a stray washer can give a ring the code of another marker. So the code only narrows
-the choice: every pair of rings gives full poses of the target (each ring's ellipse tilts the plane, the other ring turns
-it), and the pose under which most markers have a ring of the right place, size and code wins. All pairs of all frames
-are tried in one flat batch.
+the choice: every pair of rings gives full poses of the target (each ring's ellipse tilts the plane, the other ring
+turns it), and the pose under which most markers have a ring of the right place, size and code wins. All pairs of all
+frames are tried in one flat batch.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from torchpose.target import Target
 
 _RATIO_TOLERANCE = 0.02  # of the ratio of radii, for a large ring
 _RATIO_TOLERANCE_PX = 0.6  # over the semi-minor axis of the outer ellipse: what edge offsets do to a small ring
-_PLACE_TOLERANCE = (2.0, 0.3, 0.05)  # px, of the ring's semi-major axis, of the distance to the ring the pose comes from
+# px, of the ring's semi-major axis, of the distance to the ring the pose comes from
+_PLACE_TOLERANCE = (2.0, 0.3, 0.05)
 _SIZE_TOLERANCE = 1.25
 _SEEDS = 24  # assignments of one target in one frame whose pairs are tried
 
@@ -142,7 +143,9 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int) -> I
     a = a.repeat_interleave(4)
 
     # 4. each pose gathers the rings that lie where it puts their markers
-    cost, hypothesis, member = _support(rotation, translation, a, ring, row, marker, position, outer, table, target, k_matrix)
+    cost, hypothesis, member = _support(
+        rotation, translation, a, ring, row, marker, position, outer, table, target, k_matrix
+    )
     count = rotation.shape[0]
     per_marker = torch.full((count * markers,), torch.inf, dtype=torch.float64, device=device)
     per_marker.scatter_reduce_(0, hypothesis * markers + marker[member], cost, "amin")

@@ -112,13 +112,27 @@ class PoseEstimator(nn.Module):
         covariances = torch.full((*ring.shape, 2, 2), torch.nan, dtype=torch.float64, device=ring.device)
         centers[row, marker], covariances[row, marker] = center, covariance
         return gather_evidence(
-            rings, ring, centers, covariances, table.centers[target], table.normals[target], radii,
-            table.coplanar[target], camera.matrix,
+            rings,
+            ring,
+            centers,
+            covariances,
+            table.centers[target],
+            table.normals[target],
+            radii,
+            table.coplanar[target],
+            camera.matrix,
         )
 
     def _poses(
-        self, target: Tensor, solvable: Tensor, s: Solutions, e: Evidence, identified: Identified,
-        rings: Rings, table: MarkerTable, camera: Camera,
+        self,
+        target: Tensor,
+        solvable: Tensor,
+        s: Solutions,
+        e: Evidence,
+        identified: Identified,
+        rings: Rings,
+        table: MarkerTable,
+        camera: Camera,
     ) -> Poses:
         """Rows of every frame and target from the solutions of the ``solvable`` ones."""
         rows, device = target.numel(), target.device
@@ -157,8 +171,13 @@ class PoseEstimator(nn.Module):
         ring = identified.ring[row, marker]
         center, center_cov = raw_centers(camera, e.center[row, marker], e.covariance[row, marker])
         detections = Detections(
-            frame[row], target[row], table.ids[target[row], marker], center, center_cov,
-            rings.outer_raw[ring], rings.inner_raw[ring],
+            frame[row],
+            target[row],
+            table.ids[target[row], marker],
+            center,
+            center_cov,
+            rings.outer_raw[ring],
+            rings.inner_raw[ring],
         )
         names = ("R", "t", "covariance", "rms", "chi2", "R_alt", "t_alt", "rms_alt", "chi2_alt")
         return Poses(
