@@ -11,5 +11,7 @@ mkdir -p "$out"
 .venv/bin/python -m torchpose estimate data/sample/frames \
     --camera data/sample/camera.yaml --target data/sample/target.yaml \
     --out "$out/poses.jsonl" --detections "$out/detections.csv" --overlay "$out/overlays"
-.venv/bin/python scripts/sample_report.py --poses "$out/poses.jsonl" --truth data/sample/truth.csv
+met=0
+.venv/bin/python scripts/sample_report.py --poses "$out/poses.jsonl" --truth data/sample/truth.csv || met=$?
 echo "Poses: $out/poses.jsonl   markers: $out/detections.csv   pictures of what was found: $out/overlays/"
+exit "$met"

@@ -37,7 +37,7 @@ setup_venv() {
     wanted=$(pwd && cat pyproject.toml configs/constraints.txt)
     if [ "$(cat "$stamp" 2>/dev/null)" != "$wanted" ]; then
         echo "Installing torchpose${extra:+[$extra]} into .venv: some minutes when torch has to be downloaded"
-        .venv/bin/python -m pip install --quiet --disable-pip-version-check \
+        .venv/bin/python -m pip install -qq --disable-pip-version-check \
             -c configs/constraints.txt -e ".${extra:+[$extra]}"
         echo "$wanted" | tee .venv/torchpose-installed >"$stamp"
     fi
