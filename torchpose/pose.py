@@ -7,7 +7,7 @@ their covariances, and the shapes of the rings' own ellipses, which decide alone
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -18,10 +18,11 @@ from torchpose.results import Reason, Status
 from torchpose.rings import Rings
 
 AMBIGUOUS_CHI2 = 20.0  # contract: two poses are ambiguous where their chi-squared differs by less
-_DISTINCT_CHI2 = 30.0  # squared Mahalanobis distance of two rotations that makes them different poses
+_MOST_INFLATION = 1e10  # of a parameter's variance by the others' freedom, beyond which it counts as open
 _SHAPE_FLOOR = (0.03, 0.5)  # px, and times the curvature a / b^2: what blur and mask do to an ellipse's shape
 _SHAPE_LIMIT = 16.0  # mean chi-squared a shape component above which the rings contradict the pose
 _CENTER_LIMIT = (30.0, 10.0)  # chi-squared, and per degree of freedom, above which the centres contradict each other
+_ITERATIONS = (8, 60)  # of the solver: for most rows, and for those that need more
 _CENTER_RMS = 0.3  # px, below which they do not: small errors of calibration or print are no mix-up
 
 
@@ -57,8 +58,7 @@ class Evidence:
         """The same rows with one marker each, (N,) int64, taken as not seen."""
         mask = self.mask.clone()
         mask[torch.arange(mask.shape[0], device=mask.device), marker] = False
-        fields = {n: getattr(self, n) for n in self.__dataclass_fields__}
-        return Evidence(**{**fields, "mask": mask})
+        return replace(self, mask=mask)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,80 +118,62 @@ def solve_poses(evidence: Evidence, rough: tuple[Tensor, Tensor]) -> Solutions:
     Args:
         evidence: N rows. rough: R (N, 3, 3), t (N, 3) to start from.
     """
-    solved = _solve(evidence, rough)
+    solved = _solve(evidence, rough, _ITERATIONS[0])
+    slow = (solved.reason == Reason.NOT_CONVERGED).nonzero()[:, 0]
+    if slow.numel():
+        solved = solved.replaced(slow, _solve(evidence[slow], (rough[0][slow], rough[1][slow]), _ITERATIONS[1]))
     bad = (solved.status == Status.REJECTED) & (evidence.mask.sum(-1) >= 4)
     row, marker = (bad[:, None] & evidence.mask).nonzero().unbind(-1)
-    retry = _solve(evidence[row].without(marker), (rough[0][row], rough[1][row]))
+    if row.numel() == 0:
+        return solved
+    retry = _solve(evidence[row].without(marker), (rough[0][row], rough[1][row]), _ITERATIONS[1])
     # of the subsets that fit, the one with the least chi-squared
-    count = bad.shape[0]
     cost = torch.where(retry.status == Status.REJECTED, torch.inf, retry.chi2.nan_to_num(nan=torch.inf))
-    least = torch.full((count,), torch.inf, dtype=cost.dtype, device=cost.device).scatter_reduce(0, row, cost, "amin")
+    least = torch.full(bad.shape, torch.inf, dtype=cost.dtype, device=cost.device).scatter_reduce(0, row, cost, "amin")
     winner = (cost.isfinite() & (cost == least[row])).nonzero()[:, 0]
     return solved.replaced(row[winner], retry[winner])
 
 
-def _solve(e: Evidence, rough: tuple[Tensor, Tensor]) -> Solutions:
-    count = e.mask.shape[0]
+def _solve(e: Evidence, rough: tuple[Tensor, Tensor], iterations: int) -> Solutions:
     seen = e.mask.sum(-1)
-    start_r, start_t = _starts(e, rough)
-    starts = start_r.shape[1]
-
-    def each(x: Tensor) -> Tensor:
-        return x.repeat_interleave(starts, 0)
-
     center = torch.where(e.mask[..., None], e.center, 0.0)
     result = pnp.solve(
-        each(e.points),
-        each(center),
+        e.points,
+        center,
         e.matrix,
-        method="iterative",
-        covariances=each(_visible(e.covariance, e.mask)),
-        mask=each(e.mask),
-        initial=(start_r.flatten(0, 1), start_t.flatten(0, 1)),
+        covariances=_visible(e.covariance, e.mask),
+        mask=e.mask,
+        initial=_starts(e, rough),
+        max_iterations=iterations,
     )
-    each_r, each_t = result.R.unflatten(0, (count, starts)), result.t.unflatten(0, (count, starts))
-    chi2_center = result.chi2.view(count, starts)
-    chi2_shape = _shape_chi2(e, each_r, each_t)
-    total = (chi2_center + chi2_shape).nan_to_num(nan=torch.inf)  # NaN: did not converge
-    best = total.argmin(1)
-    flat = torch.arange(count, device=best.device) * starts + best
-    r, t, covariance = result.R[flat], result.t[flat], result.covariance[flat]
+    # both minima of the centres, weighed again with the rings' shapes
+    both_r, both_t = torch.stack([result.R, result.R_alt], 1), torch.stack([result.t, result.t_alt], 1)
+    center_chi2 = torch.stack([result.chi2, result.chi2_alt], 1)
+    shape_chi2 = _shape_chi2(e, both_r, both_t)
+    total = (center_chi2 + shape_chi2).nan_to_num(nan=torch.inf)  # NaN: no such minimum
+    chi2, best = total.min(1)
+    row = torch.arange(best.numel(), device=best.device)
+    r, t, rms = both_r[row, best], both_t[row, best], torch.stack([result.rms, result.rms_alt], 1)
+    covariance, determined = _covariance(e, r, t)
+    chi2_alt = total[row, 1 - best]
+    chi2_alt = torch.where(chi2_alt.isfinite(), chi2_alt, torch.nan)
 
-    # the best of those solutions that are another pose
-    turn = rotations.log(each_r @ r[:, None].mT)
-    weight = torch.linalg.pinv(covariance[:, 3:, 3:].nan_to_num(nan=1.0), hermitian=True)
-    apart = (turn[:, :, None] @ weight[:, None] @ turn[..., None]).squeeze(-1).squeeze(-1) > _DISTINCT_CHI2
-    other_cost = torch.where(apart, total, torch.inf)
-    other = other_cost.argmin(1)
-    exists = other_cost.gather(1, other[:, None]).squeeze(1).isfinite()
-    flat_other = torch.arange(count, device=best.device) * starts + other
-
-    def alternative(x: Tensor) -> Tensor:
-        chosen = x[flat_other]
-        return torch.where(exists.view(-1, *[1] * (chosen.ndim - 1)), chosen, torch.nan)
-
-    chi2 = total.gather(1, best[:, None]).squeeze(1)
-    chi2_alt = torch.where(exists, other_cost.gather(1, other[:, None]).squeeze(1), torch.nan)
-    center_best = chi2_center.gather(1, best[:, None]).squeeze(1)
-    shape_best = chi2_shape.gather(1, best[:, None]).squeeze(1)
-    rms = result.rms[flat]
-    freedom = 2 * seen - 6
-    contradicts = (center_best > _CENTER_LIMIT[0] + _CENTER_LIMIT[1] * freedom) & (rms > _CENTER_RMS)
-    code = result.code[flat]
+    chi2_center, rms_best = center_chi2[row, best], rms[row, best]
+    contradicts = (chi2_center > _CENTER_LIMIT[0] + _CENTER_LIMIT[1] * (2 * seen - 6)) & (rms_best > _CENTER_RMS)
     reason = torch.full_like(seen, Reason.NONE)
     for condition, why in (
         (chi2_alt - chi2 < AMBIGUOUS_CHI2, Reason.TWO_SOLUTIONS),
-        (shape_best > 4 * _SHAPE_LIMIT * seen, Reason.RING_SHAPE),
+        (shape_chi2[row, best] > 4 * _SHAPE_LIMIT * seen, Reason.RING_SHAPE),
         (contradicts, Reason.RESIDUAL),
         (~chi2.isfinite(), Reason.NOT_CONVERGED),
-        (code == pnp.PnPCode.BEHIND_CAMERA, Reason.BEHIND_CAMERA),
-        (code == pnp.PnPCode.DEGENERATE, Reason.DEGENERATE),
+        (result.code == pnp.PnPCode.BEHIND_CAMERA, Reason.BEHIND_CAMERA),
+        ((result.code == pnp.PnPCode.DEGENERATE) | (chi2.isfinite() & ~determined), Reason.DEGENERATE),
     ):
         reason = torch.where(condition, int(why), reason)  # the last that holds
     status = torch.where(reason == Reason.NONE, int(Status.OK), int(Status.REJECTED))
     status = torch.where(reason == Reason.TWO_SOLUTIONS, int(Status.AMBIGUOUS), status)
     return Solutions(
-        r, t, covariance, rms, chi2, alternative(result.R), alternative(result.t), alternative(result.rms), chi2_alt,
+        r, t, covariance, rms_best, chi2, both_r[row, 1 - best], both_t[row, 1 - best], rms[row, 1 - best], chi2_alt,
         status, reason, e.mask,
     )
 
@@ -254,6 +236,33 @@ def _shape_chi2(e: Evidence, r: Tensor, t: Tensor) -> Tensor:
     return torch.where(e.mask[:, None, :, None], chi2, 0.0).sum((-1, -2))
 
 
+def _jacobian(e: Evidence, r: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Derivatives of the projections by the pose (N, M, 2, 6), the normalised points (N, M, 2), the weights (N, M, 2, 2).
+
+    Translation first, then the rotation from the left, R = exp(w) R_est.
+    """
+    turned = (r[:, None] @ e.points[..., None]).squeeze(-1)
+    x = turned + t[:, None]
+    n = x[..., :2] / x[..., 2:]
+    zero, one = torch.zeros_like(n[..., 0]), torch.ones_like(n[..., 0])
+    by_point = torch.stack([one, zero, -n[..., 0], zero, one, -n[..., 1]], -1).unflatten(-1, (2, 3))
+    by_point = by_point * (e.matrix.diagonal()[:2, None] / x[..., 2, None, None])
+    weight = torch.linalg.inv(_visible(e.covariance, e.mask)) * e.mask[..., None, None]
+    return torch.cat([by_point, -by_point @ rotations.skew(turned)], -1), n, weight
+
+
+def _covariance(e: Evidence, r: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+    """Pose covariance (J^T W J)^-1 (N, 6, 6), and whether the centres determine all six parameters (N,)."""
+    jac, _, weight = _jacobian(e, r, t)
+    information = (jac.mT @ weight @ jac).sum(1)
+    # in units of each parameter's own information, so that mm and rad can be compared
+    scale = information.diagonal(dim1=-2, dim2=-1).rsqrt()
+    inverse, info = torch.linalg.inv_ex(information * scale[:, :, None] * scale[:, None, :])
+    covariance = inverse * scale[:, :, None] * scale[:, None, :]
+    determined = (info == 0) & (inverse.diagonal(dim1=-2, dim2=-1) < _MOST_INFLATION).all(-1)
+    return covariance, determined
+
+
 def intrinsics_covariance(e: Evidence, s: Solutions, intrinsics: Tensor) -> Tensor:
     """What uncertain intrinsics add to the pose covariance (N, 6, 6): G Sigma_K G^T, G = d pose / d (fx, fy, cx, cy).
 
@@ -262,15 +271,8 @@ def intrinsics_covariance(e: Evidence, s: Solutions, intrinsics: Tensor) -> Tens
     Args:
         intrinsics: (4, 4) covariance of fx, fy, cx, cy, px^2 (`Camera.covariance`).
     """
-    turned = (s.R[:, None] @ e.points[..., None]).squeeze(-1)
-    x = turned + s.t[:, None]
-    f = e.matrix.diagonal()[:2]
-    n = x[..., :2] / x[..., 2:]
+    jac, n, weight = _jacobian(replace(e, mask=s.mask), s.R, s.t)
     zero, one = torch.zeros_like(n[..., 0]), torch.ones_like(n[..., 0])
-    by_point = torch.stack([one, zero, -n[..., 0], zero, one, -n[..., 1]], -1).unflatten(-1, (2, 3))
-    by_point = by_point * (f[:, None] / x[..., 2, None, None])
-    jac = torch.cat([by_point, -by_point @ rotations.skew(turned)], -1)  # (N, M, 2, 6)
     jac_k = torch.stack([n[..., 0], zero, one, zero, zero, n[..., 1], zero, one], -1).unflatten(-1, (2, 4))
-    weight = torch.linalg.inv(_visible(e.covariance, s.mask)) * s.mask[..., None, None]
     gain = -s.covariance @ (jac.mT @ weight @ jac_k).sum(1)
     return gain @ intrinsics.to(gain) @ gain.mT
