@@ -206,6 +206,19 @@ def test_distance_near_ellipses(generator):
     assert (error < bound + 1e-12).all()
 
 
+def test_curvature(generator):
+    """Against the parametric formula a b / (a^2 sin^2 + b^2 cos^2)^(3/2), also from points off the ellipse."""
+    truth = random_ellipses(100, generator, least_ratio=0.3)
+    angle = 2 * math.pi * torch.rand(100, generator=generator, dtype=torch.float64)
+    a, b = truth[:, 2], truth[:, 3]
+    expected = a * b / ((a * angle.sin()).square() + (b * angle.cos()).square()).pow(1.5)
+    index = torch.arange(100)
+    xy = conics.points_on(truth, angle)
+    torch.testing.assert_close(ellipse.curvature(xy, index, truth), expected)
+    away = truth[:, :2] + 1.02 * (xy - truth[:, :2])
+    torch.testing.assert_close(ellipse.curvature(away, index, truth), expected)
+
+
 def test_robust_fit(generator):
     """35 % of the points elsewhere: a covering straight edge, or a neighbouring concentric ring."""
     truth = random_ellipses(60, generator, least_ratio=0.4)

@@ -208,3 +208,18 @@ def test_no_edges():
     none = torch.zeros(0, dtype=torch.int64)
     found = zernike.locate(torch.zeros(1, 3, 3), none, torch.zeros(0, 2, dtype=torch.int64))
     assert found.points.shape == (0, 2)
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.4, 0.8, 1.2])
+def test_curvature_shift_equals_its_integral(sigma):
+    """The integrals over the disc by quadrature; the blur (px) includes both areas of pixels."""
+    s = math.sqrt(sigma**2 + 1 / 6) * 2 / zernike.MASK if sigma else 1e-3
+    node, weight = np.polynomial.hermite_e.hermegauss(201)
+    x = (s * node)[abs(s * node) < 1]
+    weight = weight[abs(s * node) < 1] / math.sqrt(2 * math.pi)
+    h = np.sqrt(1 - x * x)
+    zeroth = (weight * (2 * h * (2 * x * x - 1) + 4 * h**3 / 3)).sum()
+    second = (weight * ((2 * x * x - 1) * 2 * h**3 / 3 + 4 * h**5 / 5)).sum()
+    slope = torch.tensor(-1.5 * zeroth / (weight * h**3).sum())
+    expected = -0.5 * (s * s + second / zeroth) * (zernike.MASK / 2) ** 2
+    assert float(zernike.curvature_shift(slope)) == pytest.approx(expected, rel=0.01)

@@ -127,6 +127,13 @@ def distance(points: Tensor, index: Tensor, ellipses: Tensor) -> Tensor:
     return value / torch.linalg.vector_norm(gradient, dim=-1)
 
 
+def curvature(points: Tensor, index: Tensor, ellipses: Tensor) -> Tensor:
+    """Curvature (E,) in 1/px of the ellipses where the rays from their centres through the points meet them."""
+    _, gradient = _radial(points, index, ellipses)
+    # p^3 / (a b)^2 with p = 1 / |grad rho| the distance of the tangent from the centre
+    return 1 / (torch.linalg.vector_norm(gradient, dim=-1) ** 3 * (ellipses[:, 2] * ellipses[:, 3]).square()[index])
+
+
 def _radial(points: Tensor, index: Tensor, ellipses: Tensor) -> tuple[Tensor, Tensor]:
     """rho - 1 (E,) and its gradient (E, 2), rho = |S^-1 (x - c)| the elliptic radius."""
     shape = conics.shape_matrix(ellipses)

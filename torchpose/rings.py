@@ -99,7 +99,7 @@ def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera) -> Rin
     edges = ring_edges(frames, frame, rough, outward, reach)
 
     raw, keep = ellipse.fit_robust(edges.points, edges.ring, 2 * count, start=rough)
-    points = _deblurred(edges, raw, keep, outward, frame, frames.shape[0])
+    points = _unbiased(edges, raw, keep, outward, frame, frames.shape[0])
     raw, keep = ellipse.fit_robust(points, edges.ring, 2 * count, start=raw, scales=(0.5,))
     ring, points = edges.ring[keep], points[keep]
     ideal_points = ideal_pixels(camera, points)
@@ -124,12 +124,14 @@ def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera) -> Rin
     return Rings(candidates.frame[index], candidates.polarity[index], raw[index], raw[second], fit[index], fit[second])
 
 
-def _deblurred(edges: RingEdges, fitted: Tensor, keep: Tensor, outward: Tensor, frame: Tensor, frames: int) -> Tensor:
-    """Edge points (E, 2) with the effect of each frame's blur on their offsets taken off."""
-    distance = edges.offset - ellipse.distance(edges.points, edges.ring, fitted) * outward[edges.ring]
+def _unbiased(edges: RingEdges, fitted: Tensor, keep: Tensor, outward: Tensor, frame: Tensor, frames: int) -> Tensor:
+    """Edge points (E, 2) freed from what each frame's blur and the edges' curvature do to their offsets."""
+    sign = outward[edges.ring]
+    distance = edges.offset - ellipse.distance(edges.points, edges.ring, fitted) * sign
     group = frame[edges.ring]
-    slope = zernike.blur_slope(edges.offset[keep], distance[keep], group[keep], frames)
-    change = zernike.deblur(edges.offset, slope[group]) - edges.offset
+    slope = zernike.blur_slope(edges.offset[keep], distance[keep], group[keep], frames)[group]
+    pushed = zernike.curvature_shift(slope) * ellipse.curvature(edges.points, edges.ring, fitted)
+    change = zernike.deblur(edges.offset, slope) - edges.offset - pushed * sign
     return edges.points + change[:, None] * edges.normal
 
 
