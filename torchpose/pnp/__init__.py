@@ -1,8 +1,25 @@
 """Perspective-n-point: camera pose from points or lines, batched, every method behind one calling convention."""
 
 from torchpose.pnp.candidates import Candidates
+from torchpose.pnp.dlt import dlt
+from torchpose.pnp.epnp import epnp
+from torchpose.pnp.lines import lines
+from torchpose.pnp.p3p import p3p
 from torchpose.pnp.planar import planar
+from torchpose.pnp.posit import posit
 from torchpose.pnp.result import PnPCode, PnPError, PnPResult
 from torchpose.pnp.solve import solve
 
-__all__ = ["Candidates", "PnPCode", "PnPError", "PnPResult", "planar", "solve"]
+__all__ = [
+    "Candidates",
+    "PnPCode",
+    "PnPError",
+    "PnPResult",
+    "dlt",
+    "epnp",
+    "lines",
+    "p3p",
+    "planar",
+    "posit",
+    "solve",
+]

@@ -14,7 +14,7 @@ from torch import Tensor
 
 
 class Candidates(NamedTuple):
-    """S poses for each of B sets of points, best first; NaN where a solution does not exist.
+    """S poses for each of B sets of points in float64, best first; NaN where a solution does not exist.
 
     Attributes:
         R: (B, S, 3, 3), object to camera: X_cam = R X + t.
@@ -46,8 +46,9 @@ def batch_last(
         )
     if mask is not None and mask.shape != (batch, count):
         raise ValueError(f"mask has shape {tuple(mask.shape)}; expected ({batch}, {count})")
-    points = object_points.to(image_points).reshape(-1, count, 3).permute(2, 1, 0)
-    xy = image_points.permute(2, 1, 0).contiguous()
+    # closed forms square their condition numbers: float32 input is exact in float64, so is the arithmetic
+    xy = image_points.double().permute(2, 1, 0).contiguous()
+    points = object_points.to(xy).reshape(-1, count, 3).permute(2, 1, 0)
     if mask is None:
         return points.contiguous(), xy, None
     keep = mask.T

@@ -103,12 +103,9 @@ def ippe(points: Tensor, xy: Tensor, weight: Tensor | None, frame: Tensor, cente
     q = h[2] / lengths[2]  # (2, B): image of the centroid
     jx, jy = hx - q * p[0], hy - q * p[1]  # columns of the Jacobian of the projection at the centroid
 
-    # rotation that takes the z axis to the ray of the centroid; its first two columns projected are the matrix g
-    nz = (1 + q.square().sum(0)).rsqrt()
-    nx, ny = q * nz
-    k = 1 / (1 + nz)
-    xx, xy_, yy = 1 - nx * nx * k, -nx * ny * k, 1 - ny * ny * k
-    ray = torch.stack([xx, xy_, nx, xy_, yy, ny, -nx, -ny, nz]).unflatten(0, (3, 3))
+    # the first two columns of the rotation towards the centroid, projected, are the matrix g
+    ray = ray_frame(q)
+    (xx, xy_, nx), (_, yy, ny), _ = ray
     g00, g01, g10, g11 = xx + q[0] * nx, xy_ + q[0] * ny, xy_ + q[1] * nx, yy + q[1] * ny
     scale = 1 / (g00 * g11 - g01 * g10)
     a0, a1 = torch.stack([g11 * jx[0] - g01 * jx[1], g00 * jx[1] - g10 * jx[0]]) * scale
@@ -126,6 +123,15 @@ def ippe(points: Tensor, xy: Tensor, weight: Tensor | None, frame: Tensor, cente
     local = torch.stack([first, second, cross(first, second)], 1)  # (3, 3, 2, B)
     r = _product(_product(ray[:, :, None], local), frame[:, :, None])
     return r, translation(r, points, xy, weight, center)
+
+
+def ray_frame(xy: Tensor) -> Tensor:
+    """Least rotations (3, 3, B) that take the optical axis to the rays of normalised points (2, B)."""
+    nz = (1 + xy.square().sum(0)).rsqrt()
+    nx, ny = xy * nz
+    k = 1 / (1 + nz)
+    xx, mixed, yy = 1 - nx * nx * k, -nx * ny * k, 1 - ny * ny * k
+    return torch.stack([xx, mixed, nx, mixed, yy, ny, -nx, -ny, nz]).unflatten(0, (3, 3))
 
 
 def _product(a: Tensor, b: Tensor) -> Tensor:

@@ -13,6 +13,9 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.geometry.small_linalg import cross, matmul3, orthonormalise
 from torchpose.pnp._compile import compiled
+from torchpose.pnp.candidates import Candidates
+from torchpose.pnp.dlt import dlt
+from torchpose.pnp.epnp import epnp
 from torchpose.pnp.iterative import (
     Estimate,
     Observations,
@@ -23,10 +26,21 @@ from torchpose.pnp.iterative import (
     product2,
     residuals,
 )
-from torchpose.pnp.planar import COLLINEARITY, FLATNESS, ippe, plane_frame
+from torchpose.pnp.p3p import p3p
+from torchpose.pnp.planar import COLLINEARITY, FLATNESS, ippe, planar, plane_frame
+from torchpose.pnp.posit import posit
 from torchpose.pnp.result import PnPCode, PnPError, PnPResult
 
-Method = Literal["iterative", "planar"]
+Method = Literal["iterative", "planar", "dlt", "p3p", "epnp", "posit"]
+_CLOSED_FORMS: dict[str, Callable[[Tensor, Tensor, Tensor | None], Candidates]] = {
+    "planar": planar,
+    "dlt": dlt,
+    "p3p": p3p,
+    "epnp": epnp,
+    "posit": posit,
+}
+# points that each method needs
+_LEAST = {"iterative": 4, "planar": 4, "dlt": 6, "p3p": 3, "epnp": 4, "posit": 4}
 _T = TypeVar("_T")
 # bytes; the most that glibc lets the threshold grow to is 32 MiB
 _KEPT = 30 << 20
@@ -97,8 +111,10 @@ def solve(
     for name, (shape, value) in options.items():
         if value is not None:
             _expect(name, value, shape, batch)
-    if method not in ("iterative", "planar"):
-        raise ValueError(f"method is {method!r}; choose one of iterative, planar")
+    if method not in _LEAST:
+        raise ValueError(f"method is {method!r}; choose one of {', '.join(_LEAST)}")
+    if initial is not None and method != "iterative":
+        raise ValueError(f"initial is for method 'iterative'; method {method!r} needs no start")
     if initial is not None:
         rotation, translation = initial
         if rotation.shape[0] != batch or rotation.shape[-2:] != (3, 3) or translation.shape != rotation.shape[:-1]:
@@ -158,8 +174,8 @@ def _map(function: Callable[[_Rows], _T], chunks: Sequence[_Rows], like: Tensor)
     threads = min(torch.get_num_threads(), len(chunks) - 1)
     if like.device.type != "cpu" or threads < 2:
         return [function(rows) for rows in chunks]
-    # glibc gives freed memory above a threshold back to the system, and every chunk would fault it in again; freeing one
-    # large block raises that threshold to its size. Not touched, it costs nothing.
+    # glibc gives freed memory above a threshold back to the system, and every chunk would fault it in again; freeing
+    # one large block raises that threshold to its size. Not touched, it costs nothing.
     torch.empty(_KEPT, dtype=torch.uint8)
     grad = torch.is_grad_enabled()
 
@@ -262,13 +278,10 @@ def _solve_chunk(
         t0 = (shifts.permute(2, 1, 0) + (starts * center[:, None]).sum(1)) / unit
         r0, t0 = starts.flatten(2), t0.flatten(1)
     else:
-        minimum, options = 4, 2
-        low = observed.to(torch.float32) if method == "iterative" else observed
-        weight_low = None if weight is None else weight.to(low.xy)
-        start = compiled(ippe) if compile else ippe
-        r0, t0 = start(low.points, low.xy, weight_low, frame.to(low.xy), torch.zeros_like(center).to(low.xy))
-        r0 = torch.where(flat & ~line, r0, torch.nan).flatten(2)
-        t0 = t0.flatten(1)
+        candidates = _start(method, observed, weight, frame, flat, line, compile)
+        minimum = _LEAST[method]
+        options = candidates[0].shape[2]
+        r0, t0 = candidates[0].flatten(2), candidates[1].flatten(1)
     started = (r0.isfinite().all(0).all(0) & t0.isfinite().all(0)).unflatten(0, (options, batch)).any(0)
 
     final = observed
@@ -290,6 +303,44 @@ def _solve_chunk(
 def _relevant(chi2: Tensor) -> Tensor:
     """Chi-squared above which one of several minima (S, B) needs no further digits."""
     return 2 * chi2.amin(0) + 2 * DECISION
+
+
+def _start(
+    method: Method,
+    observed: Observations,
+    weight: Tensor | None,
+    frame: Tensor,
+    flat: Tensor,
+    line: Tensor,
+    compile: bool,
+) -> tuple[Tensor, Tensor]:
+    """Candidates R (3, 3, S, B), t (3, S, B) about the centroid, in units of the extent."""
+    count, batch = observed.xy.shape[1:]
+    if method != "iterative":
+        found = _CLOSED_FORMS[method](*_batch_first(observed, weight))
+        return found.R.permute(2, 3, 1, 0), found.t.permute(2, 1, 0)
+    low = observed.to(torch.float32)
+    start = compiled(ippe) if compile else ippe
+    center = torch.zeros_like(frame[0]).to(low.xy)
+    r, t = start(low.points, low.xy, None if weight is None else weight.to(low.xy), frame.to(low.xy), center)
+    r = torch.where(flat & ~line, r, torch.nan)
+    rows = (~(flat | line)).expand(batch).nonzero().squeeze(1)
+    if len(rows):
+        # three of the points, and all of them at once where there are enough
+        part = _batch_first(observed.select(rows), None if weight is None else weight[:, rows])
+        found = p3p(*part)
+        solutions = [Candidates(*(v[:, :2] for v in found))]
+        if count >= 6:
+            solutions = [epnp(*part), Candidates(*(v[:, :1] for v in found))]
+        r = r.index_copy(3, rows, torch.cat([s.R for s in solutions], 1).permute(2, 3, 1, 0).to(r))
+        t = t.index_copy(2, rows, torch.cat([s.t for s in solutions], 1).permute(2, 1, 0).to(t))
+    return r, t
+
+
+def _batch_first(observed: Observations, weight: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
+    points = observed.points.permute(2, 1, 0)
+    points = points[0] if points.shape[0] == 1 else points
+    return points, observed.xy.permute(2, 1, 0), None if weight is None else weight.T > 0
 
 
 def _rays(camera: Camera | Tensor, pixels: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
