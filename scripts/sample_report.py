@@ -89,10 +89,11 @@ def main() -> int:
     options = parser.parse_args()
     try:
         truth = read_truth(options.truth)
-        estimated = read_poses(options.poses, truth)
         absent = [name for name in (*BOUND, *CONDITIONS) if name not in truth.extra]
-        if absent:
-            raise ConfigError(f"{options.truth}: {absent[0]}: column is missing; use what scripts/make_sample.py wrote")
+        if absent or not len(truth):
+            fault = f"{absent[0]}: column is missing" if absent else "frame: no row"
+            raise ConfigError(f"{options.truth}: {fault}; use what scripts/make_sample.py wrote")
+        estimated = read_poses(options.poses, truth)
     except ConfigError as error:
         print(f"sample_report: error: {error}", file=sys.stderr)
         return 2

@@ -1,0 +1,82 @@
+"""What README.md shows works: its Python, its files, its options, its links."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import typer
+
+import torchpose as tp
+from torchpose.cli.main import app
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def blocks(language: str) -> list[str]:
+    found = re.findall(rf"^( *)```{language}\n(.*?)^ *```", README, re.MULTILINE | re.DOTALL)
+    return [re.sub(rf"^{indent}", "", body, flags=re.MULTILINE) for indent, body in found]
+
+
+def test_python_runs():
+    (code,) = blocks("python")
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count(" OK [") == 4
+
+
+@pytest.fixture
+def files(tmp_path):
+    for body in blocks("yaml"):
+        (tmp_path / body.split()[1]).write_text(body, encoding="utf-8")
+    return tmp_path
+
+
+def test_files_load(files):
+    camera = tp.Camera.load(files / "camera.yaml")
+    assert (camera.width, camera.height) == (1824, 1216)
+    assert camera.distortion.tolist() == [-0.08, 0.02, 0.0002, -0.00015]
+    target = tp.Target.load(files / "target.yaml")
+    assert (target.name, target.ids.tolist()) == ("plate", [0, 1, 2, 3])
+    assert target.part_translation.tolist() == [0, 0, 4.2]
+    assert tp.HandEye.load(files / "handeye.yaml").mount == "base"
+
+
+def test_built_in_targets_are_all_named():
+    for path in (ROOT / "torchpose" / "targets").glob("*.yaml"):
+        assert f"`{path.stem}`" in README
+
+
+def test_options_exist():
+    estimate = typer.main.get_command(app).commands["estimate"]
+    options = {name for parameter in estimate.params for name in parameter.opts}
+    section = README[README.index("## Your own images") : README.index("### How a pose")]
+    named = set(re.findall(r"(?<![\w-])--[a-z-]+", section)) - {"--help"}
+    assert {"--camera", "--resume", "--hand-eye"} <= named <= options
+
+
+def test_statuses_and_reasons_are_all_explained():
+    table = README[README.index("### How a pose") : README.index("## Library")]
+    assert set(re.findall(r"`(\w+)`", table)) >= {status.name.lower() for status in tp.Status}
+    reasons = {reason.name.lower() for reason in tp.Reason} - {"none", "two_solutions"}  # the latter is `ambiguous`
+    assert set(re.findall(r"`(\w+)`", table)) >= reasons
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page):
+    for link in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text(encoding="utf-8")):
+        assert "://" in link or (page.parent / link).exists(), link
+
+
+def test_layout_names_every_part():
+    layout = README[README.index("## Layout") : README.index("Imports point one way")]
+    parts = [path for path in (ROOT / "torchpose").iterdir() if not path.name.startswith("_")]
+    stages = {f"{path.name}/" for path in parts if (path / "__init__.py").exists()}
+    helpers = {"errors.py", "yaml_files.py"}
+    modules = {path.name for path in parts if path.suffix == ".py"} - helpers
+    assert set(re.findall(r"`([\w.]+/?)`", layout)) >= stages | modules
