@@ -111,9 +111,13 @@ def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera) -> Rin
     step = segment_mean(edges.step[keep], ring, 2 * count)
     step_ratio = step[count:] / step[:count]
     offset = torch.linalg.vector_norm(raw[count:, :2] - raw[:count, :2], dim=-1)
+    # all points lie within reach of the rough ellipse; a fit that does not has followed the stump of a circle cut off
+    shift = torch.linalg.vector_norm(raw[:, :2] - rough[:, :2], dim=-1)
+    growth = (conics.shape_matrix(raw) - conics.shape_matrix(rough)).abs().amax((1, 2))
+    near = torch.maximum(shift, growth) < reach + 1.5
     good = (
         fit.covariance.isfinite().all(-1).all(-1).view(2, count).all(0)
-        & (cover.view(2, count) > _LEAST_COVER).all(0)
+        & (near & (cover > _LEAST_COVER)).view(2, count).all(0)
         & (step_ratio > _STEP_RANGE[0])
         & (step_ratio < _STEP_RANGE[1])
         & (offset < 0.25 * raw[:count, 3])  # concentric up to perspective
