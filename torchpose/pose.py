@@ -1,8 +1,9 @@
 """Stage: from identified markers to one pose a row, its covariance, and an honest status.
 
 Every row is solved from two starts (both planar solutions; with three markers the rough pose of the identification and
-its mirror image), each refined by batched Levenberg-Marquardt. The solution that explains all evidence best wins: the centres by
-their covariances, and the shapes of the rings' own ellipses, which decide alone where only three markers are seen.
+its mirror image), each refined by batched Levenberg-Marquardt. The solution that explains all evidence best wins: the
+centres by their covariances, and the shapes of the rings' own ellipses, which decide alone where only three markers are
+seen.
 """
 
 from __future__ import annotations
@@ -83,14 +84,19 @@ class Solutions:
 
     def replaced(self, index: Tensor, other: Solutions) -> Solutions:
         """These rows, with the rows ``index`` taken from ``other``."""
-        return Solutions(
-            *(getattr(self, n).index_copy(0, index, getattr(other, n)) for n in self.__dataclass_fields__)
-        )
+        return Solutions(*(getattr(self, n).index_copy(0, index, getattr(other, n)) for n in self.__dataclass_fields__))
 
 
 def gather_evidence(
-    rings: Rings, ring: Tensor, centers: Tensor, covariances: Tensor, points: Tensor, normals: Tensor, radii: Tensor,
-    coplanar: Tensor, matrix: Tensor,
+    rings: Rings,
+    ring: Tensor,
+    centers: Tensor,
+    covariances: Tensor,
+    points: Tensor,
+    normals: Tensor,
+    radii: Tensor,
+    coplanar: Tensor,
+    matrix: Tensor,
 ) -> Evidence:
     """Lays the measurements of flat rings out by row and marker.
 
@@ -104,9 +110,7 @@ def gather_evidence(
     covariance = torch.stack([rings.outer.covariance, rings.inner.covariance], 1)
     if len(rings) == 0:  # nothing to index: any row will do, the mask hides it
         shape, covariance = shape.new_ones(1, 2, 5), covariance.new_ones(1, 2, 5, 5)
-    return Evidence(
-        points, normals, radii, centers, covariances, shape[at], covariance[at], mask, coplanar, matrix
-    )
+    return Evidence(points, normals, radii, centers, covariances, shape[at], covariance[at], mask, coplanar, matrix)
 
 
 def solve_poses(evidence: Evidence, rough: tuple[Tensor, Tensor]) -> Solutions:
@@ -173,13 +177,23 @@ def _solve(e: Evidence, rough: tuple[Tensor, Tensor], iterations: int) -> Soluti
     status = torch.where(reason == Reason.NONE, int(Status.OK), int(Status.REJECTED))
     status = torch.where(reason == Reason.TWO_SOLUTIONS, int(Status.AMBIGUOUS), status)
     return Solutions(
-        r, t, covariance, rms_best, chi2, both_r[row, 1 - best], both_t[row, 1 - best], rms[row, 1 - best], chi2_alt,
-        status, reason, e.mask,
+        r,
+        t,
+        covariance,
+        rms_best,
+        chi2,
+        both_r[row, 1 - best],
+        both_t[row, 1 - best],
+        rms[row, 1 - best],
+        chi2_alt,
+        status,
+        reason,
+        e.mask,
     )
 
 
 def _starts(e: Evidence, rough: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """Two poses (N, 2, 3, 3), (N, 2, 3) to start from: both planar solutions, or the rough pose and its mirror image."""
+    """Two poses (N, 2, 3, 3), (N, 2, 3) to start from: both planar solutions, or the rough pose and its mirror."""
     r, t = rough
     # depth mirrored along the line of sight, the plane turned back on itself: the same weak-perspective image
     weight = e.mask.double() / e.mask.sum(-1, keepdim=True)
@@ -237,7 +251,7 @@ def _shape_chi2(e: Evidence, r: Tensor, t: Tensor) -> Tensor:
 
 
 def _jacobian(e: Evidence, r: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Derivatives of the projections by the pose (N, M, 2, 6), the normalised points (N, M, 2), the weights (N, M, 2, 2).
+    """Projections' derivatives by the pose (N, M, 2, 6), normalised points (N, M, 2), weights (N, M, 2, 2).
 
     Translation first, then the rotation from the left, R = exp(w) R_est.
     """
