@@ -70,7 +70,8 @@ def grouped(std: Tensor) -> Tensor:
 def show(rows: list[list[str]], markdown: bool) -> None:
     """Prints rows of `HEADER`; the last two are those over all frames."""
     if markdown:
-        print("\n".join(f"| {' | '.join(cells)} |" for cells in (HEADER, ["---"] * len(HEADER), *rows)))
+        lines = (HEADER, ["---"] * len(HEADER), *rows)
+        print("\n".join(f"| {' | '.join(cells)} |" for cells in lines))
         return
     console = Console(width=max(Console().width, 100))  # a pipe counts as 80 columns, which would cut the numbers
     table = Table(box=box.SIMPLE_HEAD, padding=0, title="error, predicted sigma, Cramer-Rao bound")
@@ -104,8 +105,10 @@ def main() -> int:
     sigma = grouped(estimated.covariance.diagonal(dim1=1, dim2=2).sqrt())
     allowed = torch.fmax(REQUIRED, BOUND_FACTOR * bound)
 
+    separator = " / " if options.markdown else " "
+
     def cells(values: Tensor) -> list[str]:
-        return [" ".join(f"{value:.2f}" for value in group) for group in (values * SHOWN[:, None]).tolist()]
+        return [separator.join(f"{value:.2f}" for value in group) for group in (values * SHOWN[:, None]).tolist()]
 
     each = torch.stack([error, sigma, bound], -1)
     rows = [

@@ -42,9 +42,9 @@ def test_within(tmp_path, rows):
     done = report(tmp_path, rows, "--markdown")
     assert done.returncode == 0, done.stderr
     total = next(line for line in done.stdout.splitlines() if line.startswith("| RMS"))
-    lateral, depth, rotation = (cell.split()[:2] for cell in total.split("|")[5:8])
+    lateral, depth, rotation = (cell.split(" / ")[:2] for cell in total.split("|")[5:8])
     # 1 um of error; sigma sqrt(2) um lateral, 1 um in depth, sqrt(3) 0.1 mrad = 9.92 mdeg
-    assert (lateral, depth, rotation) == (["1.00", "1.41"], ["0.00", "1.00"], ["0.00", "9.92"])
+    assert (lateral, depth, rotation) == ([" 1.00", "1.41"], [" 0.00", "1.00"], [" 0.00", "9.92"])
     assert "12 of 12 frames ok; errors within" in done.stdout
     assert "mean NEES 1.0" in done.stdout
 
