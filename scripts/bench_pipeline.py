@@ -1,0 +1,209 @@
+"""What a pose costs: CPU time of every stage beside decoding, beside plain OpenCV, and peak memory.
+
+    python scripts/bench_pipeline.py [--out docs/benchmarks/pipeline.md]
+
+Frames: quad40 at the 20 MP camera and at its third (2 MP), noise sigma 2, 8 poses each, rendered here. CPU time is that
+of the whole process (time.process_time), one thread for torch and OpenCV alike; every round times decoding, torchpose
+and OpenCV one after the other, and the ratios are medians over the rounds. Memory is the largest resident set of
+`torchpose estimate` as a process of its own, on 8 and on 200 frames.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import cv2
+import numpy as np
+import torch
+
+import torchpose as tp
+from torchpose import pipeline
+from torchpose.detect import reduce
+from torchpose.geometry import rotations
+from torchpose.sim import add_noise, render
+
+SIZES = {"2 MP": (1824, 1216, 1111.11), "20 MP": (5472, 3648, 3333.33)}
+FRAMES = 8
+STAGES = ("find_candidates", "measure_rings", "identify", "solve_poses")
+
+
+def camera_of(width: int, height: int, focal: float) -> tp.Camera:
+    matrix = [[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]]
+    return tp.Camera(width, height, torch.tensor(matrix, dtype=torch.float64), torch.zeros(4, dtype=torch.float64))
+
+
+def make_frames(camera: tp.Camera, target: tp.Target) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Frames (8, H, W) uint8 with their poses: tilt 0 to 35 degrees."""
+    k = torch.arange(FRAMES, dtype=torch.float64)
+    vector = torch.stack([0.6 * k / FRAMES * (2.4 * k).cos(), 0.6 * k / FRAMES * (2.4 * k).sin(), 0.3 * k], -1)
+    rotation = rotations.exp(vector)
+    translation = torch.stack([6 * (k % 3 - 1), 4 * (k % 2), 160 + 2 * k], -1)
+    frames = [
+        add_noise(render(camera, target, rotation[i : i + 1], translation[i : i + 1], plate=(70.0, 70.0)), 2.0, seed=i)
+        for i in range(FRAMES)
+    ]
+    return torch.cat(frames), rotation, translation
+
+
+def plain_opencv(frame: np.ndarray, target: tp.Target, matrix: np.ndarray) -> np.ndarray | None:
+    """Otsu threshold, contours, direct ellipses, nearest code, solvePnP of the mean centres: t (3,) or None."""
+    _, binary = cv2.threshold(frame, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    contours, _ = cv2.findContours(binary, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    ellipses = []
+    for contour in contours:
+        if len(contour) >= 20:
+            (u, v), (a, b), _ = cv2.fitEllipseDirect(contour)
+            area = cv2.contourArea(contour)
+            if area > 0 and abs(np.pi * a * b / 4 / area - 1) < 0.1:
+                ellipses.append((u, v, a * b))
+    ratios = (target.radii[:, 1] / target.radii[:, 0]).numpy()
+    centers = np.full((len(ratios), 2), np.nan)
+    for u, v, size in ellipses:
+        for x, y, inner in ellipses:
+            if inner < 0.8 * size and (u - x) ** 2 + (v - y) ** 2 < 0.01 * size:
+                centers[np.argmin(abs(ratios - np.sqrt(inner / size)))] = (u + x) / 2, (v + y) / 2
+    if not np.isfinite(centers).all():
+        return None
+    _, _, t = cv2.solvePnP(target.centers.numpy(), centers, matrix, None, flags=cv2.SOLVEPNP_ITERATIVE)
+    return t[:, 0]
+
+
+def timed(module: ModuleType, name: str, spent: dict[str, float]) -> Callable[[], None]:
+    """Adds the CPU time of a stage to ``spent``; returns what takes the clock off again."""
+    original = getattr(module, name)
+
+    def run(*args: object, **kwargs: object) -> object:
+        start = time.process_time()
+        result = original(*args, **kwargs)
+        spent[name] += time.process_time() - start
+        return result
+
+    setattr(module, name, run)
+    return lambda: setattr(module, name, original)
+
+
+def cpu(function: Callable[[], object]) -> float:
+    start = time.process_time()
+    function()
+    return time.process_time() - start
+
+
+def bench_size(label: str, rounds: int, folder: Path, report: list[str]) -> None:
+    width, height, focal = SIZES[label]
+    camera, target = camera_of(width, height, focal), tp.Target.load("quad40")
+    frames, _, truth = make_frames(camera, target)
+    encoded = [cv2.imencode(".png", f.numpy())[1] for f in frames]
+    for i, data in enumerate(encoded):
+        (folder / f"{i}.png").write_bytes(data.tobytes())
+    camera.save(folder.parent / "camera.yaml")
+    estimator = tp.PoseEstimator(camera, target)
+    matrix = camera.matrix.numpy()
+    poses = estimator(frames)
+    plain = [plain_opencv(f.numpy(), target, matrix) for f in frames]
+    spent: dict[str, float] = defaultdict(float)
+    undo = [timed(pipeline, name, spent) for name in STAGES]
+    rows: dict[str, list[float]] = defaultdict(list)
+    for _ in range(rounds):
+        spent.clear()
+        rows["decode PNG"].append(cpu(lambda: [cv2.imdecode(e, cv2.IMREAD_UNCHANGED) for e in encoded]))
+        rows["torchpose"].append(cpu(lambda: estimator(frames)))
+        rows["OpenCV"].append(cpu(lambda: [plain_opencv(f.numpy(), target, matrix) for f in frames]))
+        for name in STAGES:
+            rows[name].append(spent[name])
+    for u in undo:
+        u()
+
+    def ms(name: str) -> float:
+        return 1e3 * statistics.median(rows[name]) / FRAMES
+
+    def ratio(a: str, b: str) -> float:
+        return statistics.median(x / y for x, y in zip(rows[a], rows[b], strict=True))
+
+    report += [f"## {label} ({width} x {height}), batch of {FRAMES}, {rounds} rounds", ""]
+    report += ["| step | CPU ms a frame | of decoding |", "|---|---|---|"]
+    report += [f"| {name} | {ms(name):.1f} | {ratio(name, 'decode PNG'):.2f} |" for name in rows]
+    ok = poses.ok
+    error = (poses.t - truth)[ok].square().mean(0).sqrt() * 1e3
+    found = [i for i, t in enumerate(plain) if t is not None]
+    theirs = torch.tensor(np.array([plain[i] for i in found])) - truth[found]
+    line = theirs.square().mean(0).sqrt() * 1e3
+    report += [
+        "",
+        f"RMS error x, y, z, um: torchpose {', '.join(f'{e:.2f}' for e in error.tolist())} ({int(ok.sum())} of",
+    ]
+    report += [
+        f"{FRAMES} ok); OpenCV {', '.join(f'{e:.1f}' for e in line.tolist())} ({len(found)} of {FRAMES} found).",
+        "",
+    ]
+
+
+def bench_reduction(rounds: int, report: list[str]) -> None:
+    """Why the one full-size pass is OpenCV's: torch's own area reduction converts to float first."""
+    frames = torch.randint(0, 256, (4, 3648, 5472), dtype=torch.uint8)
+    ours, torchs = [], []
+    for _ in range(rounds):
+        ours.append(cpu(lambda: reduce.area_reduce(frames, 4)))
+        torchs.append(cpu(lambda: torch.nn.functional.avg_pool2d(frames[:, None].float(), 4)))
+    ratio = statistics.median(b / a for a, b in zip(ours, torchs, strict=True))
+    report += [f"Area reduction of 20 MP frames by 4: avg_pool2d takes {ratio:.1f} times the CPU of cv2.resize.", ""]
+
+
+def peak_memory(folder: Path, camera: Path, count: int) -> float:
+    """Largest resident set of `torchpose estimate` on ``count`` frames, MB."""
+    many = folder.parent / f"many{count}"
+    many.mkdir()
+    for i in range(count):
+        os.link(folder / f"{i % FRAMES}.png", many / f"{i:04d}.png")
+    command = [sys.executable, "-m", "torchpose", "estimate", str(many), "--camera", str(camera), "--target", "quad40"]
+    process = subprocess.Popen([*command, "--out", str(folder.parent / f"{count}.csv"), "--quiet"])
+    _, status, usage = os.wait4(process.pid, 0)
+    if status != 0:
+        raise SystemExit(f"estimate failed on {count} frames")
+    shutil.rmtree(many)
+    return usage.ru_maxrss / 1024
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--out", type=Path, help="also write the report to this Markdown file")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
+    report = [
+        "# Pipeline benchmark",
+        "",
+        f"Made by `scripts/bench_pipeline.py` at commit {commit}; Python {platform.python_version()}, torch "
+        f"{torch.__version__}, OpenCV {cv2.__version__}, {os.cpu_count()} cores; one thread each, medians.",
+        "",
+    ]
+    with tempfile.TemporaryDirectory() as scratch:
+        for label in SIZES:
+            folder = Path(scratch) / label.replace(" ", "") / "frames"
+            folder.mkdir(parents=True)
+            bench_size(label, options.rounds, folder, report)
+            few, many = (peak_memory(folder, folder.parent / "camera.yaml", n) for n in (8, 200))
+            report += [f"Peak memory of `torchpose estimate`: {few:.0f} MB on 8 frames, {many:.0f} MB on 200.", ""]
+    bench_reduction(options.rounds, report)
+    text = "\n".join(report)
+    print(text)
+    if options.out:
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        options.out.write_text(text)
+
+
+if __name__ == "__main__":
+    main()
