@@ -69,7 +69,7 @@ def solve(
     mask: Tensor | None = None,
     initial: tuple[Tensor, Tensor] | None = None,
     huber: float = float("inf"),
-    max_iterations: int = 30,
+    max_iterations: int = 60,
     compile: bool = False,
     raise_on_failure: bool = False,
 ) -> PnPResult:
@@ -295,8 +295,7 @@ def _solve_chunk(
         (~finite, PnPCode.NOT_FINITE),
         (seen < minimum, PnPCode.TOO_FEW),
     )
-    cost = state.normal[27].unflatten(0, (options, batch))
-    late = ~state.converged.unflatten(0, (options, batch)) & (cost <= _relevant(cost))
+    late = (~state.converged & state.normal[27].isfinite()).unflatten(0, (options, batch))
     return _report(state, options, center, unit, pixel, weight, bad, compile), late.any(0)
 
 
@@ -385,7 +384,8 @@ def _refine(
     first = minimise(single, r.float(), t.float(), max_iterations=max_iterations, rtol=1e-4, compile=compile)
     r, t = orthonormalise(first.r.double()), first.t.double()
     chi2 = first.normal[27].unflatten(0, (options, -1))
-    index = (chi2 <= _relevant(chi2)).flatten().nonzero().squeeze(1)
+    # neither is one that float32 did not reach: it may yet become the better one
+    index = ((chi2 <= _relevant(chi2)).flatten() | ~first.converged).nonzero().squeeze(1)
     every = len(index) == r.shape[-1]
     part = (final, r, t) if every else (final.select(index), r[..., index], t[:, index])
     last = minimise(*part, max_iterations=max_iterations, rtol=1e-10, damping=1e-6, compile=compile)
@@ -456,7 +456,8 @@ def _report(
 
     code = torch.zeros_like(best.iterations)
     verdicts = (
-        (different & (other_chi2 - chi2[0] < DECISION), PnPCode.AMBIGUOUS),
+        # another minimum that was not reached may be lower than where its search ended
+        (different & ((other_chi2 - chi2[0] < DECISION) | ~other.converged), PnPCode.AMBIGUOUS),
         (~best.converged, PnPCode.NOT_CONVERGED),
         (~chi2[0].isfinite(), PnPCode.BEHIND_CAMERA),
         (~(independence > INDEPENDENCE) & chi2[0].isfinite(), PnPCode.DEGENERATE),
