@@ -139,14 +139,9 @@ def bench_size(label: str, rounds: int, folder: Path, report: list[str]) -> None
     found = [i for i, t in enumerate(plain) if t is not None]
     theirs = torch.tensor(np.array([plain[i] for i in found])) - truth[found]
     line = theirs.square().mean(0).sqrt() * 1e3
-    report += [
-        "",
-        f"RMS error x, y, z, um: torchpose {', '.join(f'{e:.2f}' for e in error.tolist())} ({int(ok.sum())} of",
-    ]
-    report += [
-        f"{FRAMES} ok); OpenCV {', '.join(f'{e:.1f}' for e in line.tolist())} ({len(found)} of {FRAMES} found).",
-        "",
-    ]
+    ours_um, opencv_um = (", ".join(f"{e:.2f}" for e in v.tolist()) for v in (error, line))
+    report += ["", f"RMS error x, y, z, um: torchpose {ours_um} ({int(ok.sum())} of {FRAMES} ok);"]
+    report += [f"OpenCV {opencv_um} ({len(found)} of {FRAMES} found).", ""]
 
 
 def bench_reduction(rounds: int, report: list[str]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor, nn
@@ -13,13 +14,23 @@ from torchpose.centers import compensate
 from torchpose.detect import find_candidates
 from torchpose.errors import ConfigError, FrameError
 from torchpose.markers import Identified, MarkerTable, identify
-from torchpose.pose import Evidence, Solutions, gather_evidence, intrinsics_covariance, solve_poses
+from torchpose.pose import (
+    Evidence,
+    Solutions,
+    center_rms,
+    gather_evidence,
+    intrinsics_covariance,
+    solve_poses,
+)
+from torchpose.refine import refine_photometric
 from torchpose.results import Detections, Poses, Reason, Status
 from torchpose.rings import Rings, measure_rings
 from torchpose.target import Target
 
 _FRAME_TYPES = (torch.uint8, torch.uint16, torch.float16, torch.bfloat16, torch.float32, torch.float64)
 MIN_MARKERS = 3
+Method = Literal["photometric", "centers"]
+_LEAST_KEPT = 0.5  # of the pixels around the edges that must follow the model for a refinement to count
 
 
 class PoseEstimator(nn.Module):
@@ -28,13 +39,22 @@ class PoseEstimator(nn.Module):
     Args:
         camera: intrinsics and distortion; frames must have its size.
         target: one target or several; each gets a row for every frame.
+        method: "photometric" refines every pose on the grey values around its rings; "centers" stops at the pose of the
+            compensated ring centres.
         float_range: grey value of white in floating-point frames: 1.0 or 255.0.
 
     Raises:
-        ConfigError: no target, or two of one name.
+        ConfigError: no target, or two of one name; an unknown method.
     """
 
-    def __init__(self, camera: Camera, target: Target | Sequence[Target], *, float_range: float = 1.0) -> None:
+    def __init__(
+        self,
+        camera: Camera,
+        target: Target | Sequence[Target],
+        *,
+        method: Method = "photometric",
+        float_range: float = 1.0,
+    ) -> None:
         super().__init__()
         self.camera = camera
         self.targets = (target,) if isinstance(target, Target) else tuple(target)
@@ -46,6 +66,9 @@ class PoseEstimator(nn.Module):
             raise ConfigError(f"target: name {twice[0]!r} given twice; rename one, rows are told apart by it")
         if not float_range > 0:
             raise ConfigError(f"float_range: {float_range} is not positive; use 1.0 or 255.0")
+        if method not in get_args(Method):
+            raise ConfigError(f"method: {method!r} is not known; choose one of {', '.join(get_args(Method))}")
+        self.method = method
         self.float_range = float_range
         self._table = MarkerTable.of(self.targets)
 
@@ -79,6 +102,10 @@ class PoseEstimator(nn.Module):
 
         solvable = (evidence.mask.sum(-1) >= MIN_MARKERS).nonzero()[:, 0]
         solutions = solve_poses(evidence[solvable], (identified.R[solvable], identified.t[solvable]))
+        if self.method == "photometric":
+            solutions = self._refined(
+                frames, solutions, evidence[solvable], solvable // count, rings, identified.ring[solvable], camera
+            )
         if camera.covariance is not None:
             wider = intrinsics_covariance(evidence[solvable], solutions, camera.covariance)
             solutions = replace(solutions, covariance=solutions.covariance + wider)
@@ -121,6 +148,43 @@ class PoseEstimator(nn.Module):
             radii,
             table.coplanar[target],
             camera.matrix,
+        )
+
+    def _refined(
+        self,
+        frames: Tensor,
+        s: Solutions,
+        e: Evidence,
+        frame: Tensor,
+        rings: Rings,
+        ring: Tensor,
+        camera: Camera,
+    ) -> Solutions:
+        """Solutions whose poses are refined on the grey values, where the refinement holds."""
+        solved = (s.status != Status.REJECTED).nonzero()[:, 0]
+        shapes = torch.stack([rings.outer_raw, rings.inner_raw], 1)
+        some = replace(e[solved], mask=s.mask[solved])
+        refined = refine_photometric(
+            frames,
+            camera,
+            frame[solved],
+            s.R[solved],
+            s.t[solved],
+            some.mask,
+            shapes[ring[solved].clamp_min(0)],
+            some.points,
+            some.normals,
+            some.radii,
+        )
+        good = refined.good & (refined.kept > _LEAST_KEPT)
+        index = solved[good]
+        rms = center_rms(some, refined.R, refined.t)
+        return replace(
+            s,
+            R=s.R.index_copy(0, index, refined.R[good]),
+            t=s.t.index_copy(0, index, refined.t[good]),
+            covariance=s.covariance.index_copy(0, index, refined.covariance[good]),
+            rms=s.rms.index_copy(0, index, rms[good]),
         )
 
     def _poses(

@@ -265,6 +265,14 @@ def _jacobian(e: Evidence, r: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor
     return torch.cat([by_point, -by_point @ rotations.skew(turned)], -1), n, weight
 
 
+def center_rms(e: Evidence, r: Tensor, t: Tensor) -> Tensor:
+    """RMS distance (N,) in px of the compensated centres from the projected ones."""
+    x = (r[:, None] @ e.points[..., None]).squeeze(-1) + t[:, None]
+    d = (x @ e.matrix.T)[..., :2] / x[..., 2:] - e.center
+    square = torch.where(e.mask, d.square().sum(-1), 0.0)
+    return (square.sum(-1) / e.mask.sum(-1)).sqrt()
+
+
 def _covariance(e: Evidence, r: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
     """Pose covariance (J^T W J)^-1 (N, 6, 6), and whether the centres determine all six parameters (N,)."""
     jac, _, weight = _jacobian(e, r, t)
