@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.special import ellipe
 
@@ -36,14 +36,16 @@ def ellipses(draw):
 
 @st.composite
 def circles(draw):
-    """Rotation, centre, normal, radius of a circle wholly in front of the camera."""
+    """Rotation, centre, normal, radius of a circle wholly in front of the camera and not edge-on."""
     axis = [draw(st.floats(-1, 1)) for _ in range(3)]
     rotation = rotations.exp(torch.tensor(axis, dtype=torch.float64))
     x, y, z = draw(st.floats(-150, 150)), draw(st.floats(-150, 150)), draw(st.floats(200, 2000))
     azimuth, polar = draw(st.floats(0, 2 * math.pi)), draw(st.floats(0, 0.6))
     normal = [math.sin(polar) * math.cos(azimuth), math.sin(polar) * math.sin(azimuth), math.cos(polar)]
     radius = draw(st.floats(1, 40))
-    return rotation, *(torch.tensor(v, dtype=torch.float64) for v in ([x, y, z], normal, radius))
+    center, normal, radius = (torch.tensor(v, dtype=torch.float64) for v in ([x, y, z], normal, radius))
+    assume(abs((rotation @ normal) @ center) > 0.05 * center.norm())
+    return rotation, center, normal, radius
 
 
 def circle_points(rotation, center, normal, radius):
@@ -127,7 +129,7 @@ def test_perimeter():
 def test_circle_image_holds_the_points(circle):
     x = circle_points(*circle)
     matrix = conics.circle_image(*circle)
-    assert on_conic(matrix, x[:, :2] / x[:, 2:]).abs().max() < 1e-12
+    assert on_conic(matrix, x[:, :2] / x[:, 2:]).abs().max() < 1e-11
 
 
 @no_deadline
@@ -149,8 +151,6 @@ def test_circle_poses_hold_the_truth(circle):
     rotation, center, normal, radius = circle
     n = rotation @ normal
     n = n if n @ center > 0 else -n
-    if abs(n @ center) < 0.05 * center.norm():
-        return  # edge-on: the image is a line
     centers, normals = conics.circle_poses(conics.circle_image(*circle), radius)
     assert (centers[:, 2] > 0).all()
     assert ((centers * normals).sum(-1) > 0).all()
@@ -164,9 +164,6 @@ def test_circle_poses_hold_the_truth(circle):
 @given(circles())
 def test_both_circle_poses_have_the_same_image(circle):
     matrix = conics.circle_image(*circle)
-    n = circle[0] @ circle[2]
-    if abs(n @ circle[1]) < 0.05 * circle[1].norm():
-        return
     centers, normals = conics.circle_poses(matrix, circle[3])
     eye = torch.eye(3, dtype=torch.float64).expand(2, 3, 3)
     again = conics.circle_image(eye, centers, normals, circle[3].expand(2))
