@@ -14,7 +14,7 @@ from torchpose.camera import Camera
 from torchpose.errors import ConfigError, FrameError
 from torchpose.geometry import rotations
 from torchpose.sim import add_noise, render
-from torchpose.sim.renderer import fill, kernel_reach
+from torchpose.sim.boundary import Boxes, fill
 from torchpose.target import Target
 
 F64 = torch.float64
@@ -273,10 +273,14 @@ def test_fill_gradcheck():
     position = (6 + 3 * torch.stack([theta.cos(), theta.sin()], 1)).requires_grad_()
     dv = (3 * theta.cos() * (2 * math.pi / 20)).requires_grad_()
     sigma = torch.full((20,), 0.9, dtype=F64).requires_grad_()
-    canvas = torch.zeros(20, dtype=torch.int64)
-    reach = kernel_reach(sigma)
+    shape = torch.zeros(20, dtype=torch.int64)
+    boxes = Boxes(torch.tensor([[1, 0]]), torch.tensor([[11, 12]]))
     assert torch.autograd.gradcheck(
-        lambda p, d, s: fill(p, d, s, reach, canvas, 1, 12, 11).flatten()[::5], (position, dv, sigma)
+        lambda p, d, s: fill(p, d, s, shape, boxes)[::5], (position, dv, sigma)
+    )  # fmt: skip
+    half = torch.full((20,), 0.7, dtype=F64).requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda p, s, w: fill(p, dv.detach(), s, shape, boxes, half_chord=w)[::5], (position, sigma, half)
     )
 
 

@@ -7,12 +7,15 @@ from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.geometry import rotations
-from torchpose.sim import renderer
+from torchpose.sim import boundary, renderer
+from torchpose.sim.sensor import GREY_MAX
+from torchpose.sim.shapes import rings
 from torchpose.target import Target
 
 _CHUNK_POSES = 16  # poses differentiated at a time
 
 
+@torch.enable_grad()
 def pose_crlb(
     camera: Camera,
     target: Target,
@@ -48,7 +51,7 @@ def pose_crlb(
     R, t = renderer.check_poses(R, t)
     sigma = renderer.check_blur(psf_sigma, t)
     dark_, light_, noise = (renderer.per_frame(x, t) for x in (dark, light, noise_sigma))
-    step = renderer.GREY_MAX / (2**bits - 1)
+    step = GREY_MAX / (2**bits - 1)
     variance = noise.square() + step * step / 12
     out = []
     for a in range(0, t.shape[0], _CHUNK_POSES):
@@ -60,26 +63,28 @@ def pose_crlb(
 
 def _fisher(camera: Camera, target: Target, R: Tensor, t: Tensor, sigma: Tensor, contrast: Tensor) -> Tensor:
     """Fisher information (B, 7, 7) of translation, rotation and blur at unit noise, grey levels eliminated."""
-    edges = renderer.ring_boundary(camera, target, R, t, sigma)
-    # one canvas for every marker in view, its corner at a whole pixel
-    pair, canvas = (edges.frame * len(target) + edges.marker).unique(return_inverse=True)
+    marks = rings(target).to(t).in_frames(torch.arange(t.shape[0], device=t.device))
+    edges = boundary.sample_boundary(camera, marks, R, t, sigma)
+    # windows of one size, its corner at a whole pixel, for every marker in view
+    pair, window = edges.shape.unique(return_inverse=True)
     if len(pair) == 0:
         return t.new_zeros(t.shape[0], 7, 7)
-    frame = pair // len(target)
-    reach = renderer.kernel_reach(sigma)
-    pixel = renderer.project(camera, edges, R, t)[0]
-    index = canvas[:, None].expand_as(pixel)
+    frame = marks.frame[pair]
+    pixel = boundary.project(camera, edges, R, t)[0]
+    index = window[:, None].expand_as(pixel)
     low = torch.zeros_like(pixel[: len(pair)]).scatter_reduce(0, index, pixel, "amin", include_self=False)
     high = torch.zeros_like(low).scatter_reduce(0, index, pixel, "amax", include_self=False)
-    margin = (0.5 + renderer.REACH * sigma[frame, None]).ceil()
+    margin = (0.5 + boundary.REACH * sigma[frame, None]).ceil()
     low, high = low.floor() - margin, high.ceil() + margin
-    width, height = ((high - low).amax(0).long() + 1).tolist()
+    size = (high - low).amax(0).long() + 1
+    width, height = size.tolist()
+    boxes = boundary.Boxes(low.long(), size.expand(len(pair), 2))
 
     def coverage(delta: Tensor) -> tuple[Tensor, Tensor]:
         rotation, translation, blur = rotations.exp(delta[3:6]) @ R, t + delta[:3], sigma + delta[6]
-        position, dv = renderer.project(camera, edges, rotation, translation)
-        position, dv = position - low[canvas], dv * edges.sign
-        c = renderer.fill(position, dv, blur[edges.frame], reach, canvas, len(pair), height, width)
+        position, dv = boundary.project(camera, edges, rotation, translation)
+        cells = boundary.fill(position, dv, blur[edges.frame], window, boxes)
+        c = cells.view(len(pair), height, width + 1)[..., :width]
         return c, c
 
     jacobian, c = torch.func.jacfwd(coverage, has_aux=True)(t.new_zeros(7))  # (P, h, w, 7), (P, h, w)

@@ -1,0 +1,157 @@
+"""What lies between the picture and the stored grey values: uneven light on the way in, noise and rounding after it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from torchpose.camera import Camera
+from torchpose.errors import ConfigError
+
+GREY_MAX = 255.0  # grey levels of rendered frames, whatever the bit depth of the sensor
+_GAIN_STEP = 8  # px between the points where the light is computed
+_CHUNK = 1 << 16  # pairs of deviates at a time: they stay in the processor's cache
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """Uneven light as a gain of the frame, smooth in the pixels.
+
+    The gain is applied to the blurred picture, so it is exact where it is constant over the blur. It is computed every
+    8 px and interpolated linearly.
+
+    Attributes:
+        gradient: relative change of the light from the frame's centre to its right and to its lower border.
+        point: position of a point light in the camera frame, mm, or None. The target's plane is lit with the inverse
+            square of the distance and Lambert's cosine, relative to the target's origin; everything else as if it lay
+            in that plane.
+        vignetting: exponent n of the fall-off cos^n of the angle from the optical axis; 4 is the natural one.
+    """
+
+    gradient: tuple[float, float] = (0.0, 0.0)
+    point: tuple[float, float, float] | None = None
+    vignetting: float = 0.0
+
+    def gain(self, camera: Camera, R: Tensor, t: Tensor) -> Tensor:
+        """(B, H, W) float32 gain of every pixel, for poses (B, 3, 3), (B, 3) in mm."""
+        nodes = [2 + (size - 1) // _GAIN_STEP for size in (camera.width, camera.height)]
+        u, v = (
+            torch.linspace(0, size - 1, n, dtype=t.dtype, device=t.device)
+            for size, n in zip((camera.width, camera.height), nodes, strict=True)
+        )
+        across, down = (2 * x / max(size - 1, 1) - 1 for x, size in ((u, camera.width), (v, camera.height)))
+        gain = 1 + self.gradient[0] * across + self.gradient[1] * down[:, None]
+        gain = gain.expand(len(t), *gain.shape)
+        if self.vignetting or self.point is not None:
+            pixel = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
+            ray = torch.nn.functional.pad(camera.undistort_points(pixel).nan_to_num(), (0, 1), value=1.0)
+            gain = gain * ray.square().sum(-1) ** (-0.5 * self.vignetting)
+        if self.point is not None:
+            light = t.new_tensor(self.point)
+            normal = R[:, None, None, :, 2]
+            origin = t[:, None, None]
+            depth = (origin * normal).sum(-1) / (ray * normal).sum(-1)
+            here = _irradiance(depth[..., None] * ray, light, normal)
+            gain = gain * here / _irradiance(origin, light, normal)
+        return interpolate(
+            gain[:, None].float(), size=(camera.height, camera.width), mode="bilinear", align_corners=True
+        )[:, 0].clamp_min(0)
+
+
+def _irradiance(x: Tensor, light: Tensor, normal: Tensor) -> Tensor:
+    """Of a surface at x with the given normal, from a point light, up to a factor; 0 where it faces away."""
+    to_light = light - x
+    squared = to_light.square().sum(-1)
+    # the printed side is the one that the normal points away from
+    return (-(to_light * normal).sum(-1)).clamp_min(0) / (squared * squared.sqrt())
+
+
+def add_noise(
+    frames: Tensor,
+    sigma: float | Tensor,
+    seed: int = 0,
+    *,
+    index: Tensor | None = None,
+    bits: int = 8,
+    full_well: float | None = None,
+    gamma: float = 1.0,
+) -> Tensor:
+    """Frames as the sensor delivers them: read noise, shot noise, gamma, rounding to ``bits`` bits, clipping.
+
+    The linear model of EMVA 1288 (release 4.0, section 2): the variance of a pixel is sigma^2 + 255 grey / full_well,
+    in squared grey levels. The photon count is taken as Gaussian with the mean and the variance of the Poisson
+    distribution, which differs from it below some tens of electrons.
+
+    The noise of a pixel depends on ``seed``, the frame's number and the pixel alone (a counter-based generator:
+    SplitMix64 of Steele, Lea and Flood 2014 and the Box-Muller transform in float32), so it is the same in any batch.
+
+    Args:
+        frames: (B, H, W), grey levels 0..255. sigma: read noise in grey levels of 0..255; a number or (B,).
+        seed: any integer. index: (B,) int64, the frames' numbers; 0 to B - 1 by default.
+        bits: 1 to 16; white (255) becomes 2^bits - 1.
+        full_well: electrons of a white pixel; None for a sensor without shot noise.
+        gamma: stored = 255 (grey / 255)^(1 / gamma), after the noise.
+
+    Returns:
+        (B, H, W) uint8 for up to 8 bits, else uint16.
+
+    Raises:
+        ConfigError: ``bits`` is out of range, ``sigma`` is negative, or ``full_well`` or ``gamma`` is not above 0.
+    """
+    if not 1 <= bits <= 16:
+        raise ConfigError(f"bits: {bits} is not a bit depth of this camera model; give 1 to 16")
+    for name, value in (("full_well", full_well), ("gamma", gamma)):
+        if value is not None and not value > 0:
+            raise ConfigError(f"{name}: {value} is not above 0; give a positive number")
+    count, height, width = frames.shape
+    amplitude = torch.as_tensor(sigma, dtype=torch.float32, device=frames.device).expand(count)
+    if not bool((amplitude >= 0).all()):
+        raise ConfigError("sigma: the noise is negative; give 0 or more grey levels")
+    top, dtype = 2**bits - 1, torch.uint8 if bits <= 8 else torch.uint16
+    number = torch.arange(count, device=frames.device) if index is None else index.to(frames.device)
+    key = _mix64(_mix64(torch.full_like(number, seed % 2**62)) + number)
+    flat = frames.reshape(count, height * width)
+    out = torch.empty(flat.shape, dtype=dtype, device=frames.device)
+    together = max(1, 2 * _CHUNK // max(1, flat.shape[1]))  # small frames share a chunk
+    for a in range(0, count, together):
+        rows = slice(a, a + together)
+        for b in range(0, flat.shape[1], 2 * _CHUNK):
+            grey = flat[rows, b : b + 2 * _CHUNK].float()
+            noise = _normal(key[rows], b // 2, grey.shape[1])
+            if full_well is None:
+                noise.mul_(amplitude[rows, None])
+            else:
+                variance = grey.clamp_min(0) * (GREY_MAX / full_well) + amplitude[rows, None].square()
+                noise.mul_(variance.sqrt_())
+            level = noise.add_(grey)
+            if gamma != 1:
+                level.div_(GREY_MAX).clamp_min_(0).pow_(1 / gamma).mul_(GREY_MAX)
+            out[rows, b : b + 2 * _CHUNK] = level.mul_(top / GREY_MAX).round_().clamp_(0, top).to(dtype)
+    return out.view(count, height, width)
+
+
+def _normal(key: Tensor, first: int, count: int) -> Tensor:
+    """(B, count) float32 normal deviates from the pair ``first`` on, of the frames with keys (B,) int64."""
+    pairs = (count + 1) // 2
+    bits = _mix64(key[:, None] + torch.arange(first, first + pairs, device=key.device) * _GOLDEN)
+    radius = (bits & 0xFFFFFFFF).float().add_(0.5).mul_(2.0**-32).log_().mul_(-2).sqrt_()
+    angle = ((bits >> 32).float() + 0.5).mul_(2 * math.pi * 2.0**-32)
+    out = torch.empty(len(key), pairs, 2, device=key.device)
+    torch.mul(radius, angle.cos(), out=out[..., 0])
+    torch.mul(radius, angle.sin(), out=out[..., 1])
+    return out.flatten(1)[:, :count]
+
+
+_GOLDEN = 0x9E3779B97F4A7C15 - 2**64
+
+
+def _mix64(x: Tensor) -> Tensor:
+    """Output function of SplitMix64 on int64, which wraps around as the unsigned one does."""
+    x = x + _GOLDEN
+    x = x.bitwise_xor_((x >> 30).bitwise_and_(2**34 - 1)).mul_(0xBF58476D1CE4E5B9 - 2**64)
+    x = x.bitwise_xor_((x >> 27).bitwise_and_(2**37 - 1)).mul_(0x94D049BB133111EB - 2**64)
+    return x.bitwise_xor_((x >> 31).bitwise_and_(2**33 - 1))
