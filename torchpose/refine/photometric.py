@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,11 +26,13 @@ from torchpose.geometry import rotations
 from torchpose.geometry.segments import ragged_arange, rank_in_group, segment_sum
 
 _BAND = 3.5  # px on either side of an edge
-_STEPS = 6
+_STEPS = 5
+_SELECTING = (0, 2, 3)  # steps that choose anew which pixels follow the model
 _START_BLUR = 0.8  # px
 _BLUR_RANGE = (0.3, 4.0)
 _CUT = 4.0  # robust standard deviations beyond which a pixel is left out
 _LEVELS = 6  # ring and paper, each with a constant and a gradient over the plane
+_ROOT_HALF = math.sqrt(0.5)
 _QUANTISATION = 1 / 12  # variance of rounding, in grey levels^2, below which no noise estimate falls
 
 
@@ -56,20 +59,36 @@ class Refined:
 
 @dataclass(frozen=True, eq=False)
 class _Blocks:
-    """Pixels of K markers, padded to P.
+    """Pixels of K markers, padded to P; one plane of numbers (K, P) for every component.
 
-    row: (K,) int64. ray: (K, P, 3), on the plane z = 1. warp: (K, P, 2, 2), d(ray)/d(pixel). grey, valid: (K, P).
+    row: (K,) int64. ray_x, ray_y: on the plane z = 1. warp: 4 planes, d(ray)/d(pixel) row by row. grey, valid.
     center, normal: (K, 3), target frame. radii: (K, 2).
     """
 
     row: Tensor
-    ray: Tensor
-    warp: Tensor
+    ray_x: Tensor
+    ray_y: Tensor
+    warp: tuple[Tensor, ...]
     grey: Tensor
     valid: Tensor
     center: Tensor
     normal: Tensor
     radii: Tensor
+
+
+class _Model(NamedTuple):
+    """Prediction and derivatives at one pose; planes (K, P) in float32.
+
+    fraction: of paper, F. by_d, by_q: dF/dd through both circles, dF/dq. by_pose: 6 planes, derivative of d.
+    x, y: plane coordinates over the outer radius.
+    """
+
+    fraction: Tensor
+    by_d: Tensor
+    by_q: Tensor
+    by_pose: tuple[Tensor, ...]
+    x: Tensor
+    y: Tensor
 
 
 def refine_photometric(
@@ -96,14 +115,15 @@ def refine_photometric(
     blocks = _gather(frames, camera, frame, mask, rings, centers, normals, radii)
     r, t = rotation, translation
     blur = torch.full((rows,), _START_BLUR, dtype=torch.float64, device=r.device)
+    levels = _first_levels(blocks, r, t, blur)
     weight = blocks.valid
-    levels, weight = _first_levels(blocks, r, t, blur)
     information = torch.zeros(rows, 7, 7, dtype=torch.float64, device=r.device)
     variance = torch.ones(rows, dtype=torch.float64, device=r.device)
-    for _ in range(_STEPS):
-        jac, basis, residual = _linearise(blocks, r, t, blur, levels)
-        weight = _inliers(residual, blocks)
-        step, level_step, information, variance = _gauss_newton(jac, basis, residual, weight, blocks.row, rows)
+    for iteration in range(_STEPS):
+        columns = _columns(blocks, _model(blocks, r, t, blur), levels)
+        if iteration in _SELECTING:
+            weight = _inliers(columns[:, -1], blocks)
+        step, level_step, information, variance = _gauss_newton(columns, weight, blocks.row, rows)
         r = rotations.exp(step[:, 3:6]) @ r
         t = t + step[:, :3]
         blur = (blur + step[:, 6]).clamp(*_BLUR_RANGE)
@@ -155,61 +175,82 @@ def _gather(
     slot = rank_in_group(block, count)
     most = int(slot.max()) + 1 if slot.numel() else 1
 
-    def padded(values: Tensor, fill: float) -> Tensor:
-        out = torch.full((count, most, *values.shape[1:]), fill, dtype=torch.float64, device=frames.device)
-        out[block, slot] = values.double()
-        return out
+    place = block * most + slot
+
+    def padded(values: Tensor, dtype: torch.dtype = torch.float64) -> Tensor:
+        out = torch.zeros(count * most, dtype=dtype, device=frames.device)
+        return out.index_copy_(0, place, values.to(dtype)).view(count, most)
 
     xy = camera.undistort_points(uv)
-    warp = torch.linalg.inv(camera.J_distort(xy))
-    grey = frames.reshape(-1)[(frame[row[block]] * height + v) * width + u]
     sound = xy.isfinite().all(-1)
-    xy, warp = torch.where(sound[:, None], xy, 0.0), torch.where(sound[:, None, None], warp, 0.0)
-    ray = torch.cat([xy, torch.ones_like(xy[:, :1])], -1)
+    xy = torch.where(sound[:, None], xy, 0.0)
+    j00, j01, j10, j11 = camera.J_distort(xy).flatten(-2).unbind(-1)
+    det = j00 * j11 - j01 * j10
+    warp = tuple(padded(w / det, torch.float32) for w in (j11, -j01, -j10, j00))
+    grey = frames.reshape(-1)[(frame[row[block]] * height + v) * width + u]
     return _Blocks(
         row,
-        padded(ray, 1.0),
-        padded(warp, 0.0),
-        padded(grey, 0.0),
-        padded(sound, 0.0),
+        *(padded(c) for c in xy.unbind(-1)),
+        warp,
+        padded(grey, torch.float32),
+        padded(sound, torch.float32),
         centers[row, marker],
         normals[row, marker],
         radii[row, marker],
     )
 
 
-def _fraction(b: _Blocks, r: Tensor, t: Tensor, blur: Tensor) -> tuple[Tensor, ...]:
-    """Paper fraction F (K, P) and what its derivatives need.
-
-    Returns:
-        F, dF/dd (K, P) (through both circles), dF/dq (K, P), the derivative of d by the pose (K, P, 6), and the plane
-        coordinates over the outer radius (K, P, 2).
-    """
-    rk, tk, q = r[b.row], t[b.row], blur[b.row][:, None]
+def _model(b: _Blocks, r: Tensor, t: Tensor, blur: Tensor) -> _Model:
+    """Predicts every pixel. The radius in the plane is formed in float64, what is small beside it in float32."""
+    rk = r[b.row]
     normal = (rk @ b.normal[..., None]).squeeze(-1)
-    center = (rk @ b.center[..., None]).squeeze(-1) + tk
-    along = (b.ray @ normal[..., None]).squeeze(-1)  # n . ray
-    depth = (normal * center).sum(-1)[:, None] / along
-    point = depth[..., None] * b.ray - center[:, None]  # in the plane, camera axes
-    radius = torch.linalg.vector_norm(point, dim=-1).clamp_min(1e-9)
-    e = point / radius[..., None]
-    m = e - normal[:, None] * ((e * b.ray).sum(-1) / along)[..., None]
-    # a pixel's ray moves the point by depth m . d(ray): gradient of the radius in the image
-    gradient = ((depth[..., None] * m[..., :2])[..., None, :] @ b.warp).squeeze(-2)
-    slope = torch.linalg.vector_norm(gradient, dim=-1).clamp_min(1e-12)
-    # |det| of pixel -> plane: depth^3 / (n . c) |det warp|, as the plane's area under a solid angle
-    area = depth.square() * b.warp.det().abs() / along.abs()
-    bend = area.square() / (slope**3 * radius)  # curvature of the circle's image, 1/px
-    z_outer, z_inner = (((radius - size[:, None]) / slope + 0.5 * q.square() * bend) / q for size in b.radii.unbind(-1))
-    f = _phi(z_outer) + 1 - _phi(z_inner)
+    arm = (rk @ b.center[..., None]).squeeze(-1)  # marker's centre about the target's origin, camera axes
+    center = arm + t[b.row]
+    one, two = _plane_axes(normal).unbind(1)
+
+    def scalar(value: Tensor) -> Tensor:
+        return value[:, None]
+
+    def along(axis: Tensor) -> Tensor:
+        return scalar(axis[:, 0]) * b.ray_x + scalar(axis[:, 1]) * b.ray_y + scalar(axis[:, 2])
+
+    # the ray of the pixel meets the plane at depth * ray; coordinates about the circle's centre
+    toward = 1 / along(normal)
+    depth = scalar((normal * center).sum(-1)) * toward
+    one_c, two_c = scalar((one * center).sum(-1)), scalar((two * center).sum(-1))
+    x, y = depth * along(one) - one_c, depth * along(two) - two_c
+    radius = torch.hypot(x, y).clamp_min(1e-9)
+    outer, inner = ((radius - scalar(size)).float() for size in b.radii.unbind(-1))
+
+    x, y, radius, depth, toward = (v.float() for v in (x, y, radius, depth, toward))
+    one_c, two_c, q = one_c.float(), two_c.float(), scalar(blur[b.row]).float()
+    axes = [[scalar(c).float() for c in v.unbind(-1)] for v in (one, two, normal, arm)]
+    (ax, ay, az), (bx, by, bz), (nx, ny, nz), (cx, cy, cz) = axes
+    ex, ey = x / radius, y / radius
+    # a displacement w of the ray's foot, or of the plane against it, changes the radius by m . w
+    s = (radius + ex * one_c + ey * two_c) / depth * toward
+    mx, my, mz = ex * ax + ey * bx - s * nx, ex * ay + ey * by - s * ny, ex * az + ey * bz - s * nz
+    w00, w01, w10, w11 = b.warp
+    gu, gv = mx * w00 + my * w10, mx * w01 + my * w11  # gradient of the radius in the image, over the depth
+    flat = (gu.square() + gv.square()).clamp_min(1e-30).rsqrt()
+    per_mm = flat / depth  # px for a mm of radius
+    # area of a pixel in the plane, mm^2; curvature of the circle's image, 1/px
+    area = depth.square() * (w00 * w11 - w01 * w10).abs() * toward.abs()
+    bend = area.square() * per_mm.pow(3) / radius
+    pull = 0.5 * q * bend
+    z_outer, z_inner = outer * per_mm / q + pull, inner * per_mm / q + pull
     p_outer, p_inner = _density(z_outer), _density(z_inner)
-    by_d = (p_outer - p_inner) / q
-    by_q = p_outer * (bend - z_outer / q) - p_inner * (bend - z_inner / q)
-    arm = point + center[:, None] - tk[:, None]  # R p: the point about the target's origin
-    by_pose = -torch.cat([m, torch.linalg.cross(arm, m)], -1) / slope[..., None]
-    plane = _plane_axes(normal)
-    xy = point @ plane.mT / b.radii[:, :1, None]
-    return f, by_d, by_q, by_pose, xy
+    px, py, pz = x * ax + y * bx + cx, x * ay + y * by + cy, x * az + y * bz + cz
+    by_pose = tuple(-per_mm * v for v in (mx, my, mz, py * mz - pz * my, pz * mx - px * mz, px * my - py * mx))
+    size = scalar(b.radii[:, 0]).float()
+    return _Model(
+        0.5 * torch.erfc(-z_outer * _ROOT_HALF) + 0.5 * torch.erfc(z_inner * _ROOT_HALF),
+        (p_outer - p_inner) / q,
+        p_outer * (bend - z_outer / q) - p_inner * (bend - z_inner / q),
+        by_pose,
+        x / size,
+        y / size,
+    )
 
 
 def _plane_axes(normal: Tensor) -> Tensor:
@@ -220,42 +261,45 @@ def _plane_axes(normal: Tensor) -> Tensor:
     return torch.stack([first, torch.linalg.cross(normal, first)], 1)
 
 
-def _phi(z: Tensor) -> Tensor:
-    return 0.5 * torch.erfc(-z / math.sqrt(2))
-
-
 def _density(z: Tensor) -> Tensor:
-    return torch.exp(-0.5 * z.square()) / math.sqrt(2 * math.pi)
+    return torch.exp(-0.5 * z.square()) * (1 / math.sqrt(2 * math.pi))
 
 
-def _level_basis(f: Tensor, xy: Tensor) -> Tensor:
-    """Columns (K, P, 6) of the linear unknowns: ring (1, x, y), paper (1, x, y)."""
-    plane = torch.cat([torch.ones_like(xy[..., :1]), xy], -1)
-    return torch.cat([(1 - f)[..., None] * plane, f[..., None] * plane], -1)
+def _basis(m: _Model) -> tuple[Tensor, ...]:
+    """Planes of the linear unknowns: ring (1, x, y), paper (1, x, y)."""
+    ring = 1 - m.fraction
+    return ring, ring * m.x, ring * m.y, m.fraction, m.fraction * m.x, m.fraction * m.y
 
 
-def _first_levels(b: _Blocks, r: Tensor, t: Tensor, blur: Tensor) -> tuple[Tensor, Tensor]:
-    """Grey levels (K, 6) for the poses that come in, by a few reweighted linear fits, and the weights (K, P)."""
-    f, _, _, _, xy = _fraction(b, r, t, blur)
-    basis = _level_basis(f, xy)
+def _columns(b: _Blocks, m: _Model, levels: Tensor) -> Tensor:
+    """Derivatives by pose (6), blur (1) and levels (6), and the residual: (K, 14, P) float32."""
+    a0, ax, ay, p0, px, py = (v[:, None].float() for v in levels.unbind(-1))
+    ring, paper = a0 + ax * m.x + ay * m.y, p0 + px * m.x + py * m.y
+    contrast = paper - ring
+    by_d = contrast * m.by_d
+    residual = b.grey - (ring + contrast * m.fraction)
+    columns = torch.stack([*(by_d * v for v in m.by_pose), contrast * m.by_q, *_basis(m), residual], 1)
+    return columns.masked_fill_((b.valid == 0)[:, None], 0.0)
+
+
+def _first_levels(b: _Blocks, r: Tensor, t: Tensor, blur: Tensor) -> Tensor:
+    """Grey levels (K, 6) for the poses that come in, by reweighted linear fits."""
+    basis = torch.stack(_basis(_model(b, r, t, blur)), 1).masked_fill_((b.valid == 0)[:, None], 0.0)
     weight = b.valid
-    levels = torch.zeros(basis.shape[0], _LEVELS, dtype=torch.float64, device=f.device)
-    for _ in range(4):
-        weighted = basis * weight[..., None]
-        levels = _solve(weighted.mT @ basis, (weighted.mT @ b.grey[..., None]).squeeze(-1))
-        residual = b.grey - (basis @ levels[..., None]).squeeze(-1)
-        scale = _spread(residual, b.valid)
-        weight = b.valid / (1 + (residual / (2 * scale[:, None])).square()).square()
-    return levels, weight
+    levels = torch.zeros(basis.shape[0], _LEVELS, dtype=torch.float64, device=basis.device)
+    for _ in range(3):
+        weighted = basis * weight[:, None]
+        levels = _solve((weighted @ basis.mT).double(), (weighted @ b.grey[..., None]).squeeze(-1).double())
+        residual = b.grey - (levels.float()[:, None] @ basis).squeeze(1)
+        weight = b.valid / (1 + (residual / (2 * _spread(residual, b.valid)[:, None])).square()).square()
+    return levels
 
 
 def _solve(matrix: Tensor, right: Tensor) -> Tensor:
     """Solutions of small symmetric systems (K, n, n), (K, n); a trace of the diagonal keeps empty blocks solvable."""
-    n = matrix.shape[-1]
+    eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
     ridge = 1e-12 * matrix.diagonal(dim1=-2, dim2=-1).mean(-1) + 1e-12
-    return torch.linalg.solve(
-        matrix + ridge[:, None, None] * torch.eye(n, dtype=matrix.dtype, device=matrix.device), right
-    )
+    return torch.linalg.solve(matrix + ridge[:, None, None] * eye, right)
 
 
 def _spread(residual: Tensor, valid: Tensor) -> Tensor:
@@ -264,27 +308,13 @@ def _spread(residual: Tensor, valid: Tensor) -> Tensor:
     return (1.4826 * masked.nanmedian(-1).values).nan_to_num(nan=1.0).clamp_min(math.sqrt(_QUANTISATION))
 
 
-def _linearise(b: _Blocks, r: Tensor, t: Tensor, blur: Tensor, levels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Derivatives of the prediction by pose and blur (K, P, 7) and by the levels (K, P, 6), and residuals (K, P)."""
-    f, by_d, by_q, by_pose, xy = _fraction(b, r, t, blur)
-    basis = _level_basis(f, xy)
-    plane = torch.cat([torch.ones_like(xy[..., :1]), xy], -1)
-    contrast = (plane @ (levels[:, 3:] - levels[:, :3])[..., None]).squeeze(-1)
-    jac = torch.cat([(contrast * by_d)[..., None] * by_pose, (contrast * by_q)[..., None]], -1)
-    return jac, basis, b.grey - (basis @ levels[..., None]).squeeze(-1)
-
-
 def _inliers(residual: Tensor, b: _Blocks) -> Tensor:
-    scale = _spread(residual, b.valid)
-    return b.valid * (residual.abs() < _CUT * scale[:, None])
+    return b.valid * (residual.abs() < _CUT * _spread(residual, b.valid)[:, None])
 
 
-def _gauss_newton(
-    jac: Tensor, basis: Tensor, residual: Tensor, weight: Tensor, row: Tensor, rows: int
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _gauss_newton(columns: Tensor, weight: Tensor, row: Tensor, rows: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Step (N, 7), level step (K, 6), reduced information (N, 7, 7) and residual variance (N,)."""
-    columns = torch.cat([jac, basis, residual[..., None]], -1)
-    sums = (columns * weight[..., None]).mT @ columns  # (K, 14, 14)
+    sums = ((columns * weight[:, None]) @ columns.mT).double()  # (K, 14, 14)
     nn, nb, bb = sums[:, :7, :7], sums[:, :7, 7:13], sums[:, 7:13, 7:13]
     gn, gb = sums[:, :7, 13], sums[:, 7:13, 13]
     ridge = 1e-9 * bb.diagonal(dim1=-2, dim2=-1).mean(-1) + 1e-12
