@@ -8,10 +8,11 @@ from torchpose.pnp.p3p import p3p
 from torchpose.pnp.planar import planar
 from torchpose.pnp.posit import posit
 from torchpose.pnp.result import PnPCode, PnPError, PnPResult
-from torchpose.pnp.solve import solve
+from torchpose.pnp.solve import Method, solve
 
 __all__ = [
     "Candidates",
+    "Method",
     "PnPCode",
     "PnPError",
     "PnPResult",

@@ -174,20 +174,32 @@ class _State(NamedTuple):
 
 
 def _advance(obs: Observations, state: _State, rtol: float, floor: Tensor) -> _State:
-    """Evaluates the trial poses, accepts those that lower the cost, and proposes the next damped step."""
+    """Evaluates the trial poses, accepts those that lower the cost, and proposes the next damped step.
+
+    Poses that were done stay as they are, so that a pose does not depend on the others of its batch.
+    """
     r, t = state.r_trial, state.t_trial
     normal = normal_equations(obs, r, t)
-    accept = normal[27] <= state.normal[27] * (1 + 1e-12) + floor
-    if torch.compiler.is_compiling() or not bool(accept.all()):
+    # residuals that err by sqrt(floor) in length change the cost by as much as this (Cauchy-Schwarz)
+    old = state.normal[27]
+    lower = normal[27] <= old + 2 * (old * floor).sqrt() + floor
+    accept = lower & ~state.done
+    everywhere = not torch.compiler.is_compiling() and bool(accept.all())
+    if not everywhere:
         r, t = torch.where(accept, r, state.r), torch.where(accept, t, state.t)
         normal = torch.where(accept, normal, state.normal)
-    damping = state.damping * torch.where(accept, 0.1, 10.0)
+    damping = state.damping * torch.where(lower, 0.1, 10.0)
     rows = _rows(normal)
     step = solve_rows(rows, damping)[0].squeeze(1)
     decrease = sum((step[i] * row[-1] for i, row in enumerate(rows)), start=torch.zeros_like(damping))
     done = (decrease <= rtol * normal[27] + floor) & (damping <= 1) & normal[27].isfinite()
     step = step * -torch.tensor(SIGNS, dtype=r.dtype, device=r.device)[:, None]
-    return _State(r, t, normal, damping, matmul3(cayley(step[3:]), r), t + step[:3], decrease, done)
+    r_trial, t_trial = matmul3(cayley(step[3:]), r), t + step[:3]
+    if not everywhere:
+        was = state.done
+        r_trial, t_trial = torch.where(was, state.r_trial, r_trial), torch.where(was, state.t_trial, t_trial)
+        decrease, done = torch.where(was, state.decrease, decrease), done | was
+    return _State(r, t, normal, damping, r_trial, t_trial, decrease, done)
 
 
 def minimise(
@@ -243,4 +255,4 @@ def minimise(
             index = remaining if index is None else index[remaining]
             obs, floor = obs.select(remaining), floor[remaining]
             state = _State(*(v.index_select(-1, remaining) for v in state))
-    raise ValueError(f"max_iterations is {max_iterations}; expected 1 or more")
+    raise AssertionError("unreachable: the last iteration returns")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Literal, TypeVar
 
 import torch
@@ -16,11 +16,14 @@ from torchpose.pnp._compile import compiled
 from torchpose.pnp.candidates import Candidates
 from torchpose.pnp.dlt import dlt
 from torchpose.pnp.epnp import epnp
+from torchpose.pnp.implicit import attach_gradient
 from torchpose.pnp.iterative import (
+    SIGNS,
     Estimate,
     Observations,
     covariance,
     distance,
+    linearise,
     minimise,
     normal_equations,
     product2,
@@ -42,6 +45,8 @@ _CLOSED_FORMS: dict[str, Callable[[Tensor, Tensor, Tensor | None], Candidates]] 
 # points that each method needs
 _LEAST = {"iterative": 4, "planar": 4, "dlt": 6, "p3p": 3, "epnp": 4, "posit": 4}
 _T = TypeVar("_T")
+# root mean square of a start, in normalised coordinates, above which points may lie behind the camera
+_SUSPICIOUS = 1e-3
 # bytes; the most that glibc lets the threshold grow to is 32 MiB
 _KEPT = 30 << 20
 _Rows = TypeVar("_Rows", slice, Tensor)
@@ -69,7 +74,7 @@ def solve(
     mask: Tensor | None = None,
     initial: tuple[Tensor, Tensor] | None = None,
     huber: float = float("inf"),
-    max_iterations: int = 60,
+    max_iterations: int = 100,
     compile: bool = False,
     raise_on_failure: bool = False,
 ) -> PnPResult:
@@ -94,7 +99,8 @@ def solve(
         raise_on_failure: raise instead of returning codes other than CONVERGED and AMBIGUOUS.
 
     Returns:
-        `PnPResult`, float64, on the device of ``image_points``.
+        `PnPResult`, float64, on the device of ``image_points``. With method "iterative", R and t are differentiable in
+        the points, the pixels and the camera (implicit function theorem); the other fields are not.
 
     Raises:
         ValueError: shapes do not fit, or an unknown method.
@@ -122,10 +128,13 @@ def solve(
             raise ValueError(
                 f"initial has shapes {shapes}; expected (B, 3, 3) and (B, 3), or (B, S, 3, 3) and (B, S, 3)"
             )
+    if max_iterations < 1:
+        raise ValueError(f"max_iterations is {max_iterations}; expected 1 or more")
     if isinstance(camera, Tensor):
         camera = camera.to(pixels)
         _expect("camera", camera, (3, 3), batch)
 
+    @torch.no_grad()
     def run(rows: slice | Tensor, limit: int) -> tuple[PnPResult, Tensor]:
         def part(value: Tensor, shared: int) -> Tensor:
             return value if value.ndim == shared else value[rows]
@@ -145,6 +154,9 @@ def solve(
             compile,
         )
 
+    inputs = [points, pixels, *([camera] if isinstance(camera, Tensor) else [camera.matrix, camera.distortion])]
+    needs_gradient = torch.is_grad_enabled() and method == "iterative" and any(v.requires_grad for v in inputs)
+
     if batch <= _CHUNK:
         result, _ = run(slice(None), max_iterations)
     else:
@@ -160,6 +172,8 @@ def solve(
             result = PnPResult(
                 **{f.name: getattr(result, f.name).index_copy(0, late, getattr(again, f.name)) for f in fields(again)}
             )
+    if needs_gradient:
+        result = _with_gradient(result, points, pixels, camera, sigma_px, covariances, weights, mask, huber)
     if raise_on_failure:
         failed = result.code > PnPCode.AMBIGUOUS
         if bool(failed.any()):
@@ -167,6 +181,38 @@ def solve(
             code = PnPCode(int(result.code[first])).name
             raise PnPError(f"pose {first}: {code}; {int(failed.sum())} of {batch} poses failed")
     return result
+
+
+def _with_gradient(
+    result: PnPResult,
+    points: Tensor,
+    pixels: Tensor,
+    camera: Camera | Tensor,
+    sigma_px: float,
+    covariances: Tensor | None,
+    weights: Tensor | None,
+    mask: Tensor | None,
+    huber: float,
+) -> PnPResult:
+    """The result with R and t as differentiable functions of points, pixels and camera, where there is a pose."""
+    batch, count = pixels.shape[:2]
+    good = (result.code <= PnPCode.AMBIGUOUS).nonzero().squeeze(1)
+    keep = None if mask is None else mask.reshape(-1, count).T.expand(count, batch)
+    root = _whitening((count, batch), sigma_px, covariances, weights, keep, pixels)
+    if root.ndim == 3:
+        root = root * torch.eye(2, dtype=root.dtype, device=root.device)[..., None, None]
+    root = root.expand(2, 2, count, batch).permute(3, 2, 0, 1)[good]
+    seen = None if mask is None else mask.expand(batch, count)[good][..., None]
+
+    def part(value: Tensor, shared: int) -> Tensor:
+        return value if value.ndim == shared else value[good]
+
+    image, model = pixels[good], part(points, 2)
+    if seen is not None:
+        image, model = torch.where(seen, image, 0.0), torch.where(seen, model, 0.0)
+    lens = part(camera, 2) if isinstance(camera, Tensor) else camera
+    r, t = attach_gradient(result.R[good], result.t[good], model, image, lens, root.mT @ root, huber)
+    return replace(result, R=result.R.index_copy(0, good, r), t=result.t.index_copy(0, good, t))
 
 
 def _map(function: Callable[[_Rows], _T], chunks: Sequence[_Rows], like: Tensor) -> list[_T]:
@@ -177,16 +223,10 @@ def _map(function: Callable[[_Rows], _T], chunks: Sequence[_Rows], like: Tensor)
     # glibc gives freed memory above a threshold back to the system, and every chunk would fault it in again; freeing
     # one large block raises that threshold to its size. Not touched, it costs nothing.
     torch.empty(_KEPT, dtype=torch.uint8)
-    grad = torch.is_grad_enabled()
-
-    def work(rows: _Rows) -> _T:
-        # threads are of no use inside: a chunk is made to fit the cache of one core
-        with torch.set_grad_enabled(grad):
-            return function(rows)
-
+    # no threads inside: a chunk is made to fit the cache of one core
     results = [function(chunks[0])]
     with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-        results.extend(pool.map(work, chunks[1:]))
+        results.extend(pool.map(function, chunks[1:]))
     return results
 
 
@@ -282,6 +322,7 @@ def _solve_chunk(
         minimum = _LEAST[method]
         options = candidates[0].shape[2]
         r0, t0 = candidates[0].flatten(2), candidates[1].flatten(1)
+    mirrored = r0.isinf().any(0).any(0).unflatten(0, (options, batch)).any(0)
     started = (r0.isfinite().all(0).all(0) & t0.isfinite().all(0)).unflatten(0, (options, batch)).any(0)
 
     final = observed
@@ -291,12 +332,39 @@ def _solve_chunk(
     pixel = final._replace(whitening=torch.ones_like(whitening) if final is not observed else slope)
     bad = (
         (~started, PnPCode.DEGENERATE),
+        (mirrored, PnPCode.BEHIND_CAMERA),
         (line, PnPCode.DEGENERATE),
         (~finite, PnPCode.NOT_FINITE),
         (seen < minimum, PnPCode.TOO_FEW),
     )
     late = (~state.converged & state.normal[27].isfinite()).unflatten(0, (options, batch))
-    return _report(state, options, center, unit, pixel, weight, bad, compile), late.any(0)
+    calibration = None
+    if isinstance(camera, Camera) and camera.covariance is not None:
+        calibration = _calibration(final, whitening, image, camera)
+    return _report(state, options, center, unit, pixel, weight, bad, calibration, compile), late.any(0)
+
+
+def _calibration(final: Observations, whitening: Tensor, image: Tensor, camera: Camera) -> Callable[[Estimate], Tensor]:
+    """The function of a pose that gives J^T W J_K L (6, 4, B), where L L^T is the covariance of fx, fy, cx, cy."""
+    assert camera.covariance is not None
+    values, vectors = torch.linalg.eigh(camera.covariance.to(image))
+    root = vectors * values.clamp_min(0).sqrt()  # (4, 4)
+    matrix = camera.matrix.to(image)
+    x, y = (image[0] - matrix[0, 2]) / matrix[0, 0], (image[1] - matrix[1, 2]) / matrix[1, 1]
+    du = x * root[0, :, None, None] + root[2, :, None, None]  # (4, N, B)
+    dv = y * root[1, :, None, None] + root[3, :, None, None]
+    if whitening.ndim == 3:
+        du, dv = du * whitening[0], dv * whitening[0]
+    else:
+        du, dv = whitening[0, 0] * du + whitening[0, 1] * dv, whitening[1, 0] * du + whitening[1, 1] * dv
+
+    def mixed(pose: Estimate) -> Tensor:
+        u_row, v_row, _ = linearise(final, pose.r, pose.t)
+        rows = [(u * du).sum(1) + (v * dv).sum(1) for u, v in zip(u_row[:6], v_row[:6], strict=True)]
+        signs = torch.tensor(SIGNS, dtype=image.dtype, device=image.device)
+        return torch.stack(rows) * signs[:, None, None]
+
+    return mixed
 
 
 def _relevant(chi2: Tensor) -> Tensor:
@@ -326,11 +394,17 @@ def _start(
     rows = (~(flat | line)).expand(batch).nonzero().squeeze(1)
     if len(rows):
         # three of the points, and all of them at once where there are enough
-        part = _batch_first(observed.select(rows), None if weight is None else weight[:, rows])
-        found = p3p(*part)
+        points, xy, mask = _batch_first(observed.select(rows), None if weight is None else weight[:, rows])
+        found = p3p(points, xy, mask)
         solutions = [Candidates(*(v[:, :2] for v in found))]
         if count >= 6:
-            solutions = [epnp(*part), Candidates(*(v[:, :1] for v in found))]
+            solutions = [epnp(points, xy, mask), Candidates(*(v[:, :1] for v in found))]
+            # points behind the camera have the image of their reflection at the centroid, in front of it
+            if bool((solutions[0].rms > _SUSPICIOUS).any()):
+                reflected = epnp(-points, xy, mask).rms < 0.1 * solutions[0].rms
+                solutions = [
+                    Candidates(torch.where(reflected[..., None, None], torch.inf, s.R), s.t, s.rms) for s in solutions
+                ]
         r = r.index_copy(3, rows, torch.cat([s.R for s in solutions], 1).permute(2, 3, 1, 0).to(r))
         t = t.index_copy(2, rows, torch.cat([s.t for s in solutions], 1).permute(2, 1, 0).to(t))
     return r, t
@@ -426,6 +500,7 @@ def _report(
     pixel: Observations,
     weight: Tensor | None,
     bad: tuple[tuple[Tensor, PnPCode], ...],
+    calibration: Callable[[Estimate], Tensor] | None,
     compile: bool,
 ) -> PnPResult:
     batch = state.t.shape[-1] // options
@@ -442,6 +517,9 @@ def _report(
 
     best = pick(0)
     cov, independence = (compiled(covariance) if compile else covariance)(best.normal)
+    if calibration is not None:
+        shift = (cov[:, :, None] * calibration(best)).sum(1)  # (6, 4, B): of the pose, by a deviation of the intrinsics
+        cov = cov + (shift[:, None] * shift).sum(2)
     other, other_chi2, different = best, torch.full_like(chi2[0], torch.nan), torch.zeros_like(best.converged)
     for k in range(1, options):
         candidate = pick(k)
@@ -456,9 +534,9 @@ def _report(
 
     code = torch.zeros_like(best.iterations)
     verdicts = (
+        (different & (other_chi2 - chi2[0] < DECISION), PnPCode.AMBIGUOUS),
         # another minimum that was not reached may be lower than where its search ended
-        (different & ((other_chi2 - chi2[0] < DECISION) | ~other.converged), PnPCode.AMBIGUOUS),
-        (~best.converged, PnPCode.NOT_CONVERGED),
+        (~best.converged | (different & ~other.converged), PnPCode.NOT_CONVERGED),
         (~chi2[0].isfinite(), PnPCode.BEHIND_CAMERA),
         (~(independence > INDEPENDENCE) & chi2[0].isfinite(), PnPCode.DEGENERATE),
         *bad,
