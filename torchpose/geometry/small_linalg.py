@@ -62,29 +62,6 @@ def inverse3(a: Tensor) -> Tensor:
     return columns / (a[0] * columns[:, 0]).sum(0)
 
 
-def eigvalsh3(a: Tensor) -> Tensor:
-    """Eigenvalues (3, ...) in ascending order of symmetric matrices (3, 3, ...) (Smith, CACM 4, 1961).
-
-    Accurate to a few ulp of the largest eigenvalue; use `torch.linalg.eigh` where small ones count.
-    """
-    mean = (a[0, 0] + a[1, 1] + a[2, 2]) / 3
-    off = a[0, 1].square() + a[0, 2].square() + a[1, 2].square()
-    diagonal = torch.stack([a[0, 0], a[1, 1], a[2, 2]]) - mean
-    p = ((diagonal.square().sum(0) + 2 * off) / 6).sqrt()
-    d0, d1, d2 = diagonal.unbind()
-    determinant = (
-        d0 * (d1 * d2 - a[1, 2].square())
-        - a[0, 1] * (a[0, 1] * d2 - a[1, 2] * a[0, 2])
-        + a[0, 2] * (a[0, 1] * a[1, 2] - d1 * a[0, 2])
-    )
-    p3 = p * p * p
-    cosine = torch.where(p3 > 0, determinant / (2 * torch.where(p3 > 0, p3, torch.ones_like(p3))), 1).clamp(-1, 1)
-    angle = torch.acos(cosine) / 3
-    largest = mean + 2 * p * torch.cos(angle)
-    smallest = mean + 2 * p * torch.cos(angle + 2 * torch.pi / 3)
-    return torch.stack([smallest, 3 * mean - largest - smallest, largest])
-
-
 def orthonormalise(r: Tensor) -> Tensor:
     """Rotation matrices from matrices (3, 3, ...) that are rotations up to rounding (Gram-Schmidt on the rows)."""
     first = r[0] / r[0].square().sum(0).sqrt()

@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchpose.geometry.small_linalg import cross, det3, inverse3
+from torchpose.geometry.small_linalg import cross, det3, inverse3, matmul3
 from torchpose.pnp.candidates import Candidates, batch_last, rank
 
 _PAIRS = ((0, 1), (0, 2), (1, 2))
@@ -41,7 +41,7 @@ def p3p(object_points: Tensor, image_points: Tensor, mask: Tensor | None = None)
     rays = rays / rays.square().sum(0).sqrt()
     distances = _distances(corners, rays)  # (3 points, 4, B)
     seen = rays[:, :, None] * distances  # (3, 3 points, 4, B)
-    r = _product(_triad(seen), _triad(corners).transpose(0, 1)[:, :, None])
+    r = matmul3(_triad(seen), _triad(corners).transpose(0, 1)[:, :, None])
     t = seen.mean(1) - (r * corners.mean(1)[:, None]).sum(1)
     return rank(r, t, points, xy, weight)
 
@@ -177,7 +177,3 @@ def _triad(corners: Tensor) -> Tensor:
     z = cross(x, corners[:, 2] - corners[:, 0])
     z = z / z.square().sum(0).sqrt()
     return torch.stack([x, cross(z, x), z], 1)
-
-
-def _product(a: Tensor, b: Tensor) -> Tensor:
-    return a[:, 0, None] * b[0] + a[:, 1, None] * b[1] + a[:, 2, None] * b[2]

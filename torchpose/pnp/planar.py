@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchpose.geometry.small_linalg import cross
+from torchpose.geometry.small_linalg import cross, matmul3
 from torchpose.pnp.candidates import Candidates, batch_last, rank, weighted_mean
 
 # thickness over extent (standard deviations) above which points are no plane
@@ -121,7 +121,7 @@ def ippe(points: Tensor, xy: Tensor, weight: Tensor | None, frame: Tensor, cente
     first = torch.stack([torch.stack([a0, a0]), torch.stack([a1, a1]), torch.stack([a2, -a2])])  # (3, 2, B)
     second = torch.stack([torch.stack([b0, b0]), torch.stack([b1, b1]), torch.stack([b2, -b2])])
     local = torch.stack([first, second, cross(first, second)], 1)  # (3, 3, 2, B)
-    r = _product(_product(ray[:, :, None], local), frame[:, :, None])
+    r = matmul3(matmul3(ray[:, :, None], local), frame[:, :, None])
     return r, translation(r, points, xy, weight, center)
 
 
@@ -132,10 +132,6 @@ def ray_frame(xy: Tensor) -> Tensor:
     k = 1 / (1 + nz)
     xx, mixed, yy = 1 - nx * nx * k, -nx * ny * k, 1 - ny * ny * k
     return torch.stack([xx, mixed, nx, mixed, yy, ny, -nx, -ny, nz]).unflatten(0, (3, 3))
-
-
-def _product(a: Tensor, b: Tensor) -> Tensor:
-    return a[:, 0, None] * b[0] + a[:, 1, None] * b[1] + a[:, 2, None] * b[2]
 
 
 def translation(r: Tensor, points: Tensor, xy: Tensor, weight: Tensor | None, center: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchpose.geometry.small_linalg import cross, inverse3
+from torchpose.geometry.small_linalg import cross, inverse3, matmul3
 from torchpose.pnp.candidates import Candidates, batch_last, rank, weighted_mean
 from torchpose.pnp.planar import COLLINEARITY, FLATNESS, plane_frame, ray_frame
 
@@ -69,7 +69,7 @@ def posit(object_points: Tensor, image_points: Tensor, mask: Tensor | None = Non
         r, t = torch.where(first, r[:, :, 0], r[:, :, 1]), torch.where(first, t[:, 0], t[:, 1])
     second = flat | (torch.arange(2, device=xy.device) == 0)[:, None]
     r = torch.where(second & (extent[1] > COLLINEARITY * extent[2]), r, torch.nan)
-    r, t = _product(_product(turn[:, :, None], r), frame[:, :, None]), _product(turn[:, :, None], t[:, None])[:, 0]
+    r, t = matmul3(matmul3(turn[:, :, None], r), frame[:, :, None]), matmul3(turn[:, :, None], t[:, None])[:, 0]
     t = t * extent[2] - (r * center[:, None]).sum(1)
     return rank(r, t, points, xy, weight)
 
@@ -105,8 +105,3 @@ def _error(r: Tensor, t: Tensor, points: Tensor, xy: Tensor, weight: Tensor | No
     x, y, z = r[:, 0, None] * points[0] + r[:, 1, None] * points[1] + r[:, 2, None] * points[2] + t[:, None]
     square = (x / z - xy[0]).square() + (y / z - xy[1]).square()
     return (square if weight is None else square * weight).sum(0)
-
-
-def _product(a: Tensor, b: Tensor) -> Tensor:
-    """Products of matrices (3, 3, ...) and (3, m, ...)."""
-    return a[:, 0, None] * b[0] + a[:, 1, None] * b[1] + a[:, 2, None] * b[2]
