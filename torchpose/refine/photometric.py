@@ -45,7 +45,7 @@ class Refined:
         blur: (N,) px, standard deviation of the point-spread function with the pixel.
         noise: (N,) grey levels, standard deviation of the residuals kept.
         kept: (N,) fraction of the pixels kept.
-        good: (N,) bool; where False the refinement failed and the pose is the one that came in.
+        good: (N,) bool; where False the refinement failed and the other fields mean nothing.
     """
 
     R: Tensor
