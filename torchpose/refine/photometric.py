@@ -6,7 +6,7 @@ Every pixel in a band around the edges of a frame's rings is predicted as
 
 with d the distance in px of the pixel from the projected circle, k the curvature of the projected circle, q the blur
 (point-spread function and pixel together, one for each frame). The second term of z is the pull of blur on a curved
-edge. Pose and blur are found by Gauss-Newton; the two grey levels of each marker, with linear gradients over the plane,
+edge; Phi carries the fourth cumulant of the square pixel. Pose and blur are found by Gauss-Newton; the two grey levels of each marker, with linear gradients over the plane,
 are linear unknowns, eliminated by the Schur complement. The distortion of the lens enters once, as the ray of each
 pixel. Frames and markers are padded blocks of pixels: one sequence of tensor operations for the whole batch.
 """
@@ -32,7 +32,6 @@ _START_BLUR = 0.8  # px
 _BLUR_RANGE = (0.3, 4.0)
 _CUT = 4.0  # robust standard deviations beyond which a pixel is left out
 _LEVELS = 6  # ring and paper, each with a constant and a gradient over the plane
-_ROOT_HALF = math.sqrt(0.5)
 _QUANTISATION = 1 / 12  # variance of rounding, in grey levels^2, below which no noise estimate falls
 
 
@@ -237,14 +236,27 @@ def _model(b: _Blocks, r: Tensor, t: Tensor, blur: Tensor) -> _Model:
     # area of a pixel in the plane, mm^2; curvature of the circle's image, 1/px
     area = depth.square() * (w00 * w11 - w01 * w10).abs() * toward.abs()
     bend = area.square() * per_mm.pow(3) / radius
+    # to second order in the distance: along the image's normal the radius bends where that normal is oblique in the
+    # plane, and by perspective; both as second over first derivative, 1/px, halved
+    nu, nv = gu * flat, gv * flat
+    side = (ex * two_c - ey * one_c) / depth * toward
+    hx, hy = ex * bx - ey * ax - side * nx, ex * by - ey * ay - side * ny  # as m, but across the radius
+    oblique = (hx * w00 + hy * w10) * nu + (hx * w01 + hy * w11) * nv
+    recede = ((nx * w00 + ny * w10) * nu + (nx * w01 + ny * w11) * nv) * toward
+    second = 0.5 * oblique.square() * depth * flat / radius - recede
+    d_outer, d_inner = outer * per_mm, inner * per_mm
+    d_outer, d_inner = d_outer + second * d_outer.square(), d_inner + second * d_inner.square()
     pull = 0.5 * q * bend
-    z_outer, z_inner = outer * per_mm / q + pull, inner * per_mm / q + pull
-    p_outer, p_inner = _density(z_outer), _density(z_inner)
+    z_outer, z_inner = d_outer / q + pull, d_inner / q + pull
+    # the pixel's square is not Gaussian: its fourth cumulant along the edge's normal, -(c^4 + s^4) / 120 px^4
+    square = (1 - 2 * (nu * nv).square()) / (24 * 120) / q.square().square()
+    f_outer, p_outer = _edge(z_outer, square)
+    f_inner, p_inner = _edge(z_inner, square)
     px, py, pz = x * ax + y * bx + cx, x * ay + y * by + cy, x * az + y * bz + cz
     by_pose = tuple(-per_mm * v for v in (mx, my, mz, py * mz - pz * my, pz * mx - px * mz, px * my - py * mx))
     size = scalar(b.radii[:, 0]).float()
     return _Model(
-        0.5 * torch.erfc(-z_outer * _ROOT_HALF) + 0.5 * torch.erfc(z_inner * _ROOT_HALF),
+        f_outer + 1 - f_inner,
         (p_outer - p_inner) / q,
         p_outer * (bend - z_outer / q) - p_inner * (bend - z_inner / q),
         by_pose,
@@ -261,8 +273,12 @@ def _plane_axes(normal: Tensor) -> Tensor:
     return torch.stack([first, torch.linalg.cross(normal, first)], 1)
 
 
-def _density(z: Tensor) -> Tensor:
-    return torch.exp(-0.5 * z.square()) * (1 / math.sqrt(2 * math.pi))
+def _edge(z: Tensor, square: Tensor) -> tuple[Tensor, Tensor]:
+    """Blurred step and its slope at ``z`` standard deviations: the normal law and its fourth-order Edgeworth term."""
+    z2 = z.square()
+    density = torch.exp(-0.5 * z2) * (1 / math.sqrt(2 * math.pi))
+    step = 0.5 * torch.erfc(-z * math.sqrt(0.5)) + square * density * z * (z2 - 3)
+    return step, density * (1 - square * (z2 * (z2 - 6) + 3))
 
 
 def _basis(m: _Model) -> tuple[Tensor, ...]:
