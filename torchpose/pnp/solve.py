@@ -158,7 +158,7 @@ def solve(
     needs_gradient = torch.is_grad_enabled() and method == "iterative" and any(v.requires_grad for v in inputs)
 
     if batch <= _CHUNK:
-        result, _ = run(slice(None), max_iterations)
+        result = _map(lambda rows: run(rows, max_iterations), [slice(None)], pixels)[0][0]
     else:
         # the few poses that need many iterations are put off and solved together
         first = min(_FIRST_PASS, max_iterations)
@@ -217,17 +217,24 @@ def _with_gradient(
 
 def _map(function: Callable[[_Rows], _T], chunks: Sequence[_Rows], like: Tensor) -> list[_T]:
     """The function of every chunk, in parallel on the CPU; the first one alone, as it may compile."""
-    threads = min(torch.get_num_threads(), len(chunks) - 1)
-    if like.device.type != "cpu" or threads < 2:
+    if like.device.type != "cpu":
         return [function(rows) for rows in chunks]
-    # glibc gives freed memory above a threshold back to the system, and every chunk would fault it in again; freeing
-    # one large block raises that threshold to its size. Not touched, it costs nothing.
-    torch.empty(_KEPT, dtype=torch.uint8)
-    # no threads inside: a chunk is made to fit the cache of one core
-    results = [function(chunks[0])]
-    with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-        results.extend(pool.map(function, chunks[1:]))
-    return results
+    # a chunk is made to fit the cache of one core: no threads inside, they would only wait for each other
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        results = [function(chunks[0])]
+        workers = min(threads, len(chunks) - 1)
+        if workers < 2:
+            return results + [function(rows) for rows in chunks[1:]]
+        # glibc gives freed memory above a threshold back to the system, and every chunk would fault it in again;
+        # freeing one large block raises that threshold to its size. Not touched, it costs nothing.
+        torch.empty(_KEPT, dtype=torch.uint8)
+        with ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+            results.extend(pool.map(function, chunks[1:]))
+        return results
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _join(parts: list[PnPResult]) -> PnPResult:
