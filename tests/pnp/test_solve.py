@@ -358,6 +358,7 @@ def test_compile_without_a_compiler_says_so(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:torch.*")
 def test_compiled_is_the_same() -> None:
     image = pixels(views(SQUARE, 500, tilt_deg=(0, 75))[2], 0.1)
     plain, fast = (pnp.solve(SQUARE, image, MATRIX, sigma_px=0.1, compile=c) for c in (False, True))
