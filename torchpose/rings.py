@@ -20,7 +20,8 @@ _RADII = 72
 _INNERMOST, _OUTERMOST = 0.08, 1.12  # of the outer ellipse, the range of the radial profile
 _RATIO_RANGE = (0.12, 0.93)  # of inner to outer radius
 _LEAST_PEAK = 0.25  # of the outer edge's slope in the mean radial profile
-_LEAST_COVER = 0.4  # of the perimeter with edge points, for either circle
+_LEAST_EDGE = 0.5  # of the median rise at the outer edge over all directions, for a direction that counts
+_LEAST_COVER = (0.4, 0.33)  # of the perimeter with edge points, outer and inner circle
 _STEP_RANGE = (0.4, 2.5)  # inner to outer grey step
 
 
@@ -69,9 +70,13 @@ def find_inner(frames: Tensor, candidates: Candidates) -> tuple[Tensor, Tensor]:
     uv = (shape @ circle)[:, :, None, :] * rho[:, None] + candidates.ellipse[:, :2, None, None]
     u, v = uv.round().long().unbind(1)
     cell = (candidates.frame[:, None, None] * height + v.clamp(0, height - 1)) * width + u.clamp(0, width - 1)
-    profile = frames.reshape(-1)[cell].float().nanmean(-1).double()
-    rise = (profile[:, 2:] - profile[:, :-2]) * candidates.polarity[:, None]
+    grey = frames.reshape(-1)[cell].float()
     at = rho[1:-1]
+    # what covers the outer circle on one side hides the inner one there too: only directions that show the outer count
+    edge = ((grey[:, 2:] - grey[:, :-2]) * candidates.polarity[:, None, None].float())[:, at > _RATIO_RANGE[1]].amax(1)
+    seen = edge > _LEAST_EDGE * edge.nanmedian(-1, keepdim=True).values
+    profile = torch.where(seen[:, None], grey, torch.nan).nanmean(-1).double()
+    rise = (profile[:, 2:] - profile[:, :-2]) * candidates.polarity[:, None]
     outer = rise.masked_fill(at < _RATIO_RANGE[1], -torch.inf).amax(-1)
     fall = (-rise).masked_fill((at < _RATIO_RANGE[0]) | (at > _RATIO_RANGE[1]), -torch.inf)
     peak, best = fall.max(-1)
@@ -117,7 +122,9 @@ def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera) -> Rin
     near = torch.maximum(shift, growth) < reach + 1.5
     good = (
         fit.covariance.isfinite().all(-1).all(-1).view(2, count).all(0)
-        & (near & (cover > _LEAST_COVER)).view(2, count).all(0)
+        & near.view(2, count).all(0)
+        & (cover[:count] > _LEAST_COVER[0])
+        & (cover[count:] > _LEAST_COVER[1])
         & (step_ratio > _STEP_RANGE[0])
         & (step_ratio < _STEP_RANGE[1])
         & (offset < 0.25 * raw[:count, 3])  # concentric up to perspective

@@ -10,7 +10,19 @@ from hypothesis import strategies as st
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components as scipy_components
 
-from torchpose.detect.regions import connected_components, gradient, level_line_regions, region_polarity
+from torchpose.detect.regions import (
+    Gradient,
+    Regions,
+    connected_components,
+    gradient,
+    level_line_regions,
+    region_polarity,
+    strong_cells,
+)
+
+
+def regions_of(grad: Gradient, min_pixels: int) -> Regions:
+    return level_line_regions(grad, strong_cells(grad), min_pixels)
 
 
 def discs(count=3, size=64, noise=2.0):
@@ -72,7 +84,7 @@ def test_gain_and_offset_change_nothing(gain, offset):
     frames, _, _ = discs(noise=3.0)
     one, other = gradient(frames), gradient(gain * frames + offset)
     torch.testing.assert_close(other.threshold, gain * one.threshold, rtol=1e-3, atol=0)
-    a, b = level_line_regions(one, 10), level_line_regions(other, 10)
+    a, b = regions_of(one, 10), regions_of(other, 10)
     assert torch.equal(a.cell, b.cell)
     assert torch.equal(a.region, b.region)
 
@@ -80,12 +92,12 @@ def test_gain_and_offset_change_nothing(gain, offset):
 def test_quantisation_is_no_region():
     y, x = torch.meshgrid(torch.arange(100.0), torch.arange(100.0), indexing="ij")
     frames = (100 + 0.05 * x + 0.02 * y).round()[None]
-    assert level_line_regions(gradient(frames), 10).cell.numel() == 0
+    assert regions_of(gradient(frames), 10).cell.numel() == 0
 
 
 def test_discs_are_one_region_each():
     frames, center, radius = discs()
-    regions = level_line_regions(gradient(frames), 10)
+    regions = regions_of(gradient(frames), 10)
     assert regions.frame.tolist() == [0, 1, 2]
     assert torch.equal(torch.bincount(regions.region), torch.bincount(regions.frame[regions.region]))
     inside = regions.cell % (64 * 64)
@@ -93,15 +105,15 @@ def test_discs_are_one_region_each():
     distance = (xy - center[regions.region]).norm(dim=-1) - radius[regions.region]
     assert distance.abs().max() < 3
     assert (region_polarity(regions, center, xy) > 0.9).all()
-    inverse = level_line_regions(gradient(255 - frames), 10)
+    inverse = regions_of(gradient(255 - frames), 10)
     assert (region_polarity(inverse, center, xy) < -0.9).all()
 
 
 def test_batch_equals_single_frames():
     frames, _, _ = discs()
-    together = level_line_regions(gradient(frames), 5)
+    together = regions_of(gradient(frames), 5)
     for k in range(3):
-        alone = level_line_regions(gradient(frames[k : k + 1]), 5)
+        alone = regions_of(gradient(frames[k : k + 1]), 5)
         mine = together.frame[together.region] == k
         assert torch.equal(together.cell[mine] - k * 64 * 64, alone.cell)
         assert torch.equal(together.region[mine] - together.region[mine].min(), alone.region)
@@ -113,7 +125,7 @@ def test_edges_at_the_border_do_not_wrap_around():
     frames = torch.full((2, 40, 40), 50.0)
     frames[:, :, -1] = 200
     frames[:, :, 0] = 200
-    regions = level_line_regions(gradient(frames), 5)
+    regions = regions_of(gradient(frames), 5)
     assert regions.frame.tolist() == [0, 0, 1, 1]
     for k in range(4):
         assert torch.unique(regions.cell[regions.region == k] % 40).numel() == 1
@@ -121,15 +133,15 @@ def test_edges_at_the_border_do_not_wrap_around():
 
 @pytest.mark.parametrize("shape", [(0, 8, 8), (2, 0, 8), (2, 1, 8), (2, 8, 1), (1, 1, 1), (2, 2, 2)])
 def test_tiny_frames(shape):
-    regions = level_line_regions(gradient(torch.rand(shape) * 255), 3)
+    regions = regions_of(gradient(torch.rand(shape) * 255), 3)
     assert regions.cell.numel() == regions.frame.numel() == 0
 
 
 def test_broken_pixels_only_lose_their_own_cells():
     frames, _, _ = discs()
-    whole = level_line_regions(gradient(frames), 10)
+    whole = regions_of(gradient(frames), 10)
     frames[0, 2, 3], frames[1, 4, 4], frames[2, 60, 60] = torch.nan, torch.inf, -torch.inf
     broken = gradient(frames)
     assert broken.threshold.isfinite().all()
-    assert torch.equal(level_line_regions(broken, 10).cell, whole.cell)
+    assert torch.equal(regions_of(broken, 10).cell, whole.cell)
     assert gradient(torch.full((1, 5, 5), torch.nan)).threshold.isfinite().all()

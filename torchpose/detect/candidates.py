@@ -1,23 +1,41 @@
-"""Candidate ellipses of a batch of frames: fits to the level-line regions, validated a contrario."""
+"""Candidate ellipses of a batch of frames: fits to level-line regions and chained arcs, validated a contrario."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import torch
 from torch import Tensor
 
 from torchpose import ellipse
+from torchpose.detect.arcs import cells_at, chain_pairs, describe_arcs, fit_joint, follow, perimeter_samples
 from torchpose.detect.reduce import area_reduce, reduction_factor
-from torchpose.detect.regions import Gradient, Regions, gradient, level_line_regions, region_polarity
+from torchpose.detect.regions import (
+    Gradient,
+    Regions,
+    gradient,
+    level_line_regions,
+    region_polarity,
+    strong_cells,
+)
 from torchpose.geometry import conics
-from torchpose.geometry.segments import ragged_arange, segment_sum
+from torchpose.geometry.segments import ragged_arange, segment_mean, segment_sum
 
-_MIN_PIXELS = 10
+MIN_PIXELS = 10
+_SECTORS = 6  # arcs turn by up to 60 degrees
 _MIN_SEMI_MINOR = 2.0  # reduced px
 _MIN_ASPECT = 0.12
-_MIN_COVER = 0.35  # of the perimeter that its own region follows
+_MIN_CELLS = 0.35  # of a region on its ellipse, a pixel of perimeter; an edge is two to three cells wide
+_WHOLE = 0.9  # cover from which on a region needs no chaining
+_FOLLOW = ((0.4, 1), (0.5, 2))  # least cover to be followed further, and rounds of it
+_ON_ELLIPSE = 1.5  # reduced px
+_ARC_RMS = 1.2  # reduced px, of the cells of an arc, which is a few cells wide
+_COVER_ERROR = 0.125  # 22.5 degrees in units of pi: a sample with a smaller error belongs to the arc
+_SAME = 0.08  # of the semi-minor axis, plus a pixel: ellipses nearer than that are one
+_OCTAVES = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +61,11 @@ class Candidates:
     def __getitem__(self, index: Tensor) -> Candidates:
         return Candidates(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
+    @classmethod
+    def cat(cls, parts: Sequence[Self]) -> Self:
+        """The candidates of all parts."""
+        return cls(*(torch.cat([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
+
 
 def find_candidates(frames: Tensor, factor: int | None = None) -> Candidates:
     """Ellipses in grey frames (B, H, W), one pass for the whole batch.
@@ -51,69 +74,134 @@ def find_candidates(frames: Tensor, factor: int | None = None) -> Candidates:
         frames: any real dtype, in grey levels: 0..255 for float frames, up to 65535 for uint16. Steps below 1.5 levels
             are taken for quantisation. NaN pixels are ignored.
         factor: integer reduction before the search; by default the smallest that gives at most 1.3 megapixels. The
-            smallest semi-minor axis found is 2 reduced pixels.
+            smallest semi-minor axis found is 2 reduced pixels. The same is looked for once more at twice the
+            reduction, where blurred and noisy edges stand out four times as much.
     """
     factor = reduction_factor(*frames.shape[-2:]) if factor is None else factor
-    grad = gradient(area_reduce(frames, factor))
-    regions = level_line_regions(grad, _MIN_PIXELS)
-    found = validate(grad, *fit_regions(grad, regions))
-    full = found.ellipse.clone()
-    full[:, :2] = factor * full[:, :2] + 0.5 * (factor - 1)
-    full[:, 2:4] *= factor
-    return Candidates(found.frame, full, found.polarity, found.log10_nfa, found.cover)
+    reduced = area_reduce(frames, factor)
+    found = []
+    for octave in range(_OCTAVES):
+        if octave:
+            reduced, factor = area_reduce(reduced, 2), 2 * factor
+        grad = gradient(reduced)
+        some = find_ellipses(grad)
+        full = some.ellipse.clone()
+        full[:, :2] = factor * full[:, :2] + 0.5 * (factor - 1)
+        full[:, 2:4] *= factor
+        found.append(Candidates(some.frame, full, some.polarity, some.log10_nfa, some.cover))
+    return merge_duplicates(Candidates.cat(found))
 
 
-def fit_regions(grad: Gradient, regions: Regions) -> tuple[Tensor, Tensor, Tensor]:
-    """Ellipses of those regions that follow one: frame (M,), ellipse (M, 5) in reduced px, polarity (M,)."""
-    _, height, width = grad.diag.shape
-    inside = regions.cell % (height * width)
-    xy = torch.stack([inside % width, inside // width], -1).double() + 0.5
+def find_ellipses(grad: Gradient) -> Candidates:
+    """Validated ellipses of one scale, in its own pixels."""
+    regions = level_line_regions(grad, strong_cells(grad), MIN_PIXELS)
+    whole, explained = fit_regions(grad, regions)
+    rest = regions.cell[~explained].sort().values
+    pieces = fit_arcs(grad, level_line_regions(grad, rest, MIN_PIXELS, _SECTORS))
+    return merge_duplicates(Candidates.cat([whole, pieces]))
+
+
+def fit_regions(grad: Gradient, regions: Regions) -> tuple[Candidates, Tensor]:
+    """Ellipses that single regions follow, and which of the cells (P,) bool of the regions they explain."""
+    xy = cell_centers(grad, regions.cell)
     count = regions.frame.numel()
     magnitude = torch.linalg.vector_norm(regions.gradient, dim=-1).double()
     params = ellipse.fit(xy, regions.region, count, magnitude)
     # once more with the pixels near the ellipse only
     r = ellipse.distance(xy, regions.region, params)
-    params = ellipse.fit(xy, regions.region, count, magnitude * (r.abs() < 1.5))
-    a, b = params[:, 2], params[:, 3]
-    follows = (ellipse.distance(xy, regions.region, params).abs() < 1.5).double()
-    length = segment_sum(follows, regions.region, count)
-    good = (
-        (b >= _MIN_SEMI_MINOR)
-        & (b >= _MIN_ASPECT * a)
-        & (a <= 0.5 * max(height, width))
-        & (length >= _MIN_COVER * conics.perimeter(params))
-    )
+    params = ellipse.fit(xy, regions.region, count, magnitude * (r.abs() < _ON_ELLIPSE))
+    follows = ellipse.distance(xy, regions.region, params).abs() < _ON_ELLIPSE
+    length = segment_sum(follows.double(), regions.region, count)
+    good = (plausible(grad, params) & (length >= _MIN_CELLS * conics.perimeter(params))).nonzero()[:, 0]
     polarity = region_polarity(regions, params[:, :2], xy).sign()
-    return regions.frame[good], params[good], polarity[good]
+    found = score(grad, regions.frame[good], params[good], polarity[good])
+    valid = found.log10_nfa < 0
+    whole = torch.zeros(count, dtype=torch.bool, device=xy.device)
+    whole[good[valid & (found.cover > _WHOLE)]] = True
+    return found[valid], follows & whole[regions.region]
 
 
-def validate(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> Candidates:
-    """Keeps the ellipses that noise would give less than once (number of false alarms below 1).
+def fit_arcs(grad: Gradient, arcs: Regions) -> Candidates:
+    """Ellipses of pairs of arcs, followed along their whole perimeter."""
+    xy = cell_centers(grad, arcs.cell)
+    about = describe_arcs(arcs, xy)
+    pair = torch.stack(chain_pairs(about), -1)
+    count = pair.shape[0]
+    # the cells of both members, flat
+    order = torch.argsort(arcs.region, stable=True)
+    start = about.size.cumsum(0) - about.size
+    member = pair.flatten()
+    which, offset = ragged_arange(about.size[member])
+    cell = order[start[member[which]] + offset]
+    index = which // 2
+    weight = torch.linalg.vector_norm(arcs.gradient[cell], dim=-1)
+    params = fit_joint(xy[cell], arcs.gradient[cell], index, count, weight)
+    r = ellipse.distance(xy[cell], index, params)
+    rms = segment_mean(r.square(), index, count, weight.double()).sqrt()
+    good = (plausible(grad, params) & (rms < _ARC_RMS)).nonzero()[:, 0]
+    frame, polarity = about.frame[pair[good, 0]], about.curvature[pair[good, 0]].sign()
+    found = score(grad, frame, params[good], polarity)
+    for least_cover, rounds in _FOLLOW:
+        found = merge_duplicates(found[found.cover > least_cover], 2 * _SAME)
+        params = follow(grad, found.frame, found.ellipse, found.polarity, rounds)
+        good = plausible(grad, params)
+        found = score(grad, found.frame[good], params[good], found.polarity[good])
+    return found[found.log10_nfa < 0]
+
+
+def plausible(grad: Gradient, ellipses: Tensor) -> Tensor:
+    """Ellipses (M, 5) of a size and shape that the detector answers for, bool (M,); False for NaN."""
+    a, b = ellipses[:, 2], ellipses[:, 3]
+    return (b >= _MIN_SEMI_MINOR) & (b >= _MIN_ASPECT * a) & (a <= 0.5 * max(grad.diag.shape[1:]))
+
+
+def cell_centers(grad: Gradient, cell: Tensor) -> Tensor:
+    """Positions (P, 2) float64 of flat cells in reduced px."""
+    _, height, width = grad.diag.shape
+    inside = cell % (height * width)
+    return torch.stack([inside % width, inside // width], -1).double() + 0.5
+
+
+def score(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> Candidates:
+    """Ellipses with their numbers of false alarms, of which noise gives less than one a frame below 1.
 
     One sample a pixel of perimeter: under the null hypothesis its angle error, divided by pi, is uniform in [0, 1], and
     the sum k of n of them is below its value with probability at most k^n / n!. The number of tests is the number of
     distinguishable ellipses, (h w)^(5/2): five parameters, each with as many values as the frame has pixels on a side.
     """
     _, height, width = grad.diag.shape
-    n = conics.perimeter(ellipses).ceil().long()
-    which, position = ragged_arange(n)
-    angle = position.double() * (2 * torch.pi) / n[which]
-    xy = conics.points_on(ellipses[which], angle)
-    # the normal of the ellipse through each sample: gradient of |S^-1 (x - c)|
-    inverse = torch.linalg.inv(conics.shape_matrix(ellipses))
-    normal = (inverse @ inverse)[which] @ (xy - ellipses[which, :2])[..., None]
-    normal = normal.squeeze(-1) / torch.linalg.vector_norm(normal, dim=1)
-    x, y = (xy - 0.5).round().long().unbind(-1)
-    on_frame = (x >= 0) & (x < width - 1) & (y >= 0) & (y < height - 1)
-    cell = (frame[which] * height + y.clamp(0, height - 1)) * width + x.clamp(0, width - 1)
+    which, xy, normal = perimeter_samples(ellipses)
+    cell, on_frame = cells_at(grad, frame[which], xy)
     g = grad.at(cell).double()
     cos = (g * normal).sum(-1) * polarity[which] / torch.linalg.vector_norm(g, dim=-1).clamp_min(1e-6)
     error = torch.where(on_frame, cos.clamp(-1, 1).acos() / torch.pi, 0.5)  # 0.5: neither for nor against
     count = ellipses.shape[0]
-    k = segment_sum(error, which, count)
-    cover = segment_sum((error < 0.125).double(), which, count) / n
+    size, k, on_arc = segment_sum(
+        torch.stack([torch.ones_like(error), error, (error < _COVER_ERROR).double()], -1), which, count
+    ).unbind(-1)
     log_tests = 2.5 * math.log10(max(1, height * width))
-    size = n.double()
     log10_nfa = log_tests + size * k.clamp_min(1e-12).log10() - torch.lgamma(size + 1) / math.log(10)
-    keep = log10_nfa < 0
-    return Candidates(frame[keep], ellipses[keep], polarity[keep], log10_nfa[keep], cover[keep])
+    return Candidates(frame, ellipses, polarity, log10_nfa, on_arc / size)
+
+
+def merge_duplicates(found: Candidates, tolerance: float = _SAME) -> Candidates:
+    """Of candidates that are the same ellipse the one with the fewest false alarms, sorted by frame and false alarms.
+
+    Two are the same if neither centre nor shape differ by more than a pixel plus ``tolerance`` of the semi-minor axis.
+    """
+    order = torch.argsort(found.log10_nfa, stable=True)
+    found = found[order[torch.argsort(found.frame[order], stable=True)]]
+    frames = int(found.frame[-1]) + 1 if len(found) else 0
+    per_frame = torch.bincount(found.frame, minlength=frames)
+    start = (per_frame.cumsum(0) - per_frame)[found.frame]
+    position = torch.arange(len(found), device=start.device) - start
+    # each against those before it in its frame, which have fewer false alarms
+    later, rank = ragged_arange(position)
+    better = start[later] + rank
+    p, q = found.ellipse[later], found.ellipse[better]
+    shape = (conics.shape_matrix(p) - conics.shape_matrix(q)).flatten(1).abs().amax(-1)
+    apart = torch.maximum(torch.linalg.vector_norm(p[:, :2] - q[:, :2], dim=-1), shape)
+    same = (found.polarity[later] == found.polarity[better]) & (apart < 1.0 + tolerance * q[:, 3])
+    again = torch.zeros(len(found), dtype=torch.bool, device=start.device)
+    again[later[same]] = True
+    return found[~again]

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchpose.geometry.segments import segment_sum
 
-_ANGLE_COS = 0.8  # neighbours join within 37 degrees: a circle of 3 px turns 19 to 27 degrees from pixel to pixel
+_JOIN_COS = 0.8  # neighbours join within 37 degrees: a circle of 3 px turns 19 to 27 degrees from pixel to pixel
 _NOISE_SIGMAS = 3.7  # of the gradient: one pure-noise pixel in a thousand stays
 _RANGE_FRACTION = 0.01  # of the frame's own range of grey, for frames without noise
 _LEAST_LEVEL = 1.5  # grey levels, above the flicker of quantisation
@@ -84,13 +84,23 @@ def gradient(frames: Tensor) -> Gradient:
     return Gradient(diag, anti, threshold)
 
 
-def level_line_regions(grad: Gradient, min_pixels: int) -> Regions:
-    """Connected components of strong pixels with agreeing gradient directions, of at least ``min_pixels``."""
-    batch, height, width = grad.diag.shape
+def strong_cells(grad: Gradient) -> Tensor:
+    """Flat indices (P,) int64, rising, of the cells whose gradient is above their frame's threshold."""
     power = grad.diag * grad.diag
     power.addcmul_(grad.anti, grad.anti)
-    cell = (power > 2 * grad.threshold.square()[:, None, None]).view(-1).nonzero()[:, 0]
-    del power
+    return (power > 2 * grad.threshold.square()[:, None, None]).view(-1).nonzero()[:, 0]
+
+
+def level_line_regions(grad: Gradient, cell: Tensor, min_pixels: int, sectors: int = 0) -> Regions:
+    """Connected components of cells with agreeing gradient directions, of at least ``min_pixels``.
+
+    Args:
+        cell: (P,) int64, flat indices of the cells to join, rising.
+        sectors: 0 joins neighbours whose directions are close to each other, so that whole curves hold together. With
+            n sectors neighbours join if their directions fall into the same n-th of the circle: curves break into arcs
+            of known turn, and corners part from what they join.
+    """
+    batch, height, width = grad.diag.shape
     g = grad.at(cell)
     unit = g / torch.linalg.vector_norm(g, dim=-1, keepdim=True)
 
@@ -100,7 +110,12 @@ def level_line_regions(grad: Gradient, min_pixels: int) -> Regions:
     step = torch.tensor([1, width - 1, width, width + 1], device=cell.device)
     neighbour = position[cell[:, None] + step].long()
     del position
-    agree = (unit[:, None] * unit[neighbour.clamp_min(0)]).sum(-1) > _ANGLE_COS
+    met = neighbour.clamp_min(0)
+    if sectors:
+        sector = ((torch.atan2(g[:, 1], g[:, 0]) / (2 * math.pi) + 1) * sectors).long() % sectors
+        agree = sector[:, None] == sector[met]
+    else:
+        agree = (unit[:, None] * unit[met]).sum(-1) > _JOIN_COS
     a, k = ((neighbour >= 0) & agree).nonzero().unbind(-1)
     label = connected_components(a, neighbour[a, k], cell.numel())
 

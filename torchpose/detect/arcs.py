@@ -1,0 +1,188 @@
+"""Arcs of ellipses: joint fits to positions and directions, chaining across gaps, and following an ellipse on.
+
+Whole circles come out of region growing in one piece. Where something covers a ring, touches it or crosses it, the
+region breaks into arcs or runs on along the other edge. Arcs that belong to one ellipse are chained as in ELSDc
+(Patraucean, Gurdjos, Grompone von Gioi 2017), here all pairs of a batch at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchpose.detect.regions import Gradient, Regions
+from torchpose.geometry import conics
+from torchpose.geometry.segments import ragged_arange, rank_in_group, segment_mean, segment_sum
+
+_TANGENT_PX = 2.0  # px of position error that weigh as much as a radian of direction error
+_LEAST_TURN = 0.25  # rad from end to end of an arc; less may be straight
+_MOST_ARCS = 200  # of one frame that are chained, the longest
+_RADII = 4.0  # most ratio of the radii of curvature of two arcs of one ellipse
+_BAND = 2  # px to either side in which an ellipse is followed
+_BAND_COS = 0.9  # of a gradient with the normal of the ellipse that is followed: 26 degrees
+
+
+@dataclass(frozen=True, eq=False)
+class Arcs:
+    """N smooth curve pieces.
+
+    Attributes:
+        frame: (N,) int64. middle: (N, 2) px, mean of the cells. normal: (N, 2), mean direction of the gradient.
+        curvature: (N,) 1/px, positive where the gradient points away from the centre of curvature.
+        turn: (N,) rad, from end to end. size: (N,) cells.
+    """
+
+    frame: Tensor
+    middle: Tensor
+    normal: Tensor
+    curvature: Tensor
+    turn: Tensor
+    size: Tensor
+
+
+def describe_arcs(regions: Regions, xy: Tensor) -> Arcs:
+    """Circle-like description of regions from positions and gradient directions.
+
+    Along an arc of radius R the direction of the gradient turns by ds / R; the curvature is the regression of one on
+    the other.
+
+    Args:
+        xy: (P, 2) float64, centres of the cells of the regions.
+    """
+    count, index = regions.frame.numel(), regions.region
+    unit = (regions.gradient / torch.linalg.vector_norm(regions.gradient, dim=-1, keepdim=True)).double()
+    middle, normal = segment_mean(torch.cat([xy, unit], -1), index, count).split(2, -1)
+    normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
+    n = normal[index]
+    tangent = torch.stack([-n[:, 1], n[:, 0]], -1)
+    along = ((xy - middle[index]) * tangent).sum(-1)
+    angle = torch.atan2((unit * tangent).sum(-1), (unit * n).sum(-1))
+    sums = segment_sum(torch.stack([along * angle, along.square()], -1), index, count)
+    curvature = sums[:, 0] / sums[:, 1].clamp_min(1e-9)
+    ends = torch.zeros(2, count, dtype=angle.dtype, device=angle.device)
+    ends[0].scatter_reduce_(0, index, along, "amax")
+    ends[1].scatter_reduce_(0, index, -along, "amax")
+    turn = ends.sum(0) * curvature.abs()
+    return Arcs(regions.frame, middle, normal, curvature, turn, torch.bincount(index, minlength=count))
+
+
+def chain_pairs(arcs: Arcs) -> tuple[Tensor, Tensor]:
+    """Pairs (i, j) int64 of arcs that may be of one ellipse: same turning sense, each on the inner side of the other.
+
+    The middles are no farther apart than the two circles of curvature allow.
+    """
+    curved = arcs.turn > _LEAST_TURN
+    order = torch.argsort(torch.where(curved, arcs.size, 0), descending=True, stable=True)
+    rank = torch.empty_like(order)
+    frames = int(arcs.frame.max()) + 1 if arcs.frame.numel() else 0
+    rank[order] = rank_in_group(arcs.frame[order], frames)
+    index = (curved & (rank < _MOST_ARCS)).nonzero()[:, 0]
+    index = index[torch.argsort(arcs.frame[index], stable=True)]
+    per_frame = torch.bincount(arcs.frame[index], minlength=frames)
+    start = per_frame.cumsum(0) - per_frame
+    first, second = ragged_arange(per_frame[arcs.frame[index]])
+    i, j = index[first], index[start[arcs.frame[index[first]]] + second]
+    ahead = i < j
+    i, j = i[ahead], j[ahead]
+    ki, kj = arcs.curvature[i], arcs.curvature[j]
+    ratio = (ki / kj).abs()
+    reach = 1 / torch.minimum(ki.abs(), kj.abs())
+    step = arcs.middle[j] - arcs.middle[i]
+    distance = torch.linalg.vector_norm(step, dim=-1)
+    inward_i, inward_j = -ki.sign()[:, None] * arcs.normal[i], -kj.sign()[:, None] * arcs.normal[j]
+    # a chord leaves a convex curve inwards at both ends
+    fits = (
+        (ki * kj > 0)
+        & (ratio < _RADII)
+        & (ratio > 1 / _RADII)
+        & (distance < 3 * reach)
+        & ((step * inward_i).sum(-1) > -1.0)
+        & ((step * inward_j).sum(-1) < 1.0)
+    )
+    return i[fits], j[fits]
+
+
+def fit_joint(xy: Tensor, gradient: Tensor, index: Tensor, count: int, weights: Tensor) -> Tensor:
+    """Ellipses (count, 5) from positions and gradient directions, NaN where the conic is no ellipse.
+
+    The smallest eigenvector of the scatter of two rows a point: the conic passes through the point, and its tangent
+    there is at right angles with the gradient (pole and polar). Directions hold arcs that positions alone leave open.
+
+    Args:
+        xy: (P, 2) float64. gradient: (P, 2). index: (P,) int64. weights: (P,) not negative.
+    """
+    w = weights.double()
+    center = segment_mean(xy, index, count, w)
+    local = xy - center[index]
+    scale = segment_mean(local.square().sum(-1), index, count, w).sqrt()
+    x, y = (local / scale[index, None]).unbind(-1)
+    g = gradient.double()
+    g = g / torch.linalg.vector_norm(g, dim=-1, keepdim=True).clamp_min(1e-12)
+    tx, ty = -g[:, 1], g[:, 0]
+    one, zero = torch.ones_like(x), torch.zeros_like(x)
+    on = torch.stack([x * x, x * y, y * y, x, y, one], -1)
+    along = torch.stack([2 * x * tx, x * ty + y * tx, 2 * y * ty, tx, ty, zero], -1)
+    along = along * (_TANGENT_PX / scale)[index, None]
+    upper = torch.triu_indices(6, 6, device=xy.device)
+    rows = on[:, upper[0]] * on[:, upper[1]] + along[:, upper[0]] * along[:, upper[1]]
+    sums = segment_sum(rows * w[:, None], index, count)
+    scatter = torch.zeros(count, 6, 6, dtype=sums.dtype, device=sums.device)
+    scatter[:, upper[0], upper[1]] = sums
+    scatter[:, upper[1], upper[0]] = sums
+    sound = scatter.isfinite().all(-1).all(-1)
+    conic = torch.linalg.eigh(torch.where(sound[:, None, None], scatter, 0.0)).eigenvectors[..., 0]
+    params = conics.ellipse_from_conic(conic)
+    params = torch.cat([params[:, :2] * scale[:, None] + center, params[:, 2:4] * scale[:, None], params[:, 4:]], -1)
+    return torch.where(sound[:, None], params, torch.nan)
+
+
+def follow(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor, rounds: int = 3) -> Tensor:
+    """Refits ellipses (M, 5) to whatever edge lies along them, so that an arc grows round over gaps.
+
+    Args:
+        frame: (M,) int64. ellipses: (M, 5), cells. polarity: (M,) +1 where the gradient points outwards.
+
+    Returns:
+        (M, 5); NaN where nothing was left to fit.
+    """
+    for _ in range(rounds):
+        which, xy, normal = perimeter_samples(ellipses)
+        band = torch.arange(-_BAND, _BAND + 1, dtype=torch.float64, device=xy.device)
+        at = (xy[:, None] + band[:, None] * normal[:, None]).flatten(0, 1)
+        which = which.repeat_interleave(band.numel())
+        cell, inside = cells_at(grad, frame[which], at)
+        g = grad.at(cell)
+        rise = (g * normal.repeat_interleave(band.numel(), 0)).sum(-1) * polarity[which]
+        strength = torch.linalg.vector_norm(g, dim=-1)
+        good = inside & (rise > _BAND_COS * strength) & (strength > 0.5 * grad.threshold[frame[which]])
+        keep = good.nonzero()[:, 0]
+        middle = (at[keep] - 0.5).round() + 0.5
+        ellipses = fit_joint(middle, g[keep], which[keep], ellipses.shape[0], rise[keep])
+    return ellipses
+
+
+def perimeter_samples(ellipses: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """One sample a pixel of perimeter: ellipse (S,), position (S, 2) and outward unit normal (S, 2).
+
+    Ellipses that are NaN have none.
+    """
+    n = conics.perimeter(ellipses).nan_to_num(nan=0.0).ceil().long()
+    which, position = ragged_arange(n)
+    angle = position.double() * (2 * torch.pi) / n[which]
+    of = ellipses[which]
+    a, b, theta = of[:, 2], of[:, 3], of[:, 4]
+    cos, sin = theta.cos(), theta.sin()
+    p, q = b * angle.cos(), a * angle.sin()
+    length = torch.hypot(p, q)
+    normal = torch.stack([cos * p - sin * q, sin * p + cos * q], -1) / length[:, None]
+    return which, conics.points_on(of, angle), normal
+
+
+def cells_at(grad: Gradient, frame: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
+    """Flat cells (S,) nearest to positions (S, 2), and whether they lie on the frame (S,) bool."""
+    _, height, width = grad.diag.shape
+    x, y = (xy - 0.5).round().long().unbind(-1)
+    inside = (x >= 0) & (x < width - 1) & (y >= 0) & (y < height - 1)
+    return (frame * height + y.clamp(0, height - 1)) * width + x.clamp(0, width - 1), inside
