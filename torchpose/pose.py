@@ -288,13 +288,15 @@ def _covariance(e: Evidence, r: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
 def intrinsics_covariance(e: Evidence, s: Solutions, intrinsics: Tensor) -> Tensor:
     """What uncertain intrinsics add to the pose covariance (N, 6, 6): G Sigma_K G^T, G = d pose / d (fx, fy, cx, cy).
 
-    At the least-squares optimum G = -(J^T W J)^-1 J^T W J_K, J and J_K the Jacobians of the projections.
+    At the least-squares optimum G = -(J^T W J)^-1 J^T W J_K, J and J_K the Jacobians of the projected centres; a pose
+    refined on the grey values around them follows the intrinsics in the same way.
 
     Args:
         intrinsics: (4, 4) covariance of fx, fy, cx, cy, px^2 (`Camera.covariance`).
     """
-    jac, n, weight = _jacobian(replace(e, mask=s.mask), s.R, s.t)
+    seen = replace(e, mask=s.mask)
+    jac, n, weight = _jacobian(seen, s.R, s.t)
     zero, one = torch.zeros_like(n[..., 0]), torch.ones_like(n[..., 0])
     jac_k = torch.stack([n[..., 0], zero, one, zero, zero, n[..., 1], zero, one], -1).unflatten(-1, (2, 4))
-    gain = -s.covariance @ (jac.mT @ weight @ jac_k).sum(1)
+    gain = -_covariance(seen, s.R, s.t)[0] @ (jac.mT @ weight @ jac_k).sum(1)
     return gain @ intrinsics.to(gain) @ gain.mT

@@ -6,9 +6,10 @@ Every pixel in a band around the edges of a frame's rings is predicted as
 
 with d the distance in px of the pixel from the projected circle, k the curvature of the projected circle, q the blur
 (point-spread function and pixel together, one for each frame). The second term of z is the pull of blur on a curved
-edge; Phi carries the fourth cumulant of the square pixel. Pose and blur are found by Gauss-Newton; the two grey levels of each marker, with linear gradients over the plane,
-are linear unknowns, eliminated by the Schur complement. The distortion of the lens enters once, as the ray of each
-pixel. Frames and markers are padded blocks of pixels: one sequence of tensor operations for the whole batch.
+edge; Phi carries the fourth cumulant of the square pixel. Pose and blur are found by Gauss-Newton; the two grey levels
+of each marker, with linear gradients over the plane, are linear unknowns, eliminated by the Schur complement. The
+distortion of the lens enters once, as the ray of each pixel. Frames and markers are padded blocks of pixels: one
+sequence of tensor operations for the whole batch.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ _SELECTING = (0, 2, 3)  # steps that choose anew which pixels follow the model
 _START_BLUR = 0.8  # px
 _BLUR_RANGE = (0.3, 4.0)
 _CUT = 4.0  # robust standard deviations beyond which a pixel is left out
+_TILE = 256  # pixels summed in float32 at a time; sums of tiles are float64, so padding changes no digit that counts
 _LEVELS = 6  # ring and paper, each with a constant and a gradient over the plane
 _QUANTISATION = 1 / 12  # variance of rounding, in grey levels^2, below which no noise estimate falls
 
@@ -121,7 +123,7 @@ def refine_photometric(
     for iteration in range(_STEPS):
         columns = _columns(blocks, _model(blocks, r, t, blur), levels)
         if iteration in _SELECTING:
-            weight = _inliers(columns[:, -1], blocks)
+            weight = _inliers(columns[:, :, -1].flatten(1), blocks)
         step, level_step, information, variance = _gauss_newton(columns, weight, blocks.row, rows)
         r = rotations.exp(step[:, 3:6]) @ r
         t = t + step[:, :3]
@@ -172,7 +174,7 @@ def _gather(
 
     count = row.numel()
     slot = rank_in_group(block, count)
-    most = int(slot.max()) + 1 if slot.numel() else 1
+    most = (int(slot.max()) // _TILE + 1) * _TILE if slot.numel() else _TILE
 
     place = block * most + slot
 
@@ -288,25 +290,37 @@ def _basis(m: _Model) -> tuple[Tensor, ...]:
 
 
 def _columns(b: _Blocks, m: _Model, levels: Tensor) -> Tensor:
-    """Derivatives by pose (6), blur (1) and levels (6), and the residual: (K, 14, P) float32."""
+    """Derivatives by pose (6), blur (1) and levels (6), and the residual, by tiles: (K, P / 256, 14, 256) float32."""
     a0, ax, ay, p0, px, py = (v[:, None].float() for v in levels.unbind(-1))
     ring, paper = a0 + ax * m.x + ay * m.y, p0 + px * m.x + py * m.y
     contrast = paper - ring
     by_d = contrast * m.by_d
     residual = b.grey - (ring + contrast * m.fraction)
-    columns = torch.stack([*(by_d * v for v in m.by_pose), contrast * m.by_q, *_basis(m), residual], 1)
-    return columns.masked_fill_((b.valid == 0)[:, None], 0.0)
+    return _tiled((*(by_d * v for v in m.by_pose), contrast * m.by_q, *_basis(m), residual), b.valid)
+
+
+def _tiled(planes: tuple[Tensor, ...], valid: Tensor) -> Tensor:
+    """Planes (K, P) as (K, P / 256, planes, 256), zero where padded."""
+    tiles = torch.stack([p.unflatten(1, (-1, _TILE)) for p in planes], 2)
+    return tiles.masked_fill_(valid.unflatten(1, (-1, 1, _TILE)) == 0, 0.0)
+
+
+def _products(columns: Tensor, weight: Tensor) -> Tensor:
+    """Sums over all pixels of weight times the products of every two columns: (K, n, n) float64."""
+    weighted = columns * weight.unflatten(1, (-1, 1, _TILE))
+    return (weighted @ columns.mT).double().sum(1)
 
 
 def _first_levels(b: _Blocks, r: Tensor, t: Tensor, blur: Tensor) -> Tensor:
     """Grey levels (K, 6) for the poses that come in, by reweighted linear fits."""
-    basis = torch.stack(_basis(_model(b, r, t, blur)), 1).masked_fill_((b.valid == 0)[:, None], 0.0)
+    columns = _tiled((*_basis(_model(b, r, t, blur)), b.grey), b.valid)
     weight = b.valid
-    levels = torch.zeros(basis.shape[0], _LEVELS, dtype=torch.float64, device=basis.device)
+    levels = torch.zeros(weight.shape[0], _LEVELS, dtype=torch.float64, device=weight.device)
     for _ in range(3):
-        weighted = basis * weight[:, None]
-        levels = _solve((weighted @ basis.mT).double(), (weighted @ b.grey[..., None]).squeeze(-1).double())
-        residual = b.grey - (levels.float()[:, None] @ basis).squeeze(1)
+        sums = _products(columns, weight)
+        levels = _solve(sums[:, :_LEVELS, :_LEVELS], sums[:, :_LEVELS, _LEVELS])
+        predicted = (levels.float()[:, None, None] @ columns[:, :, :_LEVELS]).flatten(1)
+        residual = b.grey - predicted
         weight = b.valid / (1 + (residual / (2 * _spread(residual, b.valid)[:, None])).square()).square()
     return levels
 
@@ -330,7 +344,7 @@ def _inliers(residual: Tensor, b: _Blocks) -> Tensor:
 
 def _gauss_newton(columns: Tensor, weight: Tensor, row: Tensor, rows: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Step (N, 7), level step (K, 6), reduced information (N, 7, 7) and residual variance (N,)."""
-    sums = ((columns * weight[:, None]) @ columns.mT).double()  # (K, 14, 14)
+    sums = _products(columns, weight)  # (K, 14, 14)
     nn, nb, bb = sums[:, :7, :7], sums[:, :7, 7:13], sums[:, 7:13, 7:13]
     gn, gb = sums[:, :7, 13], sums[:, 7:13, 13]
     ridge = 1e-9 * bb.diagonal(dim1=-2, dim2=-1).mean(-1) + 1e-12
