@@ -182,7 +182,9 @@ def fill(
         (boxes.cells,), of the dtype of the samples; the windows row by row, each row with one cell at its end, which
         is 0 to rounding.
     """
-    reach = 1.0 + REACH * float(sigma.detach().max()) if len(sigma) else 1.0
+    if len(pixel) == 0:
+        return pixel.new_zeros(boxes.cells)
+    reach = 1.0 + REACH * float(sigma.detach().max())
     rows = _offsets(math.ceil(reach), pixel)
     columns = _offsets(math.ceil(reach + (0.0 if half_chord is None else float(half_chord.detach().max()))), pixel)
     corner, size, stride, start = boxes.corner[shape], boxes.size[shape], boxes.stride[shape], boxes.start[shape]
@@ -217,14 +219,14 @@ def fill(
 def on_chords(radius: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """A disc-shaped blur as weighted horizontal chords: offsets along v (J, N), half lengths (J, N), weights (J, N).
 
-    Gauss-Chebyshev quadrature of the second kind, whose weight is the chord's length: exact for the polynomials up to
-    degree 2 J - 1 in the offset. J grows with the largest radius / sigma, so that the Gaussian over a chord is resolved.
+    Gauss-Chebyshev quadrature of the second kind, whose weight is the chord's length: exact for polynomials up to
+    degree 2 J - 1 in the offset. J grows with the largest radius / sigma, so that the Gaussian is resolved.
 
     Args:
         radius: (N,), px. sigma: (N,), px.
     """
     ratio = float((radius.detach() / sigma.detach()).max()) if len(radius) else 0.0
-    nodes = 4 + math.ceil(3.0 * ratio)
+    nodes = nodes_across(ratio)
     angle = torch.arange(1, nodes + 1, dtype=radius.dtype, device=radius.device) * (math.pi / (nodes + 1))
     weight = angle.sin().square() * (2 / (nodes + 1))
     half = (angle.sin()[:, None] * radius).clamp(min=_MIN_CHORD)
@@ -232,7 +234,7 @@ def on_chords(radius: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def accumulate(total: Tensor, index: Tensor, values: Tensor) -> Tensor:
-    """``total`` with ``values`` added at ``index``; in place where nobody differentiates, as it may be a whole frame."""
+    """``total`` with ``values`` added at ``index``; in place where nobody differentiates: it may be a whole frame."""
     add = total.index_add if torch.is_grad_enabled() else total.index_add_
     return add(0, index, values)
 
@@ -241,6 +243,11 @@ def ragged(count: Tensor) -> tuple[Tensor, Tensor]:
     """Item (sum of count,) and the running number within the item."""
     item = torch.arange(count.numel(), device=count.device).repeat_interleave(count)
     return item, torch.arange(item.numel(), device=count.device) - (count.cumsum(0) - count)[item]
+
+
+def nodes_across(ratio: float) -> int:
+    """Nodes of a Gauss rule that average an edge over an interval of half the length ``ratio`` sigma to 1e-5."""
+    return 2 + math.ceil(1.9 * ratio)
 
 
 def _posed(
@@ -261,7 +268,7 @@ def _image(camera: Camera, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor, Tenso
 
 
 def _on_circle(axes: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
-    """Points (..., 3) of circles of radii ``axes`` (..., 2, 3) about the origin, and their derivatives by angle (...)."""
+    """Points (..., 3) of circles of radii ``axes`` (..., 2, 3) about the origin, and derivatives by angle (...)."""
     a, b = axes.unbind(-2)
     cos, sin = angle.cos()[..., None], angle.sin()[..., None]
     return cos * a + sin * b, cos * b - sin * a

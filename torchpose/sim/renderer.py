@@ -12,7 +12,6 @@ have the comparisons with supersampling.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -192,7 +191,7 @@ def _moving(
     with torch.no_grad():
         ends, _ = _project_each(camera, edges, *posed(motion.new_tensor([-0.5, 0.5])))
         path = (ends - middle).norm(dim=-1) / sigma[edges.frame]
-        nodes = 4 + math.ceil(1.5 * float(path.max())) if path.numel() else 4
+        nodes = boundary.nodes_across(float(path.max()) if path.numel() else 0.0)
     node, weight = boundary.gauss_legendre(nodes, t)
     pixel, dv = _project_each(camera, edges, *posed(node - 0.5))
     return pixel.reshape(-1, 2), (weight[:, None] * dv).reshape(-1), nodes

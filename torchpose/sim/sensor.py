@@ -22,7 +22,7 @@ class Lighting:
     """Uneven light as a gain of the frame, smooth in the pixels.
 
     The gain is applied to the blurred picture, so it is exact where it is constant over the blur. It is computed every
-    8 px and interpolated linearly.
+    8 px and interpolated linearly, which leaves some (8 px / focal length)^2 of it.
 
     Attributes:
         gradient: relative change of the light from the frame's centre to its right and to its lower border.
