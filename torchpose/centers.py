@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from torchpose.ellipse import EllipseFit
+from torchpose.geometry import conics
 
 
 def compensate(outer: EllipseFit, inner: EllipseFit, radii: Tensor) -> tuple[Tensor, Tensor]:
@@ -27,3 +29,45 @@ def compensate(outer: EllipseFit, inner: EllipseFit, radii: Tensor) -> tuple[Ten
         k1.square()[:, None, None] * inner.center_covariance + k2.square()[:, None, None] * outer.center_covariance
     )
     return center, covariance
+
+
+def common_center(outer: EllipseFit, inner: EllipseFit, radii: Tensor) -> tuple[Tensor, Tensor]:
+    """`exact` for rings of two circles; arguments and result as `compensate`."""
+    ellipses = torch.stack([outer.params, inner.params], -2)
+    covariances = torch.stack([outer.center_covariance, inner.center_covariance], -3)
+    return exact(ellipses, covariances, radii)
+
+
+def exact(ellipses: Tensor, covariances: Tensor, radii: Tensor) -> tuple[Tensor, Tensor]:
+    """Image of the common centre of concentric circles, exact at any tilt, from any number of them.
+
+    With H the homography from the circles' plane, the dual conic of the image of the circle of radius r, scaled to the
+    determinant -1 / r^2, is H diag(1, 1, 0) H^T - h h^T / r^2 up to a factor common to all, h the image of the centre
+    (derived; the dual form of the pole-polar relation of Kim, Gurdjos and Kweon 2005). So the dual conics lie on a line
+    over 1 / r^2, and h is the one eigenvector of its slope. Where perspective is weak, two circles give eq. (7).
+
+    Args:
+        ellipses: (..., L, 5) px, L >= 2 circles. covariances: (..., L, 2, 2) of their centres, px^2.
+        radii: (..., L), all different, any unit.
+
+    Returns:
+        center (..., 2) px and its covariance (..., 2, 2), to first order, the circles measured independently.
+    """
+    # about the middle of the centres, in units of the largest circle: all entries of order one
+    middle = ellipses[..., :2].mean(-2, keepdim=True)
+    unit = ellipses[..., 2].amax(-1)[..., None, None]
+    e = (ellipses[..., :2] - middle) / unit
+    shape = conics.shape_matrix(ellipses) / unit[..., None]
+    block = e[..., :, None] * e[..., None, :] - shape @ shape
+    last = torch.cat([e, torch.ones_like(e[..., :1])], -1)
+    dual = torch.cat([torch.cat([block, e[..., :, None]], -1), last[..., None, :]], -2)  # times -1
+    inverse = (radii.amax(-1, keepdim=True) / radii).square()  # 1 / r^2
+    scale = (inverse / (shape.det().square())).pow(1 / 3)
+    lever = inverse - inverse.mean(-1, keepdim=True)
+    slope = ((lever * scale)[..., None, None] * dual).sum(-3)
+    _, vectors = torch.linalg.eigh(torch.where(slope.isfinite(), slope, 0.0))
+    h = vectors[..., :, -1]  # the other two eigenvalues vanish
+    center = unit[..., 0] * h[..., :2] / h[..., 2:] + middle[..., 0, :]
+    share = lever * scale / (lever * scale).sum(-1, keepdim=True)
+    covariance = (share.square()[..., None, None] * covariances).sum(-3)
+    return torch.where(slope.isfinite().all(-1).all(-1)[..., None], center, torch.nan), covariance

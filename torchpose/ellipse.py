@@ -6,7 +6,9 @@ are fitted by one sequence of tensor operations. Ellipses are (cx, cy, a >= b, t
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -15,7 +17,10 @@ from torchpose.geometry import conics
 from torchpose.geometry.segments import segment_mean, segment_sum
 
 _SOLVABLE_POINTS = 6  # five parameters and one point to spare
+_CHUNK = 1 << 15  # points summed at a time: blocks that stay in the processor's cache
 _FLAT = 1e-12  # squared ratio of the extents of a point set across and along, below which it is a line
+
+Method = Literal["halir-flusser", "taubin"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,11 +50,16 @@ class EllipseFit:
         return self.covariance[:, :2, :2]
 
 
-def fit(points: Tensor, index: Tensor, count: int, weights: Tensor | None = None) -> Tensor:
-    """Direct least-squares ellipses (Fitzgibbon 1999 in the stable form of Halir and Flusser 1998).
+def fit(
+    points: Tensor, index: Tensor, count: int, weights: Tensor | None = None, *, method: Method = "halir-flusser"
+) -> Tensor:
+    """Direct least-squares ellipses.
 
-    Minimises the weighted sum of squared algebraic distances subject to 4AC - B^2 = 1, on coordinates that are centred
-    and scaled for each ellipse. The 3x3 eigenproblem is solved in closed form.
+    "halir-flusser" minimises the weighted sum of squared algebraic distances subject to 4AC - B^2 = 1 (Fitzgibbon 1999
+    in the stable form of Halir and Flusser 1998): always an ellipse, but too small on short noisy arcs. "taubin" takes
+    the mean squared gradient for the constraint (Taubin 1991): nearly unbiased on arcs, dearer, and NaN where the best
+    conic is no ellipse. On whole ellipses both agree within a fraction of the noise. Points of one ellipse need not
+    follow each other, but are fitted faster where the index is sorted.
 
     Args:
         points: (E, 2) px, any float dtype; computed in float64. index: (E,) int64, ellipse of each point.
@@ -59,27 +69,98 @@ def fit(points: Tensor, index: Tensor, count: int, weights: Tensor | None = None
         (M, 5) float64; rows with fewer than 6 points of weight above 0, whose points lie on a line, or with a NaN among
         them are NaN.
     """
-    points = points.double()
-    w = torch.ones_like(points[:, 0]) if weights is None else weights.double()
-    counts = w > 0
-    points = torch.where(counts[:, None], points, 0.0)
-    center = segment_mean(points, index, count, w)
-    local = points - center[index]
-    scale = segment_mean(local.square().sum(-1), index, count, w).sqrt()
-    x, y = (local / scale[index, None]).unbind(-1)
-    xx, xy, yy = x * x, x * y, y * y
-    # the moments of order 2 to 4; those of order 1 vanish by centring
-    one = torch.ones_like(x)
-    rows = [xx, xy, yy, xx * x, xx * y, xy * y, yy * y, xx * xx, xx * xy, xx * yy, xy * yy, yy * yy, one]
-    sums = segment_sum(torch.stack(rows, -1) * w[:, None], index, count)
-    m20, m11, m02, m30, m21, m12, m03, m40, m31, m22, m13, m04, n = sums.unbind(-1)
+    if count == 0:
+        return torch.zeros(0, 5, dtype=torch.float64, device=points.device)
+    if weights is None and _is_blocked(index, count):
+        blocks = points.view(count, -1, 2).split(max(1, _CHUNK * count // index.numel()))
+        parts = [_moments(block) for block in blocks]
+    else:
+        parts = [_moments(block, weight) for block, weight in _padded(points, index, count, weights)]
+    return _from_moments(*(torch.cat(part) for part in zip(*parts, strict=True)), method=method)
 
+
+def _is_blocked(index: Tensor, count: int) -> bool:
+    """Whether all ellipses have the same number of points, one after the other."""
+    if index.numel() == 0 or index.numel() % count:
+        return False
+    return bool((index.view(count, -1) == torch.arange(count, device=index.device)[:, None]).all())
+
+
+def _padded(points: Tensor, index: Tensor, count: int, weights: Tensor | None) -> Iterator[tuple[Tensor, Tensor]]:
+    """Blocks (m, P, 2) of the points of successive ellipses and their weights (m, P), 0 where there is no point."""
+    if bool((index[1:] < index[:-1]).any()):
+        index, order = index.sort(stable=True)
+        points, weights = points[order], None if weights is None else weights[order]
+    sizes = torch.bincount(index, minlength=count)
+    ends = sizes.cumsum(0)
+    slot = torch.arange(index.numel(), device=index.device) - (ends - sizes)[index]
+    for a in range(0, count, step := max(1, _CHUNK * count // max(1, index.numel()))):
+        b = min(a + step, count)
+        first, last = int(ends[a] - sizes[a]), int(ends[b - 1])
+        at = (index[first:last] - a, slot[first:last])
+        width = int(sizes[a:b].max())
+        block = torch.zeros(b - a, width, 2, dtype=torch.float64, device=points.device)
+        weight = torch.zeros(b - a, width, dtype=torch.float64, device=points.device)
+        block[at] = points[first:last].double()
+        weight[at] = 1.0 if weights is None else weights[first:last].double()
+        yield block, weight
+
+
+def fit_blocks(points: Tensor, weights: Tensor | None = None, *, method: Method = "halir-flusser") -> Tensor:
+    """As `fit`, of ellipses with the same number of points: (M, P, 2), weights (M, P), result (M, 5).
+
+    Free of data-dependent control flow, for ``torch.compile`` and ``torch.func``.
+    """
+    return _from_moments(*_moments(points, weights), method=method)
+
+
+def _moments(points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    """Centroids (M, 2), mean central moments (M, 12), and whether there are enough points (M,).
+
+    The moments are m20 m11 m02, m30 m21 m12 m03, m40 m31 m22 m13 m04.
+    """
+    xy = points.double().mT.contiguous()  # (M, 2, P): the fastest layout by far for all that follows
+    if weights is None:
+        total: Tensor | int = xy.shape[2]
+        enough = torch.full((xy.shape[0],), xy.shape[2] >= _SOLVABLE_POINTS, device=xy.device)
+        center = xy.mean(-1)
+    else:
+        w = weights.double()[:, None]
+        xy = torch.where(w > 0, xy, 0.0)
+        total, enough = w.sum(-1), (w > 0).sum(-1).squeeze(-1) >= _SOLVABLE_POINTS
+        center = (xy @ w.mT).squeeze(-1) / total
+    xy = xy - center[..., None]
+    squares = torch.cat([xy * xy[:, :1], xy[:, 1:] * xy[:, 1:]], 1)  # x^2, xy, y^2
+    left = squares if weights is None else squares * w
+    second, third, fourth = left.sum(-1), left @ xy.mT, left @ squares.mT
+    sums = [second, third[:, 0], third[:, 2], fourth[:, 0], fourth[:, 1:, 2]]
+    return center, torch.cat(sums, -1) / total, enough
+
+
+def _from_moments(center: Tensor, moments: Tensor, enough: Tensor, *, method: Method) -> Tensor:
+    """Ellipses (M, 5) from the results of `_moments`."""
+    scale = (moments[:, 0] + moments[:, 2]).sqrt()
+    power = torch.tensor([2.0] * 3 + [3.0] * 4 + [4.0] * 5, dtype=scale.dtype, device=scale.device)
+    scaled = (moments / scale[:, None] ** power).unbind(-1)
+    conic = _taubin(*scaled) if method == "taubin" else _halir_flusser(*scaled)
+    ellipse = conics.ellipse_from_conic(conic)
+    one = torch.ones_like(scale)
+    ellipse = ellipse * torch.stack([scale, scale, scale, scale, one], -1) + torch.nn.functional.pad(center, (0, 3))
+    m20, m11, m02 = scaled[:3]  # m20 + m02 = 1, so their determinant is the squared ratio of the extents
+    return torch.where((enough & (m20 * m02 - m11 * m11 > _FLAT))[:, None], ellipse, torch.nan)
+
+
+def _halir_flusser(
+    m20: Tensor, m11: Tensor, m02: Tensor, m30: Tensor, m21: Tensor, m12: Tensor, m03: Tensor,
+    m40: Tensor, m31: Tensor, m22: Tensor, m13: Tensor, m04: Tensor,
+) -> Tensor:  # fmt: skip
+    """Conics (M, 6) of central moments; the 3x3 eigenproblem in closed form."""
     # scatter matrix of (x^2, xy, y^2) after eliminating the linear part (x, y, 1)
     det = m20 * m02 - m11 * m11
     i11, i12, i22 = m02 / det, -m11 / det, m20 / det
 
     def reduced(mab: Tensor, pa: Tensor, qa: Tensor, na: Tensor, pb: Tensor, qb: Tensor, nb: Tensor) -> Tensor:
-        return mab - (pa * (i11 * pb + i12 * qb) + qa * (i12 * pb + i22 * qb)) - na * nb / n
+        return mab - (pa * (i11 * pb + i12 * qb) + qa * (i12 * pb + i22 * qb)) - na * nb
 
     s11 = reduced(m40, m30, m21, m20, m30, m21, m20)
     s12 = reduced(m31, m30, m21, m20, m21, m12, m11)
@@ -95,13 +176,42 @@ def fit(points: Tensor, index: Tensor, count: int, weights: Tensor | None = None
     # back-substitute the linear part
     p, q = a * m30 + b * m21 + c * m12, a * m21 + b * m12 + c * m03
     d, e = -(i11 * p + i12 * q), -(i12 * p + i22 * q)
-    f = -(a * m20 + b * m11 + c * m02) / n
-    ellipse = conics.ellipse_from_conic(torch.stack([a, b, c, d, e, f], -1))
-    size = torch.stack([scale, scale, scale, scale, torch.ones_like(scale)], -1)
-    shift = torch.nn.functional.pad(center, (0, 3))
-    enough = segment_sum(counts.to(w), index, count) >= _SOLVABLE_POINTS
-    spread = det > _FLAT * n.square()  # m20 + m02 = n by the scaling, so det / n^2 is the squared ratio of the extents
-    return torch.where((enough & spread)[:, None], ellipse * size + shift, torch.nan)
+    return torch.stack([a, b, c, d, e, -(a * m20 + b * m11 + c * m02)], -1)
+
+
+def _taubin(
+    m20: Tensor, m11: Tensor, m02: Tensor, m30: Tensor, m21: Tensor, m12: Tensor, m03: Tensor,
+    m40: Tensor, m31: Tensor, m22: Tensor, m13: Tensor, m04: Tensor,
+) -> Tensor:  # fmt: skip
+    """Conics (M, 6) of central moments: smallest eigenvector of the scatter against the mean squared gradient."""
+    # (A, B, C, D, E) after eliminating F = -(A m20 + B m11 + C m02)
+    scatter = torch.stack([
+        m40 - m20 * m20, m31 - m20 * m11, m22 - m20 * m02, m30, m21,
+        m31 - m20 * m11, m22 - m11 * m11, m13 - m11 * m02, m21, m12,
+        m22 - m20 * m02, m13 - m11 * m02, m04 - m02 * m02, m12, m03,
+        m30, m21, m12, m20, m11,
+        m21, m12, m03, m11, m02,
+    ], -1).unflatten(-1, (5, 5))  # fmt: skip
+    zero, one = torch.zeros_like(m20), torch.ones_like(m20)
+    # mean of (2 A x + B y + D)^2 + (B x + 2 C y + E)^2, m20 + m02 = 1
+    gradient = torch.stack([
+        4 * m20, 2 * m11, zero, zero, zero,
+        2 * m11, m20 + m02, 2 * m11, zero, zero,
+        zero, 2 * m11, 4 * m02, zero, zero,
+        zero, zero, zero, one, zero,
+        zero, zero, zero, zero, one,
+    ], -1).unflatten(-1, (5, 5))  # fmt: skip
+    factor, failed = torch.linalg.cholesky_ex(gradient)
+    sound = ((failed == 0) & scatter.isfinite().all(-1).all(-1))[:, None, None]
+    eye = torch.eye(5, dtype=scatter.dtype, device=scatter.device)
+    factor, scatter = torch.where(sound, factor, eye), torch.where(sound, scatter, eye)
+    half = torch.linalg.solve_triangular(factor, scatter, upper=False)
+    white = torch.linalg.solve_triangular(factor, half.mT, upper=False)
+    _, vectors = torch.linalg.eigh(white)
+    best = torch.linalg.solve_triangular(factor.mT, vectors[:, :, :1], upper=True).squeeze(-1)
+    a, b, c, d, e = best.unbind(-1)
+    conic = torch.stack([a, b, c, d, e, -(a * m20 + b * m11 + c * m02)], -1)
+    return torch.where(sound[:, 0], conic, torch.nan)
 
 
 def _positive_eigenvector(matrix: Tensor) -> Tensor:

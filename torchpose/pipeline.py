@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from torchpose.camera import Camera
-from torchpose.centers import compensate
+from torchpose.centers import common_center, compensate
 from torchpose.detect import find_candidates
 from torchpose.errors import ConfigError, FrameError
 from torchpose.markers import Identified, MarkerTable, identify
@@ -22,14 +22,14 @@ from torchpose.pose import (
     intrinsics_covariance,
     solve_poses,
 )
-from torchpose.refine import refine_photometric
+from torchpose.refine import refine_edges, refine_photometric
 from torchpose.results import Detections, Poses, Reason, Status
 from torchpose.rings import Rings, measure_rings
 from torchpose.target import Target
 
 _FRAME_TYPES = (torch.uint8, torch.uint16, torch.float16, torch.bfloat16, torch.float32, torch.float64)
 MIN_MARKERS = 3
-Method = Literal["photometric", "centers"]
+Method = Literal["photometric", "edges", "centers", "paper"]
 _LEAST_KEPT = 0.5  # of the pixels around the edges that must follow the model for a refinement to count
 
 
@@ -39,9 +39,12 @@ class PoseEstimator(nn.Module):
     Args:
         camera: intrinsics and distortion; frames must have its size.
         target: one target or several; each gets a row for every frame.
-        method: "photometric" refines every pose on the grey values around its rings; "centers" stops at the pose of the
-            compensated ring centres.
+        method: "photometric" refines every pose on the grey values around its rings, "edges" on all their edge points;
+            "centers" stops at the pose of the ring centres; "paper" is the paper's chain: Zernike edges as read,
+            centres by eq. (7), PnP.
         float_range: grey value of white in floating-point frames: 1.0 or 255.0.
+        srgb: the grey values are sRGB-encoded and are taken back to linear ones first. Edges are half-way in linear
+            grey, so encoded frames that are taken as linear ones shift them (docs/precision.md).
 
     Raises:
         ConfigError: no target, or two of one name; an unknown method.
@@ -54,6 +57,7 @@ class PoseEstimator(nn.Module):
         *,
         method: Method = "photometric",
         float_range: float = 1.0,
+        srgb: bool = False,
     ) -> None:
         super().__init__()
         self.camera = camera
@@ -70,6 +74,7 @@ class PoseEstimator(nn.Module):
             raise ConfigError(f"method: {method!r} is not known; choose one of {', '.join(get_args(Method))}")
         self.method = method
         self.float_range = float_range
+        self.srgb = srgb
         self._table = MarkerTable.of(self.targets)
 
     def extra_repr(self) -> str:
@@ -95,14 +100,14 @@ class PoseEstimator(nn.Module):
         batch, count = frames.shape[0], len(self.targets)
         candidates = find_candidates(frames)
         candidates = candidates[torch.isin(candidates.polarity, table.polarity)]
-        rings = measure_rings(frames, candidates, camera)
+        rings = measure_rings(frames, candidates, camera, correct=self.method != "paper")
         identified = identify(rings, table, camera, batch)
         target = torch.arange(batch * count, device=frames.device) % count
         evidence = self._evidence(rings, identified, table, target, camera)
 
         solvable = (evidence.mask.sum(-1) >= MIN_MARKERS).nonzero()[:, 0]
         solutions = solve_poses(evidence[solvable], (identified.R[solvable], identified.t[solvable]))
-        if self.method == "photometric":
+        if self.method in ("photometric", "edges"):
             solutions = self._refined(
                 frames, solutions, evidence[solvable], solvable // count, rings, identified.ring[solvable], camera
             )
@@ -122,7 +127,9 @@ class PoseEstimator(nn.Module):
         if tuple(frames.shape[1:]) != size:
             got, need = f"{frames.shape[2]} x {frames.shape[1]}", f"{size[1]} x {size[0]}"
             raise FrameError(f"frames: size {got}, but the camera has {need}; use the camera file of these frames")
-        if frames.is_floating_point():
+        if self.srgb:
+            frames = _linear(frames, self.float_range)
+        elif frames.is_floating_point():
             # the detector's least contrast counts in 1/255 of white
             frames = (frames.float() * (255.0 / self.float_range)).nan_to_num(nan=0.0)
         return frames.contiguous()
@@ -134,7 +141,8 @@ class PoseEstimator(nn.Module):
         row, marker = mask.nonzero().unbind(-1)
         radii = table.radii[target]
         index = ring[row, marker]
-        center, covariance = compensate(rings.outer[index], rings.inner[index], radii[row, marker])
+        locate = compensate if self.method == "paper" else common_center
+        center, covariance = locate(rings.outer[index], rings.inner[index], radii[row, marker])
         centers = torch.full((*ring.shape, 2), torch.nan, dtype=torch.float64, device=ring.device)
         covariances = torch.full((*ring.shape, 2, 2), torch.nan, dtype=torch.float64, device=ring.device)
         centers[row, marker], covariances[row, marker] = center, covariance
@@ -160,22 +168,17 @@ class PoseEstimator(nn.Module):
         ring: Tensor,
         camera: Camera,
     ) -> Solutions:
-        """Solutions whose poses are refined on the grey values, where the refinement holds."""
+        """Solutions whose poses are refined on the frames themselves, where the refinement holds."""
         solved = (s.status != Status.REJECTED).nonzero()[:, 0]
-        shapes = torch.stack([rings.outer_raw, rings.inner_raw], 1)
+        index = ring[solved].clamp_min(0)
+        shapes = torch.stack([rings.outer_raw, rings.inner_raw], 1)[index]
         some = replace(e[solved], mask=s.mask[solved])
-        refined = refine_photometric(
-            frames,
-            camera,
-            frame[solved],
-            s.R[solved],
-            s.t[solved],
-            some.mask,
-            shapes[ring[solved].clamp_min(0)],
-            some.points,
-            some.normals,
-            some.radii,
-        )
+        start = (frames, camera, frame[solved], s.R[solved], s.t[solved], some.mask, shapes)
+        model = (some.points, some.normals, some.radii)
+        if self.method == "edges":
+            refined = refine_edges(*start, rings.polarity[index], *model)
+        else:
+            refined = refine_photometric(*start, *model)
         good = refined.good & (refined.kept > _LEAST_KEPT)
         index = solved[good]
         rms = center_rms(some, refined.R, refined.t)
@@ -253,6 +256,14 @@ class PoseEstimator(nn.Module):
             detections=detections,
             **{n: spread(getattr(s, n)) for n in names},
         )
+
+
+def _linear(frames: Tensor, white: float) -> Tensor:
+    """sRGB-encoded frames as linear grey, float32 with white at 255 (IEC 61966-2-1)."""
+    if not frames.is_floating_point():
+        white = float(torch.iinfo(frames.dtype).max)
+    x = (frames.float() / white).nan_to_num(nan=0.0)
+    return 255.0 * torch.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055).clamp_min(0).pow(2.4))
 
 
 def raw_centers(camera: Camera, ideal: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:

@@ -83,12 +83,13 @@ def find_inner(frames: Tensor, candidates: Candidates) -> tuple[Tensor, Tensor]:
     return at[best], (outer > 0) & (peak > _LEAST_PEAK * outer)
 
 
-def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera) -> Rings:
+def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera, *, correct: bool = True) -> Rings:
     """Measures outer and inner circle of every candidate that has both, each fitted separately.
 
     Args:
         frames: (B, H, W) grey, any real dtype. candidates: with the polarity of the rings looked for.
         camera: its distortion is taken off the sub-pixel points before the final fit.
+        correct: free the edges from what blur and curvature do to them; False leaves them as the moments read them.
     """
     ratio, found = find_inner(frames, candidates)
     candidates, ratio = candidates[found], ratio[found]
@@ -104,7 +105,7 @@ def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera) -> Rin
     edges = ring_edges(frames, frame, rough, outward, reach)
 
     raw, keep = ellipse.fit_robust(edges.points, edges.ring, 2 * count, start=rough)
-    points = _unbiased(edges, raw, keep, outward, frame, frames.shape[0])
+    points = _unbiased(edges, raw, keep, outward, frame, frames.shape[0]) if correct else edges.points
     raw, keep = ellipse.fit_robust(points, edges.ring, 2 * count, start=raw, scales=(0.5,))
     ring, points = edges.ring[keep], points[keep]
     ideal_points = ideal_pixels(camera, points)

@@ -1,5 +1,6 @@
 """Stage: refinement of poses beyond the marker centres."""
 
+from torchpose.refine.edges import refine_edges
 from torchpose.refine.photometric import Refined, refine_photometric
 
-__all__ = ["Refined", "refine_photometric"]
+__all__ = ["Refined", "refine_edges", "refine_photometric"]

@@ -1,0 +1,268 @@
+"""Errors of whole frames beside their Cramer-Rao bound, and whether the covariance explains them.
+
+    python scripts/precision_statistics.py --case tilt --frames 5000 --out precision.csv
+    python scripts/precision_statistics.py --case all --frames 200 --method photometric edges
+
+Simulated 2-megapixel frames of the built-in target quad40, 8 bit. One row a case and method: frames with a pose, RMS
+error over RMS bound across and along the optical axis and of the rotation, the RMS errors, mean NEES (ideal 6), the
+share inside the 99 % ellipsoid. Point-spread functions outside the model are mixtures of shifted frames: a shift of
+the principal point is a shift of the picture. The bound of a covered ring takes the covered part of that marker's
+information off; that of a foreign point-spread function is the bound of a Gaussian of the same variance.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import math
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import get_args
+
+import torch
+from scipy.stats import chi2
+from torch import Tensor
+
+import torchpose as tp
+from torchpose.analysis import pose_crlb, pose_errors
+from torchpose.geometry import rotations
+from torchpose.pipeline import Method
+from torchpose.sim import add_noise, render
+
+F64 = torch.float64
+FOCAL, WIDTH, HEIGHT = 1111.11, 1824, 1216
+PLATE = (70.0, 70.0)
+DARK, LIGHT = 30.0, 220.0
+BATCH = 8
+COVER = 128.0  # grey level of what covers a ring
+TARGET = tp.Target.load("quad40")
+
+
+@dataclass(frozen=True)
+class Case:
+    """A family of frames; ``poses(count, generator)`` gives R, t. Blur in px, noise in grey levels of 255."""
+
+    poses: Callable[[int, torch.Generator], tuple[Tensor, Tensor]]
+    noise: float = 2.0
+    blur: float = 0.7
+    psf: str = "gauss"
+    k1: float = 0.0
+    bits: int = 8
+    cover: float = 0.0
+    missing: bool = False
+    encoded: bool = False
+    srgb: bool = False
+
+
+def tilted(tilt_deg: float, near: float = 140.0, far: float = 190.0) -> Callable[..., tuple[Tensor, Tensor]]:
+    """Any tilt up to ``tilt_deg`` about any axis, any roll, distance from ``near`` to ``far`` mm."""
+
+    def draw(count: int, g: torch.Generator) -> tuple[Tensor, Tensor]:
+        lean, azimuth, roll, x, y, z = torch.rand(6, count, dtype=F64, generator=g)
+        lean, azimuth, roll = lean * math.radians(tilt_deg), azimuth * 2 * math.pi, roll * 2 * math.pi
+        zero = torch.zeros_like(lean)
+        r = rotations.exp(torch.stack([lean * azimuth.cos(), lean * azimuth.sin(), zero], -1))
+        r = r @ rotations.exp(torch.stack([zero, zero, roll], -1))
+        return r, torch.stack([(x - 0.5) * 30, (y - 0.5) * 15, near + z * (far - near)], -1)
+
+    return draw
+
+
+def grid(count: int, g: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Poses of the paper's grid of 875 (Fig. 11), in random order, again and again."""
+    turns = torch.tensor([-5.0, -2.5, 0.0, 2.5, 5.0], dtype=F64).deg2rad()
+    offsets = torch.cat([torch.zeros(1, 3, dtype=F64), 10 * torch.eye(3, dtype=F64), -10 * torch.eye(3, dtype=F64)])
+    every = torch.cartesian_prod(turns, turns, turns)
+    pick = torch.cat([torch.randperm(875, generator=g) for _ in range(1 + count // 875)])[:count]
+    roll, yaw, pitch = every[pick % 125].unbind(-1)
+    zero = torch.zeros_like(roll)
+    r = rotations.exp(torch.stack([zero, zero, roll], -1)) @ rotations.exp(torch.stack([zero, yaw, zero], -1))
+    r = r @ rotations.exp(torch.stack([pitch, zero, zero], -1))
+    return r, offsets[pick // 125] + torch.tensor([0.0, 0.0, 160.0], dtype=F64)
+
+
+CASES = {
+    "grid": Case(grid),
+    "tilt": Case(tilted(60)),
+    "far": Case(tilted(60, 250, 400)),
+    "noise-0": Case(tilted(60), noise=0.0),
+    "noise-1": Case(tilted(60), noise=1.0),
+    "noise-4": Case(tilted(60), noise=4.0),
+    "noise-8": Case(tilted(60), noise=8.0),
+    "noise-16": Case(tilted(45), noise=16.0),
+    "blur-0.4": Case(tilted(60), blur=0.4),
+    "blur-1.5": Case(tilted(60), blur=1.5),
+    "16-bit": Case(tilted(60), noise=0.5, bits=16),
+    "k1-0.1": Case(tilted(60), k1=-0.1),
+    "k1-0.3": Case(tilted(60), k1=-0.3),
+    "disc": Case(tilted(60), blur=0.35, psf="disc"),
+    "motion": Case(tilted(60), blur=0.6, psf="motion"),
+    "blackman-harris": Case(tilted(60), blur=0.5, psf="blackman-harris"),
+    "cover-10": Case(tilted(45), cover=0.10),
+    "cover-20": Case(tilted(45), cover=0.20),
+    "cover-35": Case(tilted(45), cover=0.35),
+    "missing": Case(tilted(45), missing=True),
+    "srgb": Case(tilted(60), encoded=True, srgb=True),
+    "srgb-as-linear": Case(tilted(60), encoded=True),
+}
+
+
+def camera_of(k1: float) -> tp.Camera:
+    matrix = torch.tensor([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]], dtype=F64)
+    distortion = torch.tensor([k1, 0.0, 0.0, 0.0], dtype=F64)
+    return tp.Camera(width=WIDTH, height=HEIGHT, matrix=matrix, distortion=distortion)
+
+
+def spread(psf: str) -> Tensor:
+    """Shifts (S, 2) in px whose mean frame is blurred by a foreign point-spread function."""
+    if psf == "gauss":
+        return torch.zeros(1, 2, dtype=F64)
+    if psf == "motion":  # 1 px along u
+        return torch.stack([torch.linspace(-0.45, 0.45, 10, dtype=F64), torch.zeros(10, dtype=F64)], -1)
+    side = torch.linspace(-1, 1, 9, dtype=F64)
+    square = torch.cartesian_prod(side, side)
+    return 1.2 * square[square.norm(dim=-1) <= 1.01]  # a disc of radius 1.2 px
+
+
+def picture(case: Case, camera: tp.Camera, target: tp.Target, r: Tensor, t: Tensor) -> Tensor:
+    """Frames (B, H, W), free of noise."""
+    if case.psf == "blackman-harris":
+        return filtered(case, camera, target, r, t)
+    out = torch.zeros(len(t), camera.height, camera.width)
+    shifts = spread(case.psf)
+    for shift in shifts:
+        matrix = camera.matrix.clone()
+        matrix[:2, 2] += shift
+        moved = replace(camera, matrix=matrix)
+        out += render(moved, target, r, t, psf_sigma=case.blur, plate=PLATE, dark=DARK, light=LIGHT) / len(shifts)
+    return out
+
+
+def filtered(case: Case, camera: tp.Camera, target: tp.Target, r: Tensor, t: Tensor, finer: int = 3) -> Tensor:
+    """Frames through a Blackman-Harris pixel filter 1.5 px wide in place of the pixel's square (Harris 1978)."""
+    matrix = camera.matrix.clone()
+    matrix[:2] *= finer
+    matrix[:2, 2] += (finer - 1) / 2
+    fine = replace(camera, width=finer * camera.width, height=finer * camera.height, matrix=matrix)
+    reach = math.ceil(0.75 * finer)
+    x = torch.arange(-reach, reach + 1, dtype=F64) / (1.5 * finer)
+    phase = 2 * math.pi * (x + 0.5)
+    window = 0.35875 - 0.48829 * phase.cos() + 0.14128 * (2 * phase).cos() - 0.01168 * (3 * phase).cos()
+    window = torch.where(x.abs() <= 0.5, window, 0.0)
+    kernel = (window[:, None] * window / window.sum().square())[None, None].float()
+    pad = reach - (finer - 1) // 2
+    sharp = render(fine, target, r, t, psf_sigma=finer * case.blur, plate=PLATE, dark=DARK, light=LIGHT)
+    sharp = torch.nn.functional.pad(sharp[:, None], (pad, pad, pad, pad), mode="replicate")
+    return torch.nn.functional.conv2d(sharp, kernel, stride=finer)[:, 0]
+
+
+def covered(case: Case, camera: tp.Camera, frames: Tensor, r: Tensor, t: Tensor, g: torch.Generator) -> Tensor:
+    """Frames with a sector of marker 0 covered."""
+    at = camera.project((r @ TARGET.centers[0]) + t)
+    reach = 1.3 * FOCAL * TARGET.radii[0, 0] / t[:, 2]
+    start = 2 * math.pi * torch.rand(len(t), dtype=F64, generator=g)
+    v, u = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
+    du, dv = u - at[:, 0, None, None], v - at[:, 1, None, None]
+    angle = torch.remainder(torch.atan2(dv, du) - start[:, None, None], 2 * math.pi)
+    hidden = (torch.hypot(du, dv) < reach[:, None, None]) & (angle < 2 * math.pi * case.cover)
+    return torch.where(hidden, COVER, frames)
+
+
+def bound_of(case: Case, camera: tp.Camera, r: Tensor, t: Tensor) -> Tensor:
+    variance = case.blur**2 + spread(case.psf).square().sum(-1).mean() / 2
+    options = {"psf_sigma": variance.sqrt(), "dark": DARK, "light": LIGHT, "noise_sigma": case.noise, "bits": case.bits}
+    full = pose_crlb(camera, TARGET, r, t, **options)
+    if not case.cover and not case.missing:
+        return full
+    rest = pose_crlb(camera, without_first(TARGET), r, t, **options)
+    seen = 0.0 if case.missing else 1 - case.cover
+    return torch.linalg.inv(seen * torch.linalg.inv(full) + (1 - seen) * torch.linalg.inv(rest))
+
+
+def without_first(target: tp.Target) -> tp.Target:
+    return replace(
+        target, ids=target.ids[1:], centers=target.centers[1:], normals=target.normals[1:], radii=target.radii[1:]
+    )
+
+
+def run(name: str, case: Case, methods: list[Method], frames: int, seed: int) -> list[dict[str, object]]:
+    g = torch.Generator().manual_seed(seed)
+    camera = camera_of(case.k1)
+    r, t = case.poses(frames, g)
+    drawn = without_first(TARGET) if case.missing else TARGET
+    estimators = {m: tp.PoseEstimator(camera, TARGET, method=m, srgb=case.srgb) for m in methods}
+    parts: dict[str, list[tuple[Tensor, ...]]] = {m: [] for m in methods}
+    bounds = []
+    for a in range(0, frames, BATCH):
+        s = slice(a, a + BATCH)
+        clean = picture(case, camera, drawn, r[s], t[s])
+        if case.cover:
+            clean = covered(case, camera, clean, r[s], t[s], g)
+        if case.encoded:
+            x = clean / 255
+            clean = 255 * torch.where(x <= 0.0031308, 12.92 * x, 1.055 * x.clamp_min(0.0031308) ** (1 / 2.4) - 0.055)
+        noisy = add_noise(clean, case.noise, seed=seed, index=torch.arange(a, a + len(clean)), bits=case.bits)
+        bounds.append(bound_of(case, camera, r[s], t[s]))
+        for m, estimator in estimators.items():
+            poses = estimator(noisy)
+            e = pose_errors(poses, _Pose(r[s], t[s]))
+            parts[m].append((poses.status, e.translation, e.rotation, e.nees))
+        if sys.stderr.isatty():
+            print(f"\r{name}: {a + len(clean)} of {frames}", end="", file=sys.stderr)
+    bound = torch.cat(bounds).diagonal(dim1=-2, dim2=-1)
+    limit = chi2.ppf(0.99, 6)
+    rows = []
+    for m in methods:
+        status, translation, rotation, nees = (torch.cat(x) for x in zip(*parts[m], strict=True))
+        ok = status == tp.Status.OK
+        e2, b2 = torch.cat([translation, rotation], -1)[ok].square().mean(0), bound[ok].mean(0)
+        ratio = [math.sqrt(e2[i].sum() / b2[i].sum()) for i in (slice(0, 2), slice(2, 3), slice(3, 6))]
+        rows.append({
+            "case": name,
+            "method": m,
+            "frames": frames,
+            "ok": int(ok.sum()),
+            "lateral_ratio": ratio[0],
+            "depth_ratio": ratio[1],
+            "rotation_ratio": ratio[2],
+            "lateral_um": 1e3 * math.sqrt(e2[:2].sum()),
+            "depth_um": 1e3 * math.sqrt(e2[2]),
+            "rotation_mdeg": math.degrees(1e3 * math.sqrt(e2[3:].sum())),
+            "nees": float(nees[ok].mean()),
+            "nees_median": float(nees[ok].median()),
+            "inside_99": float((nees[ok] < limit).double().mean()),
+        })  # fmt: skip
+    return rows
+
+
+@dataclass(frozen=True)
+class _Pose:
+    R: Tensor
+    t: Tensor
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--case", nargs="+", default=["tilt"], choices=[*CASES, "all"])
+    parser.add_argument("--method", nargs="+", default=["photometric"], choices=get_args(Method))
+    parser.add_argument("--frames", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--out", type=Path, help="CSV file of the rows")
+    options = parser.parse_args()
+    names = list(CASES) if "all" in options.case else options.case
+    rows: list[dict[str, object]] = []
+    for name in names:
+        for row in run(name, CASES[name], options.method, options.frames, options.seed):
+            rows.append(row)
+            print("  ".join(f"{k} {v:.3g}" if isinstance(v, float) else str(v) for k, v in row.items()), flush=True)
+    if options.out:
+        with options.out.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, rows[0].keys(), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    main()
