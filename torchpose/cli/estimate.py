@@ -69,6 +69,14 @@ def estimate(
         Path | None,
         typer.Option(help="Calibrated camera-to-base or camera-to-tool transform; adds the poses in the robot base."),
     ] = None,
+    method: Annotated[
+        str,
+        typer.Option(
+            metavar="photometric|edges|centers|paper",
+            help="Last stage: grey values, edge points, ring centres, or the paper's own chain.",
+        ),
+    ] = "photometric",
+    srgb: Annotated[bool, typer.Option("--srgb", help="The frames are sRGB-encoded: linearise them first.")] = False,
     batch: Annotated[int | None, typer.Option(min=1, help="Frames at once; by default chosen by their size.")] = None,
     threads: Annotated[int | None, typer.Option(min=1, help="Threads to use; by default one a core.")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar and no summary.")] = False,
@@ -102,6 +110,8 @@ def estimate(
             overlay=overlay,
             resume=resume,
             hand_eye=calibration,
+            method=method,
+            srgb=srgb,
             batch=batch,
             threads=threads or _cores(),
             quiet=quiet,
@@ -118,6 +128,8 @@ def _run(
     overlay: Path | None,
     resume: bool,
     hand_eye: HandEye | None,
+    method: str,
+    srgb: bool,
     batch: int | None,
     threads: int,
     quiet: bool,
@@ -137,14 +149,14 @@ def _run(
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     # decoding is the larger part of the work; torch's threads wait actively and would take its cores away
     torch.set_num_threads(max(1, threads // 2))
-    estimator = PoseEstimator(camera, targets)
+    estimator = PoseEstimator(camera, targets, method=method, srgb=srgb)  # type: ignore[arg-type]  # it checks
     painter = None if overlay is None else Overlay(camera, targets, overlay, threads=threads)
     store = ResultStore(
         out,
         detections,
         schema=POSE_SCHEMA | (BASE_SCHEMA if hand_eye else {}),
         targets=len(targets),
-        origin=_origin(camera, targets, sources, hand_eye, detections is not None),
+        origin=_origin(camera, targets, sources, hand_eye, method, srgb, detections is not None),
         resume=resume,
     )
     # a resumed run works on the same batches as one that was not interrupted, so that rows agree to the last bit
@@ -277,7 +289,13 @@ def _check_outputs(
 
 
 def _origin(
-    camera: Camera, targets: Sequence[Target], sources: Sequence[Source], hand_eye: HandEye | None, detections: bool
+    camera: Camera,
+    targets: Sequence[Target],
+    sources: Sequence[Source],
+    hand_eye: HandEye | None,
+    method: str,
+    srgb: bool,
+    detections: bool,
 ) -> dict[str, Any]:
     """What the rows depend on, for `ResultStore`. Names are those that its error messages shall say."""
     from importlib.metadata import version
@@ -287,6 +305,8 @@ def _origin(
         "--camera": _digest(camera),
         "--target": [[target.name, _digest(target)] for target in targets],
         "--hand-eye": None if hand_eye is None else _digest(hand_eye),
+        "--method": method,
+        "--srgb": srgb,
         "--detections": detections,
         "INPUT": sorted({str(source.root) for source in sources}),
     }

@@ -11,6 +11,8 @@ frame is found along with its pose: the slope of o over l (`zernike.blur_slope`)
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -22,6 +24,7 @@ from torchpose.geometry.segments import segment_mean, segment_sum
 from torchpose.refine.photometric import Refined
 
 _REACH = 2.0  # px searched to either side of the fitted ellipses
+_CHAIN = 2 * math.sqrt(2) / math.pi  # edge pixels per px of a circle: mean of max(|cos|, |sin|)
 _START_SPREAD = 0.3  # px
 _SOFT = 3.0  # Geman-McClure scale in standard deviations
 _SOFT_BIAS = 1.17  # of a normal distribution, standard deviation over its RMS under these weights
@@ -43,6 +46,8 @@ def refine_edges(
     centers: Tensor,
     normals: Tensor,
     radii: Tensor,
+    *,
+    prior: Tensor | None = None,
 ) -> Refined:
     """Refines N poses on the edge points of their rings.
 
@@ -52,6 +57,7 @@ def refine_edges(
         mask: (N, M) bool, markers seen. rings: (N, M, 2, 5) their fitted ellipses in raw pixels, outer and inner.
         polarity: (N, M), +1 dark ring on light, -1 light on dark.
         centers, normals: (N, M, 3) in the target frame. radii: (N, M, 2), mm.
+        prior: (N, 6, 6), as in `refine_photometric`.
     """
     rows = rotation.shape[0]
     row, marker = mask.nonzero().unbind(-1)
@@ -82,6 +88,8 @@ def refine_edges(
     slope = torch.ones(rows, dtype=torch.float64, device=r.device)
     information = torch.zeros(rows, 6, 6, dtype=torch.float64, device=r.device)
     variance = torch.ones(rows, dtype=torch.float64, device=r.device)
+    known = torch.zeros_like(information) if prior is None else prior
+    moved = torch.zeros(rows, 6, dtype=torch.float64, device=r.device)
     for i in range(_STEPS):
         distance, bend, by_pose = circle_distance(ray, warp, r[of], t[of], center, normal, radius)
         true = edges.offset - sign * distance  # of the projected circle from the pixel's centre
@@ -96,15 +104,23 @@ def refine_edges(
         extra = torch.stack([weight * error.square(), (weight > 0).double()], -1)
         sums = segment_sum(torch.cat([weight[:, None] * products.flatten(1), extra], -1), of, rows)
         information, right = sums[:, :42].unflatten(1, (6, 7)).split([6, 1], -1)
-        step_pose = _solve_scaled(information, -right[..., 0])
-        variance = sums[:, 42] / (sums[:, 43] - 7).clamp_min(1)
+        variance = _CHAIN * zernike.edge_correlation() * sums[:, 42] / (sums[:, 43] - 7).clamp_min(1)
+        information = information + known * variance[:, None, None]
+        pull = variance[:, None] * (known @ moved[..., None]).squeeze(-1)
+        step_pose = _solve_scaled(information, -right[..., 0] - pull)
+        moved = moved + step_pose
         r, t = rotations.exp(step_pose[:, 3:]) @ r, t + step_pose[:, :3]
     inverse, info = torch.linalg.inv_ex(information)
-    covariance = inverse * (zernike.edge_correlation() * variance)[:, None, None]
+    covariance = inverse * variance[:, None, None]
     kept = segment_mean(keep, of, rows, sound)
     good = (info == 0) & covariance.isfinite().all(-1).all(-1) & (covariance.diagonal(dim1=-2, dim2=-1) > 0).all(-1)
     blur = ((1 - slope) * zernike.MASK**2 - 1).clamp_min(0).div(12).sqrt()
-    noise = variance.sqrt() * slope * segment_mean(step, of, rows) / zernike.offset_noise()
+    noise = (
+        (variance / (_CHAIN * zernike.edge_correlation())).sqrt()
+        * slope
+        * segment_mean(step, of, rows)
+        / zernike.offset_noise()
+    )
     return Refined(r, t, covariance, blur, noise, kept, good)
 
 

@@ -33,6 +33,7 @@ _START_BLUR = 0.8  # px
 _BLUR_RANGE = (0.3, 4.0)
 _CUT = 4.0  # robust standard deviations beyond which a pixel is left out
 _TILE = 256  # pixels summed in float32 at a time; sums of tiles are float64, so padding changes no digit that counts
+_MOST_SPREAD = 1.5  # of a marker's residuals, in those of the best marker of its frame
 _LEVELS = 6  # ring and paper, each with a constant and a gradient over the plane
 _QUANTISATION = 1 / 12  # variance of rounding, in grey levels^2, below which no noise estimate falls
 
@@ -103,6 +104,8 @@ def refine_photometric(
     centers: Tensor,
     normals: Tensor,
     radii: Tensor,
+    *,
+    prior: Tensor | None = None,
 ) -> Refined:
     """Refines N poses on the grey values around the rings of their markers.
 
@@ -111,6 +114,8 @@ def refine_photometric(
         rotation, translation: (N, 3, 3), (N, 3) to start from, within about a pixel.
         mask: (N, M) bool, markers seen. rings: (N, M, 2, 5) their fitted ellipses in raw pixels, outer and inner.
         centers, normals: (N, M, 3) in the target frame. radii: (N, M, 2), mm.
+        prior: (N, 6, 6), information about the pose besides the frames, that is the inverse covariance of the start:
+            from the robot, or to hold what is known.
     """
     rows = rotation.shape[0]
     blocks = _gather(frames, camera, frame, mask, rings, centers, normals, radii)
@@ -120,11 +125,14 @@ def refine_photometric(
     weight = blocks.valid
     information = torch.zeros(rows, 7, 7, dtype=torch.float64, device=r.device)
     variance = torch.ones(rows, dtype=torch.float64, device=r.device)
+    known = torch.zeros_like(information) if prior is None else torch.nn.functional.pad(prior, (0, 1, 0, 1))
+    moved = torch.zeros(rows, 7, dtype=torch.float64, device=r.device)
     for iteration in range(_STEPS):
         columns = _columns(blocks, _model(blocks, r, t, blur), levels)
         if iteration in _SELECTING:
             weight = _inliers(columns[:, :, -1].flatten(1), blocks)
-        step, level_step, information, variance = _gauss_newton(columns, weight, blocks.row, rows)
+        step, level_step, information, variance = _gauss_newton(columns, weight, blocks.row, rows, known, moved)
+        moved = moved + step
         r = rotations.exp(step[:, 3:6]) @ r
         t = t + step[:, :3]
         blur = (blur + step[:, 6]).clamp(*_BLUR_RANGE)
@@ -312,16 +320,21 @@ def _products(columns: Tensor, weight: Tensor) -> Tensor:
 
 
 def _first_levels(b: _Blocks, r: Tensor, t: Tensor, blur: Tensor) -> Tensor:
-    """Grey levels (K, 6) for the poses that come in, by reweighted linear fits."""
-    columns = _tiled((*_basis(_model(b, r, t, blur)), b.grey), b.valid)
-    weight = b.valid
-    levels = torch.zeros(weight.shape[0], _LEVELS, dtype=torch.float64, device=weight.device)
+    """Grey levels (K, 6) for the poses that come in: medians, then reweighted linear fits.
+
+    A third of a ring may be covered: a least-squares fit of gradients would bend towards the cover and stay there.
+    """
+    model = _model(b, r, t, blur)
+    columns = _tiled((*_basis(model), b.grey), b.valid)
+    none = torch.zeros_like(model.fraction[:, 0])
+    ring, paper = _median(b.grey, b.valid * (model.fraction < 0.05)), _median(b.grey, b.valid * (model.fraction > 0.95))
+    levels = torch.stack([ring, none, none, paper, none, none], -1).nan_to_num(nan=0.0).double()
     for _ in range(3):
-        sums = _products(columns, weight)
-        levels = _solve(sums[:, :_LEVELS, :_LEVELS], sums[:, :_LEVELS, _LEVELS])
         predicted = (levels.float()[:, None, None] @ columns[:, :, :_LEVELS]).flatten(1)
         residual = b.grey - predicted
-        weight = b.valid / (1 + (residual / (2 * _spread(residual, b.valid)[:, None])).square()).square()
+        weight = b.valid / (1 + (residual / (2 * _spread(residual, b)[:, None])).square()).square()
+        sums = _products(columns, weight)
+        levels = _solve(sums[:, :_LEVELS, :_LEVELS], sums[:, :_LEVELS, _LEVELS])
     return levels
 
 
@@ -332,17 +345,29 @@ def _solve(matrix: Tensor, right: Tensor) -> Tensor:
     return torch.linalg.solve(matrix + ridge[:, None, None] * eye, right)
 
 
-def _spread(residual: Tensor, valid: Tensor) -> Tensor:
-    """Robust standard deviation (K,) from the median absolute residual."""
-    masked = residual.abs().masked_fill(valid == 0, torch.nan)
-    return (1.4826 * masked.nanmedian(-1).values).nan_to_num(nan=1.0).clamp_min(math.sqrt(_QUANTISATION))
+def _median(values: Tensor, where: Tensor) -> Tensor:
+    """Medians (K,) of the values (K, P) where the mask is not 0; NaN where it is 0 everywhere."""
+    return values.masked_fill(where == 0, torch.nan).nanmedian(-1).values
+
+
+def _spread(residual: Tensor, b: _Blocks) -> Tensor:
+    """Robust standard deviation (K,) from the median absolute residual.
+
+    All markers of a frame share its noise, so none may claim much more than the best of them: cover would.
+    """
+    own = (1.4826 * _median(residual.abs(), b.valid)).nan_to_num(nan=1.0).clamp_min(math.sqrt(_QUANTISATION))
+    least = torch.full((int(b.row.max()) + 1 if len(own) else 0,), torch.inf, dtype=own.dtype, device=own.device)
+    least = least.scatter_reduce(0, b.row, own, "amin")
+    return torch.minimum(own, _MOST_SPREAD * least[b.row])
 
 
 def _inliers(residual: Tensor, b: _Blocks) -> Tensor:
-    return b.valid * (residual.abs() < _CUT * _spread(residual, b.valid)[:, None])
+    return b.valid * (residual.abs() < _CUT * _spread(residual, b)[:, None])
 
 
-def _gauss_newton(columns: Tensor, weight: Tensor, row: Tensor, rows: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _gauss_newton(
+    columns: Tensor, weight: Tensor, row: Tensor, rows: int, known: Tensor, moved: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Step (N, 7), level step (K, 6), reduced information (N, 7, 7) and residual variance (N,)."""
     sums = _products(columns, weight)  # (K, 14, 14)
     nn, nb, bb = sums[:, :7, :7], sums[:, :7, 7:13], sums[:, 7:13, 7:13]
@@ -352,12 +377,14 @@ def _gauss_newton(columns: Tensor, weight: Tensor, row: Tensor, rows: int) -> tu
     eliminated = torch.linalg.solve(bb, torch.cat([nb.mT, gb[..., None]], -1))  # (K, 6, 8)
     information = segment_sum(nn - nb @ eliminated[..., :7], row, rows)
     right = segment_sum(gn - (nb @ eliminated[..., 7:]).squeeze(-1), row, rows)
-    step = _solve_scaled(information, right)
-    level_step = eliminated[..., 7] - (eliminated[..., :7] @ step[row][..., None]).squeeze(-1)
     used = segment_sum(weight.sum(-1), row, rows)
     unknowns = 7 + _LEVELS * torch.bincount(row, minlength=rows)
     chi2 = segment_sum(sums[:, 13, 13], row, rows)
     variance = (chi2 / (used - unknowns).clamp_min(1)).clamp_min(_QUANTISATION)
+    known = known * variance[:, None, None]
+    information = information + known
+    step = _solve_scaled(information, right - (known @ moved[..., None]).squeeze(-1))
+    level_step = eliminated[..., 7] - (eliminated[..., :7] @ step[row][..., None]).squeeze(-1)
     return step, level_step, information, variance
 
 
