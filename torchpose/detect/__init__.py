@@ -1,5 +1,7 @@
 """Stage: candidate ellipses in whole batches of frames, by parallel region growing and a-contrario validation."""
 
-from torchpose.detect.candidates import Candidates, find_candidates
+from torchpose.detect.candidates import Candidates, Verdict, find_candidates
+from torchpose.detect.lines import Segments
+from torchpose.detect.shapes import Shapes, find_shapes
 
-__all__ = ["Candidates", "find_candidates"]
+__all__ = ["Candidates", "Segments", "Shapes", "Verdict", "find_candidates", "find_shapes"]

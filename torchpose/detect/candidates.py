@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from enum import IntEnum
 from typing import Self
 
 import torch
@@ -38,6 +39,19 @@ _SAME = 0.08  # of the semi-minor axis, plus a pixel: ellipses nearer than that 
 _OCTAVES = 2
 
 
+class Verdict(IntEnum):
+    """What became of an ellipse that was looked at."""
+
+    ACCEPTED = 0
+    TOO_SMALL = 1  # semi-minor axis below 2 reduced px
+    TOO_FLAT = 2  # axes' ratio below 0.12
+    TOO_LARGE = 3  # wider than the frame
+    OFF_ELLIPSE = 4  # most of the region is not on its ellipse
+    FALSE_ALARM = 5  # noise would give as much
+    DUPLICATE = 6  # the same ellipse was found better
+    POLYGON = 7  # straight sides explain it better
+
+
 @dataclass(frozen=True, eq=False)
 class Candidates:
     """Ellipses found in B frames, flat, in full-frame pixels (pixel centre at integer coordinates).
@@ -47,6 +61,7 @@ class Candidates:
         polarity: (M,) float64, +1 where the inside is darker than the outside, -1 where lighter.
         log10_nfa: (M,) float64, log10 of the number of false alarms, negative for each candidate.
         cover: (M,) float64, fraction of the perimeter with the gradient of the ellipse.
+        verdict: (M,) int64, `Verdict`.
     """
 
     frame: Tensor
@@ -54,6 +69,7 @@ class Candidates:
     polarity: Tensor
     log10_nfa: Tensor
     cover: Tensor
+    verdict: Tensor
 
     def __len__(self) -> int:
         return self.frame.shape[0]
@@ -67,7 +83,7 @@ class Candidates:
         return cls(*(torch.cat([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
 
 
-def find_candidates(frames: Tensor, factor: int | None = None) -> Candidates:
+def find_candidates(frames: Tensor, factor: int | None = None, *, explain: bool = False) -> Candidates:
     """Ellipses in grey frames (B, H, W), one pass for the whole batch.
 
     Args:
@@ -76,6 +92,7 @@ def find_candidates(frames: Tensor, factor: int | None = None) -> Candidates:
         factor: integer reduction before the search; by default the smallest that gives at most 1.3 megapixels. The
             smallest semi-minor axis found is 2 reduced pixels. The same is looked for once more at twice the
             reduction, where blurred and noisy edges stand out four times as much.
+        explain: also return what was looked at and rejected, see `Candidates.verdict`.
     """
     factor = reduction_factor(*frames.shape[-2:]) if factor is None else factor
     reduced = area_reduce(frames, factor)
@@ -84,24 +101,27 @@ def find_candidates(frames: Tensor, factor: int | None = None) -> Candidates:
         if octave:
             reduced, factor = area_reduce(reduced, 2), 2 * factor
         grad = gradient(reduced)
-        some = find_ellipses(grad)
-        full = some.ellipse.clone()
-        full[:, :2] = factor * full[:, :2] + 0.5 * (factor - 1)
-        full[:, 2:4] *= factor
-        found.append(Candidates(some.frame, full, some.polarity, some.log10_nfa, some.cover))
-    return merge_duplicates(Candidates.cat(found))
+        some = find_ellipses(grad, explain)
+        found.append(replace(some, ellipse=full_frame(some.ellipse, factor)))
+    return merge_duplicates(Candidates.cat(found), explain=explain)
 
 
-def find_ellipses(grad: Gradient) -> Candidates:
-    """Validated ellipses of one scale, in its own pixels."""
+def full_frame(ellipses: Tensor, factor: int) -> Tensor:
+    """Ellipses (M, 5) of a frame reduced by ``factor`` in the pixels of the frame itself."""
+    center = factor * ellipses[:, :2] + 0.5 * (factor - 1)
+    return torch.cat([center, factor * ellipses[:, 2:4], ellipses[:, 4:]], -1)
+
+
+def find_ellipses(grad: Gradient, explain: bool = False) -> Candidates:
+    """Validated ellipses of one scale, in its own pixels; with ``explain`` the rejected ones, too."""
     regions = level_line_regions(grad, strong_cells(grad), MIN_PIXELS)
-    whole, explained = fit_regions(grad, regions)
+    whole, explained = fit_regions(grad, regions, explain)
     rest = regions.cell[~explained].sort().values
     pieces = fit_arcs(grad, level_line_regions(grad, rest, MIN_PIXELS, _SECTORS))
-    return merge_duplicates(Candidates.cat([whole, pieces]))
+    return merge_duplicates(Candidates.cat([whole, pieces]), explain=explain)
 
 
-def fit_regions(grad: Gradient, regions: Regions) -> tuple[Candidates, Tensor]:
+def fit_regions(grad: Gradient, regions: Regions, explain: bool = False) -> tuple[Candidates, Tensor]:
     """Ellipses that single regions follow, and which of the cells (P,) bool of the regions they explain."""
     xy = cell_centers(grad, regions.cell)
     count = regions.frame.numel()
@@ -112,13 +132,21 @@ def fit_regions(grad: Gradient, regions: Regions) -> tuple[Candidates, Tensor]:
     params = ellipse.fit(xy, regions.region, count, magnitude * (r.abs() < _ON_ELLIPSE))
     follows = ellipse.distance(xy, regions.region, params).abs() < _ON_ELLIPSE
     length = segment_sum(follows.double(), regions.region, count)
-    good = (plausible(grad, params) & (length >= _MIN_CELLS * conics.perimeter(params))).nonzero()[:, 0]
     polarity = region_polarity(regions, params[:, :2], xy).sign()
+    verdict = plausible(grad, params)
+    off = length < _MIN_CELLS * conics.perimeter(params)
+    verdict = torch.where((verdict == Verdict.ACCEPTED) & off, int(Verdict.OFF_ELLIPSE), verdict)
+    good = (verdict == Verdict.ACCEPTED).nonzero()[:, 0]
     found = score(grad, regions.frame[good], params[good], polarity[good])
-    valid = found.log10_nfa < 0
     whole = torch.zeros(count, dtype=torch.bool, device=xy.device)
-    whole[good[valid & (found.cover > _WHOLE)]] = True
-    return found[valid], follows & whole[regions.region]
+    whole[good[(found.verdict == Verdict.ACCEPTED) & (found.cover > _WHOLE)]] = True
+    explained = follows & whole[regions.region]
+    if not explain:
+        return accepted(found), explained
+    bad = ((verdict != Verdict.ACCEPTED) & params.isfinite().all(-1)).nonzero()[:, 0]
+    unknown = torch.full((bad.numel(),), torch.nan, dtype=params.dtype, device=params.device)
+    rejected = Candidates(regions.frame[bad], params[bad], polarity[bad], unknown, unknown, verdict[bad])
+    return Candidates.cat([found, rejected]), explained
 
 
 def fit_arcs(grad: Gradient, arcs: Regions) -> Candidates:
@@ -138,21 +166,28 @@ def fit_arcs(grad: Gradient, arcs: Regions) -> Candidates:
     params = fit_joint(xy[cell], arcs.gradient[cell], index, count, weight)
     r = ellipse.distance(xy[cell], index, params)
     rms = segment_mean(r.square(), index, count, weight.double()).sqrt()
-    good = (plausible(grad, params) & (rms < _ARC_RMS)).nonzero()[:, 0]
+    good = ((plausible(grad, params) == Verdict.ACCEPTED) & (rms < _ARC_RMS)).nonzero()[:, 0]
     frame, polarity = about.frame[pair[good, 0]], about.curvature[pair[good, 0]].sign()
     found = score(grad, frame, params[good], polarity)
     for least_cover, rounds in _FOLLOW:
         found = merge_duplicates(found[found.cover > least_cover], 2 * _SAME)
         params = follow(grad, found.frame, found.ellipse, found.polarity, rounds)
-        good = plausible(grad, params)
+        good = plausible(grad, params) == Verdict.ACCEPTED
         found = score(grad, found.frame[good], params[good], found.polarity[good])
-    return found[found.log10_nfa < 0]
+    return accepted(found)
 
 
 def plausible(grad: Gradient, ellipses: Tensor) -> Tensor:
-    """Ellipses (M, 5) of a size and shape that the detector answers for, bool (M,); False for NaN."""
+    """Verdict (M,) int64 on the size and shape of ellipses (M, 5); `Verdict.TOO_LARGE` for NaN."""
     a, b = ellipses[:, 2], ellipses[:, 3]
-    return (b >= _MIN_SEMI_MINOR) & (b >= _MIN_ASPECT * a) & (a <= 0.5 * max(grad.diag.shape[1:]))
+    verdict = torch.where(a <= 0.5 * max(grad.diag.shape[1:]), int(Verdict.ACCEPTED), int(Verdict.TOO_LARGE))
+    verdict = torch.where(b < _MIN_ASPECT * a, int(Verdict.TOO_FLAT), verdict)
+    return torch.where(b < _MIN_SEMI_MINOR, int(Verdict.TOO_SMALL), verdict)
+
+
+def accepted(found: Candidates) -> Candidates:
+    """Those that were accepted."""
+    return found[found.verdict == Verdict.ACCEPTED]
 
 
 def cell_centers(grad: Gradient, cell: Tensor) -> Tensor:
@@ -181,15 +216,20 @@ def score(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> 
     ).unbind(-1)
     log_tests = 2.5 * math.log10(max(1, height * width))
     log10_nfa = log_tests + size * k.clamp_min(1e-12).log10() - torch.lgamma(size + 1) / math.log(10)
-    return Candidates(frame, ellipses, polarity, log10_nfa, on_arc / size)
+    verdict = torch.where(log10_nfa < 0, int(Verdict.ACCEPTED), int(Verdict.FALSE_ALARM))
+    return Candidates(frame, ellipses, polarity, log10_nfa, on_arc / size, verdict)
 
 
-def merge_duplicates(found: Candidates, tolerance: float = _SAME) -> Candidates:
+def merge_duplicates(found: Candidates, tolerance: float = _SAME, *, explain: bool = False) -> Candidates:
     """Of candidates that are the same ellipse the one with the fewest false alarms, sorted by frame and false alarms.
 
     Two are the same if neither centre nor shape differ by more than a pixel plus ``tolerance`` of the semi-minor axis.
+
+    Args:
+        explain: mark the others as `Verdict.DUPLICATE` instead of leaving them out; what was rejected before stays as
+            it is and never counts as better.
     """
-    order = torch.argsort(found.log10_nfa, stable=True)
+    order = torch.argsort(found.log10_nfa, stable=True)  # NaN, of those rejected without a score, comes last
     found = found[order[torch.argsort(found.frame[order], stable=True)]]
     frames = int(found.frame[-1]) + 1 if len(found) else 0
     per_frame = torch.bincount(found.frame, minlength=frames)
@@ -202,6 +242,10 @@ def merge_duplicates(found: Candidates, tolerance: float = _SAME) -> Candidates:
     shape = (conics.shape_matrix(p) - conics.shape_matrix(q)).flatten(1).abs().amax(-1)
     apart = torch.maximum(torch.linalg.vector_norm(p[:, :2] - q[:, :2], dim=-1), shape)
     same = (found.polarity[later] == found.polarity[better]) & (apart < 1.0 + tolerance * q[:, 3])
+    if explain:
+        same &= (found.verdict[later] == Verdict.ACCEPTED) & (found.verdict[better] == Verdict.ACCEPTED)
     again = torch.zeros(len(found), dtype=torch.bool, device=start.device)
     again[later[same]] = True
-    return found[~again]
+    if not explain:
+        return found[~again]
+    return replace(found, verdict=torch.where(again, int(Verdict.DUPLICATE), found.verdict))

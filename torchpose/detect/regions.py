@@ -91,14 +91,14 @@ def strong_cells(grad: Gradient) -> Tensor:
     return (power > 2 * grad.threshold.square()[:, None, None]).view(-1).nonzero()[:, 0]
 
 
-def level_line_regions(grad: Gradient, cell: Tensor, min_pixels: int, sectors: int = 0) -> Regions:
+def level_line_regions(grad: Gradient, cell: Tensor, min_pixels: int, sectors: int = 0, phase: float = 0.0) -> Regions:
     """Connected components of cells with agreeing gradient directions, of at least ``min_pixels``.
 
     Args:
         cell: (P,) int64, flat indices of the cells to join, rising.
         sectors: 0 joins neighbours whose directions are close to each other, so that whole curves hold together. With
             n sectors neighbours join if their directions fall into the same n-th of the circle: curves break into arcs
-            of known turn, and corners part from what they join.
+            of known turn, and corners part from what they join. phase: fraction of a sector that the first starts at.
     """
     batch, height, width = grad.diag.shape
     g = grad.at(cell)
@@ -112,7 +112,7 @@ def level_line_regions(grad: Gradient, cell: Tensor, min_pixels: int, sectors: i
     del position
     met = neighbour.clamp_min(0)
     if sectors:
-        sector = ((torch.atan2(g[:, 1], g[:, 0]) / (2 * math.pi) + 1) * sectors).long() % sectors
+        sector = ((torch.atan2(g[:, 1], g[:, 0]) / (2 * math.pi) + 1) * sectors + phase).long() % sectors
         agree = sector[:, None] == sector[met]
     else:
         agree = (unit[:, None] * unit[met]).sum(-1) > _JOIN_COS

@@ -36,6 +36,36 @@ def picture_path(folder: Path, frame: str) -> Path:
     return folder / (frame if frame.lower().endswith(".png") else f"{frame}.png")
 
 
+def make_folder(folder: Path) -> None:
+    """Makes the folder of the pictures.
+
+    Raises:
+        ConfigError: it cannot be created or written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / ".probe.tmp"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise ConfigError(f"{folder}: --overlay: cannot be written ({error.strerror}); choose another place") from None
+
+
+def write_picture(path: Path, picture: np.ndarray) -> None:
+    """Writes a PNG file whole or not at all.
+
+    Raises:
+        ConfigError: it cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(f".{path.name}.tmp")
+        temporary.write_bytes(cv2.imencode(".png", picture, _PNG)[1].tobytes())
+        temporary.replace(path)
+    except OSError as error:
+        raise ConfigError(f"{path}: --overlay: cannot be written ({error.strerror}); free some space") from None
+
+
 class Overlay:
     """Draws and writes the picture of each frame.
 
@@ -58,15 +88,7 @@ class Overlay:
         steps = torch.linspace(0, 1, _AXIS_POINTS, dtype=torch.float64)
         # (T, 3 axes, points, 3): from the target's origin, about as long as the target is wide
         self._axes = extent[:, None, None, None] * torch.eye(3, dtype=torch.float64)[:, None] * steps[:, None]
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            probe = folder / ".probe.tmp"
-            probe.touch()
-            probe.unlink()
-        except OSError as error:
-            raise ConfigError(
-                f"{folder}: --overlay: cannot be written ({error.strerror}); choose another place"
-            ) from None
+        make_folder(folder)
 
     def write(self, frames: Tensor, poses: Poses, names: Sequence[str]) -> None:
         """Writes one picture a frame.
@@ -93,18 +115,10 @@ class Overlay:
         return torch.where(points[..., 2:] > 0, pixels, torch.nan).numpy()
 
     def _write_one(self, frame: Tensor, index: int, poses: Poses, lines: np.ndarray, name: str) -> None:
-        picture = self._draw(frame, index, poses, lines, name)
-        path = picture_path(self._folder, name)
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            temporary = path.with_name(f".{path.name}.tmp")
-            temporary.write_bytes(cv2.imencode(".png", picture, _PNG)[1].tobytes())
-            temporary.replace(path)
-        except OSError as error:
-            raise ConfigError(f"{path}: --overlay: cannot be written ({error.strerror}); free some space") from None
+        write_picture(picture_path(self._folder, name), self._draw(frame, index, poses, lines, name))
 
     def _draw(self, frame: Tensor, index: int, poses: Poses, lines: np.ndarray, name: str) -> np.ndarray:
-        picture = cv2.cvtColor(_eight_bit(frame.numpy()), cv2.COLOR_GRAY2BGR)
+        picture = cv2.cvtColor(eight_bit(frame.numpy()), cv2.COLOR_GRAY2BGR)
         unit = max(picture.shape[:2]) / 1000  # everything is drawn in thousandths of the picture's longer side
         found = poses.detections[poses.detections.frame == index]
         for outer, inner, center, marker, target in zip(
@@ -115,16 +129,16 @@ class Overlay:
             found.target.tolist(),
             strict=True,
         ):
-            _ellipse(picture, outer, _OUTER)
-            _ellipse(picture, inner, _INNER)
+            draw_ellipse(picture, outer, _OUTER)
+            draw_ellipse(picture, inner, _INNER)
             _cross(picture, center, max(0.4 * inner[3], 3.0))
             # a ring that two targets claim shows both ids, one below the other
             place = (center[0] + 0.75 * outer[2], center[1] - 0.75 * outer[2] + 32 * unit * target)
-            _text(picture, str(marker), place, unit, _CENTRE)
+            draw_text(picture, str(marker), place, unit, _CENTRE)
         rows = (poses.frame == index).nonzero()[:, 0].tolist()
         for row in rows:
             for axis, colour in zip(lines[row], _AXES, strict=True):
-                _polyline(picture, axis, colour, max(1, round(1.5 * unit)))
+                draw_polyline(picture, axis, colour, max(1, round(1.5 * unit)))
         _banners(picture, [self._banner(poses, row) for row in rows], name, unit)
         return picture
 
@@ -144,7 +158,7 @@ class Overlay:
         return " ".join(words), _STATUS_COLOUR.get(status, _RED)
 
 
-def _eight_bit(frame: np.ndarray) -> np.ndarray:
+def eight_bit(frame: np.ndarray) -> np.ndarray:
     """The frame for the eye: 16-bit grey values are stretched to their range."""
     if frame.dtype == np.uint8:
         return frame
@@ -157,7 +171,7 @@ def _fixed(values: Sequence[float] | np.ndarray) -> tuple[int, ...]:
     return tuple(round(v * (1 << _SHIFT)) for v in values)
 
 
-def _ellipse(picture: np.ndarray, ellipse: Sequence[float], colour: Colour) -> None:
+def draw_ellipse(picture: np.ndarray, ellipse: Sequence[float], colour: Colour) -> None:
     cx, cy, a, b, theta = ellipse
     turn = float(np.rad2deg(theta))
     cv2.ellipse(picture, _fixed((cx, cy)), _fixed((a, b)), turn, 0, 360, colour, 1, lineType=cv2.LINE_AA, shift=_SHIFT)
@@ -169,7 +183,7 @@ def _cross(picture: np.ndarray, center: Sequence[float], arm: float) -> None:
         cv2.line(picture, _fixed(start), _fixed(end), _CENTRE, 1, cv2.LINE_AA, _SHIFT)
 
 
-def _polyline(picture: np.ndarray, points: np.ndarray, colour: Colour, width: int) -> None:
+def draw_polyline(picture: np.ndarray, points: np.ndarray, colour: Colour, width: int) -> None:
     height, wide = picture.shape[:2]
     # OpenCV's fixed point overflows far outside of the picture
     near = np.isfinite(points).all(-1) & (np.abs(points) < 10 * max(height, wide)).all(-1)
@@ -178,7 +192,7 @@ def _polyline(picture: np.ndarray, points: np.ndarray, colour: Colour, width: in
         cv2.polylines(picture, [chain], False, colour, width, cv2.LINE_AA, _SHIFT)
 
 
-def _text(picture: np.ndarray, text: str, place: tuple[float, float], size: float, colour: Colour) -> None:
+def draw_text(picture: np.ndarray, text: str, place: tuple[float, float], size: float, colour: Colour) -> None:
     """Text with a dark rim, readable on any ground."""
     x, y = round(place[0]), round(place[1])
     rim = max(1, round(1.5 * size))
@@ -208,4 +222,4 @@ def _banners(picture: np.ndarray, banners: Sequence[tuple[str, Colour]], name: s
             cv2.LINE_AA,
         )
         top += line + 1
-    _text(picture, name, (6 * unit, picture.shape[0] - 8 * unit), 0.5 * unit, (255, 255, 255))
+    draw_text(picture, name, (6 * unit, picture.shape[0] - 8 * unit), 0.5 * unit, (255, 255, 255))

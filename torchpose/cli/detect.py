@@ -1,0 +1,145 @@
+"""``torchpose detect``: ellipses, segments and polygons of any picture, without camera or target."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from torchpose.cli.estimate import INTERRUPTED, _check_outputs, _cores, _report_unreadable
+
+if TYPE_CHECKING:  # imported where they are used: torch takes more than a second, which --help need not wait for
+    import numpy as np
+
+    from torchpose.io.rows import Row
+    from torchpose.io.sources import Source
+
+EPILOG = """
+Examples:
+
+`torchpose detect frames/ --out ellipses.csv`
+
+`torchpose detect picture.jpg --out shapes.csv --overlay seen/ --explain`
+
+Exit codes: 0 every frame was processed; 1 a frame could not be read; 2 a usage or configuration error.
+"""
+
+_BATCH_PIXELS = 40_000_000
+
+
+def detect(
+    inputs: Annotated[
+        list[Path],
+        typer.Argument(metavar="INPUT...", help="Image files, folders of them or capture manifests, of any size."),
+    ],
+    out: Annotated[Path, typer.Option(help="Table of the shapes: .csv, .jsonl or .parquet.")],
+    overlay: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder for pictures of what was found, one a frame.")
+    ] = None,
+    explain: Annotated[
+        bool, typer.Option("--explain", help="Also list the ellipses that were rejected, with the reason.")
+    ] = False,
+    threads: Annotated[int | None, typer.Option(min=1, help="Threads to use; by default one a core.")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar and no summary.")] = False,
+) -> int:
+    """Find ellipses, straight edges and polygons, with their numbers of false alarms. No parameter to tune.
+
+    One row a shape, in pixels of the frame (pixel centre at integer coordinates).
+    """
+    import cv2
+    import torch
+
+    from torchpose.cli.terminal import FrameProgress, native_stderr_silenced
+    from torchpose.io.shape_rows import SHAPE_SCHEMA
+    from torchpose.io.sources import find_sources
+    from torchpose.io.writers import check_table_path, write_rows
+    from torchpose.report.overlay import make_folder
+
+    check_table_path(out, "--out")
+    sources = find_sources(inputs)
+    _check_outputs(inputs, sources, [out], overlay)
+    if overlay is not None:
+        make_folder(overlay)
+    cv2.setNumThreads(1)
+    torch.set_num_threads(threads or _cores())
+    unreadable: dict[str, str] = {}
+    rows: list[Row] = []
+    try:
+        with (
+            native_stderr_silenced(),
+            FrameProgress(len(sources), 0, quiet=quiet) as progress,
+            torch.inference_mode(),
+        ):
+            for some, frames in _batches(sources, unreadable):
+                found = _rows(some, frames, explain)
+                if overlay is not None:
+                    _draw(overlay, some, frames, found)
+                rows += found
+                progress.advance(len(some), _kinds(rows))
+    except KeyboardInterrupt:
+        typer.echo("torchpose: error: interrupted: nothing was written; run again", err=True)
+        return INTERRUPTED
+    order = {source.name: number for number, source in enumerate(sources)}
+    rows.sort(key=lambda row: order[row["frame"]])
+    write_rows(out, rows, SHAPE_SCHEMA)
+    progress.summary(_kinds(rows), out)
+    if unreadable:
+        _report_unreadable(unreadable)
+        return 1
+    return 0
+
+
+def _batches(sources: Sequence[Source], unreadable: dict[str, str]) -> Iterator[tuple[list[Source], np.ndarray]]:
+    """Frames (B, H, W) of consecutive sources of one size and type; those that cannot be read go to ``unreadable``."""
+    import numpy as np
+
+    from torchpose.io.images import UnreadableImageError, decode
+
+    waiting: list[Source] = []
+    images: list[np.ndarray] = []
+    for source in sources:
+        try:
+            image = decode(source.path)
+        except UnreadableImageError as error:
+            unreadable[source.name] = error.reason
+            continue
+        fits = not images or (image.shape == images[0].shape and image.dtype == images[0].dtype)
+        if images and not (fits and (len(images) + 1) * image.size <= _BATCH_PIXELS):
+            yield waiting, np.stack(images)
+            waiting, images = [], []
+        waiting.append(source)
+        images.append(image)
+    if images:
+        yield waiting, np.stack(images)
+
+
+def _rows(sources: Sequence[Source], images: np.ndarray, explain: bool) -> list[Row]:
+    import torch
+
+    from torchpose.detect import Verdict, find_shapes
+    from torchpose.io.shape_rows import shape_rows
+    from torchpose.rings import find_inner
+
+    frames = torch.from_numpy(images)
+    shapes = find_shapes(frames, explain=explain)
+    ratios = torch.full_like(shapes.ellipses.log10_nfa, torch.nan)
+    valid = (shapes.ellipses.verdict == Verdict.ACCEPTED).nonzero()[:, 0]
+    ratio, found = find_inner(frames, shapes.ellipses[valid])
+    ratios[valid[found]] = ratio[found]
+    return shape_rows(shapes, ratios, [source.name for source in sources])
+
+
+def _draw(folder: Path, sources: Sequence[Source], images: np.ndarray, rows: list[Row]) -> None:
+    from torchpose.report.detection_overlay import draw_shapes
+    from torchpose.report.overlay import picture_path, write_picture
+
+    for source, image in zip(sources, images, strict=True):
+        mine = [row for row in rows if row["frame"] == source.name]
+        write_picture(picture_path(folder, source.name), draw_shapes(image, mine))
+
+
+def _kinds(rows: list[Row]) -> Counter[str]:
+    return Counter(row["kind"] for row in rows if row["verdict"] == "accepted")

@@ -1,0 +1,81 @@
+"""Everything a picture holds, each edge explained once: ellipses, polygons and straight segments."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchpose import ellipse
+from torchpose.detect.candidates import Candidates, Verdict, find_candidates
+from torchpose.detect.lines import Segments, find_segments
+from torchpose.detect.reduce import area_reduce, reduction_factor
+from torchpose.detect.regions import gradient, strong_cells
+from torchpose.geometry import conics
+from torchpose.geometry.segments import ragged_arange, segment_sum
+
+_NEAR = 2.0  # reduced px between a line and the ellipse that explains it
+_MOSTLY = 0.7  # of the samples of a line, or of the perimeter of an ellipse
+_BULGE = 0.1  # of the semi-minor axis: the sides of a hexagon leave its best circle by 8 %
+_SAMPLES = 9  # of a line
+
+
+@dataclass(frozen=True, eq=False)
+class Shapes:
+    """Ellipses and straight edges of B frames, in full-frame pixels (pixel centre at integer coordinates)."""
+
+    ellipses: Candidates
+    segments: Segments
+
+
+def find_shapes(frames: Tensor, factor: int | None = None, *, explain: bool = False) -> Shapes:
+    """Ellipses, segments and polygons of grey frames (B, H, W); where two explain the same edge, the likelier one.
+
+    That is the one with fewer false alarms (Patraucean, Gurdjos, Grompone von Gioi 2017): a hexagon is no circle though
+    an ellipse passes near its sides, and a circle is no polygon with many sides.
+
+    Args:
+        frames, factor, explain: as for `find_candidates`.
+    """
+    factor = reduction_factor(*frames.shape[-2:]) if factor is None else factor
+    ellipses = find_candidates(frames, factor, explain=explain)
+    grad = gradient(area_reduce(frames, factor))
+    segments = find_segments(grad, strong_cells(grad))
+    segments = replace(segments, ends=factor * segments.ends + 0.5 * (factor - 1))
+
+    valid = (ellipses.verdict == Verdict.ACCEPTED).nonzero()[:, 0]
+    line, owner = _explained(segments, ellipses[valid], _NEAR * factor)
+    likelihood = torch.where(segments.chain >= 0, segments.chain_log10_nfa, segments.log10_nfa)
+    beaten = ellipses.log10_nfa[valid[owner]] > likelihood[line]
+    # an ellipse loses to a polygon that goes all along it, not to one side of it
+    polygon = segments.chain[line] >= 0
+    length = torch.linalg.vector_norm(segments.ends[:, 1] - segments.ends[:, 0], dim=-1)
+    along = segment_sum(length[line] * (beaten & polygon), owner, valid.numel())
+    lost = torch.zeros(len(ellipses), dtype=torch.bool, device=frames.device)
+    lost[valid] = along > _MOSTLY * conics.perimeter(ellipses.ellipse[valid])
+    explained = torch.zeros(len(segments), dtype=torch.bool, device=frames.device)
+    explained[line[~lost[valid[owner]]]] = True
+    segments = segments[~explained]
+    if explain:
+        verdict = torch.where(lost, int(Verdict.POLYGON), ellipses.verdict)
+        return Shapes(replace(ellipses, verdict=verdict), segments)
+    return Shapes(ellipses[~lost], segments)
+
+
+def _explained(segments: Segments, ellipses: Candidates, tolerance: float) -> tuple[Tensor, Tensor]:
+    """Pairs of a segment and an ellipse of its frame that runs along it: indices (Q,), (Q,) int64."""
+    order = torch.argsort(ellipses.frame, stable=True)
+    frames = int(torch.cat([segments.frame, ellipses.frame, segments.frame.new_zeros(1)]).max()) + 1
+    per_frame = torch.bincount(ellipses.frame, minlength=frames)
+    start = per_frame.cumsum(0) - per_frame
+    line, offset = ragged_arange(per_frame[segments.frame])
+    owner = order[start[segments.frame[line]] + offset]
+    fraction = torch.linspace(0, 1, _SAMPLES, dtype=torch.float64, device=line.device)
+    ends = segments.ends[line]
+    at = ends[:, :1] + fraction[:, None] * (ends[:, 1:] - ends[:, :1])
+    index = owner.repeat_interleave(_SAMPLES)
+    off = ellipse.distance(at.flatten(0, 1), index, ellipses.ellipse).abs()
+    near = off < tolerance + _BULGE * ellipses.ellipse[index, 3]
+    along = near.view(-1, _SAMPLES).double().mean(-1) > _MOSTLY
+    return line[along], owner[along]
