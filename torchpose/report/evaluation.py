@@ -50,7 +50,8 @@ def plot_consistency(evaluation: Evaluation, title: str) -> Figure:
     figure, axes = _figure(1, 3, (13, 4.2))
     z = evaluation.error / evaluation.predicted
     x = torch.linspace(-5, 5, 200, dtype=torch.float64)
-    bins = torch.linspace(-5, 5, 41).tolist()
+    count = max(12, min(40, int(2 * math.sqrt(len(z)))))
+    bins = torch.linspace(-5, 5, count + 1).tolist()
     for panel, first, name in ((axes[0], 0, "translation"), (axes[1], 3, "rotation")):
         for i in range(first, first + 3):
             values = z[:, i][z[:, i].isfinite()].clamp(-5, 5)
@@ -63,7 +64,7 @@ def plot_consistency(evaluation: Evaluation, title: str) -> Figure:
     axes[0].set_ylabel("density")
     nees = evaluation.errors.nees[evaluation.error[:, 0].isfinite()]
     top = 25.0
-    edges = torch.linspace(0, top, 41)
+    edges = torch.linspace(0, top, count + 1)
     axes[2].hist(nees.nan_to_num(top).clamp(max=top).tolist(), bins=edges.tolist(), density=True, color="#b3cde3")
     s = torch.linspace(0.01, top, 300, dtype=torch.float64)
     axes[2].plot(s, s.square() * (-s / 2).exp() / 16, color=_GREY, lw=1)  # chi-squared, 6 degrees of freedom

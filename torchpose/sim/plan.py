@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -215,6 +215,17 @@ class Plan:
 
     def __len__(self) -> int:
         return len(self.t)
+
+    def rows(self, which: Tensor) -> Plan:
+        """The plan of the frames numbered ``which`` (K,) alone, which are then numbered from 0."""
+        return replace(
+            self,
+            R=self.R[which],
+            t=self.t[which],
+            conditions={name: column[which] for name, column in self.conditions.items()},
+            motion=self.motion[which],
+            seen=self.seen[which],
+        )
 
     @property
     def names(self) -> list[str]:

@@ -1,0 +1,107 @@
+"""Costs of simulated frames: rendering and noise beside the encoding of the PNG, memory, and Blender where it is there.
+
+python scripts/bench_simulation.py [--plan configs/plans/paper_grid.yaml] [--frames 64] [--blender 3]
+
+All on one thread, so that the ratios do not depend on the cores. A figure is the median over batches, with the
+quartiles. Run it on an otherwise idle machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import torch
+
+from torchpose.errors import ConfigError
+from torchpose.sim.dataset import analytic
+from torchpose.sim.plan import Plan, load_plan
+from torchpose.sim.sensor import add_noise
+
+BATCH = 4
+
+
+def timed(work: Callable[[int], object], batches: int) -> list[float]:
+    """Milliseconds a frame of each batch, without the first."""
+    times = []
+    for number in range(batches + 1):
+        start = time.perf_counter()
+        work(number)
+        times.append(1e3 * (time.perf_counter() - start) / BATCH)
+    return times[1:]
+
+
+def show(name: str, times: list[float]) -> float:
+    quartiles = statistics.quantiles(times, n=4) if len(times) > 1 else times * 3
+    print(f"{name:28s} {quartiles[1]:9.2f} ms a frame  (quartiles {quartiles[0]:.2f}, {quartiles[2]:.2f})")
+    return quartiles[1]
+
+
+def peak() -> float:
+    """Largest memory of the process so far, MiB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def blender_times(plan: Plan, frames: int) -> list[float]:
+    from torchpose.sim.blender import blender
+
+    renderer = blender(plan, threads=1)
+    times = []
+    for number in range(frames + 1):
+        start = time.perf_counter()
+        renderer(torch.tensor([number]))
+        times.append(1e3 * (time.perf_counter() - start))
+    return times[1:]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--plan", type=Path, default=Path("configs/plans/paper_grid.yaml"))
+    parser.add_argument("--frames", type=int, default=64)
+    parser.add_argument("--blender", type=int, default=0, metavar="N", help="time N frames of Blender as well")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    try:
+        plan = load_plan(options.plan)
+        sensor, clean = plan.file.sensor, analytic(plan)
+        batches = max(2, min(options.frames, len(plan)) // BATCH)
+        which = [(torch.arange(BATCH) + BATCH * i) % len(plan) for i in range(batches + 1)]
+        pictures = [clean(w) for w in which[:2]]
+
+        def noise(number: int) -> torch.Tensor:
+            return add_noise(
+                pictures[number % 2],
+                plan.conditions["noise"][which[number]],
+                plan.file.seed,
+                index=which[number],
+                bits=sensor.bits,
+                full_well=sensor.full_well,
+                gamma=sensor.gamma,
+            )
+
+        noisy = [noise(i).numpy() for i in range(2)]
+        print(f"{plan.camera.width} x {plan.camera.height}, {batches} batches of {BATCH} frames, one thread")
+        memory = peak()
+        rendering = show("rendering", timed(lambda i: clean(which[i]), batches))
+        sensing = show("noise and rounding", timed(noise, batches))
+        encoding = show("PNG encoding", timed(lambda i: [cv2.imencode(".png", f) for f in noisy[i % 2]], batches))
+        print(f"(rendering + noise) / encoding {(rendering + sensing) / encoding:.2f}")
+        print(f"memory grew by {peak() - memory:.0f} MiB over {batches * BATCH} frames")
+        if options.blender:
+            cycles = show("Blender Cycles", blender_times(plan, options.blender))
+            print(f"Blender / rendering {cycles / rendering:.0f}")
+    except ConfigError as error:
+        print(f"bench_simulation: error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
