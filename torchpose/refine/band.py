@@ -1,0 +1,63 @@
+"""The pixels near the two circles of a ring, enumerated row by row without touching the others."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchpose.geometry.segments import ragged_arange
+
+
+def band_pixels(outer: Tensor, inner: Tensor, band: float, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Pixels within about ``band`` px of either ellipse of K rings, each once.
+
+    A row of pixels cuts the two ellipses, each grown and shrunk by the band, in nested spans; the pixels between the
+    ends of a grown and a shrunk span belong to the band. Where the ring is thinner than two bands, theirs merge.
+
+    Args:
+        outer, inner: (K, 5) ellipses in pixels, the inner one inside. band: px. height, width: of the frame.
+
+    Returns:
+        ring (P,), u (P,), v (P,) int64, sorted by ring and row.
+    """
+    reach = _half_height(outer, band)
+    first = (outer[:, 1] - reach).ceil().clamp(0, height).long()
+    last = (outer[:, 1] + reach).floor().clamp(-1, height - 1).long()
+    ring, offset = ragged_arange((last - first + 1).clamp_min(0))
+    v = first[ring] + offset
+    spans = [_span(e[ring], sign * band, v.double(), width) for e in (outer, inner) for sign in (1, -1)]
+    (low0, high0), (low1, high1), (low2, high2), (low3, high3) = spans
+    # nested, from outside inwards; a span that the row misses is empty in the middle of the one around it
+    low1, high1 = _within(low1, high1, low0, high0)
+    low2, high2 = _within(low2, high2, low1, high1)
+    low3, high3 = _within(low3, high3, low2, high2)
+    start = torch.stack([low0, low2, high3, high1], -1)
+    length = torch.stack([low1 - low0, low3 - low2, high2 - high3, high0 - high1], -1)
+    segment, position = ragged_arange(length.flatten())
+    row = segment // 4
+    return ring[row], start.flatten()[segment] + position, v[row]
+
+
+def _half_height(ellipse: Tensor, band: float) -> Tensor:
+    a, b, theta = ellipse[:, 2] + band, ellipse[:, 3] + band, ellipse[:, 4]
+    return torch.hypot(a * theta.sin(), b * theta.cos())
+
+
+def _span(ellipse: Tensor, grow: float, v: Tensor, width: int) -> tuple[Tensor, Tensor]:
+    """First pixel inside and first one beyond it, int64, where rows ``v`` cut grown ellipses; equal where they miss."""
+    a, b = (ellipse[:, 2] + grow).clamp_min(1e-3), (ellipse[:, 3] + grow).clamp_min(1e-3)
+    cos, sin = ellipse[:, 4].cos(), ellipse[:, 4].sin()
+    y = v - ellipse[:, 1]
+    # (x cos + y sin)^2 / a^2 + (y cos - x sin)^2 / b^2 = 1, a quadratic in x
+    p = (cos / a).square() + (sin / b).square()
+    half = cos * sin * (1 / b.square() - 1 / a.square()) * y
+    root = half.square() - p * (((sin / a).square() + (cos / b).square()) * y.square() - 1)
+    middle, reach = ellipse[:, 0] + half / p, root.clamp_min(0).sqrt() / p
+    low, high = (middle - reach).ceil().clamp(0, width).long(), (middle + reach).floor().clamp(-1, width - 1).long() + 1
+    return low, torch.where(root > 0, high, low).maximum(low)
+
+
+def _within(low: Tensor, high: Tensor, outer_low: Tensor, outer_high: Tensor) -> tuple[Tensor, Tensor]:
+    low = low.clamp(outer_low, outer_high)
+    high = high.clamp(outer_low, outer_high)
+    return low, torch.maximum(low, high)
