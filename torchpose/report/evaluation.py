@@ -55,17 +55,16 @@ def plot_consistency(evaluation: Evaluation, title: str) -> Figure:
     for panel, first, name in ((axes[0], 0, "translation"), (axes[1], 3, "rotation")):
         for i in range(first, first + 3):
             values = z[:, i][z[:, i].isfinite()].clamp(-5, 5)
-            panel.hist(
-                values.tolist(), bins=bins, density=True, histtype="step", lw=1.5, color=_COLOURS[i % 3], label=AXES[i]
-            )
+            density = torch.histc(values, count, -5, 5) * (count / 10 / max(len(values), 1))
+            panel.stairs(density.tolist(), bins, lw=1.5, color=_COLOURS[i % 3], label=AXES[i])
         panel.plot(x, (-0.5 * x.square()).exp() / math.sqrt(2 * math.pi), color=_GREY, lw=1, label="ideal")
         panel.set_xlabel(f"{name} error / claimed sigma")
         panel.legend(frameon=False, fontsize=9)
     axes[0].set_ylabel("density")
     nees = evaluation.errors.nees[evaluation.error[:, 0].isfinite()]
     top = 25.0
-    edges = torch.linspace(0, top, count + 1)
-    axes[2].hist(nees.nan_to_num(top).clamp(max=top).tolist(), bins=edges.tolist(), density=True, color="#b3cde3")
+    density = torch.histc(nees.nan_to_num(top).clamp(max=top), count, 0, top) * (count / top / max(len(nees), 1))
+    axes[2].stairs(density.tolist(), torch.linspace(0, top, count + 1).tolist(), fill=True, color="#b3cde3")
     s = torch.linspace(0.01, top, 300, dtype=torch.float64)
     axes[2].plot(s, s.square() * (-s / 2).exp() / 16, color=_GREY, lw=1)  # chi-squared, 6 degrees of freedom
     low, high = evaluation.nees_interval

@@ -75,8 +75,8 @@ def render(
     """Noise-free frames of a target, grey values 0..255, differentiable in pose, blur and grey levels.
 
     The target's rings are drawn with ``dark`` on ``light``, or the other way round where ``target.background`` is dark.
-    A shape is drawn from either side, and not at all where it reaches behind the camera or beyond the radius up to
-    which the distortion model is one-to-one.
+    A shape, the plate too, is drawn from either side, and not at all where it reaches behind the camera or beyond the
+    radius up to which the distortion model is one-to-one.
 
     Args:
         camera: the camera; its width and height are those of the frames.
@@ -98,8 +98,7 @@ def render(
         (B, H, W) float32.
 
     Raises:
-        ConfigError: ``psf_sigma`` is not above 0, the plate reaches behind the camera, or there are background
-            pictures and no plate.
+        ConfigError: ``psf_sigma`` is not above 0, or there are background pictures and no plate.
         FrameError: shapes of R and t, of ``motion`` or of background pictures disagree.
     """
     R, t = check_poses(R, t)
@@ -132,10 +131,8 @@ def render(
             layers.append(_levels(covers, a, count, t))
         frames = ground[s].expand(count, camera.height, camera.width).float().contiguous()
         twist = None if motion is None else motion[s].to(t)
-        for number, (shapes, level) in enumerate(layers):
+        for shapes, level in layers:
             boxes, coverage = cover(camera, shapes, R[s], t[s], sigma[s], defocus=defocus, motion=twist)
-            if number == 0 and plate is not None and not bool(boxes.size.all()):
-                _check_plate(camera, shapes, R[s], t[s])
             frames = _paint(frames, shapes, level, boxes, coverage.float())
         if lighting is not None:
             frames = frames * lighting.gain(camera, R[s], t[s])
@@ -239,17 +236,6 @@ def _ground(
 def _levels(shapes: Shapes, first: int, count: int, like: Tensor) -> tuple[Shapes, Tensor]:
     chosen = shapes.to(like).of_frames(first, count)
     return chosen, chosen.level
-
-
-def _check_plate(camera: Camera, rim: Shapes, R: Tensor, t: Tensor) -> None:
-    """Raises ConfigError where a plate reaches behind the camera, rather than lying outside of the frame."""
-    frame = rim.frame[rim.side_of]
-    x = (R[frame] @ rim.side[:, 0, :, None]).squeeze(-1) + t[frame]
-    radius = (x[:, :2] / x[:, 2:]).norm(dim=-1)
-    if not bool(((x[:, 2] > 0) & (radius < camera.fold_radius)).all()):
-        raise ConfigError(
-            "plate: it reaches behind the camera or out of the distortion model; make it smaller or omit it"
-        )
 
 
 def per_frame(value: float | Tensor, like: Tensor) -> Tensor:
