@@ -276,11 +276,11 @@ def test_fill_gradcheck():
     shape = torch.zeros(20, dtype=torch.int64)
     boxes = Boxes(torch.tensor([[1, 0]]), torch.tensor([[11, 12]]))
     assert torch.autograd.gradcheck(
-        lambda p, d, s: fill(p, d, s, shape, boxes)[::5], (position, dv, sigma)
+        lambda p, d, s: fill(p, d, s, shape, boxes).flatten()[::5], (position, dv, sigma)
     )  # fmt: skip
     half = torch.full((20,), 0.7, dtype=F64).requires_grad_()
     assert torch.autograd.gradcheck(
-        lambda p, s, w: fill(p, dv.detach(), s, shape, boxes, half_chord=w)[::5], (position, sigma, half)
+        lambda p, s, w: fill(p, dv.detach(), s, shape, boxes, half_chord=w).flatten()[::5], (position, sigma, half)
     )
 
 

@@ -83,8 +83,8 @@ def _fisher(camera: Camera, target: Target, R: Tensor, t: Tensor, sigma: Tensor,
     def coverage(delta: Tensor) -> tuple[Tensor, Tensor]:
         rotation, translation, blur = rotations.exp(delta[3:6]) @ R, t + delta[:3], sigma + delta[6]
         position, dv = boundary.project(camera, edges, rotation, translation)
-        cells = boundary.fill(position, dv, blur[edges.frame], window, boxes)
-        c = cells.view(len(pair), height, width + 1)[..., :width]
+        rows = boundary.fill(position, dv, blur[edges.frame], window, boxes)
+        c = rows.view(len(pair), height, width + 1)[..., :width]
         return c, c
 
     jacobian, c = torch.func.jacfwd(coverage, has_aux=True)(t.new_zeros(7))  # (P, h, w, 7), (P, h, w)

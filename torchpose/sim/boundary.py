@@ -59,20 +59,19 @@ class Boxes:
     size: Tensor
 
     @property
-    def stride(self) -> Tensor:
-        """(P,) cells of a row: one more than its columns, which takes what lies right of the window."""
-        return self.size[:, 0] + 1
+    def stride(self) -> int:
+        """Cells of a row: one more than the widest window has columns, which takes what lies right of the window."""
+        return int(self.size[:, 0].amax()) + 1 if len(self.size) else 1
 
     @property
-    def start(self) -> Tensor:
-        """(P,) first cell of each window."""
-        cells = self.stride * self.size[:, 1]
-        return cells.cumsum(0) - cells
+    def first_row(self) -> Tensor:
+        """(P,) rows of the windows before each."""
+        return self.size[:, 1].cumsum(0) - self.size[:, 1]
 
     @property
-    def cells(self) -> int:
-        """Cells of all windows."""
-        return int((self.stride * self.size[:, 1]).sum())
+    def rows(self) -> int:
+        """Rows of all windows."""
+        return int(self.size[:, 1].sum())
 
 
 @torch.no_grad()
@@ -179,16 +178,18 @@ def fill(
         half_chord: (N,), px: blur along the rows by a box of twice this width besides, see `on_chords`.
 
     Returns:
-        (boxes.cells,), of the dtype of the samples; the windows row by row, each row with one cell at its end, which
-        is 0 to rounding.
+        (boxes.rows, boxes.stride), of the dtype of the samples; the rows of all windows one below the other, 0 to
+        rounding behind their ends.
     """
     if len(pixel) == 0:
-        return pixel.new_zeros(boxes.cells)
+        return pixel.new_zeros(boxes.rows, boxes.stride)
     reach = 1.0 + REACH * float(sigma.detach().max())
-    rows = _offsets(math.ceil(reach), pixel)
-    columns = _offsets(math.ceil(reach + (0.0 if half_chord is None else float(half_chord.detach().max()))), pixel)
-    corner, size, stride, start = boxes.corner[shape], boxes.size[shape], boxes.stride[shape], boxes.start[shape]
-    increments = pixel.new_zeros(boxes.cells)
+    beside = reach + (0.0 if half_chord is None else float(half_chord.detach().max()))
+    rows = _offsets(math.floor(reach), math.floor(reach), pixel)
+    # the sum along a row ends where the kernel does, which is a pixel further right than left
+    columns = _offsets(math.floor(beside), math.ceil(beside), pixel)
+    corner, size, first_row, stride = boxes.corner[shape], boxes.size[shape], boxes.first_row[shape], boxes.stride
+    increments = pixel.new_zeros(boxes.rows * stride)
     # each chunk copies all windows where a derivative is wanted
     cells = _CHUNK_CELLS * (16 if torch.is_grad_enabled() else 1)
     chunk = max(1, cells // (len(rows) * len(columns)))
@@ -209,11 +210,10 @@ def fill(
         across = across * inside * -dv[s, None]
         # what begins left of the window has its full effect from the first column on
         column = column.clamp(min=0).minimum(size[s, :1])
-        cell = start[s, None] + torch.where(inside, row, 0) * stride[s, None]
+        cell = (first_row[s, None] + torch.where(inside, row, 0)) * stride
         index = cell[:, :, None] + column[:, None]
         increments = accumulate(increments, index.view(-1), (across[:, :, None] * along[:, None]).view(-1))
-    # every row of a window ends at 0: one sum does for all
-    return increments.cumsum(0)
+    return increments.view(-1, stride).cumsum(1)
 
 
 def on_chords(radius: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -300,8 +300,8 @@ def _sign(x: Tensor) -> Tensor:
     return torch.where(x < 0, -1.0, 1.0).to(x)
 
 
-def _offsets(reach: int, like: Tensor) -> Tensor:
-    return torch.arange(-reach, reach + 1, dtype=like.dtype, device=like.device)
+def _offsets(before: int, behind: int, like: Tensor) -> Tensor:
+    return torch.arange(-before, behind + 1, dtype=like.dtype, device=like.device)
 
 
 def gauss_legendre(order: int, like: Tensor) -> tuple[Tensor, Tensor]:

@@ -129,7 +129,7 @@ def render(
             layers.append(_levels(target, a, count, t))
         if covers is not None:
             layers.append(_levels(covers, a, count, t))
-        frames = ground[s].expand(count, camera.height, camera.width).float().contiguous()
+        frames = ground[s].float().expand(count, camera.height, camera.width).contiguous()
         twist = None if motion is None else motion[s].to(t)
         for shapes, level in layers:
             boxes, coverage = cover(camera, shapes, R[s], t[s], sigma[s], defocus=defocus, motion=twist)
@@ -206,17 +206,14 @@ def _project_each(camera: Camera, edges: Boundary, R: Tensor, t: Tensor) -> tupl
 def _paint(frames: Tensor, shapes: Shapes, level: Tensor, boxes: Boxes, coverage: Tensor) -> Tensor:
     """Frames (B, H, W) with one layer of shapes of grey levels (S,) over them."""
     _, height, width = frames.shape
-    # one entry a row of a window: its cells follow each other in the frame as they do in the coverage
-    row, rows = boundary.ragged(boxes.size[:, 1])
-    first = (shapes.frame * height + boxes.corner[:, 1])[row] + rows
-    first = first * width + boxes.corner[row, 0] - boxes.start[row] - rows * boxes.stride[row]
-    cells = boxes.stride[row]
+    row, number = boundary.ragged(boxes.size[:, 1])
+    first = ((shapes.frame * height + boxes.corner[:, 1])[row] + number) * width + boxes.corner[row, 0]
     flat = frames.view(-1)
-    index = torch.arange(boxes.cells, device=cells.device) + first.repeat_interleave(cells)
-    # the cell behind the end of a row covers nothing, so it may fall on any pixel
-    index = index.clamp_(max=flat.numel() - 1)
-    change = level.float()[row].repeat_interleave(cells) - flat.index_select(0, index)
-    return boundary.accumulate(flat, index, coverage * change).view_as(frames)
+    # behind the end of its window a row covers nothing, so those cells may fall on any pixel
+    index = first[:, None] + torch.arange(boxes.stride, device=first.device)
+    index = index.clamp_(max=flat.numel() - 1).view(-1)
+    change = coverage * (level.float()[row, None] - flat.index_select(0, index).view_as(coverage))
+    return boundary.accumulate(flat, index, change.view(-1)).view_as(frames)
 
 
 def _ground(
