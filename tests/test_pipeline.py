@@ -142,6 +142,17 @@ def test_wrong_frames_are_refused(sample: tuple[tp.PoseEstimator, Tensor]) -> No
         estimator(torch.zeros(1, 1216, 1824, dtype=torch.int64))
 
 
+def test_dead_pixels_are_ignored(sample: tuple[tp.PoseEstimator, Tensor], poses: tp.Poses) -> None:
+    """NaN in one pixel of five hundred, also on the rings, costs nothing but these pixels."""
+    estimator, frames = sample
+    spoilt = frames[:2].float() / 255
+    g = torch.Generator().manual_seed(0)
+    spoilt[torch.rand(spoilt.shape, generator=g) < 0.002] = torch.nan
+    result = estimator(spoilt)
+    assert result.ok.all()
+    assert ((result.t - poses.t[:2]).abs() < 5 * poses.std[:2, :3]).all()
+
+
 def test_empty_batch(sample: tuple[tp.PoseEstimator, Tensor]) -> None:
     estimator, frames = sample
     assert len(estimator(frames[:0])) == 0

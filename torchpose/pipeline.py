@@ -131,7 +131,7 @@ class PoseEstimator(nn.Module):
             frames = _linear(frames, self.float_range)
         elif frames.is_floating_point():
             # the detector's least contrast counts in 1/255 of white
-            frames = (frames.float() * (255.0 / self.float_range)).nan_to_num(nan=0.0)
+            frames = frames.float() * (255.0 / self.float_range)
         return frames.contiguous()
 
     def _evidence(

@@ -178,17 +178,17 @@ def _gather(
         return out.index_copy_(0, place, values.to(dtype)).view(count, most)
 
     xy = camera.undistort_points(uv)
-    sound = xy.isfinite().all(-1)
+    grey = frames.reshape(-1)[(frame[row[block]] * height + v) * width + u].float()
+    sound = xy.isfinite().all(-1) & grey.isfinite()
     xy = torch.where(sound[:, None], xy, 0.0)
     j00, j01, j10, j11 = camera.J_distort(xy).flatten(-2).unbind(-1)
     det = j00 * j11 - j01 * j10
     warp = tuple(padded(w / det, torch.float32) for w in (j11, -j01, -j10, j00))
-    grey = frames.reshape(-1)[(frame[row[block]] * height + v) * width + u]
     return _Blocks(
         row,
         *(padded(c) for c in xy.unbind(-1)),
         warp,
-        padded(grey, torch.float32),
+        padded(torch.where(sound, grey, 0.0), torch.float32),
         padded(sound, torch.float32),
         centers[row, marker],
         normals[row, marker],
