@@ -24,7 +24,7 @@ from torchpose.sim.dataset import analytic
 from torchpose.sim.plan import Plan, load_plan
 from torchpose.sim.sensor import add_noise
 
-BATCH = 4
+BATCH = 3  # as the data set writer for 2 megapixels
 
 
 def timed(work: Callable[[int], object], batches: int) -> list[float]:

@@ -41,7 +41,7 @@ Renderer = Callable[[Tensor], Tensor]
 """Noise-free frames (B, H, W) float32 of the frames numbered (B,)."""
 
 BOUND = ("sx", "sy", "sz", "srx", "sry", "srz")
-_BATCH_PIXELS = 1 << 23
+_BATCH_PIXELS = 7_000_000  # larger buffers go back to the system and are cleared anew each time
 
 
 def plan_truth(plan: Plan) -> Truth:

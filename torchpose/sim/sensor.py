@@ -114,6 +114,7 @@ def add_noise(
     top, dtype = 2**bits - 1, torch.uint8 if bits <= 8 else torch.uint16
     number = torch.arange(count, device=frames.device) if index is None else index.to(frames.device)
     key = _mix64(_mix64(torch.full_like(number, seed % 2**62)) + number)
+    steps = torch.arange(1, min(_CHUNK, (height * width + 1) // 2) + 1, device=frames.device) * _GOLDEN
     flat = frames.reshape(count, height * width)
     out = torch.empty(flat.shape, dtype=dtype, device=frames.device)
     together = max(1, 2 * _CHUNK // max(1, flat.shape[1]))  # small frames share a chunk
@@ -121,7 +122,8 @@ def add_noise(
         rows = slice(a, a + together)
         for b in range(0, flat.shape[1], 2 * _CHUNK):
             grey = flat[rows, b : b + 2 * _CHUNK].float()
-            noise = _normal(key[rows], b // 2, grey.shape[1])
+            start = key[rows] + torch.tensor(b // 2, device=key.device) * _GOLDEN
+            noise = _normal(start, steps, grey.shape[1])
             if full_well is None:
                 noise.mul_(amplitude[rows, None])
             else:
@@ -134,15 +136,15 @@ def add_noise(
     return out.view(count, height, width)
 
 
-def _normal(key: Tensor, first: int, count: int) -> Tensor:
-    """(B, count) float32 normal deviates from the pair ``first`` on, of the frames with keys (B,) int64."""
+def _normal(start: Tensor, steps: Tensor, count: int) -> Tensor:
+    """(B, count) float32 normal deviates, two for each counter ``start`` (B,) + ``steps`` (>= count / 2,)."""
     pairs = (count + 1) // 2
-    bits = _mix64(key[:, None] + torch.arange(first, first + pairs, device=key.device) * _GOLDEN)
+    bits = _scramble(start[:, None] + steps[:pairs])
     radius = (bits & 0xFFFFFFFF).float().add_(0.5).mul_(2.0**-32).log_().mul_(-2).sqrt_()
-    angle = ((bits >> 32).float() + 0.5).mul_(2 * math.pi * 2.0**-32)
-    out = torch.empty(len(key), pairs, 2, device=key.device)
+    angle = bits.bitwise_right_shift_(32).float().add_(0.5).mul_(2 * math.pi * 2.0**-32)
+    out = torch.empty(len(start), pairs, 2, device=start.device)
     torch.mul(radius, angle.cos(), out=out[..., 0])
-    torch.mul(radius, angle.sin(), out=out[..., 1])
+    torch.mul(radius, angle.sin_(), out=out[..., 1])
     return out.flatten(1)[:, :count]
 
 
@@ -150,8 +152,12 @@ _GOLDEN = 0x9E3779B97F4A7C15 - 2**64
 
 
 def _mix64(x: Tensor) -> Tensor:
-    """Output function of SplitMix64 on int64, which wraps around as the unsigned one does."""
-    x = x + _GOLDEN
-    x = x.bitwise_xor_((x >> 30).bitwise_and_(2**34 - 1)).mul_(0xBF58476D1CE4E5B9 - 2**64)
-    x = x.bitwise_xor_((x >> 27).bitwise_and_(2**37 - 1)).mul_(0x94D049BB133111EB - 2**64)
+    """SplitMix64 of the counters x, int64, which wraps around as the unsigned type does."""
+    return _scramble(x + _GOLDEN)
+
+
+def _scramble(x: Tensor) -> Tensor:
+    """Output function of SplitMix64, in place."""
+    x.bitwise_xor_((x >> 30).bitwise_and_(2**34 - 1)).mul_(0xBF58476D1CE4E5B9 - 2**64)
+    x.bitwise_xor_((x >> 27).bitwise_and_(2**37 - 1)).mul_(0x94D049BB133111EB - 2**64)
     return x.bitwise_xor_((x >> 31).bitwise_and_(2**33 - 1))
