@@ -2,21 +2,17 @@
 
 Every pixel in a band around the edges of a frame's rings is predicted as
 
-    grey = ring + (paper - ring) F,   F = Phi(z_outer) + 1 - Phi(z_inner),   z = (d + q^2 k / 2) / q
+    grey = ring + (paper - ring) F
 
-with d the distance in px of the pixel from the projected circle, k the curvature of the projected circle, q the blur
-(point-spread function and pixel together, one for each frame). The second term of z is the pull of blur on a curved
-edge; Phi carries the fourth cumulant of the square pixel. Pose and blur are found by Gauss-Newton; the two grey levels
-of each marker, with linear gradients over the plane, are linear unknowns, eliminated by the Schur complement. The
-distortion of the lens enters once, as the ray of each pixel. Frames and markers are padded blocks of pixels: one
-sequence of tensor operations for the whole batch.
+with the fraction of paper F of `ring_model`. Pose and blur (one for each frame) are found by Gauss-Newton; the two grey
+levels of each marker, with linear gradients over the plane, are linear unknowns, eliminated by the Schur complement.
+Frames and markers are padded blocks of pixels: one sequence of tensor operations for the whole batch.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -24,10 +20,9 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.geometry import rotations
 from torchpose.geometry.segments import segment_sum
-from torchpose.refine.band import band_pixels
+from torchpose.refine.ring_model import PixelBlocks, RingModel, gather_pixels, ring_model
 
-_BAND = 3.5  # px on either side of an edge
-_COARSE = 4  # the first steps take one pixel of so many
+_COARSE = 4  # the first steps take one pixel of so many; both are whole numbers of tiles
 _STEPS = (3, 1)  # of Gauss-Newton, on some of the pixels and on all
 _START_BLUR = 0.8  # px
 _BLUR_RANGE = (0.3, 4.0)
@@ -59,45 +54,6 @@ class Refined:
     good: Tensor
 
 
-@dataclass(frozen=True, eq=False)
-class _Blocks:
-    """Pixels of K markers, padded to P; one plane of numbers (K, P) for every component.
-
-    row: (K,) int64. ray_x, ray_y: on the plane z = 1. warp: 4 planes, d(ray)/d(pixel) row by row. grey, valid.
-    center, normal: (K, 3), target frame. radii: (K, 2).
-    """
-
-    row: Tensor
-    ray_x: Tensor
-    ray_y: Tensor
-    warp: tuple[Tensor, ...]
-    grey: Tensor
-    valid: Tensor
-    center: Tensor
-    normal: Tensor
-    radii: Tensor
-
-    def every(self, nth: int) -> _Blocks:
-        """The same with one pixel of ``nth``."""
-        planes = {n: getattr(self, n)[:, ::nth].contiguous() for n in ("ray_x", "ray_y", "grey", "valid")}
-        return replace(self, **planes, warp=tuple(w[:, ::nth].contiguous() for w in self.warp))
-
-
-class _Model(NamedTuple):
-    """Prediction and derivatives at one pose; planes (K, P) in float32.
-
-    fraction: of paper, F. by_d, by_q: dF/dd through both circles, dF/dq. by_pose: 6 planes, derivative of d.
-    x, y: plane coordinates over the outer radius.
-    """
-
-    fraction: Tensor
-    by_d: Tensor
-    by_q: Tensor
-    by_pose: tuple[Tensor, ...]
-    x: Tensor
-    y: Tensor
-
-
 def refine_photometric(
     frames: Tensor,
     camera: Camera,
@@ -123,7 +79,7 @@ def refine_photometric(
             from the robot, or to hold what is known.
     """
     rows = rotation.shape[0]
-    blocks = _gather(frames, camera, frame, mask, rings, centers, normals, radii)
+    blocks = gather_pixels(frames, camera, frame, mask, rings, centers, normals, radii, _TILE * _COARSE)
     r, t = rotation, translation
     blur = torch.full((rows,), _START_BLUR, dtype=torch.float64, device=r.device)
     coarse = blocks.every(_COARSE)
@@ -134,7 +90,7 @@ def refine_photometric(
     known = torch.zeros_like(information) if prior is None else torch.nn.functional.pad(prior, (0, 1, 0, 1))
     moved = torch.zeros(rows, 7, dtype=torch.float64, device=r.device)
     for part in (*[coarse] * _STEPS[0], *[blocks] * _STEPS[1]):
-        columns = _columns(part, _model(part, r, t, blur), levels)
+        columns = _columns(part, ring_model(part, r, t, blur), levels)
         weight = _inliers(columns[:, :, -1].flatten(1), part)
         step, level_step, information, variance = _gauss_newton(columns, weight, blocks.row, rows, known, moved)
         moved = moved + step
@@ -149,142 +105,13 @@ def refine_photometric(
     return Refined(r, t, covariance, blur, variance.sqrt(), kept, good)
 
 
-def _gather(
-    frames: Tensor,
-    camera: Camera,
-    frame: Tensor,
-    mask: Tensor,
-    rings: Tensor,
-    centers: Tensor,
-    normals: Tensor,
-    radii: Tensor,
-) -> _Blocks:
-    """The pixels within the band around either circle of every marker seen."""
-    height, width = frames.shape[-2:]
-    row, marker = mask.nonzero().unbind(-1)
-    both = rings[row, marker]  # (K, 2, 5)
-    block, u, v = band_pixels(both[:, 0], both[:, 1], _BAND, height, width)
-    uv = torch.stack([u, v], -1).double()
-    count = row.numel()
-    size = torch.bincount(block, minlength=count)
-    # the pixels of the first steps, one of so many, are a whole number of tiles too
-    grain = _TILE * _COARSE
-    most = (int(size.max()) // grain + 1) * grain if count else grain
-    start = torch.arange(count, device=block.device) * most - (size.cumsum(0) - size)
-    place = torch.arange(block.numel(), device=block.device) + start[block]
-
-    def padded(values: Tensor, dtype: torch.dtype = torch.float64) -> Tensor:
-        out = torch.zeros(count * most, dtype=dtype, device=frames.device)
-        return out.index_copy_(0, place, values.to(dtype)).view(count, most)
-
-    xy = camera.undistort_points(uv)
-    grey = frames.reshape(-1)[(frame[row[block]] * height + v) * width + u].float()
-    sound = xy.isfinite().all(-1) & grey.isfinite()
-    xy = torch.where(sound[:, None], xy, 0.0)
-    j00, j01, j10, j11 = camera.J_distort(xy).flatten(-2).unbind(-1)
-    det = j00 * j11 - j01 * j10
-    warp = tuple(padded(w / det, torch.float32) for w in (j11, -j01, -j10, j00))
-    return _Blocks(
-        row,
-        *(padded(c) for c in xy.unbind(-1)),
-        warp,
-        padded(torch.where(sound, grey, 0.0), torch.float32),
-        padded(sound, torch.float32),
-        centers[row, marker],
-        normals[row, marker],
-        radii[row, marker],
-    )
-
-
-def _model(b: _Blocks, r: Tensor, t: Tensor, blur: Tensor) -> _Model:
-    """Predicts every pixel. The radius in the plane is formed in float64, what is small beside it in float32."""
-    rk = r[b.row]
-    normal = (rk @ b.normal[..., None]).squeeze(-1)
-    arm = (rk @ b.center[..., None]).squeeze(-1)  # marker's centre about the target's origin, camera axes
-    center = arm + t[b.row]
-    one, two = _plane_axes(normal).unbind(1)
-
-    def scalar(value: Tensor) -> Tensor:
-        return value[:, None]
-
-    def along(axis: Tensor) -> Tensor:
-        return scalar(axis[:, 0]) * b.ray_x + scalar(axis[:, 1]) * b.ray_y + scalar(axis[:, 2])
-
-    # the ray of the pixel meets the plane at depth * ray; coordinates about the circle's centre
-    toward = 1 / along(normal)
-    depth = scalar((normal * center).sum(-1)) * toward
-    one_c, two_c = scalar((one * center).sum(-1)), scalar((two * center).sum(-1))
-    x, y = depth * along(one) - one_c, depth * along(two) - two_c
-    radius = torch.hypot(x, y).clamp_min(1e-9)
-    outer, inner = ((radius - scalar(size)).float() for size in b.radii.unbind(-1))
-
-    x, y, radius, depth, toward = (v.float() for v in (x, y, radius, depth, toward))
-    one_c, two_c, q = one_c.float(), two_c.float(), scalar(blur[b.row]).float()
-    axes = [[scalar(c).float() for c in v.unbind(-1)] for v in (one, two, normal, arm)]
-    (ax, ay, az), (bx, by, bz), (nx, ny, nz), (cx, cy, cz) = axes
-    ex, ey = x / radius, y / radius
-    # a displacement w of the ray's foot, or of the plane against it, changes the radius by m . w
-    s = (radius + ex * one_c + ey * two_c) / depth * toward
-    mx, my, mz = ex * ax + ey * bx - s * nx, ex * ay + ey * by - s * ny, ex * az + ey * bz - s * nz
-    w00, w01, w10, w11 = b.warp
-    gu, gv = mx * w00 + my * w10, mx * w01 + my * w11  # gradient of the radius in the image, over the depth
-    flat = (gu.square() + gv.square()).clamp_min(1e-30).rsqrt()
-    per_mm = flat / depth  # px for a mm of radius
-    # area of a pixel in the plane, mm^2; curvature of the circle's image, 1/px
-    area = depth.square() * (w00 * w11 - w01 * w10).abs() * toward.abs()
-    bend = area.square() * per_mm.pow(3) / radius
-    # to second order in the distance: along the image's normal the radius bends where that normal is oblique in the
-    # plane, and by perspective; both as second over first derivative, 1/px, halved
-    nu, nv = gu * flat, gv * flat
-    side = (ex * two_c - ey * one_c) / depth * toward
-    hx, hy = ex * bx - ey * ax - side * nx, ex * by - ey * ay - side * ny  # as m, but across the radius
-    oblique = (hx * w00 + hy * w10) * nu + (hx * w01 + hy * w11) * nv
-    recede = ((nx * w00 + ny * w10) * nu + (nx * w01 + ny * w11) * nv) * toward
-    second = 0.5 * oblique.square() * depth * flat / radius - recede
-    d_outer, d_inner = outer * per_mm, inner * per_mm
-    d_outer, d_inner = d_outer + second * d_outer.square(), d_inner + second * d_inner.square()
-    pull = 0.5 * q * bend
-    z_outer, z_inner = d_outer / q + pull, d_inner / q + pull
-    # the pixel's square is not Gaussian: its fourth cumulant along the edge's normal, -(c^4 + s^4) / 120 px^4
-    square = (1 - 2 * (nu * nv).square()) / (24 * 120) / q.square().square()
-    f_outer, p_outer = _edge(z_outer, square)
-    f_inner, p_inner = _edge(z_inner, square)
-    px, py, pz = x * ax + y * bx + cx, x * ay + y * by + cy, x * az + y * bz + cz
-    by_pose = tuple(-per_mm * v for v in (mx, my, mz, py * mz - pz * my, pz * mx - px * mz, px * my - py * mx))
-    size = scalar(b.radii[:, 0]).float()
-    return _Model(
-        f_outer + 1 - f_inner,
-        (p_outer - p_inner) / q,
-        p_outer * (bend - z_outer / q) - p_inner * (bend - z_inner / q),
-        by_pose,
-        x / size,
-        y / size,
-    )
-
-
-def _plane_axes(normal: Tensor) -> Tensor:
-    """Two unit vectors (K, 2, 3) across ``normal`` (K, 3)."""
-    axis = torch.nn.functional.one_hot(normal.abs().argmin(-1), 3).to(normal)
-    first = torch.linalg.cross(normal, axis)
-    first = first / torch.linalg.vector_norm(first, dim=-1, keepdim=True)
-    return torch.stack([first, torch.linalg.cross(normal, first)], 1)
-
-
-def _edge(z: Tensor, square: Tensor) -> tuple[Tensor, Tensor]:
-    """Blurred step and its slope at ``z`` standard deviations: the normal law and its fourth-order Edgeworth term."""
-    z2 = z.square()
-    density = torch.exp(-0.5 * z2) * (1 / math.sqrt(2 * math.pi))
-    step = 0.5 * torch.erfc(-z * math.sqrt(0.5)) + square * density * z * (z2 - 3)
-    return step, density * (1 - square * (z2 * (z2 - 6) + 3))
-
-
-def _basis(m: _Model) -> tuple[Tensor, ...]:
+def _basis(m: RingModel) -> tuple[Tensor, ...]:
     """Planes of the linear unknowns: ring (1, x, y), paper (1, x, y)."""
     ring = 1 - m.fraction
     return ring, ring * m.x, ring * m.y, m.fraction, m.fraction * m.x, m.fraction * m.y
 
 
-def _columns(b: _Blocks, m: _Model, levels: Tensor) -> Tensor:
+def _columns(b: PixelBlocks, m: RingModel, levels: Tensor) -> Tensor:
     """Derivatives by pose (6), blur (1) and levels (6), and the residual, by tiles: (K, P / 256, 14, 256) float32."""
     a0, ax, ay, p0, px, py = (v[:, None].float() for v in levels.unbind(-1))
     ring, paper = a0 + ax * m.x + ay * m.y, p0 + px * m.x + py * m.y
@@ -306,12 +133,12 @@ def _products(columns: Tensor, weight: Tensor) -> Tensor:
     return (weighted @ columns.mT).double().sum(1)
 
 
-def _first_levels(b: _Blocks, r: Tensor, t: Tensor, blur: Tensor) -> Tensor:
+def _first_levels(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor) -> Tensor:
     """Grey levels (K, 6) for the poses that come in: medians, then reweighted linear fits.
 
     A third of a ring may be covered: a least-squares fit of gradients would bend towards the cover and stay there.
     """
-    model = _model(b, r, t, blur)
+    model = ring_model(b, r, t, blur)
     columns = _tiled((*_basis(model), b.grey), b.valid)
     none = torch.zeros_like(model.fraction[:, 0])
     ring, paper = _median(b.grey, b.valid * (model.fraction < 0.05)), _median(b.grey, b.valid * (model.fraction > 0.95))
@@ -337,7 +164,7 @@ def _median(values: Tensor, where: Tensor) -> Tensor:
     return values.masked_fill(where == 0, torch.nan).nanmedian(-1).values
 
 
-def _spread(residual: Tensor, b: _Blocks) -> Tensor:
+def _spread(residual: Tensor, b: PixelBlocks) -> Tensor:
     """Robust standard deviation (K,) from the median absolute residual.
 
     All markers of a frame share its noise, so none may claim much more than the best of them: cover would.
@@ -348,7 +175,7 @@ def _spread(residual: Tensor, b: _Blocks) -> Tensor:
     return torch.minimum(own, _MOST_SPREAD * least[b.row])
 
 
-def _inliers(residual: Tensor, b: _Blocks) -> Tensor:
+def _inliers(residual: Tensor, b: PixelBlocks) -> Tensor:
     return b.valid * (residual.abs() < _CUT * _spread(residual, b)[:, None])
 
 

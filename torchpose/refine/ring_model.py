@@ -1,0 +1,193 @@
+"""What the pixels around the edges of a ring should show: prediction and derivatives, for padded blocks of pixels.
+
+    F = Phi(z_outer) + 1 - Phi(z_inner),   z = (d + q^2 k / 2) / q
+
+is the fraction of paper in a pixel; d is its distance in px from the projected circle, k the curvature of the circle's
+image, q the blur (point-spread function and pixel together). The second term of z is the pull of blur on a curved edge;
+Phi carries the fourth cumulant of the square pixel. The distortion of the lens enters once, as the ray of each pixel.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchpose.camera import Camera
+from torchpose.refine.band import band_pixels
+
+_BAND = 3.5  # px on either side of an edge
+
+
+@dataclass(frozen=True, eq=False)
+class PixelBlocks:
+    """Pixels of K markers, padded to P; one plane of numbers (K, P) for every component.
+
+    row: (K,) int64. ray_x, ray_y: on the plane z = 1. warp: 4 planes, d(ray)/d(pixel) row by row. grey, valid.
+    center, normal: (K, 3), target frame. radii: (K, 2).
+    """
+
+    row: Tensor
+    ray_x: Tensor
+    ray_y: Tensor
+    warp: tuple[Tensor, ...]
+    grey: Tensor
+    valid: Tensor
+    center: Tensor
+    normal: Tensor
+    radii: Tensor
+
+    def every(self, nth: int) -> PixelBlocks:
+        """The same with one pixel of ``nth``."""
+        planes = {n: getattr(self, n)[:, ::nth].contiguous() for n in ("ray_x", "ray_y", "grey", "valid")}
+        return replace(self, **planes, warp=tuple(w[:, ::nth].contiguous() for w in self.warp))
+
+
+class RingModel(NamedTuple):
+    """Prediction and derivatives at one pose; planes (K, P) in float32.
+
+    fraction: of paper, F. by_d, by_q: dF/dd through both circles, dF/dq. by_pose: 6 planes, derivative of d.
+    x, y: plane coordinates over the outer radius.
+    """
+
+    fraction: Tensor
+    by_d: Tensor
+    by_q: Tensor
+    by_pose: tuple[Tensor, ...]
+    x: Tensor
+    y: Tensor
+
+
+def gather_pixels(
+    frames: Tensor,
+    camera: Camera,
+    frame: Tensor,
+    mask: Tensor,
+    rings: Tensor,
+    centers: Tensor,
+    normals: Tensor,
+    radii: Tensor,
+    grain: int,
+) -> PixelBlocks:
+    """The pixels within the band around either circle of every marker seen; arguments as in `refine_photometric`.
+
+    ``grain``: the padded length P is a multiple of it.
+    """
+    height, width = frames.shape[-2:]
+    row, marker = mask.nonzero().unbind(-1)
+    both = rings[row, marker]  # (K, 2, 5)
+    block, u, v = band_pixels(both[:, 0], both[:, 1], _BAND, height, width)
+    uv = torch.stack([u, v], -1).double()
+    count = row.numel()
+    size = torch.bincount(block, minlength=count)
+    most = (int(size.max()) // grain + 1) * grain if count else grain
+    start = torch.arange(count, device=block.device) * most - (size.cumsum(0) - size)
+    place = torch.arange(block.numel(), device=block.device) + start[block]
+
+    def padded(values: Tensor, dtype: torch.dtype = torch.float64) -> Tensor:
+        out = torch.zeros(count * most, dtype=dtype, device=frames.device)
+        return out.index_copy_(0, place, values.to(dtype)).view(count, most)
+
+    xy = camera.undistort_points(uv)
+    grey = frames.reshape(-1)[(frame[row[block]] * height + v) * width + u].float()
+    sound = xy.isfinite().all(-1) & grey.isfinite()
+    xy = torch.where(sound[:, None], xy, 0.0)
+    j00, j01, j10, j11 = camera.J_distort(xy).flatten(-2).unbind(-1)
+    det = j00 * j11 - j01 * j10
+    warp = tuple(padded(w / det, torch.float32) for w in (j11, -j01, -j10, j00))
+    return PixelBlocks(
+        row,
+        padded(xy[:, 0]),
+        padded(xy[:, 1]),
+        warp,
+        padded(torch.where(sound, grey, 0.0), torch.float32),
+        padded(sound, torch.float32),
+        centers[row, marker],
+        normals[row, marker],
+        radii[row, marker],
+    )
+
+
+def ring_model(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor) -> RingModel:
+    """Predicts every pixel. The radius in the plane is formed in float64, what is small beside it in float32."""
+    rk = r[b.row]
+    normal = (rk @ b.normal[..., None]).squeeze(-1)
+    arm = (rk @ b.center[..., None]).squeeze(-1)  # marker's centre about the target's origin, camera axes
+    center = arm + t[b.row]
+    one, two = _plane_axes(normal).unbind(1)
+
+    def scalar(value: Tensor) -> Tensor:
+        return value[:, None]
+
+    def along(axis: Tensor) -> Tensor:
+        return scalar(axis[:, 0]) * b.ray_x + scalar(axis[:, 1]) * b.ray_y + scalar(axis[:, 2])
+
+    # the ray of the pixel meets the plane at depth * ray; coordinates about the circle's centre
+    toward = 1 / along(normal)
+    depth = scalar((normal * center).sum(-1)) * toward
+    one_c, two_c = scalar((one * center).sum(-1)), scalar((two * center).sum(-1))
+    x, y = depth * along(one) - one_c, depth * along(two) - two_c
+    radius = torch.hypot(x, y).clamp_min(1e-9)
+    outer, inner = ((radius - scalar(size)).float() for size in b.radii.unbind(-1))
+
+    x, y, radius, depth, toward = (v.float() for v in (x, y, radius, depth, toward))
+    one_c, two_c, q = one_c.float(), two_c.float(), scalar(blur[b.row]).float()
+    axes = [[scalar(c).float() for c in v.unbind(-1)] for v in (one, two, normal, arm)]
+    (ax, ay, az), (bx, by, bz), (nx, ny, nz), (cx, cy, cz) = axes
+    ex, ey = x / radius, y / radius
+    # a displacement w of the ray's foot, or of the plane against it, changes the radius by m . w
+    s = (radius + ex * one_c + ey * two_c) / depth * toward
+    mx, my, mz = ex * ax + ey * bx - s * nx, ex * ay + ey * by - s * ny, ex * az + ey * bz - s * nz
+    w00, w01, w10, w11 = b.warp
+    gu, gv = mx * w00 + my * w10, mx * w01 + my * w11  # gradient of the radius in the image, over the depth
+    flat = (gu.square() + gv.square()).clamp_min(1e-30).rsqrt()
+    per_mm = flat / depth  # px for a mm of radius
+    # area of a pixel in the plane, mm^2; curvature of the circle's image, 1/px
+    area = depth.square() * (w00 * w11 - w01 * w10).abs() * toward.abs()
+    bend = area.square() * per_mm.pow(3) / radius
+    # to second order in the distance: along the image's normal the radius bends where that normal is oblique in the
+    # plane, and by perspective; both as second over first derivative, 1/px, halved
+    nu, nv = gu * flat, gv * flat
+    side = (ex * two_c - ey * one_c) / depth * toward
+    hx, hy = ex * bx - ey * ax - side * nx, ex * by - ey * ay - side * ny  # as m, but across the radius
+    oblique = (hx * w00 + hy * w10) * nu + (hx * w01 + hy * w11) * nv
+    recede = ((nx * w00 + ny * w10) * nu + (nx * w01 + ny * w11) * nv) * toward
+    second = 0.5 * oblique.square() * depth * flat / radius - recede
+    d_outer, d_inner = outer * per_mm, inner * per_mm
+    d_outer, d_inner = d_outer + second * d_outer.square(), d_inner + second * d_inner.square()
+    pull = 0.5 * q * bend
+    z_outer, z_inner = d_outer / q + pull, d_inner / q + pull
+    # the pixel's square is not Gaussian: its fourth cumulant along the edge's normal, -(c^4 + s^4) / 120 px^4
+    square = (1 - 2 * (nu * nv).square()) / (24 * 120) / q.square().square()
+    f_outer, p_outer = _edge(z_outer, square)
+    f_inner, p_inner = _edge(z_inner, square)
+    px, py, pz = x * ax + y * bx + cx, x * ay + y * by + cy, x * az + y * bz + cz
+    by_pose = tuple(-per_mm * v for v in (mx, my, mz, py * mz - pz * my, pz * mx - px * mz, px * my - py * mx))
+    size = scalar(b.radii[:, 0]).float()
+    return RingModel(
+        f_outer + 1 - f_inner,
+        (p_outer - p_inner) / q,
+        p_outer * (bend - z_outer / q) - p_inner * (bend - z_inner / q),
+        by_pose,
+        x / size,
+        y / size,
+    )
+
+
+def _plane_axes(normal: Tensor) -> Tensor:
+    """Two unit vectors (K, 2, 3) across ``normal`` (K, 3)."""
+    axis = torch.nn.functional.one_hot(normal.abs().argmin(-1), 3).to(normal)
+    first = torch.linalg.cross(normal, axis)
+    first = first / torch.linalg.vector_norm(first, dim=-1, keepdim=True)
+    return torch.stack([first, torch.linalg.cross(normal, first)], 1)
+
+
+def _edge(z: Tensor, square: Tensor) -> tuple[Tensor, Tensor]:
+    """Blurred step and its slope at ``z`` standard deviations: the normal law and its fourth-order Edgeworth term."""
+    z2 = z.square()
+    density = torch.exp(-0.5 * z2) * (1 / math.sqrt(2 * math.pi))
+    step = 0.5 * torch.erfc(-z * math.sqrt(0.5)) + square * density * z * (z2 - 3)
+    return step, density * (1 - square * (z2 * (z2 - 6) + 3))
