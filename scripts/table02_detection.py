@@ -96,9 +96,10 @@ def main() -> int:
 
     axis = (REDUCTION - 1) / 2 + REDUCTION * ELSDC_OFFSET
     print(f"""
-The paper's 4.95 px. A frame reduced by {REDUCTION} has its pixel x at u = {REDUCTION} x + {(REDUCTION - 1) / 2}. Whoever
-multiplies by {REDUCTION} alone, and takes ELSDc's ellipses without the +{ELSDC_OFFSET} px of its stencil, is
-off by {axis} px per axis, {math.sqrt(2) * axis:.3f} px in all, whatever the noise. Our detections with both mistakes made:
+The paper's 4.95 px. A frame reduced by {REDUCTION} has its pixel x at
+u = {REDUCTION} x + {(REDUCTION - 1) / 2}. Whoever multiplies by {REDUCTION} alone, and takes ELSDc's
+ellipses without the +{ELSDC_OFFSET} px of its stencil, is off by {axis} px
+per axis, {math.sqrt(2) * axis:.3f} px in all, whatever the noise. Our detections with both mistakes made:
 noise   mean error px   paper, mean error px""")
     for noise, errors in raw.items():
         mean = sum(errors) / len(errors) if errors else math.nan

@@ -22,7 +22,7 @@ from torchpose.rings import Rings
 from torchpose.target import Target
 
 _RATIO_TOLERANCE = 0.02  # of the ratio of radii, for a large ring
-_RATIO_TOLERANCE_PX = 0.6  # over the semi-minor axis of the outer ellipse: what edge offsets do to a small ring
+_RATIO_TOLERANCE_PX = 0.35  # over the semi-minor axis of the outer ellipse: what edge offsets do to a small ring
 # px, of the ring's semi-major axis, of the distance to the ring the pose comes from
 _PLACE_TOLERANCE = (2.0, 0.3, 0.05)
 _SIZE_TOLERANCE = 1.25
@@ -146,6 +146,8 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int) -> I
     cost, hypothesis, member = _support(
         rotation, translation, a, ring, row, marker, position, outer, table, target, k_matrix
     )
+    # the code has its say, too: markers of neighbouring codes must not change places
+    cost = 0.5 * (cost + mismatch[member])
     count = rotation.shape[0]
     per_marker = torch.full((count * markers,), torch.inf, dtype=torch.float64, device=device)
     per_marker.scatter_reduce_(0, hypothesis * markers + marker[member], cost, "amin")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -14,6 +16,7 @@ from torchpose.edges import REACH, RingEdges, ring_edges
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import conics
 from torchpose.geometry.segments import segment_mean, segment_sum
+from torchpose.small_rings import fit_small_rings
 
 _ANGLES = 64
 _RADII = 72
@@ -22,6 +25,8 @@ _RATIO_RANGE = (0.12, 0.93)  # of inner to outer radius
 _LEAST_PEAK = 0.25  # of the outer edge's slope in the mean radial profile
 _LEAST_EDGE = 0.5  # of the median rise at the outer edge over all directions, for a direction that counts
 _LEAST_COVER = (0.4, 0.33)  # of the perimeter with edge points, outer and inner circle
+_SMALL = 4.0  # px: circles of a smaller semi-minor axis fill the mask of an edge
+_EDGE_APART = 0.8  # ... and so do two edges closer than 5 px
 _STEP_RANGE = (0.4, 2.5)  # inner to outer grey step
 
 
@@ -44,6 +49,17 @@ class Rings:
 
     def __len__(self) -> int:
         return self.frame.shape[0]
+
+    @classmethod
+    def cat(cls, parts: Sequence[Self]) -> Self:
+        """The rings of all parts."""
+
+        def fits(name: str) -> EllipseFit:
+            some = [getattr(part, name) for part in parts]
+            return EllipseFit(*(torch.cat([getattr(f, n) for f in some]) for n in EllipseFit.__dataclass_fields__))
+
+        tensors = [torch.cat([getattr(p, n) for p in parts]) for n in ("frame", "polarity", "outer_raw", "inner_raw")]
+        return cls(*tensors, fits("outer"), fits("inner"))
 
     @property
     def ratio(self) -> Tensor:
@@ -131,9 +147,36 @@ def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera, *, cor
         & (offset < 0.25 * raw[:count, 3])  # concentric up to perspective
         & (raw[count:, 2] < raw[:count, 2])
     )
-    index = good.nonzero()[:, 0]
+    small = torch.minimum((1 - ratio) * _EDGE_APART, ratio) * outer[:, 3] < _SMALL
+    index = (good & ~small).nonzero()[:, 0]
     second = index + count
-    return Rings(candidates.frame[index], candidates.polarity[index], raw[index], raw[second], fit[index], fit[second])
+    large = Rings(candidates.frame[index], candidates.polarity[index], raw[index], raw[second], fit[index], fit[second])
+    if not bool(small.any()):
+        return large
+    return Rings.cat([large, _measure_small(frames, candidates[small], ratio[small], camera)])
+
+
+def _measure_small(frames: Tensor, candidates: Candidates, ratio: Tensor, camera: Camera) -> Rings:
+    """Rings whose circles are too close to each other, or too small, to be measured one by one."""
+    found = fit_small_rings(frames, candidates.frame, candidates.ellipse, ratio, candidates.polarity)
+    index = found.good.nonzero()[:, 0]
+    outer, inner = found.outer[index], found.inner[index]
+    return Rings(
+        candidates.frame[index],
+        candidates.polarity[index],
+        outer.params,
+        inner.params,
+        replace(outer, params=_ideal(camera, outer.params)),
+        replace(inner, params=_ideal(camera, inner.params)),
+    )
+
+
+def _ideal(camera: Camera, ellipses: Tensor) -> Tensor:
+    """Ellipses (K, 5) of raw pixels in ideal ones; they are small, so that the distortion is affine across them."""
+    angle = torch.arange(_ANGLES, dtype=torch.float64, device=ellipses.device) * (2 * torch.pi / _ANGLES)
+    points = conics.points_on(ellipses[:, None], angle.expand(ellipses.shape[0], -1)).flatten(0, 1)
+    ring = torch.arange(ellipses.shape[0], device=ellipses.device).repeat_interleave(_ANGLES)
+    return ellipse.fit(ideal_pixels(camera, points), ring, ellipses.shape[0])
 
 
 def _unbiased(edges: RingEdges, fitted: Tensor, keep: Tensor, outward: Tensor, frame: Tensor, frames: int) -> Tensor:
