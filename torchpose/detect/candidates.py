@@ -31,6 +31,7 @@ _MIN_SEMI_MINOR = 2.0  # reduced px
 _MIN_ASPECT = 0.12
 _MIN_CELLS = 0.35  # of a region on its ellipse, a pixel of perimeter; an edge is two to three cells wide
 _WHOLE = 0.9  # cover from which on a region needs no chaining
+_PART_ROUNDS = 2  # of following the ellipse of a region that is only a part of it
 _FOLLOW = ((0.4, 1), (0.5, 2))  # least cover to be followed further, and rounds of it
 _ON_ELLIPSE = 1.5  # reduced px
 _ARC_RMS = 1.2  # reduced px, of the cells of an arc, which is a few cells wide
@@ -76,6 +77,11 @@ class Candidates:
 
     def __getitem__(self, index: Tensor) -> Candidates:
         return Candidates(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+
+    def replaced(self, index: Tensor, other: Candidates) -> Candidates:
+        """These candidates, with the rows ``index`` taken from ``other``."""
+        names = self.__dataclass_fields__
+        return Candidates(*(getattr(self, name).index_copy(0, index, getattr(other, name)) for name in names))
 
     @classmethod
     def cat(cls, parts: Sequence[Self]) -> Self:
@@ -138,6 +144,13 @@ def fit_regions(grad: Gradient, regions: Regions, explain: bool = False) -> tupl
     verdict = torch.where((verdict == Verdict.ACCEPTED) & off, int(Verdict.OFF_ELLIPSE), verdict)
     good = (verdict == Verdict.ACCEPTED).nonzero()[:, 0]
     found = score(grad, regions.frame[good], params[good], polarity[good])
+    # a region that is not a whole ellipse runs along something else as well: only what lies along the ellipse counts
+    part = (found.cover <= _WHOLE).nonzero()[:, 0]
+    some = found[part]
+    refit = follow(grad, some.frame, some.ellipse, some.polarity, _PART_ROUNDS)
+    sound = (plausible(grad, refit) == Verdict.ACCEPTED).nonzero()[:, 0]
+    again = score(grad, some.frame[sound], refit[sound], some.polarity[sound])
+    found = found.replaced(part[sound], again)
     whole = torch.zeros(count, dtype=torch.bool, device=xy.device)
     whole[good[(found.verdict == Verdict.ACCEPTED) & (found.cover > _WHOLE)]] = True
     explained = follows & whole[regions.region]

@@ -1,0 +1,211 @@
+"""Detection against contrast, noise, blur, size, tilt and cover, beside OpenCV's detectors.
+
+python scripts/bench_detection.py [--frames 16] [--seed 0] [--only blur noise] [--megapixels 20]
+
+Frames are rendered with the target quad40 on the 2 MP camera; a marker counts as found if an ellipse lies within
+0.3 semi-minor axes of its outer circle and within 20 % of its size. Given are recall of the outer circles, ellipses
+that lie on none of the circles (a frame), RMS error of the centres (px), and CPU time a frame (ms), by one thread. The
+peers get their usual settings, none of them tuned. --megapixels 20 times candidates alone, 8 large frames at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchpose.camera import Camera
+from torchpose.detect import find_candidates
+from torchpose.geometry import conics, rotations
+from torchpose.sim import add_noise, render
+from torchpose.target import Target
+
+Detector = Callable[[np.ndarray], np.ndarray]  # frame (H, W) uint8 -> ellipses (M, 5)
+F64 = torch.float64
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One point of a sweep; the defaults are the easy case."""
+
+    distance: float = 160.0  # mm
+    tilt: float = 20.0  # deg
+    psf: float = 0.8  # px
+    noise: float = 2.0
+    dark: float = 30.0
+    light: float = 220.0
+    cover: float = 0.0  # of the perimeter of every ring
+
+
+SWEEPS: dict[str, list[tuple[str, Condition]]] = {
+    "contrast": [(f"{c}", Condition(dark=20.0, light=20.0 + c)) for c in (190, 60, 30, 15)],
+    "noise": [(f"{n}", Condition(noise=float(n))) for n in (0, 2, 8, 16)],
+    "blur": [(f"{p}", Condition(psf=p)) for p in (0.5, 1.0, 2.0, 4.0)],
+    "size": [(f"{z}", Condition(distance=z)) for z in (80.0, 160.0, 400.0, 800.0)],
+    "tilt": [(f"{t}", Condition(tilt=float(t))) for t in (0, 30, 50, 60, 70)],
+    "cover": [(f"{c}", Condition(cover=c)) for c in (0.0, 0.1, 0.2, 0.35)],
+}
+
+
+def camera(scale: int = 1) -> Camera:
+    """The 2 MP camera, or the same with ``scale`` times the pixels along each side."""
+    f, width, height = 1111.11 * scale, 1824 * scale, 1216 * scale
+    k = [[f, 0.0, (width - 1) / 2], [0.0, f, (height - 1) / 2], [0.0, 0.0, 1.0]]
+    return Camera(width=width, height=height, matrix=torch.tensor(k, dtype=F64), distortion=torch.zeros(4, dtype=F64))
+
+
+def scenes(
+    lens: Camera, target: Target, condition: Condition, count: int, seed: int
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Frames (H, W) uint8 with the outer and inner ellipses (M, 2, 5) of their markers."""
+    rng = np.random.default_rng(seed)
+    for number in range(count):
+        azimuth, roll = rng.uniform(0, 2 * math.pi, 2)
+        tilt = math.radians(condition.tilt)
+        lean = torch.tensor([[tilt * math.cos(azimuth), tilt * math.sin(azimuth), 0.0]], dtype=F64)
+        r = rotations.exp(lean) @ rotations.exp(torch.tensor([[0.0, 0.0, roll]], dtype=F64))
+        z = condition.distance
+        t = torch.tensor([[rng.uniform(-0.08, 0.08) * z, rng.uniform(-0.04, 0.04) * z, z]], dtype=F64)
+        clean = render(lens, target, r, t, psf_sigma=condition.psf, dark=condition.dark, light=condition.light)
+        truth = circles(lens, target, r, t)
+        covered = cover(clean[0].numpy(), truth[:, 0], condition, rng)
+        yield add_noise(torch.from_numpy(covered)[None], condition.noise, seed + number)[0], truth
+
+
+def circles(lens: Camera, target: Target, r: Tensor, t: Tensor) -> Tensor:
+    """Projected circles (M, 2, 5) of every marker."""
+    center = (r @ target.centers[..., None]).squeeze(-1) + t
+    conic = conics.circle_image(r[:, None], center[:, None], target.normals[:, None], target.radii)
+    to_px = torch.linalg.inv(lens.matrix)
+    return conics.ellipse_from_conic(conics.from_matrix(to_px.T @ conic @ to_px))
+
+
+def cover(frame: np.ndarray, outer: Tensor, condition: Condition, rng: np.random.Generator) -> np.ndarray:
+    """The frame with a half plane over each ring, blurred like the rest."""
+    for ellipse in outer if condition.cover else ():
+        angle = rng.uniform(0, 2 * math.pi)
+        along = np.array([math.cos(angle), math.sin(angle)])
+        across, near = np.array([-along[1], along[0]]), math.cos(math.pi * condition.cover)
+        corners = [along * near - across, along * near + across, along * 1.3 + across, along * 1.3 - across]
+        points = np.array(corners) @ conics.shape_matrix(ellipse).numpy().T + ellipse[:2].numpy()
+        mask = np.zeros(frame.shape, np.uint8)
+        cv2.fillPoly(mask, [np.round(points * 16).astype(np.int32)], 255, cv2.LINE_AA, 4)
+        weight = cv2.GaussianBlur(mask.astype(np.float32) / 255, (0, 0), condition.psf)
+        grey = rng.uniform(condition.dark, condition.light)
+        frame = frame * (1 - weight) + grey * weight
+    return frame.astype(np.float32)
+
+
+def ours(frame: np.ndarray) -> np.ndarray:
+    return find_candidates(torch.from_numpy(frame)[None]).ellipse.numpy()
+
+
+def blobs(frame: np.ndarray) -> np.ndarray:
+    parameters = cv2.SimpleBlobDetector.Params()
+    parameters.maxArea = 1e6
+    found = cv2.SimpleBlobDetector.create(parameters).detect(frame)
+    return np.array([[*k.pt, k.size / 2, k.size / 2, 0.0] for k in found]).reshape(-1, 5)
+
+
+def hough(frame: np.ndarray) -> np.ndarray:
+    found = cv2.HoughCircles(cv2.GaussianBlur(frame, (0, 0), 1.5), cv2.HOUGH_GRADIENT, 1.5, 10)
+    rows = [] if found is None else [[u, v, r, r, 0.0] for u, v, r in found.reshape(-1, 3)]
+    return np.array(rows).reshape(-1, 5)
+
+
+def contours(frame: np.ndarray) -> np.ndarray:
+    """Otsu's threshold, contours, direct ellipse fits; those with an area unlike their ellipse's are left out."""
+    _, binary = cv2.threshold(frame, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    rows = []
+    for contour in cv2.findContours(binary, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]:
+        if len(contour) < 12:
+            continue
+        (u, v), (first, second), angle = cv2.fitEllipseDirect(contour)
+        area = math.pi * first * second / 4
+        if area > 0 and abs(cv2.contourArea(contour) / area - 1) < 0.1:
+            rows.append([u, v, max(first, second) / 2, min(first, second) / 2, math.radians(angle)])
+    return np.array(rows).reshape(-1, 5)
+
+
+def detectors() -> dict[str, Detector]:
+    return {
+        "torchpose": ours,
+        "SimpleBlobDetector": blobs,
+        "HoughCircles": hough,
+        "contours+fitEllipseDirect": contours,
+    }
+
+
+def judge(found: np.ndarray, truth: Tensor) -> tuple[int, int, list[float]]:
+    """Outer circles found, ellipses on none of the circles, and centre errors in px."""
+    if len(found) == 0:
+        return 0, 0, []
+    ellipses, all_circles = torch.from_numpy(found), truth.flatten(0, 1)
+    miss = torch.linalg.vector_norm(ellipses[:, None, :2] - all_circles[:, :2], dim=-1)
+    size = ((ellipses[:, None, 2] * ellipses[:, None, 3]) / (all_circles[:, 2] * all_circles[:, 3])).sqrt()
+    hit = (miss < 0.3 * all_circles[:, 3]) & ((size - 1).abs() < 0.2)
+    errors = torch.where(hit, miss, torch.inf).amin(0)[0::2]
+    return int(errors.isfinite().sum()), int((~hit.any(1)).sum()), errors[errors.isfinite()].tolist()
+
+
+def sweep(name: str, frames: int, seed: int, peers: dict[str, Detector]) -> None:
+    lens, target = camera(), Target.load("quad40")
+    for label, condition in SWEEPS[name]:
+        made = list(scenes(lens, target, condition, frames, seed))
+        for peer, detect in peers.items():
+            hits, false, errors, start = 0, 0, [], time.process_time()
+            results = [detect(frame.numpy()) for frame, _ in made]
+            cpu = 1e3 * (time.process_time() - start) / len(made)
+            for found, (_, truth) in zip(results, made, strict=True):
+                some, wrong, miss = judge(found, truth)
+                hits, false, errors = hits + some, false + wrong, errors + miss
+            recall = hits / (len(target) * len(made))
+            rms = math.sqrt(sum(e * e for e in errors) / len(errors)) if errors else math.nan
+            print(
+                f"{name:9s} {label:>6s}  {peer:26s} recall {recall:6.3f}  false {false / len(made):6.2f}  "
+                f"error {rms:7.4f} px  {cpu:8.1f} ms"
+            )
+
+
+def large(megapixels: float) -> None:
+    """CPU time of the candidates of a batch of 8 large frames, median of five."""
+    scale = max(1, round(math.sqrt(megapixels / 2.2)))
+    lens, target = camera(scale), Target.load("quad40")
+    made = [frame for frame, _ in scenes(lens, target, Condition(), 2, 0)]
+    batch = torch.stack(made * 4)
+    times = []
+    for _ in range(6):
+        start = time.process_time()
+        find_candidates(batch)
+        times.append(1e3 * (time.process_time() - start) / len(batch))
+    print(f"candidates, 8 x {lens.width} x {lens.height}: {sorted(times[1:])[2]:.1f} ms CPU a frame")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--frames", type=int, default=16, help="of each condition")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", nargs="*", choices=sorted(SWEEPS), default=sorted(SWEEPS))
+    parser.add_argument("--megapixels", type=float, help="time large frames instead")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    if arguments.megapixels:
+        large(arguments.megapixels)
+        return 0
+    peers = detectors()
+    for name in arguments.only:
+        sweep(name, arguments.frames, arguments.seed, peers)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
