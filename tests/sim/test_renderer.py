@@ -69,12 +69,12 @@ def compare(
     radii: tuple[float, float],
     psf: float,
     n: int,
+    window: tuple[int, int, int, int] = (40, 12, 80, 60),
 ) -> Witness:
     """The renderer against the witness at n/2 and n samples a pixel, extrapolated to infinitely many."""
     cam = camera(model=model, distortion=distortion)
     R, t = pose(tilt, azimuth, (8.0, -9.0, 200.0))
     ours = render(cam, target(radii), R, t, psf_sigma=psf, dark=DARK, light=LIGHT)[0].double().numpy()
-    window = (40, 12, 80, 60)
     u0, v0, w, h = window
     ours = ours[v0 : v0 + h, u0 : u0 + w]
     coarse, fine = (
@@ -128,6 +128,24 @@ def test_matches_converged_supersampling(case):
     assert found.rms < 5e-4
     assert found.edge < 5e-5
     assert found.centroid < 1e-6
+
+
+# rings of 6 px, tilted by 70 degrees
+SMALL = [
+    ("brown_conrady", BROWN, 70, 30, (3.0, 1.2), 0.7),
+    ("brown_conrady", BROWN, 70, 100, (3.0, 0.9), 0.4),
+    ("brown_conrady", (), 70, 0, (3.0, 2.1), 0.5),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", SMALL)
+def test_small_steep_rings_match_supersampling_at_128(case):
+    found = compare(*case, n=128, window=(68, 31, 23, 24))
+    print(case, found)
+    assert found.unconverged < 2e-3
+    assert found.rms < 1e-3
+    assert found.centroid < 1e-5
 
 
 def test_dark_mass_is_the_area_of_the_ellipses():
