@@ -16,6 +16,7 @@ import json
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
@@ -181,7 +182,8 @@ def write_dataset(
         raise ConfigError(f"{out}: --out: cannot be made ({error.strerror}); choose another folder") from None
     write_text(out / "plan.json", json.dumps(origin, indent=2) + "\n")
     plan.camera.save(out / "camera.yaml")
-    plan.target.save(out / "target.yaml")
+    # without a part: the truth is the pose of the target itself
+    replace(plan.target, part_rotation=None, part_translation=None).save(out / "target.yaml")
     names = plan.names
     done = {path.name for path in folder.iterdir()}
     pending = torch.tensor([i for i, name in enumerate(names) if name not in done], dtype=torch.int64)
