@@ -120,8 +120,8 @@ def spread(psf: str) -> Tensor:
     if psf == "gauss":
         return torch.zeros(1, 2, dtype=F64)
     if psf == "motion":  # 1 px along u
-        return torch.stack([torch.linspace(-0.45, 0.45, 10, dtype=F64), torch.zeros(10, dtype=F64)], -1)
-    side = torch.linspace(-1, 1, 9, dtype=F64)
+        return torch.stack([torch.linspace(-0.4, 0.4, 5, dtype=F64), torch.zeros(5, dtype=F64)], -1)
+    side = torch.linspace(-1, 1, 7, dtype=F64)
     square = torch.cartesian_prod(side, side)
     return 1.2 * square[square.norm(dim=-1) <= 1.01]  # a disc of radius 1.2 px
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.linalg import eigh
 from scipy.stats import chi2
 from skimage.measure import EllipseModel
 
@@ -303,3 +304,55 @@ def test_batch_invariance(generator):
     for k in range(5):
         alone = ellipse.fit(xy[index == k], torch.zeros(40, dtype=torch.int64), 1)
         torch.testing.assert_close(alone[0], together[k], rtol=1e-12, atol=0)
+
+
+def test_taubin_on_arcs(generator):
+    """Bias of the major axis on short arcs: the direct fit shrinks, Taubin's hardly."""
+    trials, arc, noise = 600, math.pi / 2, 0.1
+    truth = torch.tensor([50.0, 40, 60, 50, 0.3], dtype=torch.float64).expand(trials, 5)
+    angle = arc * torch.arange(150, dtype=torch.float64) / 150
+    xy = conics.points_on(truth[:, None].expand(-1, 150, -1), angle).reshape(-1, 2)
+    xy = xy + noise * torch.randn(xy.shape, generator=generator, dtype=torch.float64)
+    index = torch.arange(trials).repeat_interleave(150)
+    direct, better = (ellipse.fit(xy, index, trials, method=m).nanmedian(0).values for m in ("halir-flusser", "taubin"))
+    assert truth[0, 2] - direct[2] > 1.0
+    assert abs(truth[0, 2] - better[2]) < 0.3
+
+
+def test_taubin_on_whole_ellipses(generator):
+    truth = random_ellipses(50, generator, least_ratio=0.4)
+    xy, index = sample(truth, 200, generator)
+    assert_same_ellipses(ellipse.fit(xy, index, 50, method="taubin"), truth, atol=1e-8)
+    noisy = xy + 0.05 * torch.randn(xy.shape, generator=generator, dtype=torch.float64)
+    both = [ellipse.fit(noisy, index, 50, method=m) for m in ("halir-flusser", "taubin")]
+    assert_same_ellipses(both[1], both[0], atol=0.01)
+
+
+def test_taubin_is_the_generalised_eigenvector(generator):
+    """Against scipy on the raw coordinates: scatter of (x^2, xy, y^2, x, y, 1) against that of its gradients."""
+    truth = torch.tensor([[3.0, -2, 9, 5, 0.7]], dtype=torch.float64)
+    xy, index = sample(truth, 60, generator, arc=3.0, noise=0.1)
+    x, y = xy.numpy().T
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    design = np.stack([x * x, x * y, y * y, x, y, one], -1)
+    gradient = np.concatenate(
+        [np.stack([2 * x, y, zero, one, zero, zero], -1), np.stack([zero, x, 2 * y, zero, one, zero], -1)]
+    )
+    # N is singular: the largest mu of N a = mu M a is the smallest lambda of M a = lambda N a
+    _, vectors = eigh(gradient.T @ gradient, design.T @ design)
+    expected = conics.ellipse_from_conic(torch.from_numpy(vectors[:, -1]))
+    assert_same_ellipses(ellipse.fit(xy, index, 1, method="taubin"), expected[None], atol=1e-6)
+
+
+@pytest.mark.parametrize("method", ["halir-flusser", "taubin"])
+def test_every_layout_gives_the_same_fit(generator, method):
+    """Equal counts, unequal counts, unsorted points, blocks."""
+    truth = random_ellipses(9, generator, least_ratio=0.4)
+    xy, index = sample(truth, 40, generator, noise=0.1)
+    expected = ellipse.fit(xy, index, 9, method=method)
+    assert_same_ellipses(ellipse.fit_blocks(xy.view(9, 40, 2), method=method), expected, atol=1e-9)
+    order = torch.randperm(len(index), generator=generator)
+    assert_same_ellipses(ellipse.fit(xy[order], index[order], 9, method=method), expected, atol=1e-9)
+    more, at = torch.cat([xy[:7], xy]), torch.cat([index[:7], index])
+    weights = torch.cat([torch.zeros(7), torch.ones(len(index))])
+    assert_same_ellipses(ellipse.fit(more, at, 9, weights, method=method), expected, atol=1e-9)

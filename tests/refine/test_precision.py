@@ -1,0 +1,65 @@
+"""Poses of whole frames against the Cramer-Rao bound: what the model covers, what it does not, damage.
+
+Few frames of every case of scripts/precision_statistics.py; the figures of docs/precision.md come from that script.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
+import precision_statistics as statistics
+
+# torch's forward mode loads its decompositions through torch.jit on first use
+pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is:DeprecationWarning")
+
+FRAMES = 12
+RATIOS = ("lateral_ratio", "depth_ratio", "rotation_ratio")
+
+
+def row(case: str, method: str) -> dict[str, float]:
+    (found,) = statistics.run(case, statistics.CASES[case], [method], FRAMES, seed=7)
+    return found
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        "grid",
+        "tilt",
+        "noise-8",
+        "k1-0.3",
+        "motion",
+        "cover-35",
+        "missing",
+        "srgb",
+        pytest.param("disc", marks=pytest.mark.slow),
+        pytest.param("blackman-harris", marks=pytest.mark.slow),
+    ],
+)
+def test_photometric_is_near_the_bound(case: str) -> None:
+    found = row(case, "photometric")
+    assert found["ok"] == FRAMES
+    # 12 frames: the ratio scatters by 10 to 20 %, the mean NEES of 6 by 1
+    assert max(found[name] for name in RATIOS) < 1.6
+    assert 3.5 < found["nees"] < 9.0
+
+
+@pytest.mark.parametrize("case", ["tilt", "noise-8", "k1-0.3", "cover-35", "missing"])
+def test_edges_stay_within_their_covariance(case: str) -> None:
+    found = row(case, "edges")
+    assert found["ok"] == FRAMES
+    assert max(found[name] for name in RATIOS) < 2.8
+    assert 2.5 < found["nees"] < 9.0
+
+
+def test_methods_in_order_of_precision() -> None:
+    rows = statistics.run(
+        "tilt", statistics.CASES["tilt"], ["photometric", "edges", "centers", "paper"], FRAMES, seed=7
+    )
+    ratios = [found["lateral_ratio"] for found in rows]
+    assert ratios == sorted(ratios)
+    assert ratios[2] > 1.5 * ratios[1]
