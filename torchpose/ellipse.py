@@ -139,9 +139,10 @@ def _moments(points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Ten
 
 def _from_moments(center: Tensor, moments: Tensor, enough: Tensor, *, method: Method) -> Tensor:
     """Ellipses (M, 5) from the results of `_moments`."""
-    scale = (moments[:, 0] + moments[:, 2]).sqrt()
-    power = torch.tensor([2.0] * 3 + [3.0] * 4 + [4.0] * 5, dtype=scale.dtype, device=scale.device)
-    scaled = (moments / scale[:, None] ** power).unbind(-1)
+    rows = moments.mT.contiguous()
+    square = (rows[0] + rows[2]).reciprocal()
+    scale = square.rsqrt()
+    scaled = torch.cat([rows[:3] * square, rows[3:7] * (square / scale), rows[7:] * square.square()]).unbind(0)
     conic = _taubin(*scaled) if method == "taubin" else _halir_flusser(*scaled)
     ellipse = conics.ellipse_from_conic(conic)
     one = torch.ones_like(scale)
