@@ -26,25 +26,25 @@ def row(case: str, method: str) -> dict[str, float]:
 
 
 @pytest.mark.parametrize(
-    "case",
+    ("case", "ratio"),
     [
-        "grid",
-        "tilt",
-        "noise-8",
-        "k1-0.3",
-        "motion",
-        "cover-35",
-        "missing",
-        "srgb",
-        pytest.param("disc", marks=pytest.mark.slow),
-        pytest.param("blackman-harris", marks=pytest.mark.slow),
+        ("grid", 1.6),
+        ("tilt", 1.6),
+        ("noise-8", 1.6),
+        ("k1-0.3", 1.6),
+        ("motion", 1.6),
+        ("cover-35", 2.0),  # a ring covered so far is not always found
+        ("missing", 1.6),
+        ("srgb", 2.5),  # the bound is that of even noise; linearising makes it uneven
+        pytest.param("disc", 1.6, marks=pytest.mark.slow),
+        pytest.param("blackman-harris", 1.6, marks=pytest.mark.slow),
     ],
 )
-def test_photometric_is_near_the_bound(case: str) -> None:
+def test_photometric_is_near_the_bound(case: str, ratio: float) -> None:
     found = row(case, "photometric")
     assert found["ok"] == FRAMES
     # 12 frames: the ratio scatters by 10 to 20 %, the mean NEES of 6 by 1
-    assert max(found[name] for name in RATIOS) < 1.6
+    assert max(found[name] for name in RATIOS) < ratio
     assert 3.5 < found["nees"] < 9.0
 
 

@@ -28,6 +28,8 @@ _START_BLUR = 0.8  # px
 _BLUR_RANGE = (0.3, 4.0)
 _CUT = 4.0  # robust standard deviations beyond which a pixel is left out
 _TILE = 256  # pixels summed in float32 at a time; sums of tiles are float64, so padding changes no digit that counts
+_SECTORS = 48  # of a circle
+_SECTOR_KEPT = 0.9  # of a sector's pixels that must follow the model for it to count
 _MOST_SPREAD = 1.5  # of a marker's residuals, in those of the best marker of its frame
 _LEVELS = 6  # ring and paper, each with a constant and a gradient over the plane
 _QUANTISATION = 1 / 12  # variance of rounding, in grey levels^2, below which no noise estimate falls
@@ -90,8 +92,11 @@ def refine_photometric(
     known = torch.zeros_like(information) if prior is None else torch.nn.functional.pad(prior, (0, 1, 0, 1))
     moved = torch.zeros(rows, 7, dtype=torch.float64, device=r.device)
     for part in (*[coarse] * _STEPS[0], *[blocks] * _STEPS[1]):
-        columns = _columns(part, ring_model(part, r, t, blur), levels)
+        model = ring_model(part, r, t, blur)
+        columns = _columns(part, model, levels)
         weight = _inliers(columns[:, :, -1].flatten(1), part)
+        if part is blocks:
+            weight = weight * _clear_sectors(weight, part, model)
         step, level_step, information, variance = _gauss_newton(columns, weight, blocks.row, rows, known, moved)
         moved = moved + step
         r = rotations.exp(step[:, 3:6]) @ r
@@ -177,6 +182,22 @@ def _spread(residual: Tensor, b: PixelBlocks) -> Tensor:
 
 def _inliers(residual: Tensor, b: PixelBlocks) -> Tensor:
     return b.valid * (residual.abs() < _CUT * _spread(residual, b)[:, None])
+
+
+def _clear_sectors(weight: Tensor, b: PixelBlocks, m: RingModel) -> Tensor:
+    """0 for the pixels (K, P) of those sectors of either circle where many pixels do not follow the model, else 1.
+
+    What covers an edge agrees with it by chance wherever the edge passes through the cover's own grey.
+    """
+    middle = 0.5 * (1 + b.radii[:, 1] / b.radii[:, 0])
+    outer = torch.hypot(m.x, m.y) > middle[:, None].float()
+    turn = (torch.atan2(m.y, m.x) / (2 * math.pi) + 0.5) * _SECTORS
+    block = torch.arange(len(b.row), device=b.row.device)[:, None]
+    cell = ((2 * block + outer) * _SECTORS + turn.long().clamp(0, _SECTORS - 1)).flatten()
+    count = 2 * _SECTORS * len(b.row)
+    total = torch.zeros(count, dtype=weight.dtype, device=weight.device).index_add_(0, cell, b.valid.flatten())
+    used = torch.zeros_like(total).index_add_(0, cell, weight.flatten())
+    return (used > _SECTOR_KEPT * total)[cell].view_as(weight).to(weight.dtype)
 
 
 def _gauss_newton(
