@@ -3,10 +3,11 @@
 Where the two circles are closer than an edge mask, or the inner one fits into the mask, each edge bends the other's
 measurement. The whole ring as one model has no such limit:
 
-    I = paper + slope . x + contrast (E(1) - E(q)),   E(s) = Phi(d_s / sigma),
+    I = paper + slope . x + contrast (E(1) - E(q)),   E(s) = Phi(d_s / sigma - sigma k_s / 2),
 
-d_s the first-order distance inside the ellipse scaled by s, Phi the normal distribution, q the ratio of the radii. The
-circles share centre and shape, which perspective changes by less than a hundredth of a pixel at these sizes.
+d_s the first-order distance inside the ellipse scaled by s, k_s its curvature, Phi the normal distribution, q the ratio
+of the radii. The circles share centre and shape; perspective parts their centres by a few hundredths of a pixel at most
+at these sizes, which the refinement of the pose on the grey values makes good.
 """
 
 from __future__ import annotations
@@ -119,7 +120,7 @@ def _windows(frames: Tensor, frame: Tensor, outer: Tensor) -> tuple[Tensor, Tens
     u, v = corner[index, 0] + position % side[index], corner[index, 1] + position // side[index]
     xy = torch.stack([u, v], -1).double()
     theta = torch.cat([outer[:, :2], conics.shape_matrix(outer).flatten(1)[:, [0, 1, 3]]], -1)
-    near = _depth(theta, index, xy, None) > -_MARGIN
+    near = _depth(theta, index, xy, None)[0] > -_MARGIN
     seen = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     cut = segment_sum((near & ~seen).double(), index, frame.numel()) > 0
     keep = near & seen
@@ -127,8 +128,8 @@ def _windows(frames: Tensor, frame: Tensor, outer: Tensor) -> tuple[Tensor, Tens
     return index, xy, frames.reshape(-1)[(frame[index] * height + v) * width + u].double(), ~cut
 
 
-def _depth(theta: Tensor, index: Tensor, xy: Tensor, scale: Tensor | None) -> Tensor:
-    """First-order distance (P,) inside the ellipse, scaled by ``scale`` (K,)."""
+def _depth(theta: Tensor, index: Tensor, xy: Tensor, scale: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """First-order distance (P,) inside the ellipse scaled by ``scale`` (K,), slope (P,) of the elliptic radius, a b."""
     cx, cy, s11, s12, s22 = theta[:, :_SHAPE].unbind(-1)
     det = s11 * s22 - s12 * s12
     i11, i12, i22 = (s22 / det)[index], (-s12 / det)[index], (s11 / det)[index]
@@ -136,13 +137,18 @@ def _depth(theta: Tensor, index: Tensor, xy: Tensor, scale: Tensor | None) -> Te
     u, v = i11 * dx + i12 * dy, i12 * dx + i22 * dy
     rho = torch.hypot(u, v).clamp_min(1e-6)
     length = torch.hypot(i11 * u + i12 * v, i12 * u + i22 * v) / rho
-    return ((1.0 if scale is None else scale[index]) - rho) / length.clamp_min(1e-9)
+    return ((1.0 if scale is None else scale[index]) - rho) / length.clamp_min(1e-9), length, det[index]
 
 
 def _coverage(theta: Tensor, index: Tensor, xy: Tensor) -> Tensor:
+    """E(1) - E(q) at every pixel (P,)."""
     sigma = theta[index, 6]
-    outside = _depth(theta, index, xy, None) / sigma
-    return torch.special.ndtr(outside) - torch.special.ndtr(_depth(theta, index, xy, theta[:, 5]) / sigma)
+    depth, length, area = _depth(theta, index, xy, None)
+    inner_depth, _, _ = _depth(theta, index, xy, theta[:, 5])
+    # blur draws the edge of a disc of curvature k inwards by sigma^2 k / 2
+    drawn = 0.5 * sigma / (length**3 * area.square()).clamp_min(1e-9)
+    outer = torch.special.ndtr(depth / sigma - drawn)
+    return outer - torch.special.ndtr(inner_depth / sigma - drawn / theta[index, 5])
 
 
 def _slope(theta: Tensor, index: Tensor, xy: Tensor, k: int) -> Tensor:

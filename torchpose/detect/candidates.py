@@ -30,7 +30,8 @@ _SECTORS = 6  # arcs turn by up to 60 degrees
 _MIN_SEMI_MINOR = 2.0  # reduced px
 _MIN_ASPECT = 0.12
 _MIN_CELLS = 0.35  # of a region on its ellipse, a pixel of perimeter; an edge is two to three cells wide
-_WHOLE = 0.9  # cover from which on a region needs no chaining
+_WHOLE = 0.9  # cover from which on a region needs no chaining, if it has no more cells elsewhere
+_LEAST_COVER = 0.58  # a circle in a square is covered by 0.5
 _PART_ROUNDS = 2  # of following the ellipse of a region that is only a part of it
 _FOLLOW = ((0.4, 1), (0.5, 2))  # least cover to be followed further, and rounds of it
 _ON_ELLIPSE = 1.5  # reduced px
@@ -50,7 +51,8 @@ class Verdict(IntEnum):
     OFF_ELLIPSE = 4  # most of the region is not on its ellipse
     FALSE_ALARM = 5  # noise would give as much
     DUPLICATE = 6  # the same ellipse was found better
-    POLYGON = 7  # straight sides explain it better
+    FRAGMENT = 7  # too little of its perimeter is there
+    POLYGON = 8  # straight sides explain it better
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +147,8 @@ def fit_regions(grad: Gradient, regions: Regions, explain: bool = False) -> tupl
     good = (verdict == Verdict.ACCEPTED).nonzero()[:, 0]
     found = score(grad, regions.frame[good], params[good], polarity[good])
     # a region that is not a whole ellipse runs along something else as well: only what lies along the ellipse counts
-    part = (found.cover <= _WHOLE).nonzero()[:, 0]
+    beyond = length < _WHOLE * torch.bincount(regions.region, minlength=count)
+    part = ((found.cover <= _WHOLE) | beyond[good]).nonzero()[:, 0]
     some = found[part]
     refit = follow(grad, some.frame, some.ellipse, some.polarity, _PART_ROUNDS)
     sound = (plausible(grad, refit) == Verdict.ACCEPTED).nonzero()[:, 0]
@@ -230,6 +233,7 @@ def score(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> 
     log_tests = 2.5 * math.log10(max(1, height * width))
     log10_nfa = log_tests + size * k.clamp_min(1e-12).log10() - torch.lgamma(size + 1) / math.log(10)
     verdict = torch.where(log10_nfa < 0, int(Verdict.ACCEPTED), int(Verdict.FALSE_ALARM))
+    verdict = torch.where((log10_nfa < 0) & (on_arc < _LEAST_COVER * size), int(Verdict.FRAGMENT), verdict)
     return Candidates(frame, ellipses, polarity, log10_nfa, on_arc / size, verdict)
 
 

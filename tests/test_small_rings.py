@@ -1,0 +1,44 @@
+"""Whole-ring fits of rendered rings too small for separate edges."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from exact import exact_ellipses, pinhole, random_poses
+
+from torchpose.sim import add_noise, render
+from torchpose.small_rings import fit_small_rings
+from torchpose.target import Target
+
+
+@pytest.mark.parametrize("tilt", [0.1, 40.0])
+@pytest.mark.parametrize("noise", [1.0, 4.0])
+def test_within_their_own_covariance(tilt, noise):
+    camera, target = pinhole(1111.11, 400, 300), Target.load("quad40")
+    r, t = random_poses(12, tilt, (600, 800), seed=4)
+    t[:, :2] = 0
+    frames = add_noise(render(camera, target, r, t, psf_sigma=0.8), noise, seed=1)
+    truth = exact_ellipses(target, camera, r, t).flatten(0, 1)
+    frame = torch.arange(12).repeat_interleave(4)
+    rough = truth[:, 0].clone()
+    rough[:, :2] += 0.4
+    rough[:, 2:4] += 0.3
+    ratio = truth[:, 1, 3] / truth[:, 0, 3] + 0.05
+    found = fit_small_rings(frames, frame, rough, ratio, torch.ones(48, dtype=torch.float64))
+    assert found.good.all()
+    for fit, exact in ((found.outer, truth[:, 0]), (found.inner, truth[:, 1])):
+        error = fit.params[:, :2] - exact[:, :2]
+        nees = (error[:, None] @ torch.linalg.solve(fit.center_covariance, error[..., None])).flatten()
+        assert error.norm(dim=-1).max() < 0.04 + 0.03 * noise
+        if tilt < 1:  # perspective parts the centres of tilted circles, see the module
+            assert nees.mean() < 3.0  # 1 expected: each circle is given twice the variance of the common fit
+    code = (found.inner.params[:, 2:4].prod(-1) / found.outer.params[:, 2:4].prod(-1)).sqrt()
+    assert (code - truth[:, 1, 3] / truth[:, 0, 3]).abs().max() < 0.01 + 0.01 * noise
+
+
+def test_refuses_what_is_no_ring():
+    frames = 128 + 20 * torch.randn(1, 80, 80, generator=torch.Generator().manual_seed(1))
+    frames[0, 30:50, 30:50] = 20.0  # a square without a hole
+    rough = torch.tensor([[20.0, 20, 7, 7, 0], [40, 40, 9, 9, 0], [1, 40, 7, 7, 0]], dtype=torch.float64)
+    half, one = torch.full((3,), 0.5, dtype=torch.float64), torch.ones(3, dtype=torch.float64)
+    assert not fit_small_rings(frames, torch.zeros(3, dtype=torch.int64), rough, half, one).good.any()
