@@ -26,7 +26,7 @@ from torchpose.sim.shapes import Shapes
 REACH = 5.0  # the Gaussian is cut at this many standard deviations: 6e-7 of an edge's contrast
 _COARSE_CIRCLE, _COARSE_SIDE = 72, 9  # samples from which speed and extent in pixels are taken
 _MARGIN = 1.05  # for the speed between those samples
-_NODES, _PANEL = 12, 6.5  # Gauss-Legendre nodes on each panel of at most so many sigma
+_NODES, _PANEL = 16, 11.0  # Gauss-Legendre nodes on each panel of at most so many sigma; leaves about 5e-9
 _CHUNK_CELLS = 1 << 18  # pixels of patches computed at a time: they stay in the processor's cache
 _MIN_CHORD = 1e-3  # px; chords below this blur by less than 1e-6 px^2, and differences over them would cancel
 
