@@ -1,4 +1,4 @@
-"""Accuracy against cost of every method, beside OpenCV's circle grid and ringgrid's centres, on the same frames.
+"""Accuracy against cost of every method, beside OpenCV's blobs and ringgrid's proposals, on the same frames.
 
     python scripts/bench_precision.py --frames 64 --noise 2
 
@@ -6,8 +6,8 @@ Simulated 2-megapixel frames of quad40, tilt up to 45 degrees. Cost: CPU millise
 whole estimator and of the refinement alone (less what "centers" takes). Peers measure centres, which cv2.solvePnP
 (IPPE, then iterative) turns into poses with the true correspondence:
 
-- OpenCV: blob detector and asymmetric order as in findCirclesGrid's default detector, blobs nearest to the markers;
-- ringgrid (pip install ringgrid), where it is installed: centres nearest to the markers.
+- OpenCV: the blob detector that findCirclesGrid uses, blobs nearest to the markers;
+- ringgrid (pip install ringgrid), where it is installed: proposals (first stage) nearest to the markers.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def blobs(frame: np.ndarray) -> np.ndarray:
     """Centres (K, 2) of dark blobs, of OpenCV's detector as findCirclesGrid uses it."""
     options = cv2.SimpleBlobDetector_Params()
     options.minArea, options.maxArea = 50.0, 1e5
-    options.filterByInertia = options.filterByConvexity = False
+    options.filterByColor = options.filterByInertia = options.filterByConvexity = False  # the middle of a ring is light
     found = cv2.SimpleBlobDetector_create(options).detect(frame)
     return np.array([k.pt for k in found], dtype=np.float64).reshape(-1, 2)
 
@@ -102,7 +102,7 @@ def main() -> None:
             found[m] = (poses.R, poses.t, poses.ok)
     peers: dict[str, Callable[[np.ndarray], np.ndarray] | None] = {
         "opencv blobs": blobs,
-        "ringgrid": ringgrid_centers(),
+        "ringgrid 1st": ringgrid_centers(),
     }
     for name, centers in peers.items():
         if centers is None:
