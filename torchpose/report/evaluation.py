@@ -97,7 +97,7 @@ def save_plots(evaluation: Evaluation, truth: Truth, folder: Path, title: str) -
     """Writes errors.png, consistency.png and conditions.png; the paths.
 
     Raises:
-        ConfigError: matplotlib is missing, or the folder cannot be written.
+        ConfigError: the folder cannot be written.
     """
     made = {
         "errors.png": plot_errors(evaluation, title),
@@ -117,10 +117,8 @@ def save_plots(evaluation: Evaluation, truth: Truth, folder: Path, title: str) -
 
 
 def _figure(rows: int, columns: int, size: tuple[float, float], **options: Any) -> tuple[Figure, Any]:
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise ConfigError("matplotlib: --plots: is not installed; run pip install matplotlib") from None
+    from matplotlib.figure import Figure  # slow to import, and only plots need it
+
     figure = Figure(size, layout="constrained")  # of its own, without a window or a global state
     axes = figure.subplots(rows, columns, **options)
     for panel in axes.flat:
