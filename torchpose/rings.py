@@ -26,6 +26,7 @@ _LEAST_PEAK = 0.25  # of the outer edge's slope in the mean radial profile
 _LEAST_EDGE = 0.5  # of the median rise at the outer edge over all directions, for a direction that counts
 _LEAST_COVER = (0.4, 0.33)  # of the perimeter with edge points, outer and inner circle
 _SMALL = 4.0  # px: circles of a smaller semi-minor axis fill the mask of an edge
+_LARGE = 20.0  # px, of the outer semi-minor axis, from which on a fit of all pixels costs too much
 _EDGE_APART = 0.8  # ... and so do two edges closer than 5 px
 _STEP_RANGE = (0.4, 2.5)  # inner to outer grey step
 
@@ -147,7 +148,7 @@ def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera, *, cor
         & (offset < 0.25 * raw[:count, 3])  # concentric up to perspective
         & (raw[count:, 2] < raw[:count, 2])
     )
-    small = torch.minimum((1 - ratio) * _EDGE_APART, ratio) * outer[:, 3] < _SMALL
+    small = (torch.minimum((1 - ratio) * _EDGE_APART, ratio) * outer[:, 3] < _SMALL) & (outer[:, 3] < _LARGE)
     index = (good & ~small).nonzero()[:, 0]
     second = index + count
     large = Rings(candidates.frame[index], candidates.polarity[index], raw[index], raw[second], fit[index], fit[second])
