@@ -8,6 +8,7 @@ pixels themselves.
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -22,6 +23,11 @@ from torchpose.pnp._compile import compiled
 _STARTS = (0, 7, 13, 18, 22, 25, 27)
 # columns of the Jacobian are kept with these signs: it saves their negation
 SIGNS = (1.0, 1.0, -1.0, -1.0, 1.0, 1.0)
+# where in the packed numbers J^T r is, and J^T J row by row
+_GRADIENT = tuple(start + 6 - i for i, start in enumerate(_STARTS[:6]))
+_FULL = tuple(_STARTS[min(i, j)] + abs(i - j) for i in range(6) for j in range(6))
+# poses up to which LAPACK, one matrix after the other, costs less than the calls of an elimination
+_FEW = 64
 
 
 class Observations(NamedTuple):
@@ -141,9 +147,37 @@ def _rows(normal: Tensor) -> list[Tensor]:
     return [normal[a:b] for a, b in pairwise(_STARTS)]
 
 
+@cache
+def _constants(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """`SIGNS` (6, 1) and `_FULL`, `_GRADIENT` in a row, made once: every call for one pose counts."""
+    with torch.inference_mode(False):
+        signs = torch.tensor(SIGNS, dtype=dtype, device=device)[:, None]
+        return signs, torch.tensor(_FULL + _GRADIENT, device=device)
+
+
+def _signs(like: Tensor) -> Tensor:
+    if torch.compiler.is_compiling():  # a constant of the kernel
+        return torch.tensor(SIGNS, dtype=like.dtype, device=like.device)[:, None]
+    return _constants(like.device, like.dtype)[0]
+
+
+def _step(normal: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
+    """Damped step (6, B) in the signs of the Jacobian, and the decrease of the cost that it promises (B,)."""
+    if not torch.compiler.is_compiling() and normal.device.type == "cpu" and normal.shape[-1] <= _FEW:
+        numbers = normal.index_select(0, _constants(normal.device, normal.dtype)[1])
+        gradient = numbers[36:]
+        numbers[:36:7] *= 1 + damping
+        a = numbers[:36].T.unflatten(1, (6, 6))
+        step = torch.linalg.solve_ex(a, gradient.T)[0].T
+        return step, (step * gradient).sum(0)
+    rows = _rows(normal)
+    step = solve_rows(rows, damping)[0].squeeze(1)
+    return step, sum((step[i] * row[-1] for i, row in enumerate(rows)), start=torch.zeros_like(damping))
+
+
 def distance(normal: Tensor, step: Tensor) -> Tensor:
     """Squared Mahalanobis length (B,) of steps (6, B), translation first, by the information J^T J."""
-    step = step * torch.tensor(SIGNS, dtype=step.dtype, device=step.device)[:, None]
+    step = step * _signs(step)
     twice = [(row[:-1] * step[i:]).sum(0) - 0.5 * row[0] * step[i] for i, row in enumerate(_rows(normal))]
     return 2 * (torch.stack(twice) * step).sum(0)
 
@@ -189,11 +223,9 @@ def _advance(obs: Observations, state: _State, rtol: float, floor: Tensor) -> _S
         r, t = torch.where(accept, r, state.r), torch.where(accept, t, state.t)
         normal = torch.where(accept, normal, state.normal)
     damping = state.damping * torch.where(lower, 0.1, 10.0)
-    rows = _rows(normal)
-    step = solve_rows(rows, damping)[0].squeeze(1)
-    decrease = sum((step[i] * row[-1] for i, row in enumerate(rows)), start=torch.zeros_like(damping))
+    step, decrease = _step(normal, damping)
     done = (decrease <= rtol * normal[27] + floor) & (damping <= 1) & normal[27].isfinite()
-    step = step * -torch.tensor(SIGNS, dtype=r.dtype, device=r.device)[:, None]
+    step = step * -_signs(r)
     r_trial, t_trial = matmul3(cayley(step[3:]), r), t + step[:3]
     if not everywhere:
         was = state.done

@@ -58,6 +58,10 @@ COINCIDENCE = 1.0
 INDEPENDENCE = 1e-11
 # poses whose working set fits the cache of one core
 _CHUNK = 4096
+# most iterations in float32: what is slow there is no faster for being done twice
+_SINGLE = 8
+# poses put off that are solved at once
+_LATE = 16384
 # iterations after which a pose is put off, where there are many
 _FIRST_PASS = 3
 
@@ -166,8 +170,9 @@ def solve(
         result = _join([part for part, _ in parts])
         late = torch.cat([unfinished for _, unfinished in parts]).nonzero().squeeze(1)
         if max_iterations > first and len(late) > 0:
+            # few and long: what counts is the number of calls, so chunks of them may be large
             again = _join(
-                [part for part, _ in _map(lambda rows: run(rows, max_iterations), late.split(_CHUNK), pixels)]
+                [part for part, _ in _map(lambda rows: run(rows, max_iterations), late.split(_LATE), pixels)]
             )
             result = PnPResult(
                 **{f.name: getattr(result, f.name).index_copy(0, late, getattr(again, f.name)) for f in fields(again)}
@@ -336,7 +341,9 @@ def _solve_chunk(
     if isinstance(camera, Camera) and bool(camera.distortion.any()):
         final = Observations(local, image, whitening, camera, huber)
     state = _refine(observed, final, r0, t0, options, max_iterations if method == "iterative" else 0, compile)
-    pixel = final._replace(whitening=torch.ones_like(whitening) if final is not observed else slope)
+    pixel: Observations | float = sigma_px  # of equal weights and squares: chi-squared says it all
+    if covariances is not None or weights is not None or huber != float("inf"):
+        pixel = final._replace(whitening=torch.ones_like(whitening) if final is not observed else slope)
     bad = (
         (~started, PnPCode.DEGENERATE),
         (mirrored, PnPCode.BEHIND_CAMERA),
@@ -348,7 +355,8 @@ def _solve_chunk(
     calibration = None
     if isinstance(camera, Camera) and camera.covariance is not None:
         calibration = _calibration(final, whitening, image, camera)
-    return _report(state, options, center, unit, pixel, weight, bad, calibration, compile), late.any(0)
+    report = compiled(_report) if compile and calibration is None else _report
+    return PnPResult(*report(state, options, center, unit, pixel, seen, weight, bad, calibration)), late.any(0)
 
 
 def _calibration(final: Observations, whitening: Tensor, image: Tensor, camera: Camera) -> Callable[[Estimate], Tensor]:
@@ -462,7 +470,8 @@ def _refine(
         normal = normal_equations(final, r, t)
         return Estimate(r, t, normal, torch.zeros_like(normal[0], dtype=torch.int64), normal[27].isfinite())
     single = observed.to(torch.float32).repeat(options)
-    first = minimise(single, r.float(), t.float(), max_iterations=max_iterations, rtol=1e-4, compile=compile)
+    limit = min(max_iterations, _SINGLE)
+    first = minimise(single, r.float(), t.float(), max_iterations=limit, rtol=1e-4, compile=compile)
     r, t = orthonormalise(first.r.double()), first.t.double()
     chi2 = first.normal[27].unflatten(0, (options, -1))
     # neither is one that float32 did not reach: it may yet become the better one
@@ -504,12 +513,13 @@ def _report(
     options: int,
     center: Tensor,
     unit: Tensor,
-    pixel: Observations,
+    pixel: Observations | float,
+    seen: Tensor,
     weight: Tensor | None,
     bad: tuple[tuple[Tensor, PnPCode], ...],
     calibration: Callable[[Estimate], Tensor] | None,
-    compile: bool,
-) -> PnPResult:
+) -> tuple[Tensor, ...]:
+    """The fields of `PnPResult`."""
     batch = state.t.shape[-1] // options
     split = Estimate(*(v.unflatten(-1, (options, batch)) for v in state))
     chi2 = torch.where(split.normal[27].isnan(), torch.inf, split.normal[27])
@@ -523,7 +533,7 @@ def _report(
         return Estimate(*(v.gather(-2, order[k].expand(*v.shape[:-2], 1, batch)).squeeze(-2) for v in split))
 
     best = pick(0)
-    cov, independence = (compiled(covariance) if compile else covariance)(best.normal)
+    cov, independence = covariance(best.normal)
     if calibration is not None:
         shift = (cov[:, :, None] * calibration(best)).sum(1)  # (6, 4, B): of the pose, by a deviation of the intrinsics
         cov = cov + (shift[:, None] * shift).sum(2)
@@ -562,14 +572,16 @@ def _report(
     arm = (best.r * center).sum(1)[:, None]
     cov = torch.cat([unit * cov[:3] + cross(arm, cov[3:]), cov[3:]])
     cov = torch.cat([unit * cov[:, :3] + cross(arm, cov[:, 3:].transpose(0, 1)).transpose(0, 1), cov[:, 3:]], 1)
-    rms = _pixel_rms(pixel, weight, best)
-    rms_alt = _pixel_rms(pixel, weight, other)
+    if isinstance(pixel, Observations):
+        rms, rms_alt = _pixel_rms(pixel, weight, best), _pixel_rms(pixel, weight, other)
+    else:
+        rms, rms_alt = (pixel * (c / seen).sqrt() for c in (chi2[0], other_chi2))
 
     def fill(value: Tensor, valid: Tensor) -> Tensor:
         return torch.where(valid, value, torch.nan)
 
     rms, rms_alt = fill(rms, good), fill(rms_alt, good & different)
-    return PnPResult(
+    return (
         r,
         t,
         fill(cov, good).permute(2, 0, 1),
