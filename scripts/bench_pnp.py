@@ -1,23 +1,24 @@
 """Poses per second of `torchpose.pnp.solve` beside OpenCV and PoseLib called in a loop, wins and losses alike.
 
-    python scripts/bench_pnp.py --out bench_pnp.csv            # batches 1 to 1,000,000; minutes
+    python scripts/bench_pnp.py --out docs/benchmarks/pnp.md   # batches 1 to 1,000,000
     python scripts/bench_pnp.py --batches 1 64 4096 --no-compile
 
 Every round times every contestant once, so that a change of the machine's speed meets all of them; the table gives the
-median and the quartiles of the rounds. Loops are timed on at most `LOOP` poses. PyTorch3D, PyPose and Kornia take part
-where they can be imported. `peak_mb` is the rise of the process's high-water mark during the first call, in a fresh
-process's order of growing batches: with chunks it stays flat but for the results themselves.
+median and the quartiles of the rounds. A contestant that has used up `--seconds` at a batch size sits out the rounds
+that are left. Loops are timed on at most `LOOP` poses, other torch libraries on at most `PEERS`. PyTorch3D, PyPose and
+Kornia take part where they can be imported. `peak_mb` is the rise of the process's high-water mark at the first call of
+a batch size, in growing order: with chunks it grows by the results alone. The profile at the end says which operations
+bound the rest.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
 import math
 import platform
 import resource
+import shutil
 import statistics
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -31,6 +32,9 @@ from torchpose import pnp
 from torchpose.geometry import rotations
 
 LOOP = 1000
+PEERS = 4096
+# batches from which the first call counts as a round
+LARGE = 65536
 SIGMA_PX = 0.1
 MATRIX = torch.tensor([[1111.0, 0, 912], [0, 1111.0, 608], [0, 0, 1]], dtype=torch.float64)
 TARGETS = {
@@ -124,7 +128,7 @@ def contestants(compile: bool) -> dict[str, tuple[Callable[[Tensor, Tensor], obj
         "torchpose iterative": (ours("iterative", False), None),
         **({"torchpose iterative, compiled": (ours("iterative", True), None)} if compile else {}),
         "torchpose planar": (ours("planar", False), None),
-        "torchpose epnp": (ours("epnp", False), None),
+        "torchpose epnp": (ours("epnp", False), LARGE),
         "cv2 ITERATIVE": (opencv(cv2.SOLVEPNP_ITERATIVE), LOOP),
         "cv2 EPNP": (opencv(cv2.SOLVEPNP_EPNP), LOOP),
         "cv2 IPPE": (opencv(cv2.SOLVEPNP_IPPE), LOOP),
@@ -132,32 +136,42 @@ def contestants(compile: bool) -> dict[str, tuple[Callable[[Tensor, Tensor], obj
     }
     if (loop := poselib_loop()) is not None:
         table["PoseLib estimate_absolute_pose"] = (loop, LOOP)
-    table.update({name: (function, 65536) for name, function in torch_peers().items()})
+    table.update({name: (function, PEERS) for name, function in torch_peers().items()})
     return table
 
 
-def measure(points: Tensor, batch: int, rounds: int, compile: bool) -> list[dict[str, object]]:
+def measure(points: Tensor, batch: int, rounds: int, seconds: float, compile: bool) -> list[dict[str, object]]:
     """Rows of the table for one batch size."""
     pixels = scene(points, batch)
     table = contestants(compile)
     times: dict[str, list[float]] = {}
+    spent = dict.fromkeys(table, 0.0)
     failed: dict[str, str] = {}
     peak: dict[str, float] = {}
-    for name, (function, most) in table.items():  # not timed: caches, compilation
+
+    def once(name: str) -> None:
+        function, most = table[name]
+        part = pixels[:most]
+        start = time.perf_counter()
+        function(points, part)
+        elapsed = time.perf_counter() - start
+        spent[name] += elapsed
+        times.setdefault(name, []).append(elapsed / len(part))
+
+    for name in table:  # caches, compilation
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         try:
-            function(points, pixels[:most])
+            once(name)
         except Exception as error:  # a peer that rejects planar points is a result, not a fault of the benchmark
             failed[name] = str(error).splitlines()[0][:60] if str(error) else type(error).__name__
         peak[name] = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
-    for _ in range(rounds):
-        for name, (function, most) in table.items():
-            if name in failed:
-                continue
-            part = pixels[:most]
-            start = time.perf_counter()
-            function(points, part)
-            times.setdefault(name, []).append((time.perf_counter() - start) / len(part))
+        if batch <= LARGE:
+            times.pop(name, None)
+            spent[name] = 0.0
+    for k in range(rounds):
+        for name in table:
+            if name not in failed and (spent[name] < seconds or (k == 0 and name not in times)):
+                once(name)
     base = statistics.median(times["cv2 ITERATIVE"])
     rows = []
     for name in table:
@@ -171,6 +185,7 @@ def measure(points: Tensor, batch: int, rounds: int, compile: bool) -> list[dict
             | {
                 "us_per_pose": 1e6 * middle,
                 "us_quartiles": f"{1e6 * low:.3g}..{1e6 * high:.3g}",
+                "rounds": len(times[name]),
                 "poses_per_s": 1 / middle,
                 "times_cv2_iterative": base / middle,
                 "peak_mb": peak[name],
@@ -179,46 +194,71 @@ def measure(points: Tensor, batch: int, rounds: int, compile: bool) -> list[dict
     return rows
 
 
+def profile(points: Tensor, compile: bool, most: int = 12) -> list[dict[str, object]]:
+    """The operations that take most of the CPU time of `LARGE` poses on one thread."""
+    pixels = scene(points, LARGE)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as record:
+            pnp.solve(points, pixels, MATRIX, sigma_px=SIGMA_PX, compile=compile)
+    finally:
+        torch.set_num_threads(threads)
+    events = record.key_averages()
+    total = sum(e.self_cpu_time_total for e in events)
+    rows: list[dict[str, object]] = []
+    for e in sorted(events, key=lambda e: e.self_cpu_time_total, reverse=True)[:most]:
+        row: dict[str, object] = {"points": len(points), "compiled": compile, "operation": e.key[:60], "calls": e.count}
+        rows.append(row | {"us_per_pose": e.self_cpu_time_total / LARGE, "share": e.self_cpu_time_total / total})
+    return rows
+
+
+def markdown(rows: list[dict[str, object]], names: list[str]) -> str:
+    def cell(value: object) -> str:
+        return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+    lines = [names, ["---"] * len(names), *([cell(row.get(name, "")) for name in names] for row in rows)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--batches", type=int, nargs="+", default=[1, 16, 64, 256, 4096, 65536, 1_000_000])
     parser.add_argument("--points", type=int, nargs="+", choices=TARGETS, default=[4, 9])
     parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--seconds", type=float, default=1.0, help="most time of a contestant at one batch size")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--no-compile", dest="compile", action="store_false")
-    parser.add_argument("--out", type=Path, help="CSV file")
+    parser.add_argument("--out", type=Path, help="Markdown file")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     cv2.setNumThreads(1)
-    print(
-        f"# {platform.processor() or platform.machine()}, {args.threads} threads, torch {torch.__version__}, "
-        f"OpenCV {cv2.__version__}, {args.rounds} rounds"
+    compile = args.compile and any(shutil.which(name) for name in ("g++", "clang++"))
+    machine = (
+        f"{platform.processor() or platform.machine()}, {args.threads} threads, torch {torch.__version__}, "
+        f"OpenCV {cv2.__version__}, at most {args.rounds} rounds, sigma {SIGMA_PX} px"
+        + ("" if compile else ", nothing compiled")
     )
-    names = [
-        "points",
-        "batch",
-        "method",
-        "us_per_pose",
-        "us_quartiles",
-        "poses_per_s",
-        "times_cv2_iterative",
-        "peak_mb",
-        "note",
-    ]
-    screen = csv.DictWriter(sys.stdout, names, delimiter="\t")
-    screen.writeheader()
-    rows = []
-    for count in args.points:
-        for batch in args.batches:
-            for row in measure(TARGETS[count], batch, args.rounds, args.compile):
-                rows.append(row)
-                screen.writerow({k: f"{v:.4g}" if isinstance(v, float) else v for k, v in row.items()})
-                sys.stdout.flush()
+    print(machine)
+    names = ["points", "batch", "method", "us_per_pose", "us_quartiles", "rounds", "poses_per_s"]
+    names += ["times_cv2_iterative", "peak_mb", "note"]
+    rows: list[dict[str, object]] = []
+    for batch in sorted(args.batches):
+        for count in args.points:
+            part = measure(TARGETS[count], batch, args.rounds, args.seconds, compile)
+            print(markdown(part, names), flush=True)
+            rows += part
+    operations: list[dict[str, object]] = []
+    for fast in (False, True) if compile else (False,):
+        for count in args.points:
+            operations += profile(TARGETS[count], fast)
+    columns = ["points", "compiled", "operation", "calls", "us_per_pose", "share"]
+    print(markdown(operations, columns))
     if args.out is not None:
-        with args.out.open("w", newline="") as file:
-            writer = csv.DictWriter(file, names)
-            writer.writeheader()
-            writer.writerows(rows)
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        text = f"# Batched PnP: time of a pose\n\nBy `scripts/bench_pnp.py`. {machine}.\n\n{markdown(rows, names)}\n"
+        text += f"## What bounds it\n\nCPU time of {LARGE} poses on one thread, by operation, profiler included.\n\n"
+        args.out.write_text(text + markdown(operations, columns))
 
 
 if __name__ == "__main__":

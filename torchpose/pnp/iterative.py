@@ -234,6 +234,13 @@ def _advance(obs: Observations, state: _State, rtol: float, floor: Tensor) -> _S
     return _State(r, t, normal, damping, r_trial, t_trial, decrease, done)
 
 
+def _settle(state: _State) -> tuple[Tensor, Tensor, Tensor]:
+    """Poses and normal equations, with the last step of those that are done, of which the cost is predicted."""
+    r, t = torch.where(state.done, state.r_trial, state.r), torch.where(state.done, state.t_trial, state.t)
+    cost = (state.normal[27] - torch.where(state.done, state.decrease, 0)).clamp_min(0)
+    return r, t, torch.cat([state.normal[:27], cost[None]])
+
+
 def minimise(
     obs: Observations,
     r: Tensor,
@@ -251,6 +258,7 @@ def minimise(
     """
     # the distortion model is left to eager mode: its Python would be traced anew for every camera
     advance = compiled(_advance) if compile and obs.camera is None else _advance
+    settle = compiled(_settle) if compile else _settle
     eps = torch.finfo(r.dtype).eps
     scale = obs.whitening.square().amax(0) if obs.whitening.ndim == 3 else obs.whitening.square().amax((0, 1))
     magnitude = obs.xy.square().sum(0)
@@ -268,20 +276,15 @@ def minimise(
         remaining = (~over).nonzero().squeeze(1)
         last = iteration == max_iterations or len(remaining) == 0
         if last or (len(over) > 64 and 2 * len(remaining) <= len(over)):
-            r, t = torch.where(state.done, state.r_trial, state.r), torch.where(state.done, state.t_trial, state.t)
-            cost = (state.normal[27] - torch.where(state.done, state.decrease, 0)).clamp_min(0)
-            normal = torch.cat([state.normal[:27], cost[None]])
+            r, t, normal = settle(state)
             if result is None or index is None:
                 count = torch.full_like(over, iteration, dtype=torch.int64)
                 result = Estimate(r, t, normal, count, state.done)
             else:
-                result = Estimate(
-                    result.r.index_copy(-1, index, r),
-                    result.t.index_copy(-1, index, t),
-                    result.normal.index_copy(-1, index, normal),
-                    result.iterations.index_fill(0, index, iteration),
-                    result.converged.index_copy(0, index, state.done),
-                )
+                for whole, part in zip(result[:3], (r, t, normal), strict=True):
+                    whole.index_copy_(-1, index, part)
+                result.iterations.index_fill_(0, index, iteration)
+                result.converged.index_copy_(0, index, state.done)
             if last:
                 return result
             index = remaining if index is None else index[remaining]

@@ -57,7 +57,7 @@ COINCIDENCE = 1.0
 # least 1 - (multiple correlation)^2 of a parameter below which the points do not fix the pose
 INDEPENDENCE = 1e-11
 # poses whose working set fits the cache of one core
-_CHUNK = 4096
+_CHUNK = 8192
 # most iterations in float32: what is slow there is no faster for being done twice
 _SINGLE = 8
 # poses put off that are solved at once
@@ -171,9 +171,7 @@ def solve(
         late = torch.cat([unfinished for _, unfinished in parts]).nonzero().squeeze(1)
         if max_iterations > first and len(late) > 0:
             # few and long: what counts is the number of calls, so chunks of them may be large
-            again = _join(
-                [part for part, _ in _map(lambda rows: run(rows, max_iterations), late.split(_LATE), pixels)]
-            )
+            again = _join([part for part, _ in _map(lambda rows: run(rows, max_iterations), late.split(_LATE), pixels)])
             result = PnPResult(
                 **{f.name: getattr(result, f.name).index_copy(0, late, getattr(again, f.name)) for f in fields(again)}
             )
@@ -481,10 +479,13 @@ def _refine(
     last = minimise(*part, max_iterations=max_iterations, rtol=1e-10, damping=1e-6, compile=compile)
     if every:
         return last._replace(iterations=first.iterations + last.iterations)
+    normal = first.normal.double()
+    for whole, part in zip((r, t, normal), last[:3], strict=True):
+        whole.index_copy_(-1, index, part)
     return Estimate(
-        r.index_copy(2, index, last.r),
-        t.index_copy(1, index, last.t),
-        first.normal.double().index_copy(1, index, last.normal),
+        r,
+        t,
+        normal,
         first.iterations.index_add(0, index, last.iterations),
         first.converged.index_copy(0, index, last.converged),
     )
