@@ -59,8 +59,12 @@ class Rings:
             some = [getattr(part, name) for part in parts]
             return EllipseFit(*(torch.cat([getattr(f, n) for f in some]) for n in EllipseFit.__dataclass_fields__))
 
-        tensors = [torch.cat([getattr(p, n) for p in parts]) for n in ("frame", "polarity", "outer_raw", "inner_raw")]
-        return cls(*tensors, fits("outer"), fits("inner"))
+        def tensor(name: str) -> Tensor:
+            return torch.cat([getattr(part, name) for part in parts])
+
+        return cls(
+            tensor("frame"), tensor("polarity"), tensor("outer_raw"), tensor("inner_raw"), fits("outer"), fits("inner")
+        )
 
     @property
     def ratio(self) -> Tensor:
