@@ -39,6 +39,9 @@ def test_within_their_own_covariance(tilt, noise):
 def test_refuses_what_is_no_ring():
     frames = 128 + 20 * torch.randn(1, 80, 80, generator=torch.Generator().manual_seed(1))
     frames[0, 30:50, 30:50] = 20.0  # a square without a hole
-    rough = torch.tensor([[20.0, 20, 7, 7, 0], [40, 40, 9, 9, 0], [1, 40, 7, 7, 0]], dtype=torch.float64)
-    half, one = torch.full((3,), 0.5, dtype=torch.float64), torch.ones(3, dtype=torch.float64)
-    assert not fit_small_rings(frames, torch.zeros(3, dtype=torch.int64), rough, half, one).good.any()
+    v, u = torch.meshgrid(torch.arange(80), torch.arange(80), indexing="ij")
+    frames[0] -= 100 * torch.sigmoid(3 * (7 - torch.hypot(u - 60.0, v - 60.0)))  # a disc without a hole
+    rough = [[20.0, 20, 7, 7, 0], [40, 40, 9, 9, 0], [1, 40, 7, 7, 0], [60, 60, 7, 7, 0]]
+    half, one = torch.full((4,), 0.5, dtype=torch.float64), torch.ones(4, dtype=torch.float64)
+    found = fit_small_rings(frames, torch.zeros(4, dtype=torch.int64), torch.tensor(rough).double(), half, one)
+    assert not found.good.any()

@@ -28,6 +28,8 @@ _STEP = 1e-4  # of the numerical derivatives, px
 _MOST_MOVE = 0.7  # px of an iteration
 _START_SIGMA = 0.8  # px
 _LEAST_EXPLAINED = 0.75  # of the variance of grey around the ring
+_RATIO_RANGE = (0.12, 0.93)  # beyond it, a plain disc or its rim
+_RATIO_SIGMA = 0.1  # of the ratio: an inner circle that is not sure is none
 _SHAPE = 5  # parameters of centre and shape; then ratio and blur, then the four grey ones
 
 
@@ -89,6 +91,9 @@ def fit_small_rings(frames: Tensor, frame: Tensor, outer: Tensor, ratio: Tensor,
         & covariance.isfinite().all(-1).all(-1)
         & (variance < (1 - _LEAST_EXPLAINED) * total)
         & (linear[:, 3] * polarity < 0)
+        & (theta[:, 5] > _RATIO_RANGE[0])
+        & (theta[:, 5] < _RATIO_RANGE[1])
+        & (covariance[:, 5, 5].sqrt() < _RATIO_SIGMA * theta[:, 5])
         & (torch.linalg.vector_norm(params[:, :2] - outer[:, :2], dim=-1) < 0.3 * outer[:, 3] + 1)
     )
     to_axes = _to_axes(params)
