@@ -163,3 +163,15 @@ def test_no_row() -> None:
     s = solve_poses(evidence(QUAD, r, t)[none], (r[none], t[none]))
     assert s.R.shape == (0, 3, 3)
     assert s.status.shape == (0,)
+
+
+def test_rows_do_not_depend_on_each_other() -> None:
+    """The same measurements give the same pose alone and in a batch, to 1e-9 mm and rad."""
+    r, t = random_poses(24, 50, (150, 190))
+    e = evidence(QUAD, r, t, sigma=0.05)
+    together = solve_poses(e, (r, t))
+    for k in range(len(r)):
+        one = torch.tensor([k])
+        alone = solve_poses(e[one], (r[one], t[one]))
+        assert (alone.t[0] - together.t[k]).abs().max() < 1e-9
+        assert (alone.R[0] - together.R[k]).abs().max() < 1e-9
