@@ -298,6 +298,17 @@ def test_many_chunks_are_the_same_as_one() -> None:
     assert len(pnp.solve(SQUARE, image[:0], MATRIX)) == 0
 
 
+@pytest.mark.parametrize("points", [SQUARE, GRID, CUBOID], ids=["4", "9", "solid"])
+def test_a_pose_does_not_depend_on_its_batch(points: Tensor) -> None:
+    image = pixels(views(points, 300, tilt_deg=(10, 60))[2], 0.1)
+    many = pnp.solve(points, image, MATRIX, sigma_px=0.1)
+    for few in (1, 12):
+        alone = pnp.solve(points, image[:few], MATRIX, sigma_px=0.1)
+        assert alone.code.tolist() == many.code[:few].tolist()
+        torch.testing.assert_close(alone.t, many.t[:few], rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(alone.R, many.R[:few], rtol=0, atol=1e-9)
+
+
 def test_float32_input_is_solved_in_float64() -> None:
     r, t, xy = views(GRID, 30, tilt_deg=(20, 60))
     result = pnp.solve(GRID.float(), pixels(xy).float(), MATRIX.float(), sigma_px=0.01)

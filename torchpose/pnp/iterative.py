@@ -224,7 +224,7 @@ def _advance(obs: Observations, state: _State, rtol: float, floor: Tensor) -> _S
         normal = torch.where(accept, normal, state.normal)
     damping = state.damping * torch.where(lower, 0.1, 10.0)
     step, decrease = _step(normal, damping)
-    done = (decrease <= rtol * normal[27] + floor) & (damping <= 1) & normal[27].isfinite()
+    done = (decrease <= rtol * normal[27] + floor) & (damping <= 1) & (normal[27] < torch.inf)
     step = step * -_signs(r)
     r_trial, t_trial = matmul3(cayley(step[3:]), r), t + step[:3]
     if not everywhere:
@@ -272,7 +272,7 @@ def minimise(
     for iteration in range(1, max_iterations + 1):
         state = _State(*advance(obs, state, rtol, floor))
         # neither a pose without numbers nor one whose steps have shrunk to nothing will come to an end
-        over = state.done | ~((state.damping < 1e8) & state.normal[27].isfinite())
+        over = state.done | ~((state.damping < 1e8) & (state.normal[27] < torch.inf))
         remaining = (~over).nonzero().squeeze(1)
         last = iteration == max_iterations or len(remaining) == 0
         if last or (len(over) > 64 and 2 * len(remaining) <= len(over)):
