@@ -33,6 +33,8 @@ from torchpose.geometry import rotations
 
 LOOP = 1000
 PEERS = 4096
+# least batch that is timed compiled: below, kernels are specialised to every size anew
+COMPILED = 64
 # batches from which the first call counts as a round
 LARGE = 65536
 SIGMA_PX = 0.1
@@ -143,7 +145,7 @@ def contestants(compile: bool) -> dict[str, tuple[Callable[[Tensor, Tensor], obj
 def measure(points: Tensor, batch: int, rounds: int, seconds: float, compile: bool) -> list[dict[str, object]]:
     """Rows of the table for one batch size."""
     pixels = scene(points, batch)
-    table = contestants(compile)
+    table = contestants(compile and batch >= COMPILED)
     times: dict[str, list[float]] = {}
     spent = dict.fromkeys(table, 0.0)
     failed: dict[str, str] = {}
