@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchpose.cli.estimate import INTERRUPTED, _check_outputs, _cores, _report_unreadable
+from torchpose.cli.common import INTERRUPTED, check_outputs, cores, report_unreadable
 
 if TYPE_CHECKING:  # imported where they are used: torch takes more than a second, which --help need not wait for
     import numpy as np
@@ -60,11 +60,11 @@ def detect(
 
     check_table_path(out, "--out")
     sources = find_sources(inputs)
-    _check_outputs(inputs, sources, [out], overlay)
+    check_outputs(inputs, sources, [out], overlay)
     if overlay is not None:
         make_folder(overlay)
     cv2.setNumThreads(1)
-    torch.set_num_threads(threads or _cores())
+    torch.set_num_threads(threads or cores())
     unreadable: dict[str, str] = {}
     rows: list[Row] = []
     try:
@@ -87,7 +87,7 @@ def detect(
     write_rows(out, rows, SHAPE_SCHEMA)
     progress.summary(_kinds(rows), out)
     if unreadable:
-        _report_unreadable(unreadable)
+        report_unreadable(unreadable)
         return 1
     return 0
 

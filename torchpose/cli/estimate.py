@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from torchpose.cli.common import INTERRUPTED, check_outputs, cores, report_unreadable
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:  # imported where they are used: torch takes more than a second, which --help need not wait for
@@ -22,7 +22,6 @@ if TYPE_CHECKING:  # imported where they are used: torch takes more than a secon
     from torchpose.results import Poses
     from torchpose.target import Target
 
-INTERRUPTED = 130  # as shells have it: 128 + SIGINT
 
 EPILOG = """
 Examples:
@@ -99,7 +98,7 @@ def estimate(
     targets = [Target.load(name) for name in target]
     sources = find_sources(inputs)
     calibration = _load_hand_eye(hand_eye, sources)
-    _check_outputs(inputs, sources, [p for p in (out, detections) if p is not None], overlay)
+    check_outputs(inputs, sources, [p for p in (out, detections) if p is not None], overlay)
     with native_stderr_silenced():
         return _run(
             camera_model,
@@ -113,7 +112,7 @@ def estimate(
             method=method,
             srgb=srgb,
             batch=batch,
-            threads=threads or _cores(),
+            threads=threads or cores(),
             quiet=quiet,
         )
 
@@ -179,7 +178,7 @@ def _run(
         store.close()
     progress.summary(store.counts, out)
     if store.unreadable:
-        _report_unreadable(store.unreadable)
+        report_unreadable(store.unreadable)
         return 1
     return 0
 
@@ -261,33 +260,6 @@ def _load_hand_eye(path: Path | None, sources: Sequence[Source]) -> HandEye | No
     return hand_eye
 
 
-def _check_outputs(
-    inputs: Sequence[Path],
-    sources: Sequence[Source],
-    tables: list[Path],
-    overlay: Path | None,
-) -> None:
-    """Refuses outputs that would overwrite or mingle with inputs."""
-    read = {path.resolve() for path in inputs}
-    for table in tables:
-        if table.resolve() in read:
-            raise ConfigError(f"{table}: --out: is an INPUT too; choose another file")
-    if overlay is None:
-        return
-    place = overlay.resolve()
-    folder = next((path for path in inputs if path.is_dir() and place.is_relative_to(path.resolve())), None)
-    if folder is not None:
-        raise ConfigError(
-            f"{overlay}: --overlay: lies inside INPUT {folder}, where its pictures would be taken for frames; "
-            "choose a folder outside"
-        )
-    from torchpose.report.overlay import picture_path
-
-    frames = {source.path.resolve() for source in sources}
-    if any(picture_path(place, source.name) in frames for source in sources):
-        raise ConfigError(f"{overlay}: --overlay: its pictures would overwrite the frames; choose another folder")
-
-
 def _origin(
     camera: Camera,
     targets: Sequence[Target],
@@ -320,18 +292,3 @@ def _digest(model: Any) -> str:
     values = [(field.name, getattr(model, field.name)) for field in fields(model) if field.name != "source"]
     plain = [(name, value.tolist() if hasattr(value, "tolist") else value) for name, value in values]
     return hashlib.sha256(repr(plain).encode()).hexdigest()
-
-
-def _cores() -> int:
-    """Cores that this process may use, where the system tells."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _report_unreadable(unreadable: dict[str, str]) -> None:
-    shown = [f"{frame} ({reason})" for frame, reason in list(unreadable.items())[:5]]
-    more = [f"and {len(unreadable) - 5} more"] if len(unreadable) > 5 else []
-    typer.echo(
-        f"torchpose: error: {', '.join(shown + more)}: INPUT: {len(unreadable)} could not be read; "
-        "replace the files and run again",
-        err=True,
-    )

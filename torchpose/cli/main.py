@@ -10,7 +10,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from torchpose.cli import detect, estimate, evaluate, simulate
+from torchpose.cli import common, detect, estimate, evaluate, simulate
 from torchpose.errors import TorchposeError
 
 INTERNAL_ERROR = 70  # EX_SOFTWARE of sysexits.h: none of the codes that say something about the input
@@ -59,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     except TorchposeError as error:
         _fail(str(error))
     except (KeyboardInterrupt, typer.Abort):
-        _fail("interrupted before anything was computed", estimate.INTERRUPTED)
+        _fail("interrupted before anything was computed", common.INTERRUPTED)
     except Exception as error:
         # typer brings its own copy of click or depends on click, by version: known by what its errors can do
         if hasattr(error, "format_message"):

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from torchpose.cli.estimate import INTERRUPTED, _cores
+from torchpose.cli.common import INTERRUPTED, cores
 
 EPILOG = """
 Examples:
@@ -55,7 +55,7 @@ def simulate(
     from torchpose.sim.plan import load_plan
 
     cv2.setNumThreads(1)
-    torch.set_num_threads(max(1, (threads or _cores()) // 2))
+    torch.set_num_threads(max(1, (threads or cores()) // 2))
     read = load_plan(plan)
     with FrameProgress(len(read), 0, quiet=quiet) as progress:
         try:
@@ -66,7 +66,7 @@ def simulate(
                 resume=resume,
                 bop=bop,
                 batch=batch,
-                threads=threads or _cores(),
+                threads=threads or cores(),
                 progress=lambda done: progress.advance(done, Counter()),
             )
         except KeyboardInterrupt:
