@@ -36,7 +36,7 @@ from torchpose.sim import add_noise, render
 
 SIZES = {"2 MP": (1824, 1216, 1111.11), "20 MP": (5472, 3648, 3333.33)}
 FRAMES = 8
-STAGES = ("find_candidates", "measure_rings", "identify", "solve_poses")
+STAGES = ("find_candidates", "measure_rings", "identify", "solve_poses", "refine_photometric")
 
 
 def camera_of(width: int, height: int, focal: float) -> tp.Camera:

@@ -182,7 +182,7 @@ def perimeter_samples(ellipses: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def cells_at(grad: Gradient, frame: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
     """Flat cells (S,) nearest to positions (S, 2), and whether they lie on the frame (S,) bool."""
-    _, height, width = grad.diag.shape
+    _, height, width = grad.shape
     x, y = (xy - 0.5).round().long().unbind(-1)
     inside = (x >= 0) & (x < width - 1) & (y >= 0) & (y < height - 1)
     return (frame * height + y.clamp(0, height - 1)) * width + x.clamp(0, width - 1), inside

@@ -196,7 +196,7 @@ def fit_arcs(grad: Gradient, arcs: Regions) -> Candidates:
 def plausible(grad: Gradient, ellipses: Tensor) -> Tensor:
     """Verdict (M,) int64 on the size and shape of ellipses (M, 5); `Verdict.TOO_LARGE` for NaN."""
     a, b = ellipses[:, 2], ellipses[:, 3]
-    verdict = torch.where(a <= 0.5 * max(grad.diag.shape[1:]), int(Verdict.ACCEPTED), int(Verdict.TOO_LARGE))
+    verdict = torch.where(a <= 0.5 * max(grad.shape[1:]), int(Verdict.ACCEPTED), int(Verdict.TOO_LARGE))
     verdict = torch.where(b < _MIN_ASPECT * a, int(Verdict.TOO_FLAT), verdict)
     return torch.where(b < _MIN_SEMI_MINOR, int(Verdict.TOO_SMALL), verdict)
 
@@ -208,7 +208,7 @@ def accepted(found: Candidates) -> Candidates:
 
 def cell_centers(grad: Gradient, cell: Tensor) -> Tensor:
     """Positions (P, 2) float64 of flat cells in reduced px."""
-    _, height, width = grad.diag.shape
+    _, height, width = grad.shape
     inside = cell % (height * width)
     return torch.stack([inside % width, inside // width], -1).double() + 0.5
 
@@ -220,7 +220,7 @@ def score(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> 
     the sum k of n of them is below its value with probability at most k^n / n!. The number of tests is the number of
     distinguishable ellipses, (h w)^(5/2): five parameters, each with as many values as the frame has pixels on a side.
     """
-    _, height, width = grad.diag.shape
+    _, height, width = grad.shape
     which, xy, normal = perimeter_samples(ellipses)
     cell, on_frame = cells_at(grad, frame[which], xy)
     g = grad.at(cell).double()

@@ -52,7 +52,7 @@ def find_segments(grad: Gradient, cells: Tensor) -> Segments:
     """
     found = [_straight(grad, level_line_regions(grad, cells, _MIN_CELLS, _SECTORS, phase)) for phase in (0.0, 0.5)]
     frame, ends, n, k = (torch.cat(pair) for pair in zip(*found, strict=True))
-    _, height, width = grad.diag.shape
+    _, height, width = grad.shape
     pixels = math.log10(max(2, height * width))
     nfa = math.log10(2) + 2.5 * pixels + _log10_tail(n, k)
     keep = (nfa < 0).nonzero()[:, 0]
@@ -83,7 +83,7 @@ def _log10_tail(n: Tensor, k: Tensor) -> Tensor:
 
 def _straight(grad: Gradient, regions: Regions) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Lines of straight regions: frame (N,), ends (N, 2, 2), number of samples (N,) and sum of their errors (N,)."""
-    _, height, width = grad.diag.shape
+    _, height, width = grad.shape
     inside = regions.cell % (height * width)
     xy = torch.stack([inside % width, inside // width], -1).double() + 0.5
     index, count = regions.region, regions.frame.numel()

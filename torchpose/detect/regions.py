@@ -19,27 +19,39 @@ _JOIN_COS = 0.8  # neighbours join within 37 degrees: a circle of 3 px turns 19 
 _NOISE_SIGMAS = 3.7  # of the gradient: one pure-noise pixel in a thousand stays
 _RANGE_FRACTION = 0.01  # of the frame's own range of grey, for frames without noise
 _LEAST_LEVEL = 1.5  # grey levels, above the flicker of quantisation
-_NOISE_SAMPLES = 40_000
+_NOISE_SAMPLES = 10_000
+_PART_PIXELS = 6_000_000  # of the frames whose gradients are formed at a time
 
 
 @dataclass(frozen=True, eq=False)
 class Gradient:
-    """2 x 2 gradient of (B, h, w) frames; cell (x, y) is centred at (x + 0.5, y + 0.5).
+    """2 x 2 gradient of (B, h, w) frames, formed where it is asked for; cell (x, y) is centred at (x + 0.5, y + 0.5).
 
     Attributes:
-        diag, anti: (B, h, w) float32, I(x+1, y+1) - I(x, y) and I(x+1, y) - I(x, y+1); zero in the last row and column.
-            The gradient is gx = (diag + anti) / 2, gy = (diag - anti) / 2.
+        frames: (B, h, w) float32, contiguous.
         threshold: (B,) float32, magnitude that pure white noise exceeds in one cell of a thousand at most.
     """
 
-    diag: Tensor
-    anti: Tensor
+    frames: Tensor
     threshold: Tensor
 
+    @property
+    def shape(self) -> torch.Size:
+        """(B, h, w)."""
+        return self.frames.shape
+
     def at(self, cells: Tensor) -> Tensor:
-        """Gradients (..., 2) gx, gy at flat cell indices (...)."""
-        p, q = self.diag.view(-1)[cells], self.anti.view(-1)[cells]
-        return torch.stack([0.5 * (p + q), 0.5 * (p - q)], -1)
+        """Gradients (..., 2) gx, gy at flat cell indices (...); zero in the last row and column and at NaN pixels."""
+        _, height, width = self.shape
+        flat = self.frames.view(-1)
+        x, y = cells % width, (cells // width) % height
+        inside = (x < width - 1) & (y < height - 1)
+        first = torch.where(inside, cells, 0)
+        right, below = torch.where(inside, cells + 1, 0), torch.where(inside, cells + width, 0)
+        diag = flat[torch.where(inside, cells + width + 1, 0)] - flat[first]
+        anti = flat[right] - flat[below]
+        g = torch.stack([0.5 * (diag + anti), 0.5 * (diag - anti)], -1)
+        return torch.where(g.isfinite().all(-1, keepdim=True), g, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,35 +72,45 @@ class Regions:
 def gradient(frames: Tensor) -> Gradient:
     """Gradient and noise threshold of frames (B, h, w) float32 in grey levels (0..255 or more).
 
-    The noise is estimated from the median squared gradient, which edges hardly touch. Cells at a pixel that is NaN or
-    infinite have no gradient.
+    The noise is estimated from the median squared gradient of a sample of the cells, which edges hardly touch; pixels
+    that are NaN or infinite do not count.
     """
     batch, height, width = frames.shape
-    diag, anti = torch.zeros_like(frames), torch.zeros_like(frames)
+    frames = frames.contiguous()
     if frames.numel() == 0:
-        return Gradient(diag, anti, frames.new_full((batch,), _LEAST_LEVEL))
-    torch.sub(frames[:, 1:, 1:], frames[:, :-1, :-1], out=diag[:, :-1, :-1])
-    torch.sub(frames[:, :-1, 1:], frames[:, 1:, :-1], out=anti[:, :-1, :-1])
-    flat = frames.flatten(1)
-    low, high = flat.aminmax(dim=-1)
-    if not bool((high - low).isfinite().all()):
-        for difference in (diag, anti):
-            difference.nan_to_num_(nan=0.0, posinf=0.0, neginf=0.0)
-        finite = flat.isfinite()
-        low, high = flat.where(finite, torch.inf).amin(-1), flat.where(finite, -torch.inf).amax(-1)
+        return Gradient(frames, frames.new_full((batch,), _LEAST_LEVEL))
     stride = max(1, height * width // _NOISE_SAMPLES)
-    p, q = diag.flatten(1)[:, ::stride], anti.flatten(1)[:, ::stride]
-    # (diag^2 + anti^2) / 2 is sigma^2 chi^2_2, whose median is 2 ln 2 sigma^2
-    sigma = ((p.square() + q.square()).median(-1).values / (4 * math.log(2))).sqrt()
+    sample = torch.arange(0, height * width, stride, device=frames.device)
+    start = torch.arange(batch, device=frames.device)[:, None] * (height * width)
+    grad = Gradient(frames, frames.new_zeros(batch))
+    # |gradient|^2 is sigma^2 chi^2_2, whose median is 2 ln 2 sigma^2
+    sigma = (grad.at(start + sample).square().sum(-1).median(-1).values / (2 * math.log(2))).sqrt()
+    grey = frames.view(batch, -1)[:, sample]
+    finite = grey.isfinite()
+    low, high = grey.where(finite, torch.inf).amin(-1), grey.where(finite, -torch.inf).amax(-1)
     threshold = torch.maximum(_NOISE_SIGMAS * sigma, _RANGE_FRACTION * (high - low)).clamp_min(_LEAST_LEVEL)
-    return Gradient(diag, anti, threshold)
+    return Gradient(frames, threshold)
 
 
 def strong_cells(grad: Gradient) -> Tensor:
-    """Flat indices (P,) int64, rising, of the cells whose gradient is above their frame's threshold."""
-    power = grad.diag * grad.diag
-    power.addcmul_(grad.anti, grad.anti)
-    return (power > 2 * grad.threshold.square()[:, None, None]).view(-1).nonzero()[:, 0]
+    """Flat indices (P,) int64, rising, of the cells whose gradient is above their frame's threshold.
+
+    The dense pass is taken over a few frames at a time: what fits the cache is not fetched twice, and the memory of one
+    part serves the next.
+    """
+    batch, height, width = grad.shape
+    if grad.frames.numel() == 0:
+        return torch.zeros(0, dtype=torch.int64, device=grad.frames.device)
+    limit = 2 * grad.threshold.square()[:, None, None]
+    some = max(1, _PART_PIXELS // (height * width))
+    found = []
+    for start in range(0, batch, some):
+        f = grad.frames[start : start + some]
+        power = (f[:, 1:, 1:] - f[:, :-1, :-1]).square_()
+        power.addcmul_(anti := f[:, :-1, 1:] - f[:, 1:, :-1], anti)
+        frame, y, x = ((power > limit[start : start + some]) & (power < torch.inf)).nonzero().unbind(-1)
+        found.append(((frame + start) * height + y) * width + x)
+    return torch.cat(found)
 
 
 def level_line_regions(grad: Gradient, cell: Tensor, min_pixels: int, sectors: int = 0, phase: float = 0.0) -> Regions:
@@ -100,16 +122,23 @@ def level_line_regions(grad: Gradient, cell: Tensor, min_pixels: int, sectors: i
             n sectors neighbours join if their directions fall into the same n-th of the circle: curves break into arcs
             of known turn, and corners part from what they join. phase: fraction of a sector that the first starts at.
     """
-    batch, height, width = grad.diag.shape
+    batch, height, width = grad.shape
+    count = cell.numel()
     g = grad.at(cell)
     unit = g / torch.linalg.vector_norm(g, dim=-1, keepdim=True)
 
-    position = torch.full((batch * height * width + width + 2,), -1, dtype=torch.int32, device=cell.device)
-    position[cell] = torch.arange(cell.numel(), dtype=torch.int32, device=cell.device)
+    # a sparse set (Briggs and Torczon 1993): what the table holds elsewhere is never read as a member, so no fill
+    position = torch.empty(batch * height * width + width + 2, dtype=torch.int32, device=cell.device)
+    position[cell] = torch.arange(count, dtype=torch.int32, device=cell.device)
     # half of the 8-neighbourhood; the last row and column hold no strong cell, so a wrapped index meets none
     step = torch.tensor([1, width - 1, width, width + 1], device=cell.device)
-    neighbour = position[cell[:, None] + step].long()
+    place = cell[:, None] + step
+    neighbour = position[place].long()
     del position
+    known = (neighbour >= 0) & (neighbour < count)
+    if count:
+        known &= cell[neighbour.clamp(0, count - 1)] == place
+    neighbour = torch.where(known, neighbour, -1)
     met = neighbour.clamp_min(0)
     if sectors:
         sector = ((torch.atan2(g[:, 1], g[:, 0]) / (2 * math.pi) + 1) * sectors + phase).long() % sectors
