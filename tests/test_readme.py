@@ -55,9 +55,19 @@ def test_built_in_targets_are_all_named():
 def test_options_exist():
     estimate = typer.main.get_command(app).commands["estimate"]
     options = {name for parameter in estimate.params for name in parameter.opts}
-    section = README[README.index("## Your own images") : README.index("### How a pose")]
+    section = README[README.index("## Your own images") : README.index("### Other commands")]
     named = set(re.findall(r"(?<![\w-])--[a-z-]+", section)) - {"--help"}
     assert {"--camera", "--resume", "--hand-eye"} <= named <= options
+
+
+def test_other_commands_exist_with_their_options():
+    commands = typer.main.get_command(app).commands
+    section = README[README.index("### Other commands") : README.index("### How a pose")]
+    lines = re.findall(r"`torchpose (\w+)([^`]*)`", section)
+    assert {name for name, _ in lines} == set(commands) - {"estimate"}
+    for name, usage in lines:
+        options = {option for parameter in commands[name].params for option in parameter.opts}
+        assert set(re.findall(r"--[a-z-]+", usage)) <= options
 
 
 def test_statuses_and_reasons_are_all_explained():
