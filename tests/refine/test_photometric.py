@@ -99,6 +99,16 @@ def test_a_covered_third_of_a_ring_is_left_out() -> None:
     assert nees(errors(result, r, t), result.covariance).max() < 60
 
 
+def test_quiet_frames_of_another_blur_keep_their_pixels() -> None:
+    """A point-spread function outside the model leaves residuals far above the rounding, but no outliers."""
+    r, t = random_poses(4, 30, (150, 170), seed=8)
+    sharp = render(CAMERA, QUAD, r, t, psf_sigma=0.4, plate=PLATE)
+    spread = torch.nn.functional.avg_pool2d(sharp[:, None], 3, stride=1, padding=1)[:, 0]
+    result = refined(add_noise(0.5 * (sharp + spread), 0.0), r, t)
+    assert (result.kept > 0.9).all()
+    assert errors(result, r, t)[:, :2].abs().max() < 5e-4
+
+
 def test_light_rings_on_dark() -> None:
     dark = Target.load("quad40_dark")
     r, t = random_poses(3, 30, (150, 170), seed=6)

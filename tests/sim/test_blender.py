@@ -68,6 +68,7 @@ def test_what_is_not_modelled_is_an_error(plan, field, old, new):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)  # twelve seconds a frame on one core
 def test_agrees_with_the_analytic_renderer(plan):
     pytest.importorskip("bpy")
     from torchpose.sim.blender import blender

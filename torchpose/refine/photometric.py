@@ -27,6 +27,7 @@ _STEPS = (3, 1)  # of Gauss-Newton, on some of the pixels and on all
 _START_BLUR = 0.8  # px
 _BLUR_RANGE = (0.3, 4.0)
 _CUT = 4.0  # robust standard deviations beyond which a pixel is left out
+_MISFIT = 0.02  # of the contrast: what a point-spread function that is not Gaussian leaves at the edges of quiet frames
 _TILE = 256  # pixels summed in float32 at a time; sums of tiles are float64, so padding changes no digit that counts
 _SECTORS = 48  # of a circle
 _SECTOR_KEPT = 0.9  # of a sector's pixels that must follow the model for it to count
@@ -94,7 +95,7 @@ def refine_photometric(
     for part in (*[coarse] * _STEPS[0], *[blocks] * _STEPS[1]):
         model = ring_model(part, r, t, blur)
         columns = _columns(part, model, levels)
-        weight = _inliers(columns[:, :, -1].flatten(1), part)
+        weight = _inliers(columns[:, :, -1].flatten(1), part, levels)
         if part is blocks:
             weight = weight * _clear_sectors(weight, part, model)
         step, level_step, information, variance = _gauss_newton(columns, weight, blocks.row, rows, known, moved)
@@ -180,8 +181,10 @@ def _spread(residual: Tensor, b: PixelBlocks) -> Tensor:
     return torch.minimum(own, _MOST_SPREAD * least[b.row])
 
 
-def _inliers(residual: Tensor, b: PixelBlocks) -> Tensor:
-    return b.valid * (residual.abs() < _CUT * _spread(residual, b)[:, None])
+def _inliers(residual: Tensor, b: PixelBlocks, levels: Tensor) -> Tensor:
+    contrast = (levels[:, 3] - levels[:, 0]).abs().to(residual.dtype)
+    cut = _CUT * _spread(residual, b) + _MISFIT * contrast
+    return b.valid * (residual.abs() < cut[:, None])
 
 
 def _clear_sectors(weight: Tensor, b: PixelBlocks, m: RingModel) -> Tensor:
