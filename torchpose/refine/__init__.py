@@ -1,6 +1,7 @@
 """Stage: refinement of poses beyond the marker centres."""
 
 from torchpose.refine.edges import refine_edges
-from torchpose.refine.photometric import Refined, refine_photometric
+from torchpose.refine.photometric import refine_photometric
+from torchpose.refine.result import Refined
 
 __all__ = ["Refined", "refine_edges", "refine_photometric"]

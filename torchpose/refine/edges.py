@@ -21,7 +21,7 @@ from torchpose.camera import Camera
 from torchpose.edges import ring_edges
 from torchpose.geometry import rotations
 from torchpose.geometry.segments import segment_mean, segment_sum
-from torchpose.refine.photometric import Refined
+from torchpose.refine.result import Refined
 
 _REACH = 2.0  # px searched to either side of the fitted ellipses
 _CHAIN = 2 * math.sqrt(2) / math.pi  # edge pixels per px of a circle: mean of max(|cos|, |sin|)

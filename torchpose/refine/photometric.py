@@ -12,7 +12,6 @@ Frames and markers are padded blocks of pixels: one sequence of tensor operation
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -20,6 +19,7 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.geometry import rotations
 from torchpose.geometry.segments import segment_sum
+from torchpose.refine.result import Refined
 from torchpose.refine.ring_model import PixelBlocks, RingModel, gather_pixels, ring_model
 
 _COARSE = 4  # the first steps take one pixel of so many; both are whole numbers of tiles
@@ -34,27 +34,6 @@ _SECTOR_KEPT = 0.9  # of a sector's pixels that must follow the model for it to 
 _MOST_SPREAD = 1.5  # of a marker's residuals, in those of the best marker of its frame
 _LEVELS = 6  # ring and paper, each with a constant and a gradient over the plane
 _QUANTISATION = 1 / 12  # variance of rounding, in grey levels^2, below which no noise estimate falls
-
-
-@dataclass(frozen=True, eq=False)
-class Refined:
-    """Refined poses of N rows.
-
-    Attributes:
-        R: (N, 3, 3), t: (N, 3) mm, covariance: (N, 6, 6) as in `results.Poses`.
-        blur: (N,) px, standard deviation of the point-spread function with the pixel.
-        noise: (N,) grey levels, standard deviation of the residuals kept.
-        kept: (N,) fraction of the pixels kept.
-        good: (N,) bool; where False the refinement failed and the other fields mean nothing.
-    """
-
-    R: Tensor
-    t: Tensor
-    covariance: Tensor
-    blur: Tensor
-    noise: Tensor
-    kept: Tensor
-    good: Tensor
 
 
 def refine_photometric(

@@ -1,0 +1,28 @@
+"""What every refinement returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """Refined poses of N rows.
+
+    Attributes:
+        R: (N, 3, 3), t: (N, 3) mm, covariance: (N, 6, 6) as in `results.Poses`.
+        blur: (N,) px, standard deviation of the point-spread function with the pixel.
+        noise: (N,) grey levels, standard deviation of the residuals kept.
+        kept: (N,) fraction of the pixels kept.
+        good: (N,) bool; where False the refinement failed and the other fields mean nothing.
+    """
+
+    R: Tensor
+    t: Tensor
+    covariance: Tensor
+    blur: Tensor
+    noise: Tensor
+    kept: Tensor
+    good: Tensor
