@@ -13,7 +13,6 @@ information off; that of a foreign point-spread function is the bound of a Gauss
 from __future__ import annotations
 
 import argparse
-import csv
 import math
 import sys
 from collections.abc import Callable
@@ -28,6 +27,7 @@ from torch import Tensor
 import torchpose as tp
 from torchpose.analysis import pose_crlb, pose_errors
 from torchpose.geometry import rotations
+from torchpose.io.writers import write_rows
 from torchpose.pipeline import Method
 from torchpose.sim import add_noise, render
 
@@ -258,10 +258,7 @@ def main() -> None:
             rows.append(row)
             print("  ".join(f"{k} {v:.3g}" if isinstance(v, float) else str(v) for k, v in row.items()), flush=True)
     if options.out:
-        with options.out.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, rows[0].keys(), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
+        write_rows(options.out, rows, {name: type(value) for name, value in rows[0].items()})
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ file is the longest error of all. The bound counts rounding as noise of 1/12.
 from __future__ import annotations
 
 import argparse
-import csv
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +22,7 @@ from torch import Tensor
 
 import torchpose as tp
 from torchpose.detect import find_candidates
+from torchpose.io.writers import write_rows
 from torchpose.refine import refine_edges, refine_photometric
 from torchpose.rings import Rings, measure_rings
 from torchpose.sim import add_noise, render
@@ -138,10 +138,7 @@ def main() -> None:
         print(f"{noise:5g}  {limit:8.5f}  {cells}   {published:.4f}", flush=True)
         rows.append({"noise": noise, "seeds": options.seeds, "bound": limit, **found, **worst, **bias})
     if options.out:
-        with options.out.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, rows[0].keys(), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
+        write_rows(options.out, rows, {name: type(value) for name, value in rows[0].items()})
 
 
 if __name__ == "__main__":

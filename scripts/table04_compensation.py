@@ -11,7 +11,6 @@ pixel at which the ring lies drawn at random; RMS length of the error over seeds
 from __future__ import annotations
 
 import argparse
-import csv
 import math
 from pathlib import Path
 
@@ -23,6 +22,7 @@ from torchpose.centers import common_center, compensate
 from torchpose.detect import find_candidates
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import conics, rotations
+from torchpose.io.writers import write_rows
 from torchpose.rings import measure_rings
 from torchpose.sim import add_noise, render
 
@@ -102,10 +102,7 @@ def main() -> None:
             row |= {f"measured_{n}": x for n, x in zip((*names, "paper"), rms, strict=True)}
             rows.append(row)
     if options.out:
-        with options.out.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, rows[0].keys(), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
+        write_rows(options.out, rows, {name: type(value) for name, value in rows[0].items()})
 
 
 if __name__ == "__main__":
