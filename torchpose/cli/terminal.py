@@ -67,6 +67,40 @@ class FrameProgress:
         self._console.print(table)
 
 
+class StudyProgress:
+    """One bar over studies that run one after the other.
+
+    Args:
+        names: of the studies. quiet: show nothing even on a terminal.
+    """
+
+    def __init__(self, names: list[str], *, quiet: bool) -> None:
+        console = Console(stderr=True)
+        self._names = names
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.percentage:.0f} %"),
+            console=console,
+            disable=quiet or not console.is_terminal,
+            transient=True,
+        )
+        self._task = self._progress.add_task("studies", total=len(names))
+
+    def __enter__(self) -> Self:
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._progress.stop()
+
+    def advance(self, name: str, done: float) -> None:
+        """Tells that ``done``, 0 to 1, of the study ``name`` is finished."""
+        self._progress.update(self._task, description=name, completed=self._names.index(name) + done)
+
+
 def _coloured(counts: Counter[str]) -> list[str]:
     return [f"[{STATUS_STYLE.get(status, 'red')}]{status} {count}[/]" for status, count in counts.most_common()]
 

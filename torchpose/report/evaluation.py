@@ -4,37 +4,35 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 
 from torchpose.analysis.evaluation import AXES, UNITS, Evaluation
 from torchpose.errors import ConfigError
+from torchpose.report.figures import COLOURS, GREY, subplots
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from torchpose.sim.truth import Truth
 
-_COLOURS = ("#0072b2", "#d55e00", "#009e73")  # of Okabe and Ito, told apart without red and green
-_GREY = "#666666"
-
 
 def plot_errors(evaluation: Evaluation, title: str) -> Figure:
     """Errors of the six axes over the frames, with the bands that the estimates claim (as Fig. 11 of the paper)."""
-    figure, axes = _figure(2, 3, (13, 6), sharex=True)
+    figure, axes = subplots(2, 3, (13, 6), sharex=True)
     number = torch.arange(len(evaluation.error))
     for i, panel in enumerate(axes.flat):
         error, claimed = evaluation.error[:, i], evaluation.predicted[:, i]
         panel.fill_between(number, -2 * claimed, 2 * claimed, color="#e6e6e6", lw=0)
         if bool(evaluation.bound[:, i].isfinite().any()):
             for sign in (-2, 2):
-                panel.plot(number, sign * evaluation.bound[:, i], color=_GREY, lw=0.6, ls="--")
-        panel.plot(number, error, ".", ms=3, color=_COLOURS[i % 3])
+                panel.plot(number, sign * evaluation.bound[:, i], color=GREY, lw=0.6, ls="--")
+        panel.plot(number, error, ".", ms=3, color=COLOURS[i % 3])
         axis = evaluation.axes[i]
         panel.set_title(f"{AXES[i]}: bias {axis.bias:.3g}, spread {axis.spread:.3g} {UNITS[i]}", fontsize=10)
         panel.set_ylabel(UNITS[i])
-        panel.axhline(0, color=_GREY, lw=0.6)
+        panel.axhline(0, color=GREY, lw=0.6)
         limit = 1.15 * max(_largest(error), 2.2 * _largest(claimed.nanmedian()[None]))
         panel.set_ylim(-limit, limit)
     for panel in axes[1]:
@@ -47,7 +45,7 @@ def plot_errors(evaluation: Evaluation, title: str) -> Figure:
 
 def plot_consistency(evaluation: Evaluation, title: str) -> Figure:
     """Distributions of the errors in their own sigmas and of the NEES, beside what they should be."""
-    figure, axes = _figure(1, 3, (13, 4.2))
+    figure, (axes,) = subplots(1, 3, (13, 4.2))
     z = evaluation.error / evaluation.predicted
     x = torch.linspace(-5, 5, 200, dtype=torch.float64)
     count = max(12, min(40, int(2 * math.sqrt(len(z)))))
@@ -56,8 +54,8 @@ def plot_consistency(evaluation: Evaluation, title: str) -> Figure:
         for i in range(first, first + 3):
             values = z[:, i][z[:, i].isfinite()].clamp(-5, 5)
             density = torch.histc(values, count, -5, 5) * (count / 10 / max(len(values), 1))
-            panel.stairs(density.tolist(), bins, lw=1.5, color=_COLOURS[i % 3], label=AXES[i])
-        panel.plot(x, (-0.5 * x.square()).exp() / math.sqrt(2 * math.pi), color=_GREY, lw=1, label="ideal")
+            panel.stairs(density.tolist(), bins, lw=1.5, color=COLOURS[i % 3], label=AXES[i])
+        panel.plot(x, (-0.5 * x.square()).exp() / math.sqrt(2 * math.pi), color=GREY, lw=1, label="ideal")
         panel.set_xlabel(f"{name} error / claimed sigma")
         panel.legend(frameon=False, fontsize=9)
     axes[0].set_ylabel("density")
@@ -66,7 +64,7 @@ def plot_consistency(evaluation: Evaluation, title: str) -> Figure:
     density = torch.histc(nees.nan_to_num(top).clamp(max=top), count, 0, top) * (count / top / max(len(nees), 1))
     axes[2].stairs(density.tolist(), torch.linspace(0, top, count + 1).tolist(), fill=True, color="#b3cde3")
     s = torch.linspace(0.01, top, 300, dtype=torch.float64)
-    axes[2].plot(s, s.square() * (-s / 2).exp() / 16, color=_GREY, lw=1)  # chi-squared, 6 degrees of freedom
+    axes[2].plot(s, s.square() * (-s / 2).exp() / 16, color=GREY, lw=1)  # chi-squared, 6 degrees of freedom
     low, high = evaluation.nees_interval
     axes[2].set_title(f"mean {evaluation.nees:.2f}; {low:.2f} to {high:.2f} if the covariance is right", fontsize=10)
     axes[2].set_xlabel("NEES (larger ones in the last bin)")
@@ -76,7 +74,7 @@ def plot_consistency(evaluation: Evaluation, title: str) -> Figure:
 
 def plot_conditions(evaluation: Evaluation, truth: Truth, title: str) -> Figure:
     """Lateral, depth and angular error over distance and tilt."""
-    figure, axes = _figure(2, 3, (13, 6.5), sharey="col")
+    figure, axes = subplots(2, 3, (13, 6.5), sharey="col")
     ok = evaluation.error[:, 0].isfinite()
     values = (
         ("lateral, um", evaluation.errors.lateral * 1e3),
@@ -85,7 +83,7 @@ def plot_conditions(evaluation: Evaluation, truth: Truth, title: str) -> Figure:
     )
     tilt = truth.R[:, 2, 2].abs().clamp(max=1).acos().rad2deg()
     for row, (name, condition) in zip(axes, (("distance, mm", truth.t[:, 2]), ("tilt, degrees", tilt)), strict=True):
-        for panel, (label, value), colour in zip(row, values, _COLOURS, strict=True):
+        for panel, (label, value), colour in zip(row, values, COLOURS[:3], strict=True):
             panel.semilogy(condition[ok], value[ok], ".", ms=4, color=colour)
             panel.set_xlabel(name)
             panel.set_ylabel(label)
@@ -114,17 +112,6 @@ def save_plots(evaluation: Evaluation, truth: Truth, folder: Path, title: str) -
             raise ConfigError(f"{path}: --plots: cannot be written ({error.strerror}); choose another folder") from None
         paths.append(path)
     return paths
-
-
-def _figure(rows: int, columns: int, size: tuple[float, float], **options: Any) -> tuple[Figure, Any]:
-    from matplotlib.figure import Figure  # slow to import, and only plots need it
-
-    figure = Figure(size, layout="constrained")  # of its own, without a window or a global state
-    axes = figure.subplots(rows, columns, **options)
-    for panel in axes.flat:
-        panel.spines[["top", "right"]].set_visible(False)
-        panel.grid(alpha=0.25, lw=0.5)
-    return figure, axes
 
 
 def _largest(values: torch.Tensor) -> float:

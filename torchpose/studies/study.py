@@ -1,9 +1,11 @@
-"""What every study returns: tables with their units in the column names, pictures and sentences with figures."""
+"""What every study returns: tables with their units in the column names, pictures, and figures beside the paper's."""
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +16,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Value = float | int | str | bool | None
-Progress = Callable[[float], None]
+Progress = Callable[[float], None]  # told the part that is done, 0 to 1
+RESULT = "result.json"
 
 
 @dataclass(frozen=True)
@@ -33,13 +36,14 @@ class Table:
     rows: list[dict[str, Value]]
     note: str = ""
 
+    @property
     def columns(self) -> list[str]:
         return list(self.rows[0]) if self.rows else []
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture of a study; ``name`` and ``note`` as for tables."""
+    """A picture of a study; ``name``, ``title`` and ``note`` as of tables."""
 
     name: str
     title: str
@@ -47,17 +51,43 @@ class Picture:
     note: str = ""
 
 
+@dataclass(frozen=True)
+class Comparison:
+    """One figure of the paper beside ours and, where there is one, the bound that no method can beat.
+
+    Attributes:
+        what: the quantity and its circumstances. unit: of all three figures, "" for counts and ratios.
+        paper, ours, bound: None where there is none; text where the paper states a claim.
+    """
+
+    what: str
+    unit: str
+    paper: float | str | None
+    ours: float | str | None
+    bound: float | str | None = None
+
+
 @dataclass
 class StudyResult:
-    """Tables, pictures and statements of one study. ``settings``: what the figures depend on (seeds, frames, noise)."""
+    """What one study found.
+
+    Attributes:
+        comparisons: the figures of the paper that the study repeats.
+        statements: sentences with the figures of this run.
+        settings: what the figures depend on (seeds, frames, noise).
+    """
 
     tables: list[Table] = field(default_factory=list)
     pictures: list[Picture] = field(default_factory=list)
+    comparisons: list[Comparison] = field(default_factory=list)
     statements: list[str] = field(default_factory=list)
     settings: dict[str, Any] = field(default_factory=dict)
 
-    def save(self, folder: Path) -> list[Path]:
-        """Writes ``NAME.csv`` for every table and ``NAME.png`` for every picture; returns their paths.
+    def save(self, folder: Path, about: dict[str, Any] | None = None) -> list[Path]:
+        """Writes every table as ``NAME.csv``, every picture as ``NAME.png``, and all but the pictures' pixels as JSON.
+
+        Args:
+            about: further entries of the JSON file, which is written last: where it is, the others are whole.
 
         Raises:
             ConfigError: the folder cannot be written.
@@ -68,14 +98,23 @@ class StudyResult:
             raise ConfigError(f"{folder}: --out: {error.strerror}; choose a folder that can be written") from None
         written = []
         for table in self.tables:
-            path = folder / f"{table.name}.csv"
-            write_rows(path, table.rows, {column: _type(table.rows, column) for column in table.columns()})
-            written.append(path)
+            written.append(folder / f"{table.name}.csv")
+            write_rows(written[-1], table.rows, {column: _type(table.rows, column) for column in table.columns})
         for picture in self.pictures:
-            path = folder / f"{picture.name}.png"
-            with atomic_path(path) as temporary:
-                picture.figure.savefig(temporary, format="png", dpi=130)
-            written.append(path)
+            written.append(folder / f"{picture.name}.png")
+            with atomic_path(written[-1]) as temporary:
+                picture.figure.savefig(temporary, format="png", dpi=110)
+        record = {
+            **(about or {}),
+            "settings": self.settings,
+            "comparisons": [asdict(comparison) for comparison in self.comparisons],
+            "statements": self.statements,
+            "tables": [asdict(table) for table in self.tables],
+            "pictures": [{"name": p.name, "title": p.title, "note": p.note} for p in self.pictures],
+        }
+        written.append(folder / RESULT)
+        with atomic_path(written[-1]) as temporary:
+            temporary.write_text(json.dumps(_finite(record), indent=1, default=str) + "\n", encoding="utf-8")
         return written
 
 
@@ -87,3 +126,12 @@ def _type(rows: list[dict[str, Value]], column: str) -> type:
     """Type of a column: of the values that are there, float where integers and floats mix."""
     types = {type(row[column]) for row in rows if row[column] is not None}
     return types.pop() if len(types) == 1 else float if types == {int, float} else str
+
+
+def _finite(value: Any) -> Any:
+    """The same with None for numbers that JSON does not have."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

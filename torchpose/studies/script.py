@@ -1,0 +1,70 @@
+"""The command line of a study that is run by itself: ``python scripts/fig02_pnp_comparison.py --out out/fig02``."""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import sys
+from pathlib import Path
+from types import ModuleType
+
+from torchpose.errors import ConfigError
+from torchpose.studies.study import StudyResult, Table, Value
+
+_COMMON = ("full", "seed", "progress")
+
+
+def main(study: ModuleType) -> int:
+    """Runs a study, prints its tables and statements, writes its files; the exit code.
+
+    Whole-number parameters of the study's ``run`` besides the common ones become options of their own; left out, they
+    are as ``full`` or not makes them.
+    """
+    parser = argparse.ArgumentParser(description=study.__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, help="folder for tables (.csv) and plots (.png)")
+    parser.add_argument("--full", action="store_true", help="as many seeds and frames as the documented figures have")
+    parser.add_argument("--seed", type=int, default=0)
+    own = [name for name in inspect.signature(study.run).parameters if name not in _COMMON]
+    for name in own:
+        parser.add_argument(f"--{name.replace('_', '-')}", type=int, metavar="N")
+    options = parser.parse_args()
+    try:
+        result = study.run(full=options.full, seed=options.seed, **{name: getattr(options, name) for name in own})
+        show(result)
+        if options.out:
+            for path in result.save(options.out):
+                print(path)
+    except ConfigError as error:
+        print(f"{study.NAME}: error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def show(result: StudyResult) -> None:
+    """Prints tables, comparisons and statements."""
+    for table in result.tables:
+        print(f"\n{table.title}\n\n{text_of(table)}\n")
+        if table.note:
+            print(table.note)
+    if result.comparisons:
+        rows: list[dict[str, Value]] = [
+            {"": c.what, "unit": c.unit, "paper": c.paper, "ours": c.ours, "bound": c.bound} for c in result.comparisons
+        ]
+        print(f"\nBeside the paper\n\n{text_of(Table('', '', rows))}\n")
+    for statement in result.statements:
+        print(f"- {statement}")
+
+
+def text_of(table: Table) -> str:
+    """The table as Markdown."""
+    cells = [table.columns] + [[cell(row[column]) for column in table.columns] for row in table.rows]
+    widths = [max(len(line[i]) for line in cells) for i in range(len(table.columns))]
+    lines = ["| " + " | ".join(text.ljust(w) for text, w in zip(line, widths, strict=True)) + " |" for line in cells]
+    return "\n".join([lines[0], "| " + " | ".join("-" * w for w in widths) + " |", *lines[1:]])
+
+
+def cell(value: Value) -> str:
+    """A value as a reader wants it: four digits, nothing for None and not a number."""
+    if value is None or value != value:
+        return ""
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
