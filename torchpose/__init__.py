@@ -1,12 +1,18 @@
 """torchpose: the pose of concentric-ring targets from one camera image, batched, with covariance."""
 
-from torchpose import ellipse, pnp
-from torchpose.camera import Camera
-from torchpose.errors import ConfigError, FrameError, TorchposeError
-from torchpose.handeye import HandEye
-from torchpose.pipeline import PoseEstimator
-from torchpose.results import Detections, Poses, Reason, Status
-from torchpose.target import Target
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from torchpose import ellipse, pnp
+    from torchpose.camera import Camera
+    from torchpose.errors import ConfigError, FrameError, TorchposeError
+    from torchpose.handeye import HandEye
+    from torchpose.pipeline import PoseEstimator
+    from torchpose.results import Detections, Poses, Reason, Status
+    from torchpose.target import Target
 
 __all__ = [
     "Camera",
@@ -24,3 +30,32 @@ __all__ = [
     "pnp",
 ]
 __version__ = "0.1.0"
+
+_HOME = {
+    "Camera": "camera",
+    "ConfigError": "errors",
+    "Detections": "results",
+    "FrameError": "errors",
+    "HandEye": "handeye",
+    "PoseEstimator": "pipeline",
+    "Poses": "results",
+    "Reason": "results",
+    "Status": "results",
+    "Target": "target",
+    "TorchposeError": "errors",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Imports a public name at its first use: processes that need no torch (the help, the rig's) start in a moment."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in _HOME:
+        return import_module(f"{__name__}.{name}")
+    value = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
