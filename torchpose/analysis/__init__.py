@@ -2,5 +2,18 @@
 
 from torchpose.analysis.crlb import pose_crlb
 from torchpose.analysis.errors import PoseErrors, pose_errors, rms
+from torchpose.analysis.monte_carlo import simulate_frames, simulate_points
+from torchpose.analysis.sensitivity import ErrorBudget, Uncertainty, edge_noise, propagate
 
-__all__ = ["PoseErrors", "pose_crlb", "pose_errors", "rms"]
+__all__ = [
+    "ErrorBudget",
+    "PoseErrors",
+    "Uncertainty",
+    "edge_noise",
+    "pose_crlb",
+    "pose_errors",
+    "propagate",
+    "rms",
+    "simulate_frames",
+    "simulate_points",
+]
