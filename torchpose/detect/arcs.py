@@ -147,7 +147,10 @@ def follow(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor, ro
     Returns:
         (M, 5); NaN where nothing was left to fit.
     """
+    largest = max(grad.shape[1:])
     for _ in range(rounds):
+        # a hairline fits an ellipse of any size: without a limit, its samples would fill the memory
+        ellipses = torch.where(ellipses[:, 2:3] <= largest, ellipses, torch.nan)
         which, xy, normal = perimeter_samples(ellipses)
         band = torch.arange(-_BAND, _BAND + 1, dtype=torch.float64, device=xy.device)
         at = (xy[:, None] + band[:, None] * normal[:, None]).flatten(0, 1)
