@@ -1,114 +1,58 @@
 """A UR robot, driven through a child process so that no call can hang or crash the program that takes the pictures.
 
-Lengths mm, angles rad, poses ``(x, y, z, rx, ry, rz)`` of the tool in the robot base with a rotation vector; the child
-converts to the controller's metres. A protective stop is never unlocked here: a person looks at the robot first.
+Lengths mm, angles rad; a pose is ``(x, y, z, rx, ry, rz)`` of the tool in the robot base, with a rotation vector.
+A protective stop is never unlocked here: a person looks at the robot first.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from enum import StrEnum
+import importlib.util
+import math
+import threading
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import fields
 from types import TracebackType
-from typing import Annotated, Any
+from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+import torch
 
-from torchpose.errors import TorchposeError
-from torchpose.target import Vector
+from torchpose.errors import ConfigError
+from torchpose.geometry import rotations
+from torchpose.rig import dashboard
+from torchpose.rig.robot_link import LinkEnded, LinkError, LinkLate, RobotLink
+from torchpose.rig.robot_settings import Pose, RobotFault, RobotReading, RobotReason, RobotSettings, Settle, Workspace
 
-MAX_SPEED_MM_S = 250.0  # what ISO 10218-1 allows beside people (reduced speed)
-MAX_ACCELERATION_MM_S2 = 1200.0
+__all__ = ["Robot", "RobotFault", "RobotReading", "RobotReason", "RobotSettings", "Settle", "Workspace"]
 
-_FROZEN = ConfigDict(extra="forbid", frozen=True)
-_Positive = Annotated[FiniteFloat, Field(gt=0)]
-
-
-class RobotReason(StrEnum):
-    """Why the robot cannot go on; goes into the manifest and decides nothing but the words of the message."""
-
-    UNREACHABLE = "unreachable"
-    NOT_REMOTE = "not_remote"
-    NOT_READY = "not_ready"
-    REFUSED_SCRIPT = "refused_script"
-    INVALID_POSE = "invalid_pose"
-    OUTSIDE_WORKSPACE = "outside_workspace"
-    PROTECTIVE_STOP = "protective_stop"
-    EMERGENCY_STOP = "emergency_stop"
-    TIMED_OUT = "timed_out"
-    NOT_SETTLED = "not_settled"
-    STALE_STREAM = "stale_stream"
-    CONNECTION_LOST = "connection_lost"
-    CHILD_DIED = "child_died"
-    STOPPED = "stopped"
-
-
-class RobotFault(TorchposeError):
-    """The robot cannot go on. One line with the fix; `reason` is its name."""
-
-    def __init__(self, reason: RobotReason, message: str) -> None:
-        super().__init__(message)
-        self.reason = reason
-
-
-class Workspace(BaseModel):
-    """Box in the robot base that the tool may not leave, mm."""
-
-    model_config = _FROZEN
-    min: Vector
-    max: Vector
-
-
-class Settle(BaseModel):
-    """When a move has arrived: `samples` fresh samples in a row, all within the tolerances of the commanded pose."""
-
-    model_config = _FROZEN
-    samples: Annotated[int, Field(ge=1, le=1000)] = 10
-    tolerance_mm: _Positive = 0.05
-    tolerance_deg: _Positive = 0.02
-    timeout_s: _Positive = 3.0
-
-
-class RobotSettings(BaseModel):
-    """The `robot:` part of a rig file."""
-
-    model_config = _FROZEN
-    host: str
-    tcp: Annotated[list[FiniteFloat], Field(min_length=6, max_length=6)] | None = None
-    workspace: Workspace
-    speed_mm_s: Annotated[FiniteFloat, Field(gt=0, le=MAX_SPEED_MM_S)] = 50.0
-    acceleration_mm_s2: Annotated[FiniteFloat, Field(gt=0, le=MAX_ACCELERATION_MM_S2)] = 200.0
-    settle: Settle = Settle()
-    connect_timeout_s: _Positive = 10.0
-    move_margin_s: _Positive = 3.0
-    frequency_hz: Annotated[FiniteFloat, Field(ge=10, le=500)] = 125.0
-
-
-@dataclass(frozen=True)
-class RobotReading:
-    """One sample of the controller's stream.
-
-    Attributes:
-        pose: tool in the base, mm and rotation vector in rad. joints: rad.
-        robot_time_s: the controller's clock. host_time_s: this machine's clock (Unix time) when the sample was read.
-        robot_mode, safety_mode, safety_bits, runtime_state: as the controller numbers them.
-    """
-
-    pose: tuple[float, float, float, float, float, float]
-    joints: tuple[float, float, float, float, float, float]
-    robot_time_s: float
-    host_time_s: float
-    robot_mode: int
-    safety_mode: int
-    safety_bits: int
-    runtime_state: int
+STOP_S = 0.2  # within which `stop` returns
+_CLOSE_S = 3.0
+_CALL_S = 3.0  # for a request that the controller answers at once
+_STOPPED_STATES = (0, 1)  # of runtime_state: stopping, stopped
+# safety_status_bits of the RTDE guide, the most telling first
+_SAFETY = (
+    (0b1110_0000, RobotReason.EMERGENCY_STOP, "is in emergency stop; release the button and start the robot there"),
+    (
+        0b0000_0100,
+        RobotReason.PROTECTIVE_STOP,
+        "is in protective stop; see what it touched and unlock it at the pendant",
+    ),
+    (0b0001_0000, RobotReason.SAFETY_STOP, "is in safeguard stop; close the guard and reset it"),
+    (0b111_0000_1000, RobotReason.SAFETY_STOP, "is in a safety fault or recovery; see the log at the pendant"),
+)
+_SAFETY_WORDS = {"PROTECTIVE_STOP": 0b100, "SAFEGUARD_STOP": 0b1_0000, "EMERGENCY_STOP": 0b1000_0000}
 
 
 class Robot:
-    """Connection to one robot, for use in a ``with`` block."""
+    """One robot, for use in a ``with`` block: `preflight` first, then `move` and `read`, `close` at the end.
+
+    Every method ends within a deadline. After a fault other than a rejected pose the robot has been told to stop.
+    """
 
     def __init__(self, settings: RobotSettings) -> None:
         self.settings = settings
+        self._link: RobotLink | None = None
+        self._stopped = threading.Event()
 
     def __enter__(self) -> Robot:
         return self
@@ -116,24 +60,260 @@ class Robot:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self.close()
 
-    def preflight(self) -> dict[str, Any]:
-        """Looks at the robot before anything moves, and connects."""
-        raise NotImplementedError
+    def preflight(self, poses: Iterable[Sequence[float]] = ()) -> dict[str, Any]:
+        """Looks at the robot, connects and asks whether all poses can be reached, before anything moves.
 
-    def check(self, pose: Sequence[float]) -> tuple[float, ...]:
-        """The pose as a tuple, or a `RobotFault` when it is not six finite numbers within the workspace."""
-        raise NotImplementedError
+        Args:
+            poses: every pose of the plan.
+
+        Returns:
+            host, model, serial, polyscope, robot_mode, safety_status, remote (None where the controller cannot say),
+            tcp_offset (mm, rad), pose (mm, rad), emulated (the controller is torchpose's twin).
+
+        Raises:
+            RobotFault: whatever is in the way. ConfigError: ur-rtde is not installed.
+        """
+        plan = [self.check(pose) for pose in poses]
+        if importlib.util.find_spec("rtde_control") is None:
+            raise ConfigError("ur-rtde: package: is not installed; pip install 'torchpose[rig]'")
+        report = self._look()
+        self.close()
+        self._link = RobotLink()
+        limit, frequency = self.settings.connect_timeout_s, self.settings.frequency_hz
+        self._call("connect", limit, host=self.settings.host, frequency_hz=frequency)
+        tcp = self._call("upload", limit, frequency_hz=frequency, tcp=self.settings.tcp)
+        reading = self.read()
+        self._require_inside(reading.pose, "the tool stands")
+        for number, pose in enumerate(plan):
+            if not self._call("is_reachable", _CALL_S, pose=pose):
+                where = ", ".join(f"{v:.6g}" for v in pose)
+                self._raise_if_stopped()
+                raise self._fault(
+                    RobotReason.UNREACHABLE_POSE,
+                    f"pose {number} of the plan ({where}) is beyond its reach or safety limits; move the plan",
+                )
+        return {**report, "tcp_offset": tcp, "pose": list(reading.pose)}
+
+    def check(self, pose: Sequence[float]) -> Pose:
+        """The pose as six floats (mm, rad).
+
+        Raises:
+            RobotFault: it is not six finite numbers (`invalid_pose`) or leaves the workspace (`outside_workspace`).
+        """
+        try:
+            numbers = tuple(float(v) for v in pose)
+        except (TypeError, ValueError):
+            numbers = ()
+        if len(numbers) != 6 or not all(map(math.isfinite, numbers)):
+            raise self._fault(RobotReason.INVALID_POSE, f"pose {pose!r}: give six finite numbers x, y, z, rx, ry, rz")
+        x, y, z, rx, ry, rz = numbers
+        self._require_inside((x, y, z, rx, ry, rz), "the commanded pose lies", slack_mm=0.0)
+        return x, y, z, rx, ry, rz
 
     def read(self, fresh: int = 1) -> RobotReading:
-        """A sample that is at least `fresh` samples younger than this call."""
-        raise NotImplementedError
+        """The state of the robot after `fresh` more samples have come in.
+
+        The stream lags by a sample or two: ask for more than one where the robot has just moved.
+
+        Raises:
+            RobotFault: the stream has stopped or the connection is lost, or the robot is not in normal operation.
+        """
+        return _reading(self._state(fresh))
 
     def move(self, pose: Sequence[float]) -> RobotReading:
-        """Moves the tool on a straight line and returns the last sample of the settled robot."""
-        raise NotImplementedError
+        """Moves the tool on a straight line, waits until it has settled, and returns the last reading.
 
-    def stop(self) -> None:
-        """Stops the robot now; for a signal handler or another thread while `move` runs."""
+        Raises:
+            RobotFault: with the robot told to stop, except where the pose was rejected before anything was sent.
+        """
+        goal = self.check(pose)
+        state = self._state()
+        self._require_inside(_reading(state).pose, "the tool stands")
+        try:
+            self._travel(goal, state)
+            return self._settle(goal)
+        except BaseException:  # KeyboardInterrupt too: nothing may leave a moving robot behind
+            dashboard.stop(self.settings.host, STOP_S)
+            raise
+
+    def stop(self) -> bool:
+        """Stops the robot now and for good; whether the controller confirmed it. Returns within 0.2 s.
+
+        May be called from a signal handler or another thread; a running `move` then raises `RobotFault` (`stopped`).
+        """
+        self._stopped.set()
+        return dashboard.stop(self.settings.host, STOP_S)
 
     def close(self) -> None:
-        """Stops the script, disconnects and ends the child; never hangs."""
+        """Ends the program on the robot, disconnects and ends the child process; never hangs."""
+        link, self._link = self._link, None
+        if link is not None:
+            dashboard.stop(self.settings.host, STOP_S)
+            link.close(_CLOSE_S)
+
+    # the steps of preflight and move
+
+    def _look(self) -> dict[str, Any]:
+        """What the dashboard says, before the robot is touched."""
+        host, limit = self.settings.host, self.settings.connect_timeout_s
+        questions = ["get robot model", "get serial number", "PolyscopeVersion", "robotmode", "safetystatus"]
+        try:
+            answers = dashboard.ask(host, [*questions, "is in remote control"], limit)
+        except TimeoutError:
+            raise self._fault(
+                RobotReason.TIMED_OUT,
+                f"does not answer within {limit:g} s; check the address and restart the controller",
+            ) from None
+        except OSError as error:
+            text = error.strerror or str(error)
+            raise self._fault(
+                RobotReason.UNREACHABLE, f"cannot be reached ({text}); check address, cable and power"
+            ) from None
+        model, serial, polyscope, mode, safety, remote = (a.split(": ", 1)[-1] for a in answers)
+        self._require_safe(next((bit for word, bit in _SAFETY_WORDS.items() if safety.endswith(word)), 0))
+        if safety not in ("NORMAL", "REDUCED"):
+            raise self._fault(RobotReason.NOT_READY, f"has the safety status {safety}; see the pendant")
+        if mode != "RUNNING":
+            raise self._fault(RobotReason.NOT_READY, f"is in the mode {mode}; switch it on and release its brakes")
+        if remote == "false":
+            raise self._fault(RobotReason.NOT_REMOTE, "is in local control; switch it to remote control at the pendant")
+        return {
+            "host": host,
+            "model": model,
+            "serial": serial,
+            "polyscope": polyscope,
+            "robot_mode": mode,
+            "safety_status": safety,
+            "remote": True if remote == "true" else None,
+            "emulated": "torchpose twin" in model,
+        }
+
+    def _travel(self, goal: Pose, state: dict[str, Any]) -> None:
+        """Sends the move and waits until the controller reports its end."""
+        s, before = self.settings, state["move_changes"]
+        # the slider at the pendant slows the robot down; the controller takes the same number as m/s and rad/s
+        distance, turn = _distance(state["pose"], goal)
+        path = max(distance, 1e3 * turn)
+        expected = path / s.speed_mm_s + s.speed_mm_s / s.acceleration_mm_s2
+        limit = expected / max(state["speed_fraction"], 0.01) + s.move_margin_s
+        deadline = time.monotonic() + limit
+        if not self._call("move", _CALL_S, pose=goal, speed_mm_s=s.speed_mm_s, acceleration_mm_s2=s.acceleration_mm_s2):
+            self._raise_if_stopped()
+            self._state(fresh=2)  # a safety stop or the end of the program explains it
+            raise self._fault(RobotReason.PROGRAM_STOPPED, "does not take the move; see the log at the pendant")
+        while state["move_changes"] == before or state["move_running"]:
+            if time.monotonic() > deadline:
+                raise self._fault(
+                    RobotReason.TIMED_OUT,
+                    f"has not finished a move of {_words(distance, turn)} within {limit:.3g} s; "
+                    "see what slows it down, or raise move_margin_s",
+                )
+            state = self._state()
+            if state["runtime_state"] in _STOPPED_STATES:
+                raise self._fault(RobotReason.PROGRAM_STOPPED, "has ended the program; see the log at the pendant")
+
+    def _settle(self, goal: Pose) -> RobotReading:
+        """Waits for enough samples in a row at the goal."""
+        rule = self.settings.settle
+        deadline, good = time.monotonic() + rule.timeout_s, 0
+        while True:
+            reading = self.read()
+            distance, turn = _distance(reading.pose, goal)
+            good = good + 1 if distance <= rule.tolerance_mm and math.degrees(turn) <= rule.tolerance_deg else 0
+            if good >= rule.samples:
+                return reading
+            if time.monotonic() > deadline:
+                raise self._fault(
+                    RobotReason.NOT_SETTLED,
+                    f"stands {_words(distance, turn)} from the commanded pose {rule.timeout_s:g} s after the move; "
+                    "check the tool offset and the payload, or widen settle",
+                )
+
+    # faults
+
+    def _fault(self, reason: RobotReason, what: str) -> RobotFault:
+        return RobotFault(reason, f"robot {self.settings.host}: {what}")
+
+    def _raise_if_stopped(self) -> None:
+        if self._stopped.is_set():
+            raise self._fault(RobotReason.STOPPED, "was stopped; start anew")
+
+    def _require_safe(self, bits: int) -> None:
+        for mask, reason, what in _SAFETY:
+            if bits & mask:
+                raise self._fault(reason, what)
+
+    def _require_inside(self, pose: Pose, what: str, slack_mm: float | None = None) -> None:
+        slack = self.settings.settle.tolerance_mm if slack_mm is None else slack_mm
+        box = self.settings.workspace
+        for axis, value, low, high in zip("xyz", pose, box.min, box.max, strict=False):
+            if not low - slack <= value <= high + slack:
+                raise self._fault(
+                    RobotReason.OUTSIDE_WORKSPACE,
+                    f"{what} at {axis} = {value:.6g} mm, outside the workspace ({low:g} to {high:g} mm); "
+                    "change the pose or the workspace",
+                )
+
+    def _state(self, fresh: int = 1) -> dict[str, Any]:
+        """The child's state after `fresh` more samples, with safety looked at."""
+        self._raise_if_stopped()
+        state: dict[str, Any] = self._call("read", _CALL_S + fresh / self.settings.frequency_hz, fresh=fresh)
+        self._raise_if_stopped()
+        self._require_safe(state["safety_bits"])
+        return state
+
+    def _call(self, name: str, timeout_s: float, **arguments: Any) -> Any:
+        """A request to the child; its failures as faults."""
+        self._raise_if_stopped()
+        if self._link is None:
+            raise self._fault(RobotReason.CONNECTION_LOST, "is not connected; call preflight first")
+        try:
+            return self._link.call(name, timeout_s, **arguments)
+        except LinkError as error:
+            raise self._diagnose(name, timeout_s, error) from None
+
+    def _diagnose(self, name: str, timeout_s: float, error: LinkError) -> RobotFault:
+        """The fault behind a failed request; the robot is told to stop, the child ends."""
+        halted = dashboard.stop(self.settings.host, STOP_S)
+        if self._link is not None:
+            self._link.kill()
+        if self._stopped.is_set():
+            return self._fault(RobotReason.STOPPED, "was stopped; start anew")
+        text, restart = str(error), "restart the session"
+        if name == "upload" and "remote control" in text:
+            return self._fault(
+                RobotReason.NOT_REMOTE, "is in local control; switch it to remote control at the pendant"
+            )
+        if name == "upload" and "already in use" in text:
+            return self._fault(
+                RobotReason.REGISTERS_IN_USE,
+                "has its input registers in use; switch EtherNet/IP, PROFINET and MODBUS off",
+            )
+        if name == "upload" and not isinstance(error, LinkEnded):
+            return self._fault(
+                RobotReason.REFUSED_SCRIPT, f"did not start the control script ({text}); see the log at the pendant"
+            )
+        if error.reason == RobotReason.STALE_STREAM:
+            return self._fault(RobotReason.STALE_STREAM, f"sends no new readings; check the network, {restart}")
+        if error.reason == RobotReason.CONNECTION_LOST or (isinstance(error, LinkEnded) and not halted):
+            return self._fault(RobotReason.CONNECTION_LOST, f"has gone from the network; check it, {restart}")
+        if isinstance(error, LinkLate):
+            return self._fault(RobotReason.TIMED_OUT, f"{text}; check the controller, {restart}")
+        if isinstance(error, LinkEnded):
+            return self._fault(RobotReason.CHILD_DIED, f"the process that talks to it has ended ({text}); {restart}")
+        return self._fault(RobotReason.CONNECTION_LOST, f"{name} failed ({text}); check the controller, {restart}")
+
+
+def _distance(a: Sequence[float], b: Sequence[float]) -> tuple[float, float]:
+    """mm and rad between two poses."""
+    ra, rb = rotations.exp(torch.tensor([list(a[3:]), list(b[3:])], dtype=torch.float64))
+    return math.dist(a[:3], b[:3]), float(rotations.angle_between(ra, rb))
+
+
+def _words(distance_mm: float, turn: float) -> str:
+    return f"{distance_mm:.3g} mm and {math.degrees(turn):.3g} deg"
+
+
+def _reading(state: dict[str, Any]) -> RobotReading:
+    values = {field.name: state[field.name] for field in fields(RobotReading)}
+    return RobotReading(**{**values, "pose": tuple(state["pose"]), "joints": tuple(state["joints"])})

@@ -1,0 +1,164 @@
+"""The digital twin of a UR controller: starts its process, makes faults in it, asks it for the truth.
+
+By hand: ``python -m torchpose.rig.twin.controller --host 127.0.0.2``; ur-rtde's clients then connect to that host.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import queue
+import socket
+import threading
+from collections.abc import Sequence
+from types import TracebackType
+from typing import IO, Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+
+from torchpose.errors import ConfigError
+from torchpose.rig.processes import start_module
+from torchpose.rig.twin.machine import Fault
+
+__all__ = ["START_POSE", "Fault", "TwinController", "TwinErrors"]
+
+START_POSE = (400.0, 0.0, 300.0, 3.141592653589793, 0.0, 0.0)  # mm, rad: in front of the base, tool downwards
+_START_S = 20.0  # a loaded machine may take long to start Python
+_ANSWER_S = 5.0
+
+_NotNegative = Annotated[FiniteFloat, Field(ge=0)]
+
+
+class TwinErrors(BaseModel):
+    """How the simulated robot deviates from an ideal one; part of a twin file.
+
+    `repeatability_mm` and `repeatability_deg` are standard deviations by axis of the true pose about the reported one,
+    drawn anew for every move. `scale` stretches true displacements from the start relative to reported ones.
+    `reading_noise_mm` is the standard deviation by axis of every reported position.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    repeatability_mm: _NotNegative = 0.0
+    repeatability_deg: _NotNegative = 0.0
+    scale: FiniteFloat = 0.0
+    reading_noise_mm: _NotNegative = 0.0
+
+
+class TwinController:
+    """A running twin, for use in a ``with`` block.
+
+    Args:
+        host: loopback address; its ports 30003, 30004 and 29999 must be free.
+        faults: present from the start. start_pose: tool in the base, mm and rotation vector in rad.
+        errors: of the robot. seed: of their random numbers.
+
+    Raises:
+        ConfigError: the address or one of its ports cannot be used.
+    """
+
+    def __init__(
+        self,
+        host: str = "127.0.0.2",
+        faults: Sequence[Fault | str] = (),
+        start_pose: Sequence[float] = START_POSE,
+        errors: TwinErrors | None = None,
+        seed: int = 0,
+    ) -> None:
+        self.host = host
+        setup = {
+            "host": host,
+            "faults": [Fault(fault).value for fault in faults],
+            "start_pose": list(start_pose),
+            "errors": (errors or TwinErrors()).model_dump(),
+            "seed": seed,
+        }
+        self._process = start_module("torchpose.rig.twin.server", json.dumps(setup))
+        self._lock = threading.Lock()
+        lines: queue.Queue[str] = queue.Queue()
+        assert self._process.stdout is not None
+        threading.Thread(target=_read_line, args=(self._process.stdout, lines), daemon=True).start()
+        try:
+            ready = json.loads(lines.get(timeout=_START_S) or '{"error": "its process ended"}')
+        except queue.Empty:
+            ready = {"error": f"it did not start within {_START_S:g} s"}
+        if "error" in ready:
+            self._process.kill()
+            self._process.communicate()
+            raise ConfigError(
+                f"{host}: twin: cannot serve there ({ready['error']}); end the other twin or give another 127.0.0.x"
+            )
+        self._socket = socket.create_connection((host, ready["port"]), _ANSWER_S)
+        self._answers = self._socket.makefile("r", encoding="utf-8")
+
+    def __enter__(self) -> TwinController:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()
+
+    @property
+    def pid(self) -> int:
+        """Number of its process."""
+        return self._process.pid
+
+    def _ask(self, **request: Any) -> dict[str, Any]:
+        with self._lock:
+            self._socket.sendall(json.dumps(request).encode() + b"\n")
+            answer = self._answers.readline()
+        if not answer:
+            raise ConnectionError(f"{self.host}: the twin has ended")
+        result: dict[str, Any] = json.loads(answer)
+        return result
+
+    def inject(self, fault: Fault | str, at_fraction: float | None = None) -> None:
+        """Makes a fault, now or at a share (0 to 1) of the path of the present or the next move."""
+        try:
+            self._ask(do="inject", fault=Fault(fault).value, at_fraction=at_fraction)
+        except ConnectionError:
+            if fault != Fault.KILL:
+                raise
+
+    def clear(self) -> None:
+        """Normal operation again, as after a person has cleared the fault at the pendant; no program runs."""
+        self._ask(do="clear")
+
+    def state(self) -> dict[str, Any]:
+        """Where it stands and what has happened.
+
+        Keys: pose and true_pose (mm, rad), moving, fraction (of the path), program (running), safety, faults, moves
+        (how many were begun), unlocks (how often somebody unlocked a protective stop).
+        """
+        return self._ask(do="state")
+
+    def true_pose(self) -> tuple[float, ...]:
+        """Where the tool really is in the base now: mm and rotation vector in rad."""
+        return tuple(self.state()["true_pose"])
+
+    def close(self) -> None:
+        """Ends its process."""
+        self._answers.close()
+        self._socket.close()
+        self._process.kill()
+        self._process.communicate()
+
+
+def _read_line(stream: IO[str], lines: queue.Queue[str]) -> None:
+    lines.put(stream.readline())
+
+
+def main() -> None:
+    """Runs a twin until Ctrl-C."""
+    parser = argparse.ArgumentParser(prog="python -m torchpose.rig.twin.controller", description=main.__doc__)
+    parser.add_argument("--host", default="127.0.0.2", help="loopback address to serve on")
+    parser.add_argument("--start-pose", type=float, nargs=6, default=START_POSE, help="x y z in mm, rx ry rz in rad")
+    arguments = parser.parse_args()
+    with TwinController(arguments.host, start_pose=arguments.start_pose) as twin:
+        print(f"a UR controller's twin answers at {twin.host}; Ctrl-C ends it")
+        try:
+            threading.Event().wait()
+        except KeyboardInterrupt:
+            return
+
+
+if __name__ == "__main__":
+    main()
