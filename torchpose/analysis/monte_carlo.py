@@ -17,6 +17,8 @@ from torchpose.sim import add_noise, render
 from torchpose.sim.shapes import plane_axes
 from torchpose.target import Target
 
+_FRAMES = 16  # estimated at a time
+
 
 def simulate_points(
     camera: Camera,
@@ -93,18 +95,25 @@ def simulate_frames(
     Args:
         uncertainty: its ``image`` is not used: ``noise`` grey levels of every pixel and ``bits`` are.
         imaging: of `torchpose.sim.render` (``psf_sigma``, ``dark``, ``light``, ``plate``).
+
+    Raises:
+        ConfigError: a drawn print is no valid target any more: its uncertainty is too large for the target's rings.
     """
     generator = torch.Generator().manual_seed(seed)
     cameras = _draw_cameras(camera, uncertainty, draws, generator)
     centers, radii = _draw_prints(target, uncertainty, draws, generator)
     estimator = PoseEstimator(replace(camera, covariance=None), target, method=method)
-    errors = torch.full((draws, t.shape[0], 6), torch.nan, dtype=torch.float64)
-    for draw, true in enumerate(cameras):
-        printed = replace(target, centers=centers[draw], radii=radii[draw])
-        index = draw * t.shape[0] + torch.arange(t.shape[0])
-        poses = estimator(add_noise(render(true, printed, R, t, **imaging), noise, seed, index=index, bits=bits))
-        errors[draw] = _errors(poses.R, poses.t, R, t)
-    return errors
+    together = max(1, _FRAMES // t.shape[0])
+    errors = []
+    for first in range(0, draws, together):
+        chunk = range(first, min(first + together, draws))
+        prints = [replace(target, centers=centers[draw], radii=radii[draw]) for draw in chunk]
+        frames = [render(cameras[d], printed, R, t, **imaging) for d, printed in zip(chunk, prints, strict=True)]
+        index = first * t.shape[0] + torch.arange(len(chunk) * t.shape[0])
+        poses = estimator(add_noise(torch.cat(frames), noise, seed, index=index, bits=bits))
+        shape = (len(chunk), t.shape[0])
+        errors.append(_errors(poses.R.unflatten(0, shape), poses.t.unflatten(0, shape), R, t))
+    return torch.cat(errors)
 
 
 def _draw_cameras(camera: Camera, u: Uncertainty, draws: int, generator: torch.Generator) -> list[Camera]:
