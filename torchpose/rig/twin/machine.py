@@ -39,6 +39,7 @@ class Fault(StrEnum):
     KILL = "kill"  # the process ends at once
     STALL = "stall"  # the stream sends nothing more, its sockets stay open
     SILENT = "silent"  # connections are accepted and never answered
+    SILENT_STREAM = "silent_stream"  # those of the stream only; the dashboard answers
     NOT_REMOTE = "not_remote"
     REFUSE_SCRIPT = "refuse_script"
     REGISTERS_IN_USE = "registers_in_use"  # a fieldbus owns the input registers
