@@ -77,7 +77,7 @@ def test_tool_offset_changes_the_reported_pose_but_not_the_flange() -> None:
     assert not m.reachable(np.array([0.90, 0, 0.0, math.pi, 0, 0]))
 
 
-@pytest.mark.parametrize("fault", [Fault.PROTECTIVE_STOP, Fault.EMERGENCY_STOP])
+@pytest.mark.parametrize("fault", [Fault.PROTECTIVE_STOP, Fault.SAFEGUARD_STOP, Fault.EMERGENCY_STOP])
 def test_safety_stop_brakes_at_its_place_on_the_path(fault: Fault) -> None:
     m = machine()
     m.inject(fault, 0.4, 0.0)
@@ -87,7 +87,7 @@ def test_safety_stop_brakes_at_its_place_on_the_path(fault: Fault) -> None:
     x = m.pose(end + 1)[0] - START[0]
     assert 0.04 <= x <= 0.04 + 0.1 * 0.004 + 0.1**2 / (2 * 5.0) + 1e-9  # the fraction, one tick, the braking distance
     assert m.safety is Safety[fault.name]
-    assert m.value("safety_status_bits", end) & (1 << 2 | 1 << 7)
+    assert m.value("safety_status_bits", end) & (1 << 2 | 1 << 4 | 1 << 7)
     assert m.value("robot_mode", end) == (3 if fault is Fault.EMERGENCY_STOP else 7)
     m.clear()
     assert (m.safety, m.program) == (Safety.NORMAL, False)

@@ -173,14 +173,21 @@ def test_moves_settle_and_readings_are_fresh(twin: TwinController) -> None:
 
 
 @needs_ur_rtde
-@pytest.mark.parametrize("fault", [Fault.PROTECTIVE_STOP, Fault.EMERGENCY_STOP])
-def test_safety_stop_in_mid_move(robot: Robot, twin: TwinController, fault: Fault) -> None:
+@pytest.mark.parametrize(
+    ("fault", "reason"),
+    [
+        (Fault.PROTECTIVE_STOP, RobotReason.PROTECTIVE_STOP),
+        (Fault.SAFEGUARD_STOP, RobotReason.SAFETY_STOP),
+        (Fault.EMERGENCY_STOP, RobotReason.EMERGENCY_STOP),
+    ],
+)
+def test_safety_stop_in_mid_move(robot: Robot, twin: TwinController, fault: Fault, reason: RobotReason) -> None:
     twin.inject(fault, at_fraction=0.4)
-    with fault_within(1.5, RobotReason(fault.value)):
+    with fault_within(1.5, reason):
         robot.move(FAR)
-    with fault_within(1.0, RobotReason(fault.value)):  # nothing has been unlocked, nothing moves again
+    with fault_within(1.0, reason):  # nothing has been unlocked, nothing moves again
         robot.move(FAR)
-    with fault_within(1.0, RobotReason(fault.value)):
+    with fault_within(1.0, reason):
         Robot(robot.settings).preflight()
     state = twin.state()
     assert 0.4 <= state["fraction"] < 0.5
