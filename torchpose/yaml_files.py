@@ -139,6 +139,12 @@ def read_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
     return parse_mapping(read_text(path), path)
 
 
+def beside(path: Path, name: str) -> str:
+    """What the configuration file ``path`` calls ``name``: relative to it, or else a name of its own (built-in)."""
+    file = path.parent / name
+    return str(file) if file.with_name(file.name.split("#")[0]).exists() or "/" in name else name
+
+
 def suggest(key: str, allowed: typing.Iterable[str]) -> str:
     """The fix for an unknown name: the nearest of the allowed ones, or all of them."""
     allowed = list(allowed)

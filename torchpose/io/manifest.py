@@ -45,7 +45,7 @@ def read_manifest(path: Path) -> list[ManifestFrame]:
     ids: set[Any] = set()
     images: set[str] = set()
     millimetres: float | None = None
-    for number, record in _records(path):
+    for number, record in read_records(path):
         where = f"{path}: line {number}"
         if record.get("record") == "session":
             millimetres = _unit(record, where)
@@ -66,8 +66,12 @@ def read_manifest(path: Path) -> list[ManifestFrame]:
     return frames
 
 
-def _records(path: Path) -> list[tuple[int, dict[str, Any]]]:
-    """Line numbers and objects of a file of JSON lines, without a torn last line."""
+def read_records(path: Path) -> list[tuple[int, dict[str, Any]]]:
+    """Line numbers and objects of a file of JSON lines, without a torn last line.
+
+    Raises:
+        ConfigError: the file cannot be read, or a line is not a JSON object.
+    """
     try:
         lines = path.read_bytes().split(b"\n")
     except OSError as error:

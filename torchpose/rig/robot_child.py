@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 import os
 import sys
-import threading
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -38,21 +37,18 @@ class Driver:
         self.receive: Any = None
         self.control: Any = None
 
-    def load(self) -> None:
-        """Imports ur-rtde, so that the deadlines of connecting count the robot's time alone."""
-        import rtde_control
-        import rtde_receive
-
-        self.rtde_control, self.rtde_receive = rtde_control, rtde_receive
-
     def connect(self, host: str, frequency_hz: float) -> None:
         """Opens the stream of readings."""
+        import rtde_receive
+
         self.host = host
-        self.receive = self.rtde_receive.RTDEReceiveInterface(host, frequency_hz, VARIABLES)
+        self.receive = rtde_receive.RTDEReceiveInterface(host, frequency_hz, VARIABLES)
 
     def upload(self, frequency_hz: float, tcp: Sequence[float] | None) -> list[float]:
         """Uploads and starts the control script, sets the tool; the tool offset that is active then."""
-        self.control = self.rtde_control.RTDEControlInterface(self.host, frequency_hz)
+        import rtde_control
+
+        self.control = rtde_control.RTDEControlInterface(self.host, frequency_hz)
         if tcp is not None and not self.control.setTcp(_metres(tcp)):
             raise RuntimeError("the tool offset was not taken")
         return _millimetres(self.control.getTCPOffset())
@@ -101,13 +97,10 @@ class Driver:
         return bool(self.control.isPoseWithinSafetyLimits(_metres(pose)))
 
     def close(self) -> None:
-        """Disconnects both interfaces; each waits half a second in there."""
-        interfaces = [interface for interface in (self.control, self.receive) if interface is not None]
-        threads = [threading.Thread(target=interface.disconnect) for interface in interfaces]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
+        """Disconnects."""
+        for interface in (self.control, self.receive):
+            if interface is not None:
+                interface.disconnect()
 
 
 def _metres(pose: Sequence[float]) -> list[float]:
@@ -119,21 +112,21 @@ def _millimetres(pose: Sequence[float]) -> list[float]:
 
 
 def main() -> None:
-    """Answers ``{"call": NAME, "id": N, ...}`` with ``{"result": ...}``, ``{"reason": ...}`` or ``{"error": ...}``."""
+    """Answers ``{"call": NAME, ...arguments}`` with ``{"result": ...}``, ``{"reason": ...}`` or ``{"error": ...}``."""
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # ur-rtde prints to standard output
     driver = Driver()
     for line in sys.stdin:
         request = json.loads(line)
-        call, number = request.pop("call"), request.pop("id")
+        call = request.pop("call")
         method: Callable[..., Any] = getattr(driver, call)
         try:
-            answer: dict[str, Any] = {"result": method(**request)}
+            answer = {"result": method(**request)}
         except StreamError as error:
             answer = {"reason": str(error)}
         except Exception as error:
             answer = {"error": " ".join(str(error).split())}
-        answers.write(json.dumps({"id": number, **answer}) + "\n")
+        answers.write(json.dumps(answer) + "\n")
         if call == "close":
             os._exit(0)  # destructors of ur-rtde have aborted here
     if driver.control is not None:

@@ -18,7 +18,7 @@ from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.sim.truth import Truth, read_truth
 from torchpose.target import Target
-from torchpose.yaml_files import read_yaml, validate
+from torchpose.yaml_files import beside, read_yaml, validate
 
 _FROZEN = ConfigDict(extra="forbid", frozen=True)
 _HALTON_BASES = (2, 3, 5, 7, 11, 13)
@@ -243,8 +243,8 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
     """
     path = Path(path)
     file = validate(PlanFile, read_yaml(path), path)
-    camera = Camera.load(_beside(path, file.camera))
-    target = Target.load(_beside(path, file.target))
+    camera = Camera.load(beside(path, file.camera))
+    target = Target.load(beside(path, file.target))
     generator = torch.Generator().manual_seed(file.seed % 2**63)
     if file.depth_range is not None and not 0 < file.depth_range[0] < file.depth_range[1]:
         raise ConfigError(f"{path}: depth_range: {file.depth_range} is not 0 < near < far; correct it")
@@ -332,7 +332,7 @@ def _poses(path: Path, file: PlanFile, camera: Camera, target: Target) -> tuple[
         turns = [math.radians(angle) * eye[axis] for axis in range(3) for angle in axes.turns_deg]
         shift, turn = torch.stack(moves + [still] * len(turns)), torch.stack([still] * len(moves) + turns)
         return rotations.exp(turn) @ _euler(_floats([axes.rotation_deg]).deg2rad())[0], _floats(axes.start) + shift
-    listed: Truth = read_truth(_beside(path, str(file.poses.file)))
+    listed: Truth = read_truth(beside(path, str(file.poses.file)))
     return listed.R, listed.t
 
 
@@ -394,16 +394,9 @@ def _floats(values: Any) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
-def _beside(path: Path, name: str) -> str:
-    """A file that a plan names: relative to the plan, or else a name of its own (a built-in target)."""
-    beside = path.parent / name
-    file = beside.parent / beside.name.split("#")[0]
-    return str(beside) if file.exists() or "/" in name else name
-
-
 def _backgrounds(path: Path, name: str | None) -> list[Path]:
     if name is None:
         return []
     from torchpose.io.sources import find_sources
 
-    return [source.path for source in find_sources([Path(_beside(path, name))])]
+    return [source.path for source in find_sources([Path(beside(path, name))])]

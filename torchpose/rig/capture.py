@@ -1,0 +1,199 @@
+"""The capture loop: move, settle, read the pose, expose all cameras, read the pose again, store, next."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import torch
+
+from torchpose.geometry import rotations
+from torchpose.rig.camera import CameraFault
+from torchpose.rig.cameras import Cameras, Frame
+from torchpose.rig.plan import CapturePlan, Waypoint
+from torchpose.rig.robot import Robot
+from torchpose.rig.robot_settings import Pose, RobotFault, RobotReading, RobotReason, Settle
+from torchpose.rig.session import Session, SessionFault
+from torchpose.rig.settings import Rig
+
+COMPLETE = "complete"
+INTERRUPTED = "interrupted"
+
+Fault = CameraFault | RobotFault | SessionFault
+FAULTS = (CameraFault, RobotFault, SessionFault)
+
+OnFrame = Callable[[Waypoint, Frame], None]
+
+
+def frame_id(waypoint: Waypoint, camera: str, rig: Rig) -> str:
+    """Id of a frame, and name of its image: that of the waypoint, with the camera's where there are several."""
+    return waypoint.id if len(rig.cameras) == 1 else f"{waypoint.id}_{camera}"
+
+
+def image_origin(rig: Rig) -> dict[str, Any]:
+    """What the images of a session depend on, so that a resumed one goes on with the same."""
+    return {c.name: [c.width, c.height, c.pixel_format] for c in rig.cameras}
+
+
+def missing(plan: CapturePlan, rig: Rig, done: set[str]) -> list[tuple[Waypoint, list[str]]]:
+    """Waypoints still to be taken, each with the cameras whose frame is not there."""
+    names = [camera.name for camera in rig.cameras]
+    left = [(w, [name for name in names if frame_id(w, name, rig) not in done]) for w in plan.waypoints]
+    return [(waypoint, cameras) for waypoint, cameras in left if cameras]
+
+
+def capture(
+    plan: CapturePlan,
+    rig: Rig,
+    session: Session,
+    *,
+    scene: Callable[[str], Path] | None = None,
+    on_frame: OnFrame | None = None,
+    notes: Mapping[str, Any] | None = None,
+) -> None:
+    """Takes every frame of the plan that the session lacks and closes the session with an ``end`` record.
+
+    On the way out the robot is stopped and disconnected first, then the cameras are given back, then the ``end`` record
+    is written. While this runs, SIGINT and SIGTERM stop the robot at once.
+
+    Args:
+        scene: what emulated cameras see, see `Cameras`.
+        on_frame: called for every frame once it is stored.
+        notes: further entries of the session record.
+
+    Raises:
+        CameraFault, RobotFault, SessionFault: with the reason, which the ``end`` record names too.
+        KeyboardInterrupt: after SIGINT or SIGTERM.
+    """
+    robot = Robot(rig.robot)
+    try:
+        with stopped_by_signals(robot), Cameras(rig.cameras, scene) as cameras, robot:
+            preflight = robot.preflight([waypoint.pose for waypoint in plan.waypoints])
+            described = cameras.descriptions
+            emulated = scene is not None or bool(preflight.get("emulated")) or any(c["emulated"] for c in described)
+            record = {"plan": plan.name, "waypoints": len(plan.waypoints), "robot": preflight, "cameras": described}
+            session.begin(emulated=emulated, record=record | dict(notes or {}))
+            _take_all(plan, rig, session, robot, cameras, on_frame)
+    except FAULTS as fault:
+        session.end(fault.reason.value, str(fault))
+        raise
+    except KeyboardInterrupt:
+        session.end(INTERRUPTED)
+        raise
+    except BaseException as error:
+        session.end("internal_error", f"{type(error).__name__}: {error}")
+        raise
+    session.end(COMPLETE)
+
+
+def _take_all(
+    plan: CapturePlan, rig: Rig, session: Session, robot: Robot, cameras: Cameras, on_frame: OnFrame | None
+) -> None:
+    """The loop itself."""
+    at: Pose | None = None
+    for waypoint, names in missing(plan, rig, session.done):
+        if waypoint.pose != at:
+            robot.move(waypoint.pose)
+            at = waypoint.pose
+            time.sleep(rig.dwell_s)
+        before, frames, after = _expose(waypoint, names, rig, robot, cameras)
+        for frame in frames:
+            record = _record(waypoint, frame, before, after)
+            session.write(frame_id(waypoint, frame.camera, rig), frame.image, record)
+            if on_frame is not None:
+                on_frame(waypoint, frame)
+
+
+def _expose(
+    waypoint: Waypoint, names: list[str], rig: Rig, robot: Robot, cameras: Cameras
+) -> tuple[RobotReading, list[Frame], RobotReading]:
+    """Frames of the named cameras between two fresh readings of the robot at rest on the waypoint."""
+    settle = rig.robot.settle
+    before = robot.read(fresh=2)
+    _check_rest(waypoint, before, waypoint.pose, settle)
+    frames = cameras.grab(names)
+    after = robot.read(fresh=2)
+    _check_rest(waypoint, after, before.pose, settle)
+    return before, frames, after
+
+
+def _check_rest(waypoint: Waypoint, reading: RobotReading, pose: Pose, settle: Settle) -> None:
+    """Raises a RobotFault when the robot is not where it was."""
+    distance, angle = difference(reading.pose, pose)
+    if distance > settle.tolerance_mm or angle > settle.tolerance_deg:
+        raise RobotFault(
+            RobotReason.NOT_SETTLED,
+            f"robot: moved by {distance:.3f} mm and {angle:.3f} deg around the exposure of waypoint {waypoint.label}; "
+            "look for vibration, or raise robot.settle of the rig file",
+        )
+
+
+def difference(a: Pose, b: Pose) -> tuple[float, float]:
+    """Distance in mm and angle in degrees between two poses."""
+    first, second = (torch.tensor(pose, dtype=torch.float64) for pose in (a, b))
+    turn = rotations.angle_between(rotations.exp(first[3:]), rotations.exp(second[3:]))
+    return float((first[:3] - second[:3]).norm()), float(turn.rad2deg())
+
+
+def middle(a: Pose, b: Pose) -> Pose:
+    """The pose half-way between two near ones, whichever of the equivalent rotation vectors they have."""
+    first, second = (torch.tensor(pose, dtype=torch.float64) for pose in (a, b))
+    turn = rotations.log(rotations.exp(second[3:]) @ rotations.exp(first[3:]).mT)
+    rotation = rotations.log(rotations.exp(0.5 * turn) @ rotations.exp(first[3:]))
+    x, y, z = (0.5 * (first[:3] + second[:3])).tolist()
+    rx, ry, rz = rotation.tolist()
+    return x, y, z, rx, ry, rz
+
+
+def _record(waypoint: Waypoint, frame: Frame, before: RobotReading, after: RobotReading) -> dict[str, Any]:
+    """What the manifest says of a frame besides its image."""
+    return {
+        "camera": frame.camera,
+        "waypoint": {
+            "kind": waypoint.kind,
+            "axis": waypoint.axis,
+            "value": waypoint.value,
+            "origin": waypoint.origin,
+            "id": waypoint.id,
+        },
+        "commanded_pose": list(waypoint.pose),
+        "robot_pose": list(middle(before.pose, after.pose)),
+        "before": asdict(before),
+        "after": asdict(after),
+        "trigger_time_s": frame.trigger_time_s,
+        "camera_time": frame.camera_time,
+        "attempts": frame.attempts,
+        "failures": list(frame.failures),
+    }
+
+
+@contextlib.contextmanager
+def stopped_by_signals(robot: Robot) -> Iterator[None]:
+    """While the block runs, the first SIGINT or SIGTERM stops the robot and raises KeyboardInterrupt; later ones wait.
+
+    In a thread that is not the main one, which gets no signals, this does nothing.
+    """
+    caught = False
+
+    def stop(_number: int, _frame: FrameType | None) -> None:
+        nonlocal caught
+        if not caught:
+            caught = True
+            robot.stop()
+            raise KeyboardInterrupt
+
+    previous: dict[signal.Signals, Any] = {}
+    with contextlib.suppress(ValueError):  # not the main thread
+        for number in (signal.SIGINT, signal.SIGTERM):
+            previous[number] = signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)

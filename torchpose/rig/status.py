@@ -1,0 +1,78 @@
+"""The status of every frame while capturing, so that a target out of view is seen at once and not after the session."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from types import TracebackType
+from typing import Self
+
+import torch
+
+from torchpose.camera import Camera
+from torchpose.errors import ConfigError
+from torchpose.pipeline import PoseEstimator
+from torchpose.results import Status
+from torchpose.rig.camera import CameraSettings
+from torchpose.rig.cameras import Frame
+from torchpose.target import Target
+
+
+class LiveStatus:
+    """Estimates poses in a thread of its own, for use in a ``with`` block; at most one frame is waiting.
+
+    Args:
+        estimators: by camera name; frames of other cameras are not looked at.
+
+    Attributes:
+        counts: frames and targets so far by the name of their status.
+    """
+
+    def __init__(self, estimators: Mapping[str, PoseEstimator]) -> None:
+        self.counts: Counter[str] = Counter()
+        self._estimators = estimators
+        self._worker = ThreadPoolExecutor(1)
+        self._last: Future[None] | None = None
+
+    @classmethod
+    def load(cls, cameras: Sequence[str], targets: Sequence[str], rig: Sequence[CameraSettings]) -> LiveStatus:
+        """From camera files in the order of the rig's cameras and target files; none of both: nothing is estimated.
+
+        Raises:
+            ConfigError: a file is wrong, or camera files are too few, too many or of another frame size.
+        """
+        if bool(cameras) != bool(targets):
+            raise ConfigError("--camera, --target: one of both is given; give both to see the status, or none")
+        if cameras and len(cameras) != len(rig):
+            raise ConfigError(f"--camera: {len(cameras)} given for {len(rig)} cameras of the rig; give one for each")
+        known = [Target.load(name) for name in targets]
+        estimators = {}
+        for path, settings in zip(cameras, rig, strict=False):
+            camera = Camera.load(path)
+            if (camera.width, camera.height) != (settings.width, settings.height):
+                raise ConfigError(
+                    f"{path}: image_width, image_height: {camera.width} x {camera.height}, but camera {settings.name} "
+                    f"of the rig has {settings.width} x {settings.height}; give its own camera file"
+                )
+            estimators[settings.name] = PoseEstimator(camera, known, method="centers")
+        return cls(estimators)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self._worker.shutdown(cancel_futures=kind is not None)
+        if kind is None and self._last is not None:
+            self._last.result()
+
+    def look(self, frame: Frame) -> None:
+        """Has a frame estimated; waits while the one before is not finished."""
+        if frame.camera in self._estimators:
+            if self._last is not None:
+                self._last.result()
+            self._last = self._worker.submit(self._estimate, frame)
+
+    def _estimate(self, frame: Frame) -> None:
+        poses = self._estimators[frame.camera](torch.from_numpy(frame.image)[None])
+        self.counts.update(Status(status).name.lower() for status in poses.status.tolist())
