@@ -13,9 +13,6 @@ from torchpose.geometry import rotations
 from torchpose.sim import render
 from torchpose.target import Target
 
-# torch's forward mode loads a module that warns of torch's own use of torch.jit.script
-pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is:DeprecationWarning")
-
 F64 = torch.float64
 
 

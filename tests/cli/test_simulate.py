@@ -19,9 +19,6 @@ from torchpose.sim.dataset import analytic, plan_truth, simulated_frames
 from torchpose.sim.plan import load_plan
 from torchpose.target import Target
 
-# torch's forward mode loads a module that warns of torch's own use of torch.jit.script
-pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is:DeprecationWarning")
-
 ROOT = Path(__file__).parents[2]
 F64 = torch.float64
 CAMERA = Camera(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import pytest
 import torch
 from exact import F64, exact_ellipses, pinhole, random_poses
 from torch import Tensor
@@ -45,7 +44,6 @@ def nees(e: Tensor, covariance: Tensor) -> Tensor:
     return (e[:, None] @ torch.linalg.inv(covariance) @ e[..., None]).flatten()
 
 
-@pytest.mark.filterwarnings("ignore:.*torch.jit.script.*:DeprecationWarning")
 def test_reaches_the_bound() -> None:
     """Twenty poses, tilt to 60 degrees: mean NEES by the bound is 6 with deviation 0.8."""
     r, t = random_poses(20, 60, (140, 190), seed=1)

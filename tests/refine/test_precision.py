@@ -13,9 +13,6 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
 import precision_statistics as statistics
 
-# torch's forward mode loads its decompositions through torch.jit on first use
-pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is:DeprecationWarning")
-
 FRAMES = 12
 RATIOS = ("lateral_ratio", "depth_ratio", "rotation_ratio")
 

@@ -14,9 +14,6 @@ from torchpose.camera import Camera
 from torchpose.sim import read_truth
 from torchpose.target import Target
 
-# torch's forward mode loads a module that warns of torch's own use of torch.jit.script
-pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is:DeprecationWarning")
-
 ROOT = Path(__file__).parents[2]
 SAMPLE = ROOT / "data" / "sample"
 

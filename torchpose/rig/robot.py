@@ -19,28 +19,18 @@ import torch
 
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
-from torchpose.rig import dashboard
-from torchpose.rig.robot_link import LinkEnded, LinkError, LinkLate, RobotLink
-from torchpose.rig.robot_settings import Pose, RobotFault, RobotReading, RobotReason, RobotSettings, Settle, Workspace
+from torchpose.rig import dashboard, robot_faults
+from torchpose.rig.robot_faults import RobotFault, RobotReason
+from torchpose.rig.robot_link import LinkError, RobotLink
+from torchpose.rig.robot_settings import Pose, RobotReading, RobotSettings, Settle, Workspace
 
 __all__ = ["Robot", "RobotFault", "RobotReading", "RobotReason", "RobotSettings", "Settle", "Workspace"]
 
 STOP_S = 0.2  # within which `stop` returns
-_CLOSE_S = 3.0
+_START_S = 20.0  # a loaded computer may take long to start Python
+_CLOSE_S = 2.0
 _CALL_S = 3.0  # for a request that the controller answers at once
 _STOPPED_STATES = (0, 1)  # of runtime_state: stopping, stopped
-# safety_status_bits of the RTDE guide, the most telling first
-_SAFETY = (
-    (0b1110_0000, RobotReason.EMERGENCY_STOP, "is in emergency stop; release the button and start the robot there"),
-    (
-        0b0000_0100,
-        RobotReason.PROTECTIVE_STOP,
-        "is in protective stop; see what it touched and unlock it at the pendant",
-    ),
-    (0b0001_0000, RobotReason.SAFETY_STOP, "is in safeguard stop; close the guard and reset it"),
-    (0b111_0000_1000, RobotReason.SAFETY_STOP, "is in a safety fault or recovery; see the log at the pendant"),
-)
-_SAFETY_WORDS = {"PROTECTIVE_STOP": 0b100, "SAFEGUARD_STOP": 0b1_0000, "EMERGENCY_STOP": 0b1000_0000}
 
 
 class Robot:
@@ -76,9 +66,10 @@ class Robot:
         plan = [self.check(pose) for pose in poses]
         if importlib.util.find_spec("rtde_control") is None:
             raise ConfigError("ur-rtde: package: is not installed; pip install 'torchpose[rig]'")
-        report = self._look()
         self.close()
+        report = self._look()
         self._link = RobotLink()
+        self._call("load", _START_S)
         limit, frequency = self.settings.connect_timeout_s, self.settings.frequency_hz
         self._call("connect", limit, host=self.settings.host, frequency_hz=frequency)
         tcp = self._call("upload", limit, frequency_hz=frequency, tcp=self.settings.tcp)
@@ -86,11 +77,11 @@ class Robot:
         self._require_inside(reading.pose, "the tool stands")
         for number, pose in enumerate(plan):
             if not self._call("is_reachable", _CALL_S, pose=pose):
-                where = ", ".join(f"{v:.6g}" for v in pose)
-                self._raise_if_stopped()
+                self._state()  # a stop or the end of the program explains it better
                 raise self._fault(
                     RobotReason.UNREACHABLE_POSE,
-                    f"pose {number} of the plan ({where}) is beyond its reach or safety limits; move the plan",
+                    f"pose {number} of the plan, {robot_faults.describe(pose)}, is beyond its reach or safety limits; "
+                    "move the plan",
                 )
         return {**report, "tcp_offset": tcp, "pose": list(reading.pose)}
 
@@ -105,7 +96,10 @@ class Robot:
         except (TypeError, ValueError):
             numbers = ()
         if len(numbers) != 6 or not all(map(math.isfinite, numbers)):
-            raise self._fault(RobotReason.INVALID_POSE, f"pose {pose!r}: give six finite numbers x, y, z, rx, ry, rz")
+            raise self._fault(
+                RobotReason.INVALID_POSE,
+                f"pose {robot_faults.describe(pose)} is not six finite numbers; give x, y, z (mm), rx, ry, rz (rad)",
+            )
         x, y, z, rx, ry, rz = numbers
         self._require_inside((x, y, z, rx, ry, rz), "the commanded pose lies", slack_mm=0.0)
         return x, y, z, rx, ry, rz
@@ -156,27 +150,19 @@ class Robot:
     def _look(self) -> dict[str, Any]:
         """What the dashboard says, before the robot is touched."""
         host, limit = self.settings.host, self.settings.connect_timeout_s
-        questions = ["get robot model", "get serial number", "PolyscopeVersion", "robotmode", "safetystatus"]
         try:
-            answers = dashboard.ask(host, [*questions, "is in remote control"], limit)
+            answers = dashboard.ask(host, robot_faults.QUESTIONS, limit)
         except TimeoutError:
             raise self._fault(
-                RobotReason.TIMED_OUT,
-                f"does not answer within {limit:g} s; check the address and restart the controller",
+                RobotReason.TIMED_OUT, f"does not answer within {limit:g} s; check the address, restart the controller"
             ) from None
         except OSError as error:
-            text = error.strerror or str(error)
             raise self._fault(
-                RobotReason.UNREACHABLE, f"cannot be reached ({text}); check address, cable and power"
+                RobotReason.UNREACHABLE,
+                f"cannot be reached ({error.strerror or error}); check address, cable and power",
             ) from None
-        model, serial, polyscope, mode, safety, remote = (a.split(": ", 1)[-1] for a in answers)
-        self._require_safe(next((bit for word, bit in _SAFETY_WORDS.items() if safety.endswith(word)), 0))
-        if safety not in ("NORMAL", "REDUCED"):
-            raise self._fault(RobotReason.NOT_READY, f"has the safety status {safety}; see the pendant")
-        if mode != "RUNNING":
-            raise self._fault(RobotReason.NOT_READY, f"is in the mode {mode}; switch it on and release its brakes")
-        if remote == "false":
-            raise self._fault(RobotReason.NOT_REMOTE, "is in local control; switch it to remote control at the pendant")
+        model, serial, polyscope, mode, safety, remote, running = (a.split(": ", 1)[-1] for a in answers)
+        self._raise(robot_faults.of_dashboard(mode, safety, remote, running))
         return {
             "host": host,
             "model": model,
@@ -238,10 +224,9 @@ class Robot:
         if self._stopped.is_set():
             raise self._fault(RobotReason.STOPPED, "was stopped; start anew")
 
-    def _require_safe(self, bits: int) -> None:
-        for mask, reason, what in _SAFETY:
-            if bits & mask:
-                raise self._fault(reason, what)
+    def _raise(self, cause: robot_faults.Cause | None) -> None:
+        if cause is not None:
+            raise self._fault(*cause)
 
     def _require_inside(self, pose: Pose, what: str, slack_mm: float | None = None) -> None:
         slack = self.settings.settle.tolerance_mm if slack_mm is None else slack_mm
@@ -259,7 +244,7 @@ class Robot:
         self._raise_if_stopped()
         state: dict[str, Any] = self._call("read", _CALL_S + fresh / self.settings.frequency_hz, fresh=fresh)
         self._raise_if_stopped()
-        self._require_safe(state["safety_bits"])
+        self._raise(robot_faults.of_safety_bits(state["safety_bits"]))
         return state
 
     def _call(self, name: str, timeout_s: float, **arguments: Any) -> Any:
@@ -270,38 +255,15 @@ class Robot:
         try:
             return self._link.call(name, timeout_s, **arguments)
         except LinkError as error:
-            raise self._diagnose(name, timeout_s, error) from None
+            raise self._diagnose(name, error) from None
 
-    def _diagnose(self, name: str, timeout_s: float, error: LinkError) -> RobotFault:
-        """The fault behind a failed request; the robot is told to stop, the child ends."""
-        halted = dashboard.stop(self.settings.host, STOP_S)
+    def _diagnose(self, name: str, error: LinkError) -> RobotFault:
+        """The fault behind a failed request; the child ends, and the program, if one was uploaded, too."""
+        answers = name not in ("load", "connect") and dashboard.stop(self.settings.host, STOP_S)
         if self._link is not None:
             self._link.kill()
-        if self._stopped.is_set():
-            return self._fault(RobotReason.STOPPED, "was stopped; start anew")
-        text, restart = str(error), "restart the session"
-        if name == "upload" and "remote control" in text:
-            return self._fault(
-                RobotReason.NOT_REMOTE, "is in local control; switch it to remote control at the pendant"
-            )
-        if name == "upload" and "already in use" in text:
-            return self._fault(
-                RobotReason.REGISTERS_IN_USE,
-                "has its input registers in use; switch EtherNet/IP, PROFINET and MODBUS off",
-            )
-        if name == "upload" and not isinstance(error, LinkEnded):
-            return self._fault(
-                RobotReason.REFUSED_SCRIPT, f"did not start the control script ({text}); see the log at the pendant"
-            )
-        if error.reason == RobotReason.STALE_STREAM:
-            return self._fault(RobotReason.STALE_STREAM, f"sends no new readings; check the network, {restart}")
-        if error.reason == RobotReason.CONNECTION_LOST or (isinstance(error, LinkEnded) and not halted):
-            return self._fault(RobotReason.CONNECTION_LOST, f"has gone from the network; check it, {restart}")
-        if isinstance(error, LinkLate):
-            return self._fault(RobotReason.TIMED_OUT, f"{text}; check the controller, {restart}")
-        if isinstance(error, LinkEnded):
-            return self._fault(RobotReason.CHILD_DIED, f"the process that talks to it has ended ({text}); {restart}")
-        return self._fault(RobotReason.CONNECTION_LOST, f"{name} failed ({text}); check the controller, {restart}")
+        self._raise_if_stopped()
+        return self._fault(*robot_faults.of_link(name, error, answers))
 
 
 def _distance(a: Sequence[float], b: Sequence[float]) -> tuple[float, float]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -37,18 +38,21 @@ class Driver:
         self.receive: Any = None
         self.control: Any = None
 
-    def connect(self, host: str, frequency_hz: float) -> None:
-        """Opens the stream of readings."""
+    def load(self) -> None:
+        """Imports ur-rtde, so that the deadlines of connecting count the robot's time alone."""
+        import rtde_control
         import rtde_receive
 
+        self.rtde_control, self.rtde_receive = rtde_control, rtde_receive
+
+    def connect(self, host: str, frequency_hz: float) -> None:
+        """Opens the stream of readings."""
         self.host = host
-        self.receive = rtde_receive.RTDEReceiveInterface(host, frequency_hz, VARIABLES)
+        self.receive = self.rtde_receive.RTDEReceiveInterface(host, frequency_hz, VARIABLES)
 
     def upload(self, frequency_hz: float, tcp: Sequence[float] | None) -> list[float]:
         """Uploads and starts the control script, sets the tool; the tool offset that is active then."""
-        import rtde_control
-
-        self.control = rtde_control.RTDEControlInterface(self.host, frequency_hz)
+        self.control = self.rtde_control.RTDEControlInterface(self.host, frequency_hz)
         if tcp is not None and not self.control.setTcp(_metres(tcp)):
             raise RuntimeError("the tool offset was not taken")
         return _millimetres(self.control.getTCPOffset())
@@ -97,10 +101,13 @@ class Driver:
         return bool(self.control.isPoseWithinSafetyLimits(_metres(pose)))
 
     def close(self) -> None:
-        """Disconnects."""
-        for interface in (self.control, self.receive):
-            if interface is not None:
-                interface.disconnect()
+        """Disconnects both interfaces; each waits half a second in there."""
+        interfaces = [interface for interface in (self.control, self.receive) if interface is not None]
+        threads = [threading.Thread(target=interface.disconnect) for interface in interfaces]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
 
 
 def _metres(pose: Sequence[float]) -> list[float]:
@@ -112,21 +119,21 @@ def _millimetres(pose: Sequence[float]) -> list[float]:
 
 
 def main() -> None:
-    """Answers ``{"call": NAME, ...arguments}`` with ``{"result": ...}``, ``{"reason": ...}`` or ``{"error": ...}``."""
+    """Answers ``{"call": NAME, "id": N, ...}`` with ``{"result": ...}``, ``{"reason": ...}`` or ``{"error": ...}``."""
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # ur-rtde prints to standard output
     driver = Driver()
     for line in sys.stdin:
         request = json.loads(line)
-        call = request.pop("call")
+        call, number = request.pop("call"), request.pop("id")
         method: Callable[..., Any] = getattr(driver, call)
         try:
-            answer = {"result": method(**request)}
+            answer: dict[str, Any] = {"result": method(**request)}
         except StreamError as error:
             answer = {"reason": str(error)}
         except Exception as error:
             answer = {"error": " ".join(str(error).split())}
-        answers.write(json.dumps(answer) + "\n")
+        answers.write(json.dumps({"id": number, **answer}) + "\n")
         if call == "close":
             os._exit(0)  # destructors of ur-rtde have aborted here
     if driver.control is not None:

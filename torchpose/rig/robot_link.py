@@ -40,6 +40,7 @@ class RobotLink:
         self._process = start_module("torchpose.rig.robot_child", stderr=self._log)
         self._answers: queue.Queue[str] = queue.Queue()
         self._lock = threading.Lock()
+        self._requests = 0
         assert self._process.stdout is not None
         threading.Thread(target=_pump, args=(self._process.stdout, self._answers), daemon=True).start()
 
@@ -61,23 +62,31 @@ class RobotLink:
             raise LinkLate(f"{name}: no answer within {timeout_s:g} s")
         try:
             assert self._process.stdin is not None
-            self._process.stdin.write(json.dumps({"call": name, **arguments}) + "\n")
+            self._requests += 1
+            self._process.stdin.write(json.dumps({"call": name, "id": self._requests, **arguments}) + "\n")
             self._process.stdin.flush()
-            line = self._answers.get(timeout=max(0.0, deadline - time.monotonic()))
+            answer = self._wait(self._requests, deadline)
         except queue.Empty:
             self.kill()
             raise LinkLate(f"{name}: no answer within {timeout_s:g} s") from None
         except (OSError, ValueError):  # the pipe is broken or closed
-            line = ""
+            answer = None
         finally:
             self._lock.release()
-        if not line:
-            self._answers.put("")  # for whoever asks next
+        if answer is None:
             raise LinkEnded(self._last_words())
-        answer = json.loads(line)
         if "result" not in answer:
             raise LinkError(answer.get("error", ""), answer.get("reason"))
         return answer["result"]
+
+    def _wait(self, request: int, deadline: float) -> dict[str, Any] | None:
+        """The answer to a request; None when the child has ended."""
+        while line := self._answers.get(timeout=max(0.0, deadline - time.monotonic())):
+            answer: dict[str, Any] = json.loads(line)
+            if answer["id"] == request:  # an older one was given up, for a Ctrl-C came
+                return answer
+        self._answers.put("")  # for whoever asks next
+        return None
 
     def _last_words(self) -> str:
         """The end of what ur-rtde printed, for the message."""

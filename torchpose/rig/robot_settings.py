@@ -1,14 +1,12 @@
-"""What is said about a robot: its settings in a rig file, one reading of its stream, and the names of its faults."""
+"""What is said about a robot: its settings in a rig file, and one reading of its stream."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
-from torchpose.errors import TorchposeError
 from torchpose.target import Vector
 
 MAX_SPEED_MM_S = 250.0  # the reduced speed of ISO 10218-1, for work beside people
@@ -18,37 +16,6 @@ _FROZEN = ConfigDict(extra="forbid", frozen=True)
 _Positive = Annotated[FiniteFloat, Field(gt=0)]
 SixNumbers = Annotated[list[FiniteFloat], Field(min_length=6, max_length=6)]
 Pose = tuple[float, float, float, float, float, float]
-
-
-class RobotReason(StrEnum):
-    """Why the robot cannot go on."""
-
-    INVALID_POSE = "invalid_pose"
-    OUTSIDE_WORKSPACE = "outside_workspace"
-    UNREACHABLE_POSE = "unreachable_pose"
-    UNREACHABLE = "unreachable"
-    TIMED_OUT = "timed_out"
-    NOT_REMOTE = "not_remote"
-    NOT_READY = "not_ready"
-    REGISTERS_IN_USE = "registers_in_use"
-    REFUSED_SCRIPT = "refused_script"
-    PROTECTIVE_STOP = "protective_stop"
-    EMERGENCY_STOP = "emergency_stop"
-    SAFETY_STOP = "safety_stop"
-    PROGRAM_STOPPED = "program_stopped"
-    NOT_SETTLED = "not_settled"
-    STALE_STREAM = "stale_stream"
-    CONNECTION_LOST = "connection_lost"
-    CHILD_DIED = "child_died"
-    STOPPED = "stopped"
-
-
-class RobotFault(TorchposeError):
-    """The robot cannot go on. The message is one line with the fix; `reason` names the kind."""
-
-    def __init__(self, reason: RobotReason, message: str) -> None:
-        super().__init__(message)
-        self.reason = reason
 
 
 class Workspace(BaseModel):

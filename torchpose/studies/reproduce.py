@@ -20,16 +20,12 @@ from torchpose.studies.study import RESULT
 # in the order of the paper
 STUDIES = (
     "fig02_pnp",
-    "table01_orientation",
-    "fig04_sensitivity",
-    "fig05_shapes",
     "table02_detection",
     "fig06_regions",
     "fig07_subpixel",
     "table03_centers",
     "table04_compensation",
     "fig11_simulation",
-    "fig13_experiment",
 )
 REPORT = "report.html"
 _PACKAGES = ("torchpose", "torch", "kornia", "numpy", "opencv-python-headless", "scikit-image", "matplotlib")
@@ -61,6 +57,10 @@ def reproduce(
     unknown = [name for name in only if name not in STUDIES]
     if unknown:
         raise ConfigError(f"{unknown[0]}: --only: is no study; give one of {', '.join(STUDIES)}")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{out}: --out: {error.strerror}; choose a folder that can be written") from None
     failed: dict[str, str] = {}
     for name in STUDIES:
         about = {"study": name, "full": full, "seed": seed, "version": version("torchpose")}
@@ -77,7 +77,7 @@ def reproduce(
         except Exception as error:
             # one study must not cost the results of the others; what happened is kept beside them
             failed[name] = f"{type(error).__name__}: {error}"
-            (out / name).mkdir(parents=True, exist_ok=True)
+            (out / name).mkdir(exist_ok=True)
             (out / name / "error.txt").write_text(traceback.format_exc(), encoding="utf-8")
             continue
         spent = {"seconds": time.perf_counter() - begun, "cpu_seconds": time.process_time() - cpu}
@@ -96,10 +96,6 @@ def _finished(folder: Path, about: dict[str, Any]) -> bool:
 
 
 def _write_report(out: Path, failed: dict[str, str]) -> None:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"{out}: --out: {error.strerror}; choose a folder that can be written") from None
     folders = [out / name for name in STUDIES if (out / name / RESULT).exists() and name not in failed]
     with atomic_path(out / REPORT) as temporary:
         temporary.write_text(report(folders, failed, _environment()), encoding="utf-8")

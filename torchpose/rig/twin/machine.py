@@ -28,6 +28,7 @@ class Safety(Enum):
 
     NORMAL = (1, 1 << 0, "NORMAL")
     PROTECTIVE_STOP = (3, 1 << 2 | 1 << 10, "PROTECTIVE_STOP")
+    SAFEGUARD_STOP = (5, 1 << 4 | 1 << 10, "SAFEGUARD_STOP")
     EMERGENCY_STOP = (7, 1 << 6 | 1 << 7 | 1 << 10, "ROBOT_EMERGENCY_STOP")
 
 
@@ -35,19 +36,18 @@ class Fault(StrEnum):
     """What can be made to go wrong."""
 
     PROTECTIVE_STOP = "protective_stop"
+    SAFEGUARD_STOP = "safeguard_stop"
     EMERGENCY_STOP = "emergency_stop"
     KILL = "kill"  # the process ends at once
     STALL = "stall"  # the stream sends nothing more, its sockets stay open
     SILENT = "silent"  # connections are accepted and never answered
+    SILENT_STREAM = "silent_stream"  # those of the stream only; the dashboard answers
     NOT_REMOTE = "not_remote"
     REFUSE_SCRIPT = "refuse_script"
     REGISTERS_IN_USE = "registers_in_use"  # a fieldbus owns the input registers
     SLOW = "slow"  # moves take 20 times as long
     OFF_TARGET = "off_target"  # moves end 0.5 mm beside their goal
     IGNORE_MOVE = "ignore_move"  # the program ends when a move is sent, as after an error in it
-
-
-_INSTANT = {Fault.PROTECTIVE_STOP, Fault.EMERGENCY_STOP, Fault.KILL}
 
 
 class Machine:
@@ -198,11 +198,10 @@ class Machine:
         if fault is Fault.KILL:
             os._exit(9)
         self.faults.add(fault)
-        if fault is Fault.PROTECTIVE_STOP:
+        if fault.name in Safety.__members__:
+            self.safety, self.blocking = Safety[fault.name], False
             self.motion = self.motion.halt(now, STOP_DECELERATION)
-            self.safety, self.blocking = Safety.PROTECTIVE_STOP, False
-        elif fault is Fault.EMERGENCY_STOP:
-            self.safety = Safety.EMERGENCY_STOP
+        if fault is Fault.EMERGENCY_STOP:
             self.stop_program(now)
 
     def clear(self) -> None:
@@ -235,7 +234,7 @@ class Machine:
         if name == "target_TCP_pose":
             return self.pose(now)
         powered = self.safety is not Safety.EMERGENCY_STOP
-        paused = self.safety is Safety.PROTECTIVE_STOP
+        paused = self.safety is not Safety.NORMAL
         simple = {
             "timestamp": now,
             "robot_mode": 7 if powered else 3,

@@ -104,29 +104,30 @@ class Motion:
         left = total - t
         return self.length - 0.5 * a * left * left, a * left
 
-    def _position(self, now: float) -> tuple[float, float]:
-        """Distance and speed at time `now`."""
+    def fraction(self, now: float) -> float:
+        """Share of the path that is done at time `now`, 0 to 1."""
+        if self.length == 0:
+            return 1.0
         if self.halted is None or now <= self.halted[0]:
-            return self._travelled(now - self.begin)
+            return self._travelled(now - self.begin)[0] / self.length
         at, deceleration = self.halted
         s, v = self._travelled(at - self.begin)
         t = min(now - at, v / deceleration)
-        return min(s + v * t - 0.5 * deceleration * t * t, self.length), v - deceleration * t
-
-    def fraction(self, now: float) -> float:
-        """Share of the path that is done at time `now`, 0 to 1."""
-        length = self.length
-        return self._position(now)[0] / length if length > 0 else 1.0
+        return (s + v * t - 0.5 * deceleration * t * t) / self.length
 
     def moving(self, now: float) -> bool:
         """Whether the tool still moves at time `now`."""
-        if self.halted is not None and now > self.halted[0]:
-            return self._position(now)[1] > 0
-        return now - self.begin < self.duration
+        if self.halted is None or now <= self.halted[0]:
+            return now - self.begin < self.duration
+        at, deceleration = self.halted
+        return now - at < self._travelled(at - self.begin)[1] / deceleration
 
     def halt(self, now: float, deceleration: float) -> Motion:
-        """The same move, braked from time `now` on; a move that is being braked already stays as it is."""
-        return self if self.halted is not None else replace(self, halted=(now, deceleration))
+        """The same move, braked from time `now` on; a move that is being braked already stays as it is.
+
+        It brakes at least as hard as the move itself would, so it never runs past its goal.
+        """
+        return self if self.halted is not None else replace(self, halted=(now, max(deceleration, self.acceleration)))
 
     def pose(self, now: float) -> Array:
         """Pose (6,) at time `now`."""

@@ -39,16 +39,18 @@ class Server:
     async def run(self, host: str) -> None:
         """Serves until the process ends; prints one JSON line when ready."""
         handlers = {RTDE_PORT: self.rtde, SCRIPT_PORT: self.script, DASHBOARD_PORT: self.dashboard}
-        servers = [await asyncio.start_server(self._guarded(h, True), host, port) for port, h in handlers.items()]
-        side = await asyncio.start_server(self._guarded(self.side_channel), host, 0)
+        servers = [await asyncio.start_server(self._guarded(h), host, port) for port, h in handlers.items()]
+        side = await asyncio.start_server(self.side_channel, host, 0)
         print(json.dumps({"port": side.sockets[0].getsockname()[1]}), flush=True)
         while all(server.is_serving() for server in servers):
             self.machine.advance(time.monotonic())
             await asyncio.sleep(TICK_S)
 
-    def _guarded(self, handler: Any, may_be_silent: bool = False) -> Any:
+    def _guarded(self, handler: Any) -> Any:
+        silent = {Fault.SILENT, Fault.SILENT_STREAM} if handler == self.rtde else {Fault.SILENT}
+
         async def serve(reader: StreamReader, writer: StreamWriter) -> None:
-            while may_be_silent and Fault.SILENT in self.machine.faults:
+            while self.machine.faults & silent:
                 await asyncio.sleep(TICK_S)
             with contextlib.suppress(ConnectionError, asyncio.IncompleteReadError):
                 await handler(reader, writer)

@@ -1,0 +1,122 @@
+"""The names of what can be wrong with a robot, and how each is told from what the controller and the child say."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import StrEnum
+
+from torchpose.errors import TorchposeError
+from torchpose.rig.robot_link import LinkEnded, LinkError, LinkLate
+
+
+class RobotReason(StrEnum):
+    """Why the robot cannot go on."""
+
+    INVALID_POSE = "invalid_pose"
+    OUTSIDE_WORKSPACE = "outside_workspace"
+    UNREACHABLE_POSE = "unreachable_pose"
+    UNREACHABLE = "unreachable"
+    TIMED_OUT = "timed_out"
+    NOT_REMOTE = "not_remote"
+    NOT_READY = "not_ready"
+    REGISTERS_IN_USE = "registers_in_use"
+    REFUSED_SCRIPT = "refused_script"
+    PROTECTIVE_STOP = "protective_stop"
+    EMERGENCY_STOP = "emergency_stop"
+    SAFETY_STOP = "safety_stop"
+    PROGRAM_STOPPED = "program_stopped"
+    NOT_SETTLED = "not_settled"
+    STALE_STREAM = "stale_stream"
+    CONNECTION_LOST = "connection_lost"
+    CHILD_DIED = "child_died"
+    STOPPED = "stopped"
+
+
+class RobotFault(TorchposeError):
+    """The robot cannot go on. The message is one line with the fix; `reason` names the kind."""
+
+    def __init__(self, reason: RobotReason, message: str) -> None:
+        super().__init__(message)
+        self.reason = reason
+
+
+Cause = tuple[RobotReason, str]  # what is wrong; the fix
+
+QUESTIONS = [
+    "get robot model", "get serial number", "PolyscopeVersion", "robotmode", "safetystatus", "is in remote control",
+    "running",
+]  # fmt: skip
+
+_EMERGENCY: Cause = (RobotReason.EMERGENCY_STOP, "is in emergency stop; release the button and start the robot there")
+_PROTECTIVE: Cause = (
+    RobotReason.PROTECTIVE_STOP,
+    "is in protective stop; see what it touched and unlock it at the pendant",
+)
+_SAFEGUARD: Cause = (RobotReason.SAFETY_STOP, "is in safeguard stop; close the guard and reset it")
+_SAFETY: Cause = (RobotReason.SAFETY_STOP, "is in a safety fault or recovery; see the log at the pendant")
+_LOCAL: Cause = (RobotReason.NOT_REMOTE, "is in local control; switch it to remote control at the pendant")
+
+
+def of_safety_bits(bits: int) -> Cause | None:
+    """The cause in the stream's safety_status_bits (RTDE guide), None in normal and reduced mode."""
+    for mask, cause in (
+        (0b1110_0000, _EMERGENCY),
+        (0b100, _PROTECTIVE),
+        (0b1_0000, _SAFEGUARD),
+        (0b111_0000_1000, _SAFETY),
+    ):
+        if bits & mask:
+            return cause
+    return None
+
+
+def of_dashboard(mode: str, safety: str, remote: str, running: str) -> Cause | None:
+    """The cause in the dashboard's answers to the last four `QUESTIONS`; None where all is well."""
+    for word, cause in (
+        ("EMERGENCY_STOP", _EMERGENCY),
+        ("PROTECTIVE_STOP", _PROTECTIVE),
+        ("SAFEGUARD_STOP", _SAFEGUARD),
+    ):
+        if safety.endswith(word):
+            return cause
+    if safety not in ("NORMAL", "REDUCED"):
+        return RobotReason.NOT_READY, f"has the safety status {safety}; see the pendant"
+    if mode != "RUNNING":
+        return RobotReason.NOT_READY, f"is in the mode {mode}; switch it on and release its brakes"
+    if remote == "false":  # controllers before 5.6 cannot say
+        return _LOCAL
+    if running == "true":
+        return RobotReason.NOT_READY, "runs a program already; end it at the pendant"
+    return None
+
+
+def of_link(call: str, error: LinkError, answers: bool) -> Cause:
+    """The cause behind a failed request to the child.
+
+    Args:
+        call: name of the request. answers: whether the dashboard still does.
+    """
+    text, restart = str(error), "restart the session"
+    if call == "upload" and "remote control" in text:
+        return _LOCAL
+    if call == "upload" and "already in use" in text:
+        return (
+            RobotReason.REGISTERS_IN_USE,
+            "has its input registers in use; switch EtherNet/IP, PROFINET and MODBUS off at the pendant",
+        )
+    if call == "upload" and not isinstance(error, LinkEnded):
+        return RobotReason.REFUSED_SCRIPT, f"did not start the control script ({text}); see the log at the pendant"
+    if error.reason == RobotReason.STALE_STREAM:
+        return RobotReason.STALE_STREAM, f"sends no new readings; check the network, {restart}"
+    if error.reason == RobotReason.CONNECTION_LOST or (isinstance(error, LinkEnded) and not answers):
+        return RobotReason.CONNECTION_LOST, f"has gone from the network; check it, {restart}"
+    if isinstance(error, LinkLate):
+        return RobotReason.TIMED_OUT, f"{text}; check the controller, {restart}"
+    if isinstance(error, LinkEnded):
+        return RobotReason.CHILD_DIED, f"the process that talks to it has ended ({text}); {restart}"
+    return RobotReason.CONNECTION_LOST, f"{call} failed ({text}); check the controller, {restart}"
+
+
+def describe(pose: Sequence[float]) -> str:
+    """A pose for a message, on one line and not too long."""
+    return " ".join(repr(pose).split())[:100]
