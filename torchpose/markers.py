@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Self, TypeVar
 
 import torch
 from torch import Tensor
@@ -20,6 +20,8 @@ from torchpose.geometry import conics
 from torchpose.geometry.segments import ragged_arange, rank_in_group
 from torchpose.rings import Rings
 from torchpose.target import Target
+
+Ratio = TypeVar("Ratio", float, Tensor)
 
 _RATIO_TOLERANCE = 0.02  # of the ratio of radii, for a large ring
 _RATIO_TOLERANCE_PX = 0.35  # over the semi-minor axis of the outer ellipse: what edge offsets do to a small ring
@@ -93,6 +95,11 @@ class Identified:
         return seen.sum(-1)
 
 
+def ratio_tolerance(semi_minor: Ratio) -> Ratio:
+    """Largest error of a ring's inner/outer ratio with which its code is read; ``semi_minor``: outer axis, px."""
+    return _RATIO_TOLERANCE + _RATIO_TOLERANCE_PX / semi_minor
+
+
 def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int) -> Identified:
     """Assigns rings to the markers of every target in every frame; two rings at least.
 
@@ -107,7 +114,7 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int) -> I
 
     # 1. the code proposes: assignments (ring, target, marker), flat, sorted by row
     expected = table.radii[..., 1] / table.radii[..., 0]
-    tolerance = _RATIO_TOLERANCE + _RATIO_TOLERANCE_PX / outer[:, 3]
+    tolerance = ratio_tolerance(outer[:, 3])
     mismatch = (rings.ratio[:, None, None] - expected).abs() / tolerance[:, None, None]
     fits = (mismatch < 1) & table.valid & (rings.polarity[:, None, None] == table.polarity[:, None])
     ring, target, marker = fits.nonzero().unbind(-1)

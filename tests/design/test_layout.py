@@ -1,0 +1,91 @@
+"""Layouts: rings keep their distance, codes can be told apart, no symmetry hides an exchange."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchpose.camera import Camera
+from torchpose.design.layout import ARRANGEMENTS, Limits, assign_codes
+from torchpose.markers import ratio_tolerance
+
+F64 = torch.float64
+LIMITS = Limits(outer=12.0, inner=4.0, width=7.0, scale=6.0)
+counts = st.sampled_from(list(ARRANGEMENTS))
+sides = st.floats(20.0, 500.0)
+
+
+@settings(max_examples=60, deadline=None)
+@given(counts, sides, sides, st.floats(0.05, 1.0))
+def test_rings_keep_clear_of_each_other_and_of_the_rim(count, width, height, part):
+    radius = part * LIMITS.largest_radius(count, (width, height))
+    if radius == 0:
+        return
+    places, quiet = LIMITS.places(count, (width, height), radius), LIMITS.quiet(radius)
+    assert places.shape == (count, 2)
+    room = torch.tensor([width, height], dtype=F64) / 2 - radius - quiet
+    assert (places.abs() <= room + 1e-6).all()
+    assert float(torch.pdist(places).min()) >= 2 * radius + quiet - 1e-6
+    # the outermost rings use the plate
+    torch.testing.assert_close(places.abs().amax(0), room)
+
+
+@settings(max_examples=60, deadline=None)
+@given(counts, st.floats(0.5, 60.0))
+def test_codes_can_be_read_and_told_apart(count, radius):
+    ratios = LIMITS.ratios(count, radius)
+    semi_minor = radius * LIMITS.scale
+    if ratios is None:
+        assert semi_minor < 12 or count > 4 or semi_minor < 30
+        return
+    assert len(ratios) == count
+    assert float(ratios[0]) * semi_minor >= 4.0 - 1e-9
+    assert (1 - float(ratios[-1])) * semi_minor >= 7.0 - 1e-9
+    assert float(ratios.diff().min()) >= 2 * ratio_tolerance(semi_minor) - 1e-9
+
+
+def test_many_codes_need_large_rings():
+    assert LIMITS.ratios(12, 100.0) is not None
+    assert LIMITS.ratios(12, 6.0) is None
+    assert LIMITS.ratios(4, 1.9) is None  # below 12 px
+
+
+def test_limits_follow_the_reduced_frame():
+    def of(width, height):
+        matrix = torch.tensor([[1000.0, 0, width / 2], [0, 1000.0, height / 2], [0, 0, 1]], dtype=F64)
+        return Limits.of(Camera(width, height, matrix, torch.zeros(0, dtype=F64)), 5.0)
+
+    assert (of(800, 600).outer, of(800, 600).inner) == (12.0, 4.0)
+    # 20 megapixels are reduced by 4 for detection
+    assert (of(5472, 3648).outer, of(5472, 3648).inner) == (20.0, 6.0)
+
+
+@pytest.mark.parametrize("count", ARRANGEMENTS)
+@pytest.mark.parametrize("plate", [(80.0, 80.0), (50.0, 80.0)])
+def test_codes_differ_under_every_symmetry(count, plate):
+    places = LIMITS.places(count, plate, 0.8 * LIMITS.largest_radius(count, plate))
+    ratios = torch.linspace(0.25, 0.75, count, dtype=F64)
+    codes = assign_codes(places, ratios)
+    assert torch.equal(codes.sort().values, ratios)
+    gap = float(ratios[1] - ratios[0])
+    by_place = {(round(x, 3), round(y, 3)): c for (x, y), c in zip(places.tolist(), codes.tolist(), strict=True)}
+    symmetries = 0
+    for swap, sx, sy in itertools.product((False, True), (1, -1), (1, -1)):
+        if (swap, sx, sy) == (False, 1, 1):
+            continue
+        change = []
+        for x, y in places.tolist():
+            image = (sx * (y if swap else x), sy * (x if swap else y))
+            other = by_place.get((round(image[0], 3) + 0.0, round(image[1], 3) + 0.0))
+            change.append(None if other is None else abs(other - by_place[round(x, 3), round(y, 3)]))
+        if None in change:
+            continue  # not a symmetry of these places
+        symmetries += 1
+        moved = [c for c in change if c > 0]
+        assert len(moved) >= count // 2  # rings on the axis of a mirror stay
+        assert sum(moved) / count > (0.99 if count == 4 else 1.2) * gap
+    assert symmetries >= 3

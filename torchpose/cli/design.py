@@ -1,0 +1,248 @@
+"""``torchpose design``: from camera, working volume and accuracy to a target file, its precision and a print sheet."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from torchpose.errors import ConfigError
+
+if TYPE_CHECKING:  # imported where they are used: torch takes more than a second, which --help need not wait for
+    from torchpose.camera import Camera
+    from torchpose.design import Imaging, Need, Precision, WorkingVolume
+    from torchpose.io.rows import Row
+    from torchpose.target import Target
+
+EPILOG = """
+Examples:
+
+`torchpose design --camera camera.yaml --distance 160 --tilt 20 --plate 70x70 --accuracy-um 0.5 2 --out design/`
+
+`torchpose design --target quad40 --plate 70x70 --out sheet/`: the print sheet of an existing target; with `--camera`
+and `--distance` its predicted precision as well.
+
+Exit codes: 0 the files are written; 2 a usage or configuration error, or no target reaches the accuracy.
+"""
+
+
+def design(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for target file, print sheet, table and map.")],
+    camera: Annotated[str | None, typer.Option(help="Camera file, as for estimate.")] = None,
+    target: Annotated[
+        str | None, typer.Option(help="Existing target, file or built-in name: its sheet instead of a new design.")
+    ] = None,
+    distance: Annotated[float | None, typer.Option(help="Distance of the target, mm.")] = None,
+    distance_range: Annotated[
+        tuple[float, float] | None, typer.Option(metavar="NEAR FAR", help="Nearest and farthest distance, mm.")
+    ] = None,
+    tilt: Annotated[
+        float, typer.Option(help="Largest tilt against the optical axis, in any direction, degrees.")
+    ] = 0.0,
+    roll: Annotated[float, typer.Option(help="Largest turn about the optical axis, degrees; 180: any.")] = 180.0,
+    offset: Annotated[
+        tuple[float, float], typer.Option(metavar="X Y", help="Largest distance off the optical axis, mm.")
+    ] = (0.0, 0.0),
+    plate: Annotated[str | None, typer.Option(metavar="WxH", help="Width and height of the plate, mm.")] = None,
+    accuracy_um: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="LATERAL DEPTH", help="Standard deviations needed across and along the optical axis, um."),
+    ] = None,
+    accuracy_deg: Annotated[
+        float | None, typer.Option(help="Standard deviation needed about every axis, degrees.")
+    ] = None,
+    markers: Annotated[
+        int | None, typer.Option(help="Number of rings: 4, 6, 8, 9, 10 or 12; by default the fewest that do.")
+    ] = None,
+    blur: Annotated[float, typer.Option(help="Standard deviation of the lens's blur in focus, px.")] = 0.7,
+    noise: Annotated[float, typer.Option(help="Standard deviation of the noise, grey levels of 255.")] = 2.0,
+    levels: Annotated[
+        tuple[float, float], typer.Option(metavar="DARK LIGHT", help="Grey levels of print and paper.")
+    ] = (30.0, 220.0),
+    f_number: Annotated[
+        float | None, typer.Option(help="Aperture: counts the blur out of focus and notes the depth of field.")
+    ] = None,
+    focal_length: Annotated[float | None, typer.Option(help="Of the lens, mm; with --f-number.")] = None,
+    background: Annotated[
+        str, typer.Option(metavar="light|dark", help="Tone around the rings: dark rings on light, or the reverse.")
+    ] = "light",
+    name: Annotated[str | None, typer.Option(help="Name of the target and of the files.")] = None,
+) -> int:
+    """Choose a target for a camera, a working volume and an accuracy, and draw it at true scale (SVG, PDF).
+
+    Standard deviations are those of the image noise with an exactly known camera and print. The target is the one with
+    the fewest rings that does, at the worst point of the volume.
+    """
+    from torchpose.design import make_sheet, plate_around, predict_volume
+    from torchpose.target import Target
+
+    sides = None if plate is None else _sides(plate)
+    if target is None:
+        missing = [option for option, value in (("--plate", plate), ("--accuracy-um", accuracy_um)) if value is None]
+        if missing:
+            raise ConfigError(f"{missing[0]}: is missing; a design needs it (--target draws an existing target alone)")
+    elif name is not None or markers is not None:
+        raise ConfigError("--target: is there already; leave --name and --markers out")
+    existing = None if target is None else Target.load(target)
+    scene = None
+    if target is None or camera is not None or distance is not None or distance_range is not None:
+        volume = _volume(distance, distance_range, tilt, roll, offset)
+        scene = _Scene(_camera(camera), volume, _imaging(volume, blur, noise, levels, f_number, focal_length))
+    needed = None if accuracy_um is None else _need(accuracy_um, accuracy_deg)
+    _make_folder(out)
+    written: list[Path] = []
+    precision = None
+    if existing is None:
+        assert scene is not None
+        assert needed is not None
+        assert sides is not None
+        chosen, precision = _new_target(scene, sides, needed, name, background, markers)
+        written.append(out / f"{chosen.name}.yaml")
+        chosen.save(written[0])
+    else:
+        chosen = existing
+        if scene is not None:
+            precision = predict_volume(scene.camera, chosen, scene.volume, scene.imaging)
+    written += make_sheet(chosen, sides or plate_around(chosen)).save(out, chosen.name)
+    if scene is not None and precision is not None:
+        written += _tell_precision(chosen, scene, precision, needed, out)
+    for path in written:
+        typer.echo(str(path))
+    return 0
+
+
+@dataclass(frozen=True)
+class _Scene:
+    camera: Camera
+    volume: WorkingVolume
+    imaging: Imaging
+
+
+def _camera(name: str | None) -> Camera:
+    from torchpose.camera import Camera
+
+    if name is None:
+        raise ConfigError("--camera: is missing; give the camera file")
+    return Camera.load(name)
+
+
+def _volume(
+    distance: float | None, limits: tuple[float, float] | None, tilt: float, roll: float, offset: tuple[float, float]
+) -> WorkingVolume:
+    from torchpose.design import WorkingVolume
+
+    if limits is None:
+        if distance is None:
+            raise ConfigError("--distance: is missing; give the distance of the target in mm")
+        limits = distance, distance
+    return WorkingVolume(limits, offset, math.radians(tilt), math.radians(roll), distance)
+
+
+def _imaging(
+    volume: WorkingVolume,
+    blur: float,
+    noise: float,
+    levels: tuple[float, float],
+    f_number: float | None,
+    focal_length: float | None,
+) -> Imaging:
+    from torchpose.design import Imaging, best_focus
+    from torchpose.sim import Defocus
+
+    lens = None
+    if f_number is not None and focal_length is not None:
+        lens = Defocus(f_number, focal_length, best_focus(*volume.distance))
+    elif f_number is not None or focal_length is not None:
+        raise ConfigError("--f-number: goes together with --focal-length; give both or neither")
+    return Imaging(blur, noise, *levels, lens=lens)
+
+
+def _need(accuracy_um: tuple[float, float], accuracy_deg: float | None) -> Need:
+    from torchpose.design import Need
+
+    return Need(*accuracy_um, *([] if accuracy_deg is None else [accuracy_deg]))
+
+
+def _sides(text: str) -> tuple[float, float]:
+    number = r"(\d+\.?\d*|\.\d+)"
+    match = re.fullmatch(rf"{number}[xX]{number}", text)
+    if match is None:
+        raise ConfigError(f"--plate: {text!r} is not a size; write width x height in mm, such as 70x50")
+    return float(match[1]), float(match[2])
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{folder}: --out: {error.strerror}; choose a folder that can be written") from None
+
+
+def _new_target(
+    scene: _Scene,
+    plate: tuple[float, float],
+    need: Need,
+    name: str | None,
+    background: str,
+    markers: int | None,
+) -> tuple[Target, Precision]:
+    """The designed target and its precision; its rings are told."""
+    from torchpose.design import design_target
+
+    made = design_target(
+        scene.camera, scene.volume, plate, need, scene.imaging, name=name, background=background, markers=markers
+    )
+    ratios = ", ".join(f"{ratio:.2f}" for ratio in sorted(made.target.codes.sqrt().tolist()))
+    typer.echo(
+        f"{len(made.target)} rings of {2 * made.radius:g} mm, semi-minor axis at least {made.semi_minor:.0f} px; "
+        f"inner/outer {ratios}, neighbours {made.code_gap:.1f} tolerances of reading apart"
+    )
+    return made.target, made.precision
+
+
+def _tell_precision(target: Target, scene: _Scene, precision: Precision, need: Need | None, out: Path) -> list[Path]:
+    """Tells the predicted precision of a target; paths of its table and map."""
+    from torchpose.design import precision_map
+    from torchpose.io.writers import write_rows
+    from torchpose.report.design import save_plot
+
+    rows = precision.rows(need)
+    _show(rows, target.name)
+    typer.echo(_focus(scene))
+    table, picture = out / f"{target.name}_precision.csv", out / f"{target.name}_map.png"
+    write_rows(table, rows, {column: str if column in ("axis", "unit") else float for column in rows[0]})
+    save_plot(precision_map(scene.camera, target, scene.volume, scene.imaging), target.name, picture)
+    return [table, picture]
+
+
+def _show(rows: list[Row], name: str) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(width=max(Console().width, 100))
+    table = Table(box=box.SIMPLE_HEAD, title=f"{name}: predicted standard deviations")
+    for column in rows[0]:
+        table.add_column(column.replace("_", " "), justify="left" if column in ("axis", "unit") else "right")
+    for row in rows:
+        table.add_row(*("-" if v is None else v if isinstance(v, str) else f"{v:.3g}" for v in row.values()))
+    console.print(table)
+
+
+def _focus(scene: _Scene) -> str:
+    """What the aperture does to the depth of field."""
+    from torchpose.design import sharp_range
+
+    lens, psf = scene.imaging.lens, scene.imaging.psf_sigma
+    if lens is None:
+        return "depth of field: not counted; give --f-number and --focal-length"
+    near, far = sharp_range(scene.camera, lens, psf)
+    ends = zip(scene.imaging.blur_at(scene.camera, scene.volume.distance), scene.volume.distance, strict=True)
+    return (
+        f"depth of field: focused on {lens.focus_distance:.4g} mm, where the blur is {psf:g} px; {near:.4g} to "
+        f"{far:.4g} mm with at most 1.41 times as much; {', '.join(f'{blur:.2f} px at {z:g} mm' for blur, z in ends)}"
+    )

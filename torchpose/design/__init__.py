@@ -1,0 +1,34 @@
+"""Target design: from camera, working volume and accuracy to a target, its predicted precision and a print sheet."""
+
+from torchpose.design.precision import Need, Precision, PrecisionMap, precision_map, predict_volume
+from torchpose.design.predict import (
+    Imaging,
+    best_focus,
+    deviations,
+    edge_covariance,
+    predicted_covariance,
+    sharp_range,
+)
+from torchpose.design.search import Design, design_target
+from torchpose.design.sheet import Sheet, make_sheet, plate_around
+from torchpose.design.volume import WorkingVolume
+
+__all__ = [
+    "Design",
+    "Imaging",
+    "Need",
+    "Precision",
+    "PrecisionMap",
+    "Sheet",
+    "WorkingVolume",
+    "best_focus",
+    "design_target",
+    "deviations",
+    "edge_covariance",
+    "make_sheet",
+    "plate_around",
+    "precision_map",
+    "predict_volume",
+    "predicted_covariance",
+    "sharp_range",
+]

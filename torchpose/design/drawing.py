@@ -1,0 +1,182 @@
+"""A page of circles, rectangles, lines and text in mm, written as SVG or PDF at true scale.
+
+Both writers are our own so that a circle stays a circle (SVG) or eight cubic arcs within 5e-6 of its radius (PDF,
+which knows no circle), and a length on the page is the number in the file.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from xml.sax.saxutils import escape
+
+_POINTS = 72 / 25.4  # a mm, the unit of PDF
+_HAIR = 1e-4  # mm less of page: rasters are rounded up to whole pixels, and pictures stretched to fill them
+_ARCS = 8  # of a circle
+_DIGIT = 0.556  # width of a digit of Helvetica over its size (Adobe font metrics)
+
+
+@dataclass(frozen=True)
+class Circle:
+    """Filled disc, mm; ``grey`` from 0 (black) to 1, as everywhere here."""
+
+    x: float
+    y: float
+    radius: float
+    grey: float
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """Filled rectangle with its upper left corner at x, y, mm."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+    grey: float
+
+
+@dataclass(frozen=True)
+class Line:
+    """Straight line of ``width`` mm with flat ends."""
+
+    x1: float
+    y1: float
+    x2: float
+    y2: float
+    width: float = 0.1
+    grey: float = 0.0
+
+
+@dataclass(frozen=True)
+class Text:
+    """Text of ``size`` mm from its baseline's start at x, y; ``number`` centres a text of digits on x."""
+
+    x: float
+    y: float
+    size: float
+    text: str
+    number: bool = False
+
+
+Shape = Circle | Rectangle | Line | Text
+
+
+@dataclass(frozen=True)
+class Page:
+    """Shapes in the order of drawing on a white page, x to the right, y down, mm.
+
+    ``trim``: x, y, width and height of what is cut out.
+    """
+
+    title: str
+    width: float
+    height: float
+    trim: tuple[float, float, float, float]
+    shapes: list[Shape]
+
+    def svg(self) -> str:
+        """The page as SVG 1.1; one user unit is a mm."""
+        width, height = _number(self.width), _number(self.height)
+        lines = [
+            f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}mm" height="{height}mm" '
+            f'viewBox="0 0 {width} {height}">',
+            f"<title>{escape(self.title)}</title>",
+            f'<rect width="{width}" height="{height}" fill="#ffffff"/>',
+            *map(_svg, self.shapes),
+            "</svg>",
+        ]
+        return "\n".join(lines) + "\n"
+
+    def pdf(self) -> bytes:
+        """The page as PDF 1.6, with the trim box of the printer's trade and the wish not to be scaled."""
+        # from here on y down and mm
+        flip = f"{_number(_POINTS)} 0 0 {_number(-_POINTS)} 0 {_number(self.height * _POINTS)} cm"
+        content = "\n".join([flip, *map(_pdf, self.shapes)]).encode("cp1252", "replace")
+        x, y, width, height = self.trim
+        media = [0.0, 0.0, self.width - _HAIR, self.height - _HAIR]
+        trim = [x, self.height - y - height, x + width, self.height - y]
+        boxes = [" ".join(_number(v * _POINTS) for v in box) for box in (media, trim)]
+        objects = [
+            b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
+            b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
+            f"<< /Type /Page /Parent 2 0 R /MediaBox [{boxes[0]}] /TrimBox [{boxes[1]}] /Contents 4 0 R "
+            "/Resources << /Font << /F 5 0 R >> >> >>".encode(),
+            b"<< /Length %d >>\nstream\n%s\nendstream" % (len(content), content),
+            b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica /Encoding /WinAnsiEncoding >>",
+            b"<< /Title (%s) /Creator (torchpose) >>" % _pdf_string(self.title).encode("cp1252", "replace"),
+        ]
+        file = b"%PDF-1.6\n%\xe2\xe3\xcf\xd3\n"
+        offsets = []
+        for number, body in enumerate(objects, 1):
+            offsets.append(len(file))
+            file += b"%d 0 obj\n%s\nendobj\n" % (number, body)
+        table = b"".join(b"%010d 00000 n \n" % offset for offset in offsets)
+        size = len(objects) + 1
+        return (
+            file
+            + b"xref\n0 %d\n0000000000 65535 f \n%s" % (size, table)
+            + b"trailer\n<< /Size %d /Root 1 0 R /Info %d 0 R >>\nstartxref\n%d\n" % (size, size - 1, len(file))
+            + b"%%EOF\n"
+        )
+
+
+def _number(value: float) -> str:
+    return f"{value:.9f}".rstrip("0").rstrip(".") if value % 1 else f"{value:.0f}"
+
+
+def _numbers(*values: float) -> str:
+    return " ".join(map(_number, values))
+
+
+def _svg(shape: Shape) -> str:
+    if isinstance(shape, Text):
+        anchor = ' text-anchor="middle"' if shape.number else ""
+        return (
+            f'<text x="{_number(shape.x)}" y="{_number(shape.y)}" font-size="{_number(shape.size)}" '
+            f'font-family="Helvetica, Arial, sans-serif"{anchor}>{escape(shape.text)}</text>'
+        )
+    level = round(255 * shape.grey)
+    colour = f"#{level:02x}{level:02x}{level:02x}"
+    if isinstance(shape, Circle):
+        place = f'cx="{_number(shape.x)}" cy="{_number(shape.y)}" r="{_number(shape.radius)}"'
+        return f'<circle {place} fill="{colour}"/>'
+    if isinstance(shape, Rectangle):
+        place = f'x="{_number(shape.x)}" y="{_number(shape.y)}"'
+        size = f'width="{_number(shape.width)}" height="{_number(shape.height)}"'
+        return f'<rect {place} {size} fill="{colour}"/>'
+    ends = " ".join(f'{name}="{_number(getattr(shape, name))}"' for name in ("x1", "y1", "x2", "y2"))
+    return f'<line {ends} stroke="{colour}" stroke-width="{_number(shape.width)}"/>'
+
+
+def _pdf(shape: Shape) -> str:
+    if isinstance(shape, Text):
+        x = shape.x - (_DIGIT * shape.size * len(shape.text) / 2 if shape.number else 0)
+        place = f"1 0 0 -1 {_numbers(x, shape.y)} Tm"
+        return f"BT /F {_number(shape.size)} Tf 0 g {place} ({_pdf_string(shape.text)}) Tj ET"
+    if isinstance(shape, Circle):
+        return f"{_number(shape.grey)} g {_pdf_circle(shape)} f"
+    if isinstance(shape, Rectangle):
+        return f"{_number(shape.grey)} g {_numbers(shape.x, shape.y, shape.width, shape.height)} re f"
+    path = f"{_numbers(shape.x1, shape.y1)} m {_numbers(shape.x2, shape.y2)} l S"
+    return f"{_number(shape.grey)} G {_number(shape.width)} w {path}"
+
+
+def _pdf_circle(circle: Circle) -> str:
+    turn = 2 * math.pi / _ARCS
+    handle = 4 / 3 * math.tan(turn / 4)  # of cubic arcs that touch the circle at both ends and in the middle
+
+    def at(angle: float, along: float) -> tuple[float, float]:
+        c, s = math.cos(angle), math.sin(angle)
+        return circle.x + circle.radius * (c - along * s), circle.y + circle.radius * (s + along * c)
+
+    words = [f"{_numbers(*at(0, 0))} m"]
+    for k in range(_ARCS):
+        start, end = k * turn, (k + 1) * turn
+        words.append(f"{_numbers(*at(start, handle), *at(end, -handle), *at(end, 0))} c")
+    return " ".join(words)
+
+
+def _pdf_string(text: str) -> str:
+    return text.replace("\\", "\\\\").replace("(", "\\(").replace(")", "\\)")

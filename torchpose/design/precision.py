@@ -1,0 +1,147 @@
+"""Predicted precision of a target over a working volume: its middle, its worst points, and maps."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchpose.analysis.evaluation import AXES, UNITS
+from torchpose.camera import Camera
+from torchpose.design.predict import Imaging, deviations, edge_covariance, in_view, outlines, predicted_covariance
+from torchpose.design.volume import WorkingVolume
+from torchpose.errors import ConfigError
+from torchpose.io.rows import Row
+from torchpose.target import Target
+
+FRAME_MARGIN_PX = 10.0  # between rings and the border of the frame
+_STEPS = 5  # of distance and tilt in a map
+_AZIMUTHS = 4  # directions of the tilt in a map
+_PLACES = 3  # across the offset, along x and y
+
+
+@dataclass(frozen=True)
+class Need:
+    """Largest standard deviations that are acceptable: across and along the optical axis (um), about any axis (deg)."""
+
+    lateral_um: float
+    depth_um: float
+    angle_deg: float = math.inf
+
+    def __post_init__(self) -> None:
+        for value in (self.lateral_um, self.depth_um, self.angle_deg):
+            if not value > 0:
+                raise ConfigError(f"accuracy: {value:g} is not above 0; give standard deviations in um and degrees")
+
+    @property
+    def allowed(self) -> list[float | None]:
+        """Of every axis, in the units of `deviations`; None where any will do."""
+        angle = 1e3 * self.angle_deg if math.isfinite(self.angle_deg) else None
+        return [self.lateral_um, self.lateral_um, self.depth_um, angle, angle, angle]
+
+    def excess(self, deviation: Tensor) -> Tensor:
+        """How many times (...) the deviations (..., 6) of `deviations` exceed the need; up to 1 is good."""
+        allowed = [math.inf if value is None else value for value in self.allowed]
+        return (deviation / torch.tensor(allowed, dtype=deviation.dtype)).amax(-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Precision:
+    """Predicted standard deviations over a working volume.
+
+    Attributes:
+        middle: (6,) facing the camera in the middle. worst: (6,) the largest of every axis; units of `deviations`.
+        R, t: (6, 3, 3), (6, 3) where the largest ones were found.
+    """
+
+    middle: Tensor
+    worst: Tensor
+    R: Tensor
+    t: Tensor
+
+    def rows(self, need: Need | None = None) -> list[Row]:
+        """One row an axis: what is needed, the deviation in the middle, the largest one, and where that is."""
+        tilt = self.R[:, 2, 2].clamp(max=1).acos().rad2deg()
+        columns = (self.middle, self.worst, *self.t.unbind(1), tilt)
+        rows: list[Row] = []
+        for i, values in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
+            row: Row = {"axis": AXES[i], "unit": UNITS[i], "needed": None if need is None else need.allowed[i]}
+            row |= zip(
+                ("middle", "worst", "worst_x_mm", "worst_y_mm", "worst_z_mm", "worst_tilt_deg"), values, strict=True
+            )
+            rows.append(row)
+        return rows
+
+
+@dataclass(frozen=True, eq=False)
+class PrecisionMap:
+    """Largest predicted deviations: across (um), along (um) and about any (mdeg) axis, on two grids.
+
+    Attributes:
+        distance: (D,) mm. tilt: (T,) rad. by_tilt: (D, T, 3), on the optical axis, over all directions of the tilt.
+        x: (X,), y: (Y,) mm. by_place: (Y, X, 3), at the farthest distance, over tilts of 0 and the largest.
+    """
+
+    distance: Tensor
+    tilt: Tensor
+    by_tilt: Tensor
+    x: Tensor
+    y: Tensor
+    by_place: Tensor
+
+
+def predict_volume(camera: Camera, target: Target, volume: WorkingVolume, imaging: Imaging) -> Precision:
+    """Predicted standard deviations of a target in the middle and where each of them is largest.
+
+    Raises:
+        ConfigError: a ring leaves the frame somewhere in the volume.
+    """
+    R, t = volume.extremes()
+    if not in_view(camera, outlines(target), R, t, FRAME_MARGIN_PX):
+        raise ConfigError(
+            f"{target.name}: rings leave the frame within the working volume; narrow offset, tilt or roll, or keep "
+            "farther away"
+        )
+    # deviations do not grow steadily with the tilt: facing the camera, depth and tilt are weakest
+    halfway = volume.poses(
+        distances=sorted(set(volume.distance)),
+        tilts=[volume.tilt / 4, volume.tilt / 2] if volume.tilt else [0.0],
+        azimuths=6,
+        rolls=1,
+        offsets=[(0.0, 0.0)],
+    )
+    R, t = torch.cat([R, halfway[0]]), torch.cat([t, halfway[1]])
+    largest = deviations(edge_covariance(camera, target, R, t, imaging)).argmax(0)
+    R, t = (torch.cat([a, b[largest]]) for a, b in zip(volume.middle, (R, t), strict=True))
+    found = deviations(predicted_covariance(camera, target, R, t, imaging))
+    worst = found.argmax(0)
+    return Precision(found[0], found.amax(0), R[worst], t[worst])
+
+
+def precision_map(camera: Camera, target: Target, volume: WorkingVolume, imaging: Imaging) -> PrecisionMap:
+    """Maps of the predicted deviations over distance and tilt, and over the offset; the roll is 0."""
+    distance, tilt = _steps(*volume.distance), _steps(0.0, volume.tilt)
+    x, y = (_steps(-half, half, _PLACES) for half in volume.offset)
+
+    def largest(tilts: Tensor, distances: Tensor, places: list[tuple[float, float]]) -> Tensor:
+        """Largest deviations (distances * places, tilts, 3)."""
+        columns = []
+        for angle in tilts.tolist():
+            R, t = volume.poses(
+                distances=distances.tolist(), tilts=[angle], azimuths=_AZIMUTHS, rolls=1, offsets=places
+            )
+            found = deviations(predicted_covariance(camera, target, R, t, imaging))
+            found = found.unflatten(0, (len(distances) * len(places), -1)).amax(1)
+            columns.append(torch.stack([found[:, :2].amax(1), found[:, 2], found[:, 3:].amax(1)], 1))
+        return torch.stack(columns, 1)
+
+    by_tilt = largest(tilt, distance, [(0.0, 0.0)])
+    grid = [(a, b) for b in y.tolist() for a in x.tolist()]
+    by_place = largest(tilt[[0, -1]], distance[-1:], grid).amax(1).view(len(y), len(x), 3)
+    return PrecisionMap(distance, tilt, by_tilt, x, y, by_place)
+
+
+def _steps(low: float, high: float, count: int = _STEPS) -> Tensor:
+    return torch.linspace(low, high, count if high > low else 1, dtype=torch.float64)

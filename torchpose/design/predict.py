@@ -1,0 +1,182 @@
+"""Predicted pose covariance: of straight edges in closed form, and as the estimator itself states it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchpose import ellipse
+from torchpose.camera import Camera
+from torchpose.errors import ConfigError
+from torchpose.refine import refine_photometric
+from torchpose.sim import Defocus, add_noise, render
+from torchpose.sim.shapes import plane_axes
+from torchpose.target import Target
+
+_SAMPLES = 48  # of a circle
+_MARGIN_PX = 16  # around the rings, for blur and the band of the refinement
+_PIXEL_VARIANCE = 1 / 12  # px^2, of the pixel's own width
+_QUANTISATION = 1 / 12  # grey levels^2
+
+
+@dataclass(frozen=True)
+class Imaging:
+    """Conditions of the frames.
+
+    Attributes:
+        psf_sigma: blur of the lens in focus, px, Gaussian. noise: grey levels of 0..255, Gaussian and white.
+        dark, light: grey levels of print and paper. lens: for the blur out of focus; None: sharp everywhere.
+
+    Raises:
+        ConfigError: a number is out of range.
+    """
+
+    psf_sigma: float = 0.7
+    noise: float = 2.0
+    dark: float = 30.0
+    light: float = 220.0
+    lens: Defocus | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 < self.psf_sigma <= 4:
+            raise ConfigError(f"blur: {self.psf_sigma:g} px; give a standard deviation above 0 and up to 4 px")
+        if not 0 <= self.noise <= 64:
+            raise ConfigError(f"noise: {self.noise:g} grey levels; give a standard deviation of 0 to 64")
+        if not 0 <= self.dark < self.light <= 255:
+            raise ConfigError(f"levels: {self.dark:g} {self.light:g}; give dark and light, 0 <= dark < light <= 255")
+
+    def blur(self, camera: Camera, depth: Tensor) -> Tensor:
+        """Standard deviation (...) in px at depths (...) in mm.
+
+        A disc of radius rho has the variance rho^2 / 4 along any axis.
+        """
+        rho = torch.zeros_like(depth) if self.lens is None else self.lens.radius(camera, depth)
+        return (self.psf_sigma**2 + rho.square() / 4).sqrt()
+
+    def blur_at(self, camera: Camera, depths: Sequence[float]) -> list[float]:
+        """`blur` at numbers."""
+        return self.blur(camera, torch.tensor(depths, dtype=torch.float64)).tolist()
+
+
+def best_focus(near: float, far: float) -> float:
+    """Distance in mm to focus on, so that both ends of a range have the same disc of defocus: 2 / (1/near + 1/far)."""
+    return 2 / (1 / near + 1 / far)
+
+
+def sharp_range(camera: Camera, lens: Defocus, psf_sigma: float) -> tuple[float, float]:
+    """Depths in mm between which defocus adds less blur than the lens has in focus: a disc of up to 2 psf_sigma px.
+
+    |1/z - 1/z_focus| < 2 rho / (fx A) for a disc of radius rho px and the aperture A = focal length / f-number. At the
+    limits the whole blur is sqrt(2) psf_sigma. The far one may be infinite.
+    """
+    reach = 4 * psf_sigma / (float(camera.matrix[0, 0]) * lens.focal_length / lens.f_number)
+    focus = 1 / lens.focus_distance
+    return 1 / (focus + reach), 1 / (focus - reach) if focus > reach else math.inf
+
+
+def edge_covariance(camera: Camera, target: Target, R: Tensor, t: Tensor, imaging: Imaging) -> Tensor:
+    """Covariance of the pose from the position of every bit of edge along its normal, grey levels and blur known.
+
+    A straight blurred edge of contrast h and length L px fixes its offset with the information
+    h^2 L / (2 sqrt(pi) s n^2), s and n the standard deviations of blur and noise (integral of the squared derivative
+    of the normal law). The same as `torchpose.analysis.sensitivity.propagate` gives for the image's noise on "rings",
+    but with no derivative besides those by the pose, for searches.
+
+    Args:
+        camera, target: taken for exact. R, t: (B, 3, 3), (B, 3), target to camera, mm.
+
+    Returns:
+        (B, 6, 6) float64, mm and rad, translation first, rotation multiplied from the left.
+    """
+    arm = (rims(target) @ R[:, None].mT).flatten(1, 2)  # (B, 2 M S, 3), camera axes, about the origin
+    point = arm + t[:, None]
+    z = point[..., 2:]
+    xy = point[..., :2] / z
+    eye = torch.eye(3, dtype=R.dtype)
+    by_point = camera.J_distort(xy) @ ((eye[:2] - xy[..., None] * eye[2]) / z[..., None])  # (B, P, 2, 3)
+    pixel = camera.distort(xy).unflatten(1, (-1, _SAMPLES))
+    tangent = (pixel.roll(-1, 2) - pixel.roll(1, 2)).flatten(1, 2) / 2  # px for a step along the circle
+    length = tangent.norm(dim=-1)
+    normal = torch.stack([tangent[..., 1], -tangent[..., 0]], -1) / length[..., None]
+    by_shift = (normal[..., None, :] @ by_point).squeeze(-2)  # (B, P, 3)
+    jacobian = torch.cat([by_shift, torch.linalg.cross(arm, by_shift)], -1)
+    blur = (imaging.blur(camera, z[..., 0]).square() + _PIXEL_VARIANCE).sqrt()
+    weight = length / blur * (imaging.light - imaging.dark) ** 2 / (2 * math.sqrt(math.pi))
+    information = jacobian.mT @ (jacobian * weight[..., None]) / (imaging.noise**2 + _QUANTISATION)
+    return torch.linalg.inv(information)
+
+
+def predicted_covariance(camera: Camera, target: Target, R: Tensor, t: Tensor, imaging: Imaging) -> Tensor:
+    """Covariance that the estimator (``method="photometric"``) states for a target at every pose.
+
+    One simulated frame a pose, cropped to the target, refined from the true pose: the covariance holds whatever the
+    refinement leaves out or adds as unknowns. The frame's noise scatters it by about a percent.
+
+    Args and returns: as `edge_covariance`. NaN where the refinement fails.
+    """
+    rings = rims(target)
+    out = []
+    for i in range(len(t)):
+        pixel = camera.project(rings @ R[i].T + t[i])  # (2 M, S, 2)
+        low = (pixel.flatten(0, 1).amin(0) - _MARGIN_PX).floor()
+        width, height = (pixel.flatten(0, 1).amax(0) + _MARGIN_PX - low).ceil().int().tolist()
+        matrix = camera.matrix.clone()
+        matrix[:2, 2] -= low
+        crop = replace(camera, width=width, height=height, matrix=matrix)
+        pose = R[i : i + 1], t[i : i + 1]
+        frame = render(
+            crop,
+            target,
+            *pose,
+            psf_sigma=imaging.psf_sigma,
+            dark=imaging.dark,
+            light=imaging.light,
+            defocus=imaging.lens,
+        )
+        index = torch.arange(len(pixel)).repeat_interleave(_SAMPLES)
+        seen = ellipse.fit((pixel - low).flatten(0, 1), index, len(pixel)).view(1, len(target), 2, 5)
+        refined = refine_photometric(
+            add_noise(frame, imaging.noise, index=torch.tensor([i])),
+            crop,
+            torch.zeros(1, dtype=torch.int64),
+            *pose,
+            torch.ones(1, len(target), dtype=torch.bool),
+            seen,
+            target.centers[None],
+            target.normals[None],
+            target.radii[None],
+        )
+        out.append(torch.where(refined.good[:, None, None], refined.covariance, torch.nan))
+    return torch.cat(out) if out else t.new_zeros(0, 6, 6)
+
+
+def rims(target: Target) -> Tensor:
+    """Points (2 M, S, 3) on the outer and inner circle of every marker, in turn, mm."""
+    angle = torch.arange(_SAMPLES, dtype=torch.float64) * (2 * math.pi / _SAMPLES)
+    one, two = plane_axes(target.normals)
+    circle = angle.cos()[:, None] * one[:, None] + angle.sin()[:, None] * two[:, None]  # (M, S, 3)
+    return (target.centers[:, None, None] + target.radii[:, :, None, None] * circle[:, None]).flatten(0, 1)
+
+
+def deviations(covariance: Tensor) -> Tensor:
+    """Standard deviations (B, 6) of covariances (B, 6, 6): x, y, z in um, then about x, y, z in mdeg."""
+    std = covariance.diagonal(dim1=-2, dim2=-1).sqrt() * 1e3
+    return torch.cat([std[:, :3], std[:, 3:].rad2deg()], 1)
+
+
+def outlines(target: Target) -> Tensor:
+    """Points (12 M, 3) on the outer circles of a target, mm."""
+    return rims(target)[::2, :: _SAMPLES // 12].flatten(0, 1)
+
+
+def in_view(camera: Camera, points: Tensor, R: Tensor, t: Tensor, margin: float) -> bool:
+    """Whether points (P, 3) of the target lie ``margin`` px inside the frame at all poses (B, 3, 3), (B, 3)."""
+    seen = points @ R.mT + t[:, None]
+    pixel = camera.project(seen)
+    last = torch.tensor([camera.width - 1, camera.height - 1], dtype=t.dtype) - margin
+    inside = ((pixel >= margin) & (pixel <= last)).all()
+    return bool(inside & ((seen[..., :2] / seen[..., 2:]).norm(dim=-1) < camera.fold_radius).all())

@@ -1,0 +1,189 @@
+"""The choice: the fewest rings that reach the accuracy needed at the worst point of the working volume."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchpose.camera import Camera
+from torchpose.design.layout import ARRANGEMENTS, Limits, assign_codes
+from torchpose.design.precision import FRAME_MARGIN_PX, Need, Precision, predict_volume
+from torchpose.design.predict import Imaging, deviations, edge_covariance, in_view, outlines
+from torchpose.design.volume import WorkingVolume
+from torchpose.errors import ConfigError
+from torchpose.markers import ratio_tolerance
+from torchpose.target import Target
+
+_RADII = 10  # outer radii tried for every number of rings
+_MICRON = 1e-2  # mm, to which radii and places are rounded: a target file that people read
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """A target and what it promises. plate: width and height in mm. limits: of its rings."""
+
+    target: Target
+    plate: tuple[float, float]
+    limits: Limits
+    precision: Precision
+
+    @property
+    def radius(self) -> float:
+        """Outer radius of all rings, mm."""
+        return float(self.target.radii[0, 0])
+
+    @property
+    def semi_minor(self) -> float:
+        """Semi-minor axis of the outer circles in the worst view, px."""
+        return self.radius * self.limits.scale
+
+    @property
+    def code_gap(self) -> float:
+        """Smallest difference of two inner/outer ratios, over the tolerance of their reading in the worst view."""
+        gap = self.target.codes.sqrt().sort().values.diff().min()
+        return float(gap) / ratio_tolerance(self.semi_minor)
+
+
+def design_target(
+    camera: Camera,
+    volume: WorkingVolume,
+    plate: tuple[float, float],
+    need: Need,
+    imaging: Imaging,
+    *,
+    name: str | None = None,
+    background: str = "light",
+    markers: int | None = None,
+) -> Design:
+    """The target with the fewest rings whose predicted standard deviations meet the need everywhere in the volume.
+
+    For every number of rings the outer radius is the one with the smallest excess over the need: large rings have long
+    edges, small ones lie farther out. Radii are compared by `edge_covariance`; what is promised comes from
+    `predicted_covariance`.
+
+    Args:
+        plate: width and height, mm. name: of the target; by default its number of rings and size.
+        markers: number of rings; by default the fewest that do.
+
+    Raises:
+        ConfigError: the rings are out of view or too small, or the accuracy is out of reach; with the figure that can
+            be reached.
+    """
+    if not all(0 < side < math.inf for side in plate):
+        raise ConfigError(f"plate: {plate[0]:g} x {plate[1]:g} mm; give two positive lengths")
+    if markers is not None and markers not in ARRANGEMENTS:
+        raise ConfigError(f"markers: {markers}; there are layouts of {', '.join(map(str, ARRANGEMENTS))} rings")
+    label = name or "rings{count}" + f"_{plate[0]:g}x{plate[1]:g}"
+    limits = Limits.of(camera, volume.least_scale(camera, (plate[0] / 2, plate[1] / 2)))
+    best: tuple[float, Design] | None = None
+    counts = list(ARRANGEMENTS) if markers is None else [markers]
+    for count in counts:
+        target = _best_radius(
+            camera, volume, plate, need, imaging, limits, count, label.format(count=count), background
+        )
+        if target is None:
+            continue
+        precision = predict_volume(camera, target, volume, imaging)
+        excess = float(need.excess(precision.worst).nan_to_num(nan=math.inf))
+        if best is None or excess < best[0]:
+            best = excess, Design(target, plate, limits, precision)
+        if excess <= 1:
+            break
+    if best is None:
+        raise _no_room(camera, volume, plate, limits, counts[0])
+    if best[0] > 1:
+        raise _not_reached(best[1], need)
+    return best[1]
+
+
+def _best_radius(
+    camera: Camera,
+    volume: WorkingVolume,
+    plate: tuple[float, float],
+    need: Need,
+    imaging: Imaging,
+    limits: Limits,
+    count: int,
+    name: str,
+    background: str,
+) -> Target | None:
+    """The target of ``count`` rings with the smallest excess over the need; None where none fits."""
+    least, most = limits.outer / limits.scale, limits.largest_radius(count, plate)
+    if most < least:
+        return None
+    R, t = volume.extremes()
+    some = slice(None, None, 7)  # 7 and the turns of the volume have no common factor: all of them are met
+    best: tuple[float, Target] | None = None
+    for radius in torch.linspace(least, most, _RADII).tolist():
+        radius = math.floor(radius / _MICRON) * _MICRON
+        ratios = limits.ratios(count, radius)
+        if ratios is None:
+            continue
+        target = _target(limits.places(count, plate, radius), radius, ratios, name, background)
+        if not in_view(camera, outlines(target), R, t, FRAME_MARGIN_PX):
+            continue
+        found = deviations(edge_covariance(camera, target, R[some], t[some], imaging))
+        excess = float(need.excess(found).max())
+        if best is None or excess < best[0]:
+            best = excess, target
+    return None if best is None else best[1]
+
+
+def _target(places: Tensor, radius: float, ratios: Tensor, name: str, background: str) -> Target:
+    ordered = assign_codes(places, ratios)
+    count = len(places)
+    radii = torch.stack([torch.full_like(ordered, radius), radius * ordered], 1)
+    centers = torch.cat([places, places.new_zeros(count, 1)], 1)
+    return Target(
+        name=name,
+        background=background,  # type: ignore[arg-type]  # it checks
+        ids=torch.arange(count),
+        centers=_rounded(centers),
+        normals=torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64).expand(count, 3).contiguous(),
+        radii=_rounded(radii),
+    )
+
+
+def _rounded(length: Tensor) -> Tensor:
+    # by division: 1234 / 100 is the float64 that 12.34 is read as
+    return (length / _MICRON).round() / round(1 / _MICRON) + 0.0
+
+
+def _no_room(
+    camera: Camera, volume: WorkingVolume, plate: tuple[float, float], limits: Limits, count: int
+) -> ConfigError:
+    """Why no layout of ``count`` rings was found: they are out of view, or too small."""
+    R, t = volume.extremes()
+    corners = torch.tensor([[x, y, 0.0] for x in (-0.5, 0.5) for y in (-0.5, 0.5)], dtype=torch.float64)
+    corners = corners * torch.tensor([*plate, 0.0], dtype=torch.float64)
+    low, high = 0.0, 1.0
+    for _ in range(40):
+        middle = (low + high) / 2
+        low, high = (middle, high) if in_view(camera, middle * corners, R, t, FRAME_MARGIN_PX) else (low, middle)
+    if low < 0.999:
+        return ConfigError(
+            f"plate: {plate[0]:g} x {plate[1]:g} mm is larger than what is in view everywhere in the working volume, "
+            f"about {low * plate[0]:.3g} x {low * plate[1]:.3g} mm; shrink it, keep farther away, or narrow offset, "
+            "tilt or roll"
+        )
+    radius = limits.largest_radius(count, plate)
+    return ConfigError(
+        f"plate: {plate[0]:g} x {plate[1]:g} mm has room for {count} rings of {2 * radius:.3g} mm, whose "
+        f"semi-minor axis is {radius * limits.scale:.3g} px in the farthest, most tilted view; too small for "
+        f"{count} codes: enlarge the plate, come nearer, tilt less or take fewer markers"
+    )
+
+
+def _not_reached(best: Design, need: Need) -> ConfigError:
+    worst = best.precision.worst
+    lateral, depth, angle = float(worst[:2].max()), float(worst[2]), float(worst[3:].max()) / 1e3
+    angles = f" and {need.angle_deg:g} degrees" if math.isfinite(need.angle_deg) else ""
+    return ConfigError(
+        f"accuracy: {need.lateral_um:g} um lateral, {need.depth_um:g} um depth{angles} cannot be reached: the best "
+        f"layout ({len(best.target)} rings of {2 * best.radius:.3g} mm) has {lateral:.3g} um, "
+        f"{depth:.3g} um and {angle:.2g} degrees at its worst; enlarge the plate, come nearer, narrow the volume, or "
+        "take less noise or more pixels a mm"
+    )
