@@ -29,6 +29,7 @@ def simulate_points(
     *,
     draws: int,
     seed: int = 0,
+    true_camera: Camera | None = None,
 ) -> Tensor:
     """Errors (D, B, 6) of poses from marker centres: truth drawn about the nominal one, projected, solved.
 
@@ -37,13 +38,14 @@ def simulate_points(
 
     Args:
         R, t: (B, 3, 3), (B, 3) mm. uncertainty: as of `propagate` with features "centers".
+        true_camera: about which the cameras are drawn, where it is not the nominal one: for errors of known size.
 
     Returns:
         estimate minus truth: translation in mm, rotation vector in rad, about the camera axes; NaN without a pose.
     """
     generator = torch.Generator().manual_seed(seed)
     batch, count = t.shape[0], len(target)
-    cameras = _draw_cameras(camera, uncertainty, draws, generator)
+    cameras = _draw_cameras(true_camera or camera, uncertainty, draws, generator)
     centers, radii = _draw_prints(target, uncertainty, draws, generator)
     points = torch.einsum("bij,dmj->dbmi", R, centers) + t[:, None]
     normals = (target.normals @ R.mT).expand(draws, -1, -1, -1)

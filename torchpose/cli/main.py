@@ -10,7 +10,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from torchpose.cli import capture, common, design, detect, estimate, evaluate, reproduce, simulate
+from torchpose.cli import capture, common, design, detect, estimate, evaluate, reproduce, sensitivity, simulate
 from torchpose.errors import TorchposeError
 
 INTERNAL_ERROR = 70  # EX_SOFTWARE of sysexits.h: none of the codes that say something about the input
@@ -44,6 +44,7 @@ app.command(epilog=detect.EPILOG)(detect.detect)
 app.command(epilog=simulate.EPILOG)(simulate.simulate)
 app.command(epilog=evaluate.EPILOG)(evaluate.evaluate)
 app.command(epilog=capture.EPILOG)(capture.capture)
+app.command(epilog=sensitivity.EPILOG)(sensitivity.sensitivity)
 app.command(epilog=reproduce.EPILOG)(reproduce.reproduce)
 app.command(epilog=design.EPILOG)(design.design)
 

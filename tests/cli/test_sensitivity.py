@@ -1,0 +1,82 @@
+"""``torchpose sensitivity`` as a user types it."""
+
+from __future__ import annotations
+
+import csv
+
+import cv2
+import pytest
+
+from torchpose.cli.main import main
+
+pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is:DeprecationWarning")
+
+
+def run(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as stopped:
+        main(["sensitivity", *map(str, arguments)])
+    return stopped.value.code
+
+
+def rows_of(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_papers_set_up_by_default(tmp_path, capsys):
+    assert run("--out", tmp_path / "o", "--steps", 3, "--draws", 50) == 0
+    shown = capsys.readouterr().out
+    assert "0.2 px, focal length 0.25 %" in shown
+    rows = rows_of(tmp_path / "o" / "errors.csv")
+    assert {row["case"] for row in rows} == {"0.2 px", "1 px", "0.2 px, focal length 0.25 %"}
+    far = next(r for r in rows if r["case"] == "0.2 px" and r["axis"] == "z" and float(r["distance_mm"]) == 32)
+    assert float(far["paper_equations"]) == pytest.approx(7.68)
+    assert float(far["predicted_rms"]) == pytest.approx(7.68 / 2**0.5, rel=1e-3)
+    budget = rows_of(tmp_path / "o" / "budget.csv")
+    assert {row["source"] for row in budget} == {"image", "focal_length", "total"}
+    for name in ("errors.png", "budget.png"):
+        assert cv2.imread(str(tmp_path / "o" / name)) is not None
+
+
+def test_another_camera_and_every_source(tmp_path, capsys):
+    sources = ("--focal-error-percent", 0.05, "--principal-point-px", 1, "--print-um", 5, "--flatness-um", 10)
+    more = ("--radius-um", 5, "--scale-percent", 0.05, "--distortion", "1e-4,1e-4,1e-5,1e-5", "--tilt-deg", 20)
+    view = ("--camera", "data/sample/camera.yaml", "--target", "quad40", "--distance", 150, 170, "--steps", 3)
+    assert run("--out", tmp_path, *view, *sources, *more, "--sigma-px", 0.01, "--draws", 20) == 0
+    budget = rows_of(tmp_path / "budget.csv")
+    found = {row["source"] for row in budget if "focal" in row["case"]}
+    assert {"image", "distortion", "print_centers", "print_flatness", "print_radii", "print_scale", "total"} <= found
+
+
+def test_without_other_sources_there_is_noise_alone(tmp_path):
+    assert run("--out", tmp_path, "--focal-error-percent", 0, "--sigma-px", 0.5, "--steps", 3, "--draws", 5) == 0
+    assert {row["case"] for row in rows_of(tmp_path / "errors.csv")} == {"0.5 px"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--sigma-px", 0), "--sigma-px: is 0"),
+        (("--sigma-px", "nan"), "--sigma-px: is nan"),
+        (("--print-um", -1), "--print-um: is -1"),
+        (("--distance", 30, 20), "--distance: is 30.0 20.0; give NEAR above 0"),
+        (("--distance", 5, 20), "at 5 mm not all markers are in the frame"),
+        (("--tilt-deg", 90), "--tilt-deg"),
+        (("--distortion", "1e-3"), "--distortion: 1 numbers for 0 coefficients"),
+        (("--distortion", "a,b"), "is no list of numbers"),
+        (("--target", "quad9"), "quad9: target: is neither a file nor built in"),
+        (("--camera", "missing.yaml"), "missing.yaml"),
+        (("--draws", 1), "draws"),
+    ],
+)
+def test_wrong_input_is_one_line(tmp_path, capsys, arguments, message):
+    assert run("--out", tmp_path / "o", "--steps", 3, "--draws", 5, *arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_a_folder_that_cannot_be_written(tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert run("--out", tmp_path / "file", "--steps", 3, "--draws", 5, "--sigma-px", 1) == 2
+    assert "--out" in capsys.readouterr().err

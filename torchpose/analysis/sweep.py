@@ -1,0 +1,96 @@
+"""Errors over the working distance: the paper's equations, propagation and Monte-Carlo side by side (Fig. 4)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchpose.analysis import equations
+from torchpose.analysis.monte_carlo import simulate_points
+from torchpose.analysis.sensitivity import ErrorBudget, Uncertainty, propagate
+from torchpose.camera import Camera
+from torchpose.geometry import rotations
+from torchpose.target import Target
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """Errors of a target's pose at D distances on the optical axis; mm and rad, x y z and rotations about x y z.
+
+    Attributes:
+        distance: (D,) mm.
+        budget: predicted, by source. Its ``focal_length`` is the size of the effect of an error of exactly that share.
+        errors: (N, D, 6) of N draws, estimate minus truth. The focal length is wrong by its whole share in every draw.
+        lateral, depth, depth_focal: (D,) mm, size of eq. (3), (2) and (5) for the distance between neighbouring
+            markers.
+    """
+
+    distance: Tensor
+    budget: ErrorBudget
+    errors: Tensor
+    lateral: Tensor
+    depth: Tensor
+    depth_focal: Tensor
+
+    @property
+    def largest(self) -> Tensor:
+        """(D, 6), largest error of the draws."""
+        return self.errors.abs().amax(0)
+
+    @property
+    def rms(self) -> Tensor:
+        """(D, 6), root mean square of the draws."""
+        return self.errors.square().mean(0).sqrt()
+
+
+def sweep(
+    camera: Camera,
+    target: Target,
+    distance: Tensor,
+    uncertainty: Uncertainty,
+    *,
+    tilt: float = 0.0,
+    draws: int = 200,
+    seed: int = 0,
+) -> Sweep:
+    """Errors at the distances (D,), mm, the target's middle on the optical axis.
+
+    Args:
+        uncertainty: with one number for ``image``. Its ``focal_length`` is taken as an error of that very size, the
+            true lens being the longer one.
+        tilt: rad, about the x axis.
+    """
+    R = rotations.exp(torch.tensor([tilt, 0.0, 0.0], dtype=torch.float64)).expand(len(distance), 3, 3)
+    t = torch.stack([torch.zeros_like(distance), torch.zeros_like(distance), distance], -1).double()
+    t = t - (R @ target.centers.mean(0)) * torch.tensor([1.0, 1.0, 0.0])
+    longer = camera.matrix.clone()
+    longer[[0, 1], [0, 1]] *= 1 + uncertainty.focal_length
+    errors = simulate_points(
+        camera,
+        target,
+        R,
+        t,
+        replace(uncertainty, focal_length=0.0),
+        draws=draws,
+        seed=seed,
+        true_camera=replace(camera, matrix=longer),
+    )
+    f, near = float(camera.matrix[0, 0]), float(torch.pdist(target.centers).min())
+    assert not isinstance(uncertainty.image, Tensor)
+    return Sweep(
+        distance=distance,
+        budget=propagate(camera, target, R, t, uncertainty),
+        errors=errors,
+        lateral=uncertainty.image * equations.lateral_per_pixel(f, distance, 1.0),
+        depth=uncertainty.image * equations.depth_per_pixel(near, f, distance, 1.0).abs(),
+        depth_focal=equations.depth_focal_error(distance, 1.0, 1 + uncertainty.focal_length),
+    )
+
+
+def fit(distance: Tensor, value: Tensor, powers: Sequence[int]) -> Tensor:
+    """Values (D,) of the least-squares polynomial in the distance with the given powers."""
+    columns = torch.stack([(distance / distance.max()) ** p for p in powers], -1)
+    return columns @ torch.linalg.lstsq(columns, value[:, None]).solution[:, 0]
