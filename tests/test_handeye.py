@@ -11,6 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from torchpose.errors import ConfigError
+from torchpose.geometry import rotations
 from torchpose.handeye import HandEye
 
 VECTOR = [0.3, -1.2, 2.0]
@@ -115,3 +116,48 @@ def test_missing_file(tmp_path: Path) -> None:
 def test_rotation_of_half_a_turn(tmp_path: Path) -> None:
     handeye = load(tmp_path, f"base_from_camera: {{rotation: [{math.pi!r}, 0, 0], translation: [0, 0, 0]}}")
     np.testing.assert_allclose(handeye.rotation.numpy(), np.diag([1.0, -1, -1]), rtol=0, atol=1e-15)
+
+
+def test_file_with_covariance_survives(tmp_path: Path) -> None:
+    root = torch.randn(6, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    rotation = torch.from_numpy(MATRIX[:3, :3])
+    saved = HandEye("tool", rotation, torch.tensor([1.0, -2, 3], dtype=torch.float64), covariance=root @ root.T)
+    saved.save(tmp_path / "handeye.yaml")
+    read = HandEye.load(tmp_path / "handeye.yaml")
+    assert read.mount == "tool"
+    assert read.covariance is not None
+    np.testing.assert_allclose(read.rotation.numpy(), rotation.numpy(), rtol=0, atol=1e-15)
+    assert torch.equal(read.translation, saved.translation)
+    assert torch.equal(read.covariance, root @ root.T)
+
+
+@pytest.mark.parametrize(
+    "bad", ["[[1, 0], [0, 1]]", str(np.diag([1.0, 1, 1, 1, 1, -1]).tolist()), str(np.tri(6).tolist())]
+)
+def test_wrong_covariance_is_one_line(tmp_path: Path, bad: str) -> None:
+    with pytest.raises(ConfigError, match="covariance"):
+        load(tmp_path, f"base_from_camera: {{rotation: {VECTOR}, translation: [0, 0, 0], covariance: {bad}}}\n")
+
+
+@pytest.mark.parametrize("mount", ["base", "tool"])
+def test_base_covariance_is_the_scatter_of_base_poses(mount: str) -> None:
+    g = torch.Generator().manual_seed(3)
+    many, sigma = 4000, torch.tensor([0.1, 0.2, 0.3, 1e-3, 2e-3, 3e-3], dtype=torch.float64)
+    rotation, translation = torch.from_numpy(MATRIX[:3, :3]), torch.from_numpy(MATRIX[:3, 3])
+    known = HandEye(mount, rotation, translation, covariance=torch.diag(sigma**2))  # type: ignore[arg-type]
+    tool = None
+    if mount == "tool":
+        turned = rotations.exp(torch.tensor([[0.4, -0.3, 1.0]], dtype=torch.float64))
+        tool = (turned, torch.tensor([[200.0, 50, 300]], dtype=torch.float64))
+    seen = torch.tensor([[30.0, -20, 400]], dtype=torch.float64)
+    off = sigma * torch.randn(many, 6, dtype=torch.float64, generator=g)
+    points = []
+    for r, t in zip(rotations.exp(off[:, 3:]) @ rotation, translation + off[:, :3], strict=True):
+        base = HandEye(mount, r, t).base_from_camera(tool)  # type: ignore[arg-type]
+        points.append((base[0] @ seen[..., None])[..., 0].reshape(-1) + base[1].reshape(-1))
+    scatter = torch.cov(torch.stack(points).T)
+    center = known.base_from_camera(tool)
+    at = ((center[0] @ seen[..., None])[..., 0] + center[1]).reshape(1, 3)
+    predicted = known.base_covariance(at, tool)[0, :3, :3]
+    assert float((scatter - predicted).abs().max()) < 0.08 * float(predicted.diagonal().max())
+    assert not HandEye(mount, rotation, translation).base_covariance(at, tool).any()  # type: ignore[arg-type]

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.target import Vector
-from torchpose.yaml_files import read_yaml, validate
+from torchpose.yaml_files import format_list, read_yaml, validate, write_text
 
 _ORTHONORMAL = 1e-6  # largest entry of R^T R - I that a file may have
 
@@ -23,6 +23,7 @@ class _Pose(BaseModel):
     rotation: Vector | None = None
     translation: Vector | None = None
     matrix: list[list[FiniteFloat]] | None = None
+    covariance: list[list[FiniteFloat]] | None = None
 
     @model_validator(mode="after")
     def _one_form(self) -> _Pose:
@@ -31,6 +32,8 @@ class _Pose(BaseModel):
             raise ValueError("is not one pose; give rotation and translation, or matrix alone")
         if self.matrix is not None:
             _check_matrix(self.matrix)
+        if self.covariance is not None:
+            _check_covariance(self.covariance)
         return self
 
 
@@ -59,6 +62,18 @@ def _check_matrix(rows: list[list[float]]) -> None:
         raise ValueError("matrix is a reflection (determinant -1); give a right-handed rotation")
 
 
+def _check_covariance(rows: list[list[float]]) -> None:
+    if len(rows) != 6 or any(len(row) != 6 for row in rows):
+        raise ValueError("covariance is not 6 x 6; give that of translation (mm), then rotation (rad)")
+    c = torch.tensor(rows, dtype=torch.float64)
+    size = c.diagonal().abs().sqrt().clamp_min(1e-300)
+    unit = c / size / size[:, None]
+    if bool(((unit - unit.T).abs() > 1e-9).any()):
+        raise ValueError("covariance is not symmetric; give that of translation (mm), then rotation (rad)")
+    if bool(torch.linalg.eigvalsh(unit)[0] < -1e-9):
+        raise ValueError("covariance has a negative eigenvalue; give that of translation (mm), then rotation (rad)")
+
+
 @dataclass(frozen=True, eq=False)
 class HandEye:
     """Pose of the camera on the robot: X_mount = R X_cam + t.
@@ -67,19 +82,23 @@ class HandEye:
         mount: 'base' for a camera fixed in the cell, 'tool' for one carried by the robot.
         rotation: (3, 3) float64. translation: (3,) float64, mm.
         source: the file, for messages.
+        covariance: (6, 6) float64 of the translation (mm), then the rotation w (rad) with R_true = exp(w) R, along and
+            about the axes of the mount; None where it is not known.
     """
 
     mount: Literal["base", "tool"]
     rotation: Tensor
     translation: Tensor
     source: str = "hand-eye"
+    covariance: Tensor | None = None
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> HandEye:
         """Reads a YAML or JSON file with one of the keys ``base_from_camera`` and ``tool_from_camera``.
 
         Either holds ``{rotation: [rx, ry, rz], translation: [x, y, z]}`` (rotation vector in rad, mm) or
-        ``{matrix: ...}``, a 4 x 4 rigid transform in mm, whose rotation part is orthonormal to 1e-6.
+        ``{matrix: ...}``, a 4 x 4 rigid transform in mm, whose rotation part is orthonormal to 1e-6; either may hold
+        ``covariance``, 6 x 6.
 
         Raises:
             ConfigError: one line ``FILE: FIELD: what is wrong; the fix``.
@@ -95,7 +114,24 @@ class HandEye:
         else:
             rotation = rotations.exp(torch.tensor(pose.rotation, dtype=torch.float64))
             translation = torch.tensor(pose.translation, dtype=torch.float64)
-        return cls("base" if data.base_from_camera else "tool", rotation, translation, source)
+        spread = None if pose.covariance is None else torch.tensor(pose.covariance, dtype=torch.float64)
+        return cls("base" if data.base_from_camera else "tool", rotation, translation, source, spread)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes the hand-eye file in one piece.
+
+        Raises:
+            ConfigError: the folder does not exist or cannot be written.
+        """
+        text = (
+            f"# pose of the camera: rotation vector in rad, translation in mm\n{self.mount}_from_camera:\n"
+            f"  rotation: {format_list(rotations.log(self.rotation).tolist())}\n"
+            f"  translation: {format_list(self.translation.tolist())}\n"
+        )
+        if self.covariance is not None:
+            rows = "".join(f"    - {format_list(row)}\n" for row in self.covariance.tolist())
+            text += f"  covariance:  # translation, mm^2, then rotation, rad^2\n{rows}"
+        write_text(path, text)
 
     def base_from_camera(self, tool_poses: tuple[Tensor, Tensor] | None = None) -> tuple[Tensor, Tensor]:
         """The transform from camera to robot base, for `Poses.seen_from`.
@@ -118,3 +154,21 @@ class HandEye:
             )
         r, t = tool_poses
         return rotations.compose(r, t, self.rotation.to(r), self.translation.to(t))
+
+    def base_covariance(self, translation: Tensor, tool_poses: tuple[Tensor, Tensor] | None = None) -> Tensor:
+        """What the uncertainty of this calibration adds to poses in the robot base, (N, 6, 6); zero if not known.
+
+        Args:
+            translation: (N, 3) of the poses in the base, mm. tool_poses: as in `base_from_camera`.
+        """
+        count = len(translation)
+        if self.covariance is None:
+            return translation.new_zeros(count, 6, 6)
+        _, camera = self.base_from_camera(tool_poses)
+        turn = (tool_poses[0] if self.mount == "tool" and tool_poses else torch.eye(3).to(translation)).expand(
+            count, 3, 3
+        )
+        # a turn w of the camera about itself takes what is ``arm`` away along
+        arm = rotations.skew(translation - camera)
+        jacobian = torch.cat([torch.cat([turn, -arm @ turn], -1), torch.cat([torch.zeros_like(turn), turn], -1)], -2)
+        return jacobian @ self.covariance.to(translation) @ jacobian.mT

@@ -230,6 +230,8 @@ def _of_parts(poses: Poses, targets: list[Target]) -> Poses:
 
 def _add_base_cells(rows: list[Row], poses: Poses, sources: Sequence[Source], hand_eye: HandEye) -> None:
     """Adds the poses in the robot base; cells stay empty where a camera on the tool has no robot pose."""
+    from dataclasses import replace
+
     import torch
 
     from torchpose.geometry import rotations
@@ -240,7 +242,9 @@ def _add_base_cells(rows: list[Row], poses: Poses, sources: Sequence[Source], ha
         unknown = (float("nan"),) * 6
         tool = torch.tensor([source.robot_pose or unknown for source in sources], dtype=torch.float64)[poses.frame]
         robot = (rotations.exp(tool[:, 3:]), tool[:, :3])
-    cells = base_cells(poses.seen_from(*hand_eye.base_from_camera(robot)))
+    based = poses.seen_from(*hand_eye.base_from_camera(robot))
+    based = replace(based, covariance=based.covariance + hand_eye.base_covariance(based.t, robot))
+    cells = base_cells(based)
     for row, extra in zip(rows, cells, strict=True):
         row.update(extra)
 

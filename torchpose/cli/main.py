@@ -10,7 +10,18 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from torchpose.cli import capture, common, design, detect, estimate, evaluate, reproduce, sensitivity, simulate
+from torchpose.cli import (
+    calibrate,
+    capture,
+    common,
+    design,
+    detect,
+    estimate,
+    evaluate,
+    reproduce,
+    sensitivity,
+    simulate,
+)
 from torchpose.errors import TorchposeError
 
 INTERNAL_ERROR = 70  # EX_SOFTWARE of sysexits.h: none of the codes that say something about the input
@@ -47,6 +58,7 @@ app.command(epilog=capture.EPILOG)(capture.capture)
 app.command(epilog=sensitivity.EPILOG)(sensitivity.sensitivity)
 app.command(epilog=reproduce.EPILOG)(reproduce.reproduce)
 app.command(epilog=design.EPILOG)(design.design)
+app.command(epilog=calibrate.EPILOG)(calibrate.calibrate)
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:

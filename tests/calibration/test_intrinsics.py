@@ -1,0 +1,82 @@
+"""What calibration does with doubtful data: outliers, unknown noise, few views, views that are alike."""
+
+from dataclasses import replace
+
+import calibration_scenes as scenes
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchpose.calibration import calibrate_intrinsics
+from torchpose.calibration.intrinsics import common_sigma, locate_views, start_cameras
+from torchpose.errors import ConfigError
+
+CAMERA = scenes.camera()
+STARTS = start_cameras(CAMERA.width, CAMERA.height, "brown4")
+
+
+def test_wrong_points_are_left_out() -> None:
+    views = scenes.views(CAMERA, scenes.poses(CAMERA, 12), scenes.grid(), sigma=0.02)
+    pixels = views.pixels.clone()
+    pixels[[17, 100]] += torch.tensor([3.0, -2.0], dtype=torch.float64)
+    found = calibrate_intrinsics(replace(views, pixels=pixels), STARTS, lens="brown4")
+    assert found.left_out == 2
+    assert not {17, 100} & set((found.views.view * 20 + found.views.point).tolist())
+    assert abs(float(found.camera.matrix[0, 0]) - 1503) < 5 * float(found.covariance[0, 0].sqrt())
+
+
+@pytest.mark.parametrize("said", [0.0, 0.01], ids=["unknown", "too small"])
+def test_common_error_is_found(said: float) -> None:
+    views = scenes.views(CAMERA, scenes.poses(CAMERA, 15), scenes.grid(), sigma=0.1, said=said)
+    found = calibrate_intrinsics(views, STARTS, lens="brown4")
+    assert found.common_sigma_px == pytest.approx((0.01 - said**2) ** 0.5, rel=0.1)
+    assert found.reduced_chi2 == pytest.approx(1, abs=1e-3)
+
+
+def test_no_common_error_where_the_covariances_hold() -> None:
+    views = scenes.views(CAMERA, scenes.poses(CAMERA, 15), scenes.grid(), sigma=0.1)
+    assert calibrate_intrinsics(views, STARTS, lens="brown4").common_sigma_px == 0
+
+
+@given(sigma=st.floats(1e-4, 10), seed=st.integers(0, 1000))
+@settings(max_examples=25, deadline=None)
+def test_common_sigma_of_points_without_covariance_is_their_rms(sigma: float, seed: int) -> None:
+    residual = sigma * torch.randn(50, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    expected = float((residual.square().sum() / 70).sqrt())
+    assert common_sigma(residual, torch.zeros(50, 2, 2, dtype=torch.float64), 70) == pytest.approx(expected, rel=1e-4)
+
+
+def test_few_views_are_refused() -> None:
+    with pytest.raises(ConfigError, match="2 usable views"):
+        calibrate_intrinsics(scenes.views(CAMERA, scenes.poses(CAMERA, 2), scenes.grid(), sigma=0.1), STARTS)
+    few = scenes.views(CAMERA, scenes.poses(CAMERA, 4, tilt=(20, 30)), scenes.grid(40.0, 2, 2), sigma=0.1)
+    with pytest.raises(ConfigError, match="4 views with 16 points do not determine 8 intrinsics"):
+        calibrate_intrinsics(few, STARTS, lens="brown4")
+
+
+def test_frontal_views_are_refused_or_doubted() -> None:
+    plain = scenes.camera([])
+    frontal = scenes.views(plain, scenes.poses(plain, 10, tilt=(0, 0)), scenes.grid(), said=0.1)
+    with pytest.raises(ConfigError, match="too alike"):
+        calibrate_intrinsics(frontal, [plain], lens="pinhole")
+    little = scenes.views(CAMERA, scenes.poses(CAMERA, 10, tilt=(1, 3)), scenes.grid(), sigma=0.05)
+    found = calibrate_intrinsics(little, [CAMERA], lens="brown4")
+    assert any("tilts differ" in w for w in found.warnings)
+    assert any("focal length is known to" in w for w in found.warnings)
+    varied = scenes.views(CAMERA, scenes.poses(CAMERA, 15), scenes.grid(20, 6, 4), sigma=0.05)
+    assert not calibrate_intrinsics(varied, [CAMERA], lens="brown4").warnings
+
+
+def test_views_of_a_known_camera() -> None:
+    pose = scenes.poses(CAMERA, 4)
+    views, bundle = locate_views(scenes.views(CAMERA, pose, scenes.grid(), sigma=0.02), CAMERA)
+    assert len(views) == 4
+    assert bundle.camera is CAMERA
+    error = (bundle.t - pose[1]).abs() / bundle.pose_covariance.diagonal(dim1=-2, dim2=-1)[:, :3].sqrt()
+    assert float(error.max()) < 5
+
+
+def test_unknown_lens_is_named() -> None:
+    with pytest.raises(ConfigError, match="brown6"):
+        start_cameras(10, 10, "brown6")

@@ -1,0 +1,299 @@
+"""Intrinsics of a camera from views of known points, with their covariance and what there is to doubt about them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from torchpose import pnp
+from torchpose.calibration.bundle import Bundle, adjust
+from torchpose.calibration.views import Views
+from torchpose.camera import Camera
+from torchpose.camera.model import Model
+from torchpose.errors import ConfigError
+
+LENS_MODELS: dict[str, tuple[Model, tuple[str, ...]]] = {
+    "pinhole": ("brown_conrady", ()),
+    "brown4": ("brown_conrady", ("k1", "k2", "p1", "p2")),
+    "brown5": ("brown_conrady", ("k1", "k2", "p1", "p2", "k3")),
+    "rational8": ("brown_conrady", ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
+    "kannala_brandt": ("kannala_brandt", ("k1", "k2", "k3", "k4")),
+}
+"""Name of a lens model to the camera model and its coefficients, in the order of the camera file."""
+
+MIN_POINTS = 4  # of a view that counts
+_START_FOCALS = (0.6, 1.0, 1.8, 3.5)  # over the width, tried where no camera is given
+_START_SIGMA = 1.0  # px, of points without a covariance, until their residuals tell
+_OUTLIER = 27.6  # chi-squared of a point beyond which it is left out: 1e-6 of good points
+_MEDIAN = 2 * math.log(2)  # of chi-squared with two degrees of freedom
+_ROUNDS = 4  # of leaving out points and finding the common error
+_WIDE_SIGMA = 1e-3  # of a focal length, above which views are called too alike
+_LITTLE_TILT_DEG = 15.0  # between the views' normals, below which they are
+_LITTLE_COVER = 0.5  # of the frame's width or height, below which distortion is extrapolated
+_SINGULAR = 1e-12  # least eigenvalue of the information, scaled to a unit diagonal
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Result of `calibrate_intrinsics`.
+
+    Attributes:
+        camera: the calibrated camera, with ``camera.covariance`` of fx, fy, cx, cy.
+        covariance: (n, n) of fx, fy, cx, cy (px) and the distortion; ``names`` says which is which.
+        views: those that were used, with the points that were used. bundle: poses and residuals of these.
+        left_out: points left out because they contradict the others.
+        chi2: sum over all points. degrees: of freedom. Their quotient is the reduced chi-squared.
+        common_sigma_px: standard deviation, px per axis, that had to be added to every point (print, flatness, lens
+            model) to make the reduced chi-squared 1; 0 where the covariances of the points explain the residuals.
+        warnings: what makes the result doubtful, one sentence each.
+    """
+
+    camera: Camera
+    covariance: Tensor
+    names: tuple[str, ...]
+    views: Views
+    bundle: Bundle
+    left_out: int
+    chi2: float
+    degrees: int
+    common_sigma_px: float
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square length of the residuals, px."""
+        return float(self.bundle.residual.square().sum(-1).mean().sqrt())
+
+    @property
+    def reduced_chi2(self) -> float:
+        return self.chi2 / self.degrees
+
+    @property
+    def pose_covariance(self) -> Tensor:
+        """(N, 6, 6) of the views' poses, the uncertainty of the intrinsics included."""
+        gain = self.bundle.gain
+        return self.bundle.pose_covariance + gain @ self.covariance @ gain.mT
+
+
+def start_cameras(width: int, height: int, lens: str) -> list[Camera]:
+    """Cameras without distortion, of different focal lengths, to start from where nothing is known.
+
+    Raises:
+        ConfigError: an unknown lens model.
+    """
+    model, names = _lens(lens)
+    matrices = [[[f * width, 0, (width - 1) / 2], [0, f * width, (height - 1) / 2], [0, 0, 1]] for f in _START_FOCALS]
+    return [Camera(width, height, torch.tensor(m).double(), torch.zeros(len(names)).double(), model) for m in matrices]
+
+
+def _lens(name: str) -> tuple[Model, tuple[str, ...]]:
+    if name not in LENS_MODELS:
+        raise ConfigError(f"--model: {name!r} is not known; choose one of {', '.join(LENS_MODELS)}")
+    return LENS_MODELS[name]
+
+
+def with_lens(camera: Camera, lens: str) -> Camera:
+    """The camera with the coefficients of another lens model: cut off or filled up with zeros; none of another kind.
+
+    Raises:
+        ConfigError: an unknown lens model.
+    """
+    model, names = _lens(lens)
+    old = camera.distortion if camera.model == model else camera.distortion[:0]
+    distortion = torch.nn.functional.pad(old, (0, max(0, len(names) - len(old))))[: len(names)]
+    return replace(camera, model=model, distortion=distortion.double(), matrix=camera.matrix.double(), covariance=None)
+
+
+def calibrate_intrinsics(views: Views, starts: list[Camera], *, lens: str = "brown5") -> Calibration:
+    """Maximum-likelihood intrinsics of one camera and the poses of its views.
+
+    All points of all views are adjusted together (`torchpose.calibration.bundle.adjust`). Points that contradict the
+    others by more than 1e-6 of good ones would are left out. Where the residuals are larger than the covariances of the
+    points say, an error common to all points and axes is added to these (variance component by its residuals, as
+    Foerstner 1979), so that the covariance of the result covers it; errors that repeat in every view, such as those of
+    the print, are then counted as if they did not.
+
+    Args:
+        views: a covariance of zero means unknown; the common error then stands for it.
+        starts: cameras to start from; the one that fits best is taken. `start_cameras` where nothing is known.
+        lens: a name of `LENS_MODELS`.
+
+    Raises:
+        ConfigError: too few views or points, views that do not determine the intrinsics, or no convergence.
+    """
+    _, coefficients = _lens(lens)
+    names = ("fx", "fy", "cx", "cy", *coefficients)
+    views = views.of_views(views.counts >= MIN_POINTS)
+    _check_count(views, len(names))
+    best = min(
+        (one for start in starts for one in [_first_fit(views, with_lens(start, lens))] if one is not None),
+        key=lambda one: float(one[0].chi2.sum()),
+        default=None,
+    )
+    if best is None:
+        raise ConfigError("INPUT: no pose explains the views; give --camera to start from and check the target")
+    before = len(best[1].view)
+    views, bundle, common = _weigh(best[1], best[0], len(names))
+    if not bundle.converged:
+        raise ConfigError("INPUT: calibration did not converge; use a simpler --model or more varied views")
+    covariance = _covariance(bundle, names)
+    return Calibration(
+        replace(bundle.camera, covariance=covariance[:4, :4]),
+        covariance,
+        names,
+        views,
+        bundle,
+        before - len(views.view),
+        float(bundle.chi2.sum()),
+        _degrees(views, len(names)),
+        common,
+        _warnings(views, bundle, covariance),
+    )
+
+
+def locate_views(views: Views, camera: Camera) -> tuple[Views, Bundle]:
+    """Poses of the views of a camera that is known; points are weighed and left out as in `calibrate_intrinsics`.
+
+    Raises:
+        ConfigError: no view has a pose.
+    """
+    views = views.of_views(views.counts >= MIN_POINTS)
+    first = _first_fit(views, camera, free=False) if len(views) else None
+    if first is None:
+        raise ConfigError("INPUT: no view has a pose; check --camera, the target and the frames")
+    views, bundle, _ = _weigh(first[1], first[0], 0)
+    return views, bundle
+
+
+def _weigh(views: Views, bundle: Bundle, unknowns: int) -> tuple[Views, Bundle, float]:
+    """Views without contradicting points, their fit with proper weights, and the common error in px.
+
+    ``unknowns``: number of intrinsics, 0 for a known camera.
+    """
+    free, common = unknowns > 0, 0.0
+    for _ in range(_ROUNDS):
+        common = common_sigma(bundle.residual, views.covariance, _degrees(views, unknowns))
+        bundle = adjust(_with_common(views, common), bundle.camera, bundle.R, bundle.t, free=free)
+        keep = bundle.chi2 < _OUTLIER * max(1.0, float(bundle.chi2.median()) / _MEDIAN)
+        if bool(keep.all()):
+            continue
+        views, bundle = _without(views, bundle, keep)
+        _check_count(views, unknowns)
+        bundle = adjust(_with_common(views, common), bundle.camera, bundle.R, bundle.t, free=free)
+    return views, bundle, common
+
+
+def common_sigma(residual: Tensor, covariance: Tensor, degrees: int) -> float:
+    """Standard deviation s, px per axis, with sum of r^T (C + s^2 I)^-1 r = degrees of freedom; 0 where C suffices.
+
+    Args:
+        residual: (K, 2) px. covariance: (K, 2, 2) px^2, zero where unknown. degrees: of freedom.
+    """
+
+    def excess(s: float) -> float:
+        c = covariance + s * s * torch.eye(2, dtype=covariance.dtype)
+        return float((residual * torch.linalg.solve(c, residual)).sum()) / degrees - 1
+
+    high = max(float(residual.square().sum() / degrees) ** 0.5, 1e-9)
+    low = 1e-6 * high
+    # two standard deviations of the reduced chi-squared: what lies within says nothing about the covariances
+    if excess(low) < 2 * math.sqrt(2 / degrees):
+        return 0.0
+    for _ in range(60):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if excess(middle) > 0 else (low, middle)
+    return high
+
+
+def _with_common(views: Views, sigma: float) -> Views:
+    eye = torch.eye(2, dtype=torch.float64)
+    return replace(views, covariance=views.covariance + sigma * sigma * eye)
+
+
+def _first_fit(views: Views, start: Camera, *, free: bool = True) -> tuple[Bundle, Views] | None:
+    """Fit with equal weights from one start: poses, everything, poses anew (the other planar solution), everything."""
+    equal = replace(views, covariance=_START_SIGMA**2 * torch.eye(2, dtype=torch.float64).expand(len(views.view), 2, 2))
+    camera, bundle = start, None
+    for _ in range(2):
+        points, pixels, mask = equal.padded()
+        poses = pnp.solve(points, pixels, camera, mask=mask)
+        solved = poses.R.isfinite().all(-1).all(-1) & (poses.t[:, 2] > 0)
+        if int(solved.sum()) < len(equal):
+            equal, views = equal.of_views(solved), views.of_views(solved)
+            if len(equal) == 0:
+                return None
+        try:
+            bundle = adjust(equal, camera, poses.R[solved], poses.t[solved], free=free)
+        except (ConfigError, torch.linalg.LinAlgError):
+            return None
+        camera = bundle.camera
+    return None if bundle is None else (bundle, views)
+
+
+def _without(views: Views, bundle: Bundle, keep: Tensor) -> tuple[Views, Bundle]:
+    """Views and state without some of the points, and without views that have too few left."""
+    rest = views.of_points(keep)
+    enough = rest.counts >= MIN_POINTS
+    return rest.of_views(enough), replace(bundle, R=bundle.R[enough], t=bundle.t[enough])
+
+
+def _degrees(views: Views, unknowns: int) -> int:
+    return 2 * len(views.view) - 6 * len(views) - unknowns
+
+
+def _check_count(views: Views, unknowns: int) -> None:
+    if unknowns and len(views) < 3:
+        raise ConfigError(f"INPUT: {len(views)} usable views; calibration takes 3 at least, better 15, tilted all ways")
+    if _degrees(views, unknowns) < 1:
+        raise ConfigError(
+            f"INPUT: {len(views)} views with {len(views.view)} points do not determine {unknowns} intrinsics; "
+            "add views, or use a simpler --model"
+        )
+
+
+def _covariance(bundle: Bundle, names: tuple[str, ...]) -> Tensor:
+    information = bundle.information
+    scale = information.diagonal().clamp_min(1e-300).rsqrt()
+    values, vectors = torch.linalg.eigh(information * scale[:, None] * scale)
+    if not float(values[0]) > _SINGULAR:
+        direction = ", ".join(names[i] for i in vectors[:, 0].abs().topk(2).indices.sort().values.tolist())
+        raise ConfigError(
+            f"INPUT: the views are too alike to tell the intrinsics apart (mostly {direction}); "
+            "add views tilted by 20 to 45 degrees in different directions"
+        )
+    vectors = scale[:, None] * vectors
+    covariance = (vectors / values) @ vectors.T
+    return 0.5 * (covariance + covariance.T)
+
+
+def tilt_spread_deg(rotation: Tensor) -> float:
+    """Largest angle between the normals of any two views (N, 3, 3), in degrees."""
+    normal = rotation[:, :, 2]
+    return float((normal @ normal.T).clamp(-1, 1).acos().max().rad2deg())
+
+
+def _warnings(views: Views, bundle: Bundle, covariance: Tensor) -> list[str]:
+    notes = []
+    focal, sigma = bundle.camera.matrix.diagonal()[:2], covariance.diagonal()[:2].sqrt()
+    spread = tilt_spread_deg(bundle.R)
+    if spread < _LITTLE_TILT_DEG:
+        notes.append(
+            f"views too alike: their tilts differ by {spread:.0f} degrees at most, so focal length and distance are "
+            "hard to tell apart; add views tilted by 20 to 45 degrees in different directions"
+        )
+    if float((sigma / focal).max()) > _WIDE_SIGMA:
+        notes.append(
+            f"the focal length is known to {float((sigma / focal).max()):.2%} only, which is the relative error of "
+            "every distance; add tilted views, or views that fill the frame"
+        )
+    reach = views.pixels.amax(0) - views.pixels.amin(0)
+    size = reach.new_tensor([bundle.camera.width, bundle.camera.height])
+    if len(bundle.camera.distortion) and not bool((reach > _LITTLE_COVER * size).all()):
+        notes.append(
+            "the points cover less than half of the frame's width or height, so the distortion beyond them is "
+            "extrapolated; add views with the target near borders and corners"
+        )
+    return notes

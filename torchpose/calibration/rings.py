@@ -1,0 +1,90 @@
+"""Views of ring targets: markers found with a rough camera, then their centres from the grey values."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchpose.calibration.views import Views
+from torchpose.camera import Camera
+from torchpose.centers import common_center
+from torchpose.detect import find_candidates
+from torchpose.markers import MarkerTable, identify
+from torchpose.pipeline import PoseEstimator, raw_centers
+from torchpose.refine import refine_photometric
+from torchpose.results import Status
+from torchpose.rings import measure_rings
+from torchpose.target import Target
+
+_HELD = 1e12  # information about the rotation of a marker: as good as known
+_LEAST_KEPT = 0.5  # of a marker's pixels that must follow the model
+
+
+def find_rings(names: Sequence[str], frames: Tensor, cameras: Sequence[Camera], target: Target) -> list[Views]:
+    """Views of a target by cameras that are rough guesses: the exact common centres of each ring's two ellipses.
+
+    Args:
+        names: of the B frames. frames: (B, H, W), see `torchpose.PoseEstimator`.
+        cameras: to identify the markers with, one after the other; if there are several, all without distortion.
+
+    Returns:
+        The views of each camera. Which ring is which depends little on the camera, the centres hardly at all.
+    """
+    candidates = find_candidates(_grey(frames))
+    table = MarkerTable.of([target])
+    candidates = candidates[torch.isin(candidates.polarity, table.polarity)]
+    rings = measure_rings(_grey(frames), candidates, cameras[0])
+    every = []
+    for camera in cameras:
+        ring = identify(rings, table, camera, len(frames)).ring
+        view, marker = (ring >= 0).nonzero().unbind(-1)
+        at = ring[view, marker]
+        center, covariance = common_center(rings.outer[at], rings.inner[at], target.radii[marker])
+        # ellipses are in the pixels of the first camera without its distortion
+        pixels, covariance = raw_centers(cameras[0], center, covariance)
+        every.append(Views(tuple(names), view, target.ids[marker], target.centers[marker], pixels, covariance))
+    return every
+
+
+def _grey(frames: Tensor) -> Tensor:
+    return 255.0 * frames if frames.is_floating_point() else frames
+
+
+def measure_centers(names: Sequence[str], frames: Tensor, camera: Camera, target: Target) -> Views:
+    """Views of a target by a camera that is known well: centres of single markers, fitted to the grey values.
+
+    Every marker is moved as a whole, its tilt held at that of the target's pose, until its rendered rings agree with
+    the pixels around them; its centre then projects to the point seen. So no ellipse is fitted, and no centre is
+    compensated. Errors of the camera enter through the small tilt and distortion across one marker only.
+    """
+    poses = PoseEstimator(camera, target)(frames)
+    found = poses.detections
+    usable = (poses.status == Status.OK) | (poses.status == Status.AMBIGUOUS)
+    found = found[usable[found.frame]]
+    marker = (found.marker[:, None] == target.ids).long().argmax(1)
+    points, rotation = target.centers[marker], poses.R[found.frame]
+    arm = (rotation @ points[..., None])[..., 0]
+    held = torch.diag(torch.tensor([0.0, 0, 0, _HELD, _HELD, _HELD], dtype=torch.float64)).expand(len(marker), 6, 6)
+    refined = refine_photometric(
+        _grey(frames),
+        camera,
+        found.frame,
+        rotation,
+        arm + poses.t[found.frame],
+        torch.ones(len(marker), 1, dtype=torch.bool),
+        torch.stack([found.outer, found.inner], 1)[:, None],
+        torch.zeros(len(marker), 1, 3, dtype=torch.float64),
+        target.normals[marker][:, None],
+        target.radii[marker][:, None],
+        prior=held,
+    )
+    x = refined.t
+    xy = x[:, :2] / x[:, 2:]
+    eye = torch.eye(2, dtype=torch.float64).expand(len(x), 2, 2)
+    jacobian = camera.J_distort(xy) @ torch.cat([eye, -xy[..., None]], -1) / x[:, 2, None, None]
+    covariance = jacobian @ refined.covariance[:, :3, :3] @ jacobian.mT
+    pixels = camera.distort(xy)
+    good = refined.good & (refined.kept > _LEAST_KEPT) & pixels.isfinite().all(-1)
+    return Views(tuple(names), found.frame, found.marker, points, pixels, covariance).of_points(good)

@@ -1,0 +1,104 @@
+"""From frames to a calibration: one camera, a ring target or a board, and the robot's poses where there are any."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from torchpose.calibration.boards import Board, find_corners
+from torchpose.calibration.bundle import Bundle
+from torchpose.calibration.hand_eye import HandEyeFit, calibrate_hand_eye
+from torchpose.calibration.intrinsics import (
+    Calibration,
+    calibrate_intrinsics,
+    locate_views,
+    start_cameras,
+    with_lens,
+)
+from torchpose.calibration.rings import find_rings, measure_centers
+from torchpose.calibration.views import Views
+from torchpose.camera import Camera
+from torchpose.errors import ConfigError
+from torchpose.geometry import rotations
+from torchpose.target import Target
+
+Frames = Callable[[], Iterable[tuple[Sequence[str], Tensor]]]
+"""Gives names and frames (B, H, W) in batches, from the first on each time it is called."""
+
+_MOST_NOISE = (5.0, 0.05)  # mm, rad: a robot that is farther off was not there when the frames were taken
+
+
+def calibrate_camera(frames: Frames, shown: Target | Board, start: Camera, *, guess: bool, lens: str) -> Calibration:
+    """Intrinsics from frames of a ring target or a board.
+
+    A ring target is measured in two rounds: rough centres to calibrate the camera, with which `measure_centers` fits
+    the grey values.
+
+    Args:
+        frames: read once for a board, twice for a target. start: with the frames' size.
+        guess: only the size of ``start`` is known; several focal lengths are tried.
+
+    Raises:
+        ConfigError: nothing in view, or as `calibrate_intrinsics`.
+    """
+    starts = start_cameras(start.width, start.height, lens) if guess else [with_lens(start, lens)]
+    if isinstance(shown, Board):
+        return calibrate_intrinsics(_all_corners(frames, shown), starts, lens=lens)
+    batches = [find_rings(names, part, starts, shown) for names, part in frames()]
+    every = [Views.cat(views) for views in zip(*batches, strict=True)]
+    rough = max(every, key=lambda views: len(views.view), default=None)
+    if rough is None or not len(rough.view):
+        raise ConfigError(f"INPUT: no marker of target {shown.name} in any frame; check --target and the frames")
+    camera = calibrate_intrinsics(rough, starts, lens=lens).camera
+    return calibrate_intrinsics(_all_centers(frames, shown, camera), [camera], lens=lens)
+
+
+def locate_camera(frames: Frames, shown: Target | Board, camera: Camera) -> tuple[Views, Bundle]:
+    """Views of a camera that is known, with their poses.
+
+    Raises:
+        ConfigError: nothing in view.
+    """
+    seen = _all_corners(frames, shown) if isinstance(shown, Board) else _all_centers(frames, shown, camera)
+    return locate_views(seen, camera)
+
+
+def _all_corners(frames: Frames, board: Board) -> Views:
+    views = Views.cat([find_corners(names, part, board) for names, part in frames()])
+    if not len(views.view):
+        raise ConfigError("INPUT: the board is in none of the frames; check --board (inner corners) and the frames")
+    return views
+
+
+def _all_centers(frames: Frames, target: Target, camera: Camera) -> Views:
+    return Views.cat([measure_centers(names, part, camera, target) for names, part in frames()])
+
+
+def calibrate_robot(
+    views: Views, bundle: Bundle, intrinsics: Tensor | None, robot: Mapping[str, Sequence[float]]
+) -> HandEyeFit:
+    """Hand-eye transform from the poses of views; on which side the camera is mounted follows from the poses.
+
+    Args:
+        intrinsics: covariance of the bundle's first intrinsics (n, n), None for an exact camera.
+        robot: base_from_tool by name of the view, x y z in mm, rotation vector in rad.
+
+    Raises:
+        ConfigError: as `calibrate_hand_eye`, or poses of robot and target that have nothing to do with each other.
+    """
+    tool = torch.tensor([robot[name] for name in views.names], dtype=torch.float64)
+    poses = (rotations.exp(tool[:, 3:]), tool[:, :3])
+    shift = None if intrinsics is None else (bundle.gain[..., : len(intrinsics)], intrinsics)
+    fits = [
+        calibrate_hand_eye(poses, (bundle.R, bundle.t), bundle.pose_covariance, mount, intrinsics=shift)
+        for mount in ("base", "tool")
+    ]
+    fit = min(fits, key=lambda one: one.robot_sigma_mm)
+    if fit.robot_sigma_mm > _MOST_NOISE[0] or fit.robot_sigma_rad > _MOST_NOISE[1]:
+        raise ConfigError(
+            f"robot_pose: robot and target poses disagree by {fit.robot_sigma_mm:.1f} mm and "
+            f"{fit.robot_sigma_rad:.2g} rad; check the units and that each pose was read when its frame was taken"
+        )
+    return fit
