@@ -155,7 +155,7 @@ def test_find_inner():
         frames = render(camera, target, *poses(OFFSETS))
         found = find_candidates(frames)
         found = found[(found.polarity == 1) & (found.ellipse[:, 2] > 35)]
-        measured_ratio, ok = find_inner(frames, found)
+        measured_ratio, ok, _ = find_inner(frames, found)
         assert ok.all()
         torch.testing.assert_close(measured_ratio, torch.full_like(measured_ratio, ratio), rtol=0, atol=0.03)
 

@@ -24,7 +24,8 @@ def test_within_their_own_covariance(tilt, noise):
     rough[:, :2] += 0.4
     rough[:, 2:4] += 0.3
     ratio = truth[:, 1, 3] / truth[:, 0, 3] + 0.05
-    found = fit_small_rings(frames, frame, rough, ratio, torch.ones(48, dtype=torch.float64))
+    seen, one = torch.ones(48, 64, dtype=torch.bool), torch.ones(48, dtype=torch.float64)
+    found = fit_small_rings(frames, frame, rough, ratio, seen, one, torch.tensor(1111.11))
     assert found.good.all()
     for fit, exact in ((found.outer, truth[:, 0]), (found.inner, truth[:, 1])):
         error = fit.params[:, :2] - exact[:, :2]
@@ -43,5 +44,6 @@ def test_refuses_what_is_no_ring():
     frames[0] -= 100 * torch.sigmoid(3 * (7 - torch.hypot(u - 60.0, v - 60.0)))  # a disc without a hole
     rough = [[20.0, 20, 7, 7, 0], [40, 40, 9, 9, 0], [1, 40, 7, 7, 0], [60, 60, 7, 7, 0]]
     half, one = torch.full((4,), 0.5, dtype=torch.float64), torch.ones(4, dtype=torch.float64)
-    found = fit_small_rings(frames, torch.zeros(4, dtype=torch.int64), torch.tensor(rough).double(), half, one)
+    frame, seen = torch.zeros(4, dtype=torch.int64), torch.ones(4, 64, dtype=torch.bool)
+    found = fit_small_rings(frames, frame, torch.tensor(rough).double(), half, seen, one, torch.tensor(1111.11))
     assert not found.good.any()

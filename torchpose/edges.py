@@ -39,6 +39,9 @@ class RingEdges:
     offset: Tensor
     step: Tensor
 
+    def __getitem__(self, index: Tensor) -> RingEdges:
+        return RingEdges(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+
 
 def edge_pixels(
     frames: Tensor, frame: Tensor, ellipses: Tensor, outward: Tensor, reach: Tensor, margin: int = zernike.MASK // 2

@@ -221,6 +221,9 @@ def _support(
     away = torch.linalg.vector_norm(seen[:, :2] - outer[ring[origin[hypothesis]], :2], dim=-1)
     px, of_size, of_way = _PLACE_TOLERANCE
     miss = torch.linalg.vector_norm(uv - seen[:, :2], dim=-1) / (px + of_size * seen[:, 2] + of_way * away)
-    size = k_matrix[0, 0] * table.radii[target[member], marker[member], 0] / x[:, 2] / seen[:, 2]
-    agrees = (miss < 1) & (size < _SIZE_TOLERANCE) & (size > 1 / _SIZE_TOLERANCE) & (x[:, 2] > 0)
+    # semi-major axes: that of a circle on the optical axis, and the most that the view off axis makes of it
+    least = k_matrix[0, 0] * table.radii[target[member], marker[member], 0] / x[:, 2]
+    most = least * torch.linalg.vector_norm(x, dim=-1) / x[:, 2]
+    fits = (seen[:, 2] > least / _SIZE_TOLERANCE) & (seen[:, 2] < most * _SIZE_TOLERANCE)
+    agrees = (miss < 1) & fits & (x[:, 2] > 0)
     return miss[agrees], hypothesis[agrees], member[agrees]

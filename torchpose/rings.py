@@ -73,14 +73,15 @@ class Rings:
         return (i[:, 2] * i[:, 3] / (o[:, 2] * o[:, 3])).sqrt()
 
 
-def find_inner(frames: Tensor, candidates: Candidates) -> tuple[Tensor, Tensor]:
+def find_inner(frames: Tensor, candidates: Candidates) -> tuple[Tensor, Tensor, Tensor]:
     """Radius ratio of the circle inside each candidate, from the mean radial profile of grey.
 
     The profile is taken along radii scaled by the candidate's own ellipse, so it averages over the whole ring: an inner
     circle of two pixels that no region growing would hold together still stands out.
 
     Returns:
-        ratio (M,) float64 and found (M,) bool.
+        ratio (M,) float64, found (M,) bool, and seen (M, 64) bool: the directions, evenly spaced in eccentric anomaly
+        from +u on the circle that the candidate is the image of, in which its own edge shows.
     """
     height, width = frames.shape[-2:]
     device = frames.device
@@ -101,7 +102,7 @@ def find_inner(frames: Tensor, candidates: Candidates) -> tuple[Tensor, Tensor]:
     outer = rise.masked_fill(at < _RATIO_RANGE[1], -torch.inf).amax(-1)
     fall = (-rise).masked_fill((at < _RATIO_RANGE[0]) | (at > _RATIO_RANGE[1]), -torch.inf)
     peak, best = fall.max(-1)
-    return at[best], (outer > 0) & (peak > _LEAST_PEAK * outer)
+    return at[best], (outer > 0) & (peak > _LEAST_PEAK * outer), seen
 
 
 def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera, *, correct: bool = True) -> Rings:
@@ -112,8 +113,8 @@ def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera, *, cor
         camera: its distortion is taken off the sub-pixel points before the final fit.
         correct: free the edges from what blur and curvature do to them; False leaves them as the moments read them.
     """
-    ratio, found = find_inner(frames, candidates)
-    candidates, ratio = candidates[found], ratio[found]
+    ratio, found, seen = find_inner(frames, candidates)
+    candidates, ratio, clear = candidates[found], ratio[found], clear_directions(seen[found])
     count = len(candidates)
     outer = candidates.ellipse
     inner = torch.cat([outer[:, :2], outer[:, 2:4] * ratio[:, None], outer[:, 4:]], -1)
@@ -124,6 +125,7 @@ def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera, *, cor
     reach = torch.cat([gap, gap]).clamp(1.0, REACH)
     outward = torch.cat([candidates.polarity, -candidates.polarity])
     edges = ring_edges(frames, frame, rough, outward, reach)
+    edges = edges[clear.repeat(2, 1)[edges.ring, _direction(edges, rough)]]
 
     raw, keep = ellipse.fit_robust(edges.points, edges.ring, 2 * count, start=rough)
     points = _unbiased(edges, raw, keep, outward, frame, frames.shape[0]) if correct else edges.points
@@ -158,12 +160,29 @@ def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera, *, cor
     large = Rings(candidates.frame[index], candidates.polarity[index], raw[index], raw[second], fit[index], fit[second])
     if not bool(small.any()):
         return large
-    return Rings.cat([large, _measure_small(frames, candidates[small], ratio[small], camera)])
+    return Rings.cat([large, _measure_small(frames, candidates[small], ratio[small], clear[small], camera)])
 
 
-def _measure_small(frames: Tensor, candidates: Candidates, ratio: Tensor, camera: Camera) -> Rings:
+def clear_directions(seen: Tensor) -> Tensor:
+    """Directions (M, A) bool whose neighbours mostly show the outer edge, too, and neither next one hides it.
+
+    Single ones that noise hides stay clear; next to a cover, its own edge may pass for the circle's.
+    """
+    around = torch.stack([seen.roll(k, 1) for k in range(-2, 3)]).sum(0) > 2
+    return around & around.roll(1, 1) & around.roll(-1, 1)
+
+
+def _direction(edges: RingEdges, ellipses: Tensor) -> Tensor:
+    """Number (E,) of each edge point's direction, see `find_inner`."""
+    inverse = torch.linalg.inv(conics.shape_matrix(ellipses))[edges.ring]
+    x, y = (inverse @ (edges.points - ellipses[edges.ring, :2])[..., None]).squeeze(-1).unbind(-1)
+    return (torch.atan2(y, x) * (_ANGLES / (2 * torch.pi))).round().long() % _ANGLES
+
+
+def _measure_small(frames: Tensor, candidates: Candidates, ratio: Tensor, seen: Tensor, camera: Camera) -> Rings:
     """Rings whose circles are too close to each other, or too small, to be measured one by one."""
-    found = fit_small_rings(frames, candidates.frame, candidates.ellipse, ratio, candidates.polarity)
+    focal = camera.matrix.diagonal()[:2].mean()
+    found = fit_small_rings(frames, candidates.frame, candidates.ellipse, ratio, seen, candidates.polarity, focal)
     index = found.good.nonzero()[:, 0]
     outer, inner = found.outer[index], found.inner[index]
     return Rings(

@@ -127,7 +127,7 @@ def _rows(sources: Sequence[Source], images: np.ndarray, explain: bool) -> list[
     shapes = find_shapes(frames, explain=explain)
     ratios = torch.full_like(shapes.ellipses.log10_nfa, torch.nan)
     valid = (shapes.ellipses.verdict == Verdict.ACCEPTED).nonzero()[:, 0]
-    ratio, found = find_inner(frames, shapes.ellipses[valid])
+    ratio, found, _ = find_inner(frames, shapes.ellipses[valid])
     ratios[valid[found]] = ratio[found]
     return shape_rows(shapes, ratios, [source.name for source in sources])
 

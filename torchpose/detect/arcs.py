@@ -115,9 +115,19 @@ def fit_joint(xy: Tensor, gradient: Tensor, index: Tensor, count: int, weights: 
     """
     w = weights.double()
     center = segment_mean(xy, index, count, w)
-    local = xy - center[index]
-    scale = segment_mean(local.square().sum(-1), index, count, w).sqrt()
-    x, y = (local / scale[index, None]).unbind(-1)
+    scale = segment_mean((xy - center[index]).square().sum(-1), index, count, w).sqrt()
+    rows = direction_rows(xy, gradient, index, center, scale)
+    return fit_scatter(segment_sum(rows * w[:, None], index, count), center, scale)
+
+
+def direction_rows(xy: Tensor, gradient: Tensor, index: Tensor, center: Tensor, scale: Tensor) -> Tensor:
+    """What each point adds to the scatter that `fit_scatter` solves: (P, 21), the upper triangle.
+
+    Args:
+        xy: (P, 2) float64. gradient: (P, 2). index: (P,) int64, whose ellipse. center, scale: (M, 2), (M,), in whose
+            units the conic is sought.
+    """
+    x, y = ((xy - center[index]) / scale[index, None]).unbind(-1)
     g = gradient.double()
     g = g / torch.linalg.vector_norm(g, dim=-1, keepdim=True).clamp_min(1e-12)
     tx, ty = -g[:, 1], g[:, 0]
@@ -126,9 +136,13 @@ def fit_joint(xy: Tensor, gradient: Tensor, index: Tensor, count: int, weights: 
     along = torch.stack([2 * x * tx, x * ty + y * tx, 2 * y * ty, tx, ty, zero], -1)
     along = along * (_TANGENT_PX / scale)[index, None]
     upper = torch.triu_indices(6, 6, device=xy.device)
-    rows = on[:, upper[0]] * on[:, upper[1]] + along[:, upper[0]] * along[:, upper[1]]
-    sums = segment_sum(rows * w[:, None], index, count)
-    scatter = torch.zeros(count, 6, 6, dtype=sums.dtype, device=sums.device)
+    return on[:, upper[0]] * on[:, upper[1]] + along[:, upper[0]] * along[:, upper[1]]
+
+
+def fit_scatter(sums: Tensor, center: Tensor, scale: Tensor) -> Tensor:
+    """Ellipses (M, 5) of summed `direction_rows` (M, 21), NaN where the conic is no ellipse."""
+    upper = torch.triu_indices(6, 6, device=sums.device)
+    scatter = torch.zeros(sums.shape[0], 6, 6, dtype=sums.dtype, device=sums.device)
     scatter[:, upper[0], upper[1]] = sums
     scatter[:, upper[1], upper[0]] = sums
     sound = scatter.isfinite().all(-1).all(-1)
@@ -151,7 +165,7 @@ def follow(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor, ro
     for _ in range(rounds):
         # a hairline fits an ellipse of any size: without a limit, its samples would fill the memory
         ellipses = torch.where(ellipses[:, 2:3] <= largest, ellipses, torch.nan)
-        which, xy, normal = perimeter_samples(ellipses)
+        which, xy, normal, _ = perimeter_samples(ellipses)
         band = torch.arange(-_BAND, _BAND + 1, dtype=torch.float64, device=xy.device)
         at = (xy[:, None] + band[:, None] * normal[:, None]).flatten(0, 1)
         which = which.repeat_interleave(band.numel())
@@ -166,21 +180,23 @@ def follow(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor, ro
     return ellipses
 
 
-def perimeter_samples(ellipses: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """One sample a pixel of perimeter: ellipse (S,), position (S, 2) and outward unit normal (S, 2).
+def perimeter_samples(ellipses: Tensor, most: int | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """One sample a pixel of perimeter, of at most ``most``: ellipse (S,), position (S, 2), outward unit normal (S, 2).
 
-    Ellipses that are NaN have none.
+    And how far along the perimeter each lies, (S,) in [0, 1). Ellipses that are NaN have none.
     """
     n = conics.perimeter(ellipses).nan_to_num(nan=0.0).ceil().long()
+    n = n if most is None else n.clamp_max(most)
     which, position = ragged_arange(n)
-    angle = position.double() * (2 * torch.pi) / n[which]
+    turn = position.double() / n[which]
+    angle = 2 * torch.pi * turn
     of = ellipses[which]
     a, b, theta = of[:, 2], of[:, 3], of[:, 4]
     cos, sin = theta.cos(), theta.sin()
     p, q = b * angle.cos(), a * angle.sin()
     length = torch.hypot(p, q)
     normal = torch.stack([cos * p - sin * q, sin * p + cos * q], -1) / length[:, None]
-    return which, conics.points_on(of, angle), normal
+    return which, conics.points_on(of, angle), normal, turn
 
 
 def cells_at(grad: Gradient, frame: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:

@@ -13,6 +13,8 @@ from torch import Tensor
 
 from torchpose import ellipse
 from torchpose.detect.arcs import cells_at, chain_pairs, describe_arcs, fit_joint, follow, perimeter_samples
+from torchpose.detect.finer import SIDE, cut_outs, promising_places
+from torchpose.detect.partial import free_of_stumps
 from torchpose.detect.reduce import area_reduce, reduction_factor
 from torchpose.detect.regions import (
     Gradient,
@@ -103,15 +105,44 @@ def find_candidates(frames: Tensor, factor: int | None = None, *, explain: bool 
         explain: also return what was looked at and rejected, see `Candidates.verdict`.
     """
     factor = reduction_factor(*frames.shape[-2:]) if factor is None else factor
-    reduced = area_reduce(frames, factor)
-    found = []
+    found, reduced, scale = [], area_reduce(frames, factor), factor
     for octave in range(_OCTAVES):
         if octave:
-            reduced, factor = area_reduce(reduced, 2), 2 * factor
+            reduced, scale = area_reduce(reduced, 2), 2 * scale
         grad = gradient(reduced)
-        some = find_ellipses(grad, explain)
-        found.append(replace(some, ellipse=full_frame(some.ellipse, factor)))
-    return merge_duplicates(Candidates.cat(found), explain=explain)
+        some = find_ellipses(grad, explain=True)
+        if octave == 0 and factor > 1:
+            found.append(find_finer(frames, factor, grad.threshold, some))
+        found.append(replace(some, ellipse=full_frame(some.ellipse, scale)))
+    every = Candidates.cat(found)
+    return merge_duplicates(every if explain else accepted(every), explain=explain)
+
+
+def find_finer(frames: Tensor, factor: int, threshold: Tensor, coarse: Candidates) -> Candidates:
+    """Small ellipses of a finer scale, full px, where the coarse one has something round that is no whole ellipse.
+
+    Args:
+        frames: (B, H, W). factor: of the coarse scale. threshold: (B,), of its gradient. coarse: what was looked at
+            there, in its pixels.
+    """
+    fine = factor // 2
+    whole = (coarse.verdict == Verdict.ACCEPTED) & (coarse.cover > _WHOLE)
+    place = promising_places(coarse.frame, coarse.ellipse, whole)
+    height, width = frames.shape[-2:]
+    if place.numel() == 0 or min(height, width) < SIDE * fine:
+        return coarse[place[:0]]
+    frame = coarse.frame[place]
+    cut, corner = cut_outs(frames, frame, full_frame(coarse.ellipse[place], factor)[:, :2], fine)
+    grad = gradient(cut)
+    # where edges fill most of a cut-out, the noise of the whole frame tells more than the median of their gradients
+    grad = replace(grad, threshold=torch.minimum(grad.threshold, factor / fine * threshold[frame]))
+    found = find_ellipses(grad)
+    ellipses = full_frame(found.ellipse, fine)
+    ellipses = torch.cat([ellipses[:, :2] + corner[found.frame], ellipses[:, 2:]], -1)
+    # the ellipses that might have been tried are those of the frame, not those of the cut-out
+    more = 2.5 * math.log10(height * width / (SIDE * fine) ** 2)
+    found = replace(found, ellipse=ellipses, frame=frame[found.frame], log10_nfa=found.log10_nfa + more)
+    return found[found.log10_nfa < 0]
 
 
 def full_frame(ellipses: Tensor, factor: int) -> Tensor:
@@ -126,7 +157,14 @@ def find_ellipses(grad: Gradient, explain: bool = False) -> Candidates:
     whole, explained = fit_regions(grad, regions, explain)
     rest = regions.cell[~explained].sort().values
     pieces = fit_arcs(grad, level_line_regions(grad, rest, MIN_PIXELS, _SECTORS))
-    return merge_duplicates(Candidates.cat([whole, pieces]), explain=explain)
+    found = merge_duplicates(Candidates.cat([whole, pieces]), explain=explain)
+    valid = (found.verdict == Verdict.ACCEPTED).nonzero()[:, 0]
+    some = found[valid]
+    freed = free_of_stumps(grad, some.frame, some.ellipse, some.polarity)
+    moved = ((freed != some.ellipse).any(-1) & (plausible(grad, freed) == Verdict.ACCEPTED)).nonzero()[:, 0]
+    again = score(grad, some.frame[moved], freed[moved], some.polarity[moved])
+    found = found.replaced(valid[moved], again)
+    return merge_duplicates(found if explain else accepted(found), explain=explain)
 
 
 def fit_regions(grad: Gradient, regions: Regions, explain: bool = False) -> tuple[Candidates, Tensor]:
@@ -221,7 +259,7 @@ def score(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> 
     distinguishable ellipses, (h w)^(5/2): five parameters, each with as many values as the frame has pixels on a side.
     """
     _, height, width = grad.shape
-    which, xy, normal = perimeter_samples(ellipses)
+    which, xy, normal, _ = perimeter_samples(ellipses)
     cell, on_frame = cells_at(grad, frame[which], xy)
     g = grad.at(cell).double()
     cos = (g * normal).sum(-1) * polarity[which] / torch.linalg.vector_norm(g, dim=-1).clamp_min(1e-6)
