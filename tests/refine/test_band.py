@@ -25,7 +25,7 @@ def inner() -> torch.Tensor:
 
 
 def test_every_pixel_near_an_edge_once_and_no_other(inner: torch.Tensor) -> None:
-    ring, u, v = band_pixels(OUTER, inner, BAND, HEIGHT, WIDTH)
+    ring, u, v = band_pixels(OUTER, inner, torch.full((4,), BAND), HEIGHT, WIDTH)
     key = (ring * HEIGHT + v) * WIDTH + u
     assert key.unique().numel() == key.numel()
     assert (key.diff() > 0).all()
@@ -43,5 +43,5 @@ def test_every_pixel_near_an_edge_once_and_no_other(inner: torch.Tensor) -> None
 def test_outside_the_frame_and_none(inner: torch.Tensor) -> None:
     away = OUTER.clone()
     away[:, 0] += 500
-    assert band_pixels(away, inner + (away - OUTER), BAND, HEIGHT, WIDTH)[0].numel() == 0
-    assert band_pixels(OUTER[:0], inner[:0], BAND, HEIGHT, WIDTH)[0].numel() == 0
+    assert band_pixels(away, inner + (away - OUTER), torch.full((4,), BAND), HEIGHT, WIDTH)[0].numel() == 0
+    assert band_pixels(OUTER[:0], inner[:0], torch.zeros(0), HEIGHT, WIDTH)[0].numel() == 0

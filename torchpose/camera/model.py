@@ -203,6 +203,9 @@ class Camera:
         xy_distorted = (uv - center) / focal
         if len(self.distortion) == 0:
             return xy_distorted
+        ideal = self.model != "kannala_brandt" and not bool(self.distortion.any())
+        if ideal and not self.distortion.requires_grad:
+            return xy_distorted
         u, v = xy_distorted.unbind(-1)
         with torch.no_grad():
             x, y = self._invert(u.detach().contiguous(), v.detach().contiguous())

@@ -8,14 +8,14 @@ from torch import Tensor
 from torchpose.geometry.segments import ragged_arange
 
 
-def band_pixels(outer: Tensor, inner: Tensor, band: float, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
+def band_pixels(outer: Tensor, inner: Tensor, band: Tensor, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
     """Pixels within about ``band`` px of either ellipse of K rings, each once.
 
     A row of pixels cuts the two ellipses, each grown and shrunk by the band, in nested spans; the pixels between the
     ends of a grown and a shrunk span belong to the band. Where the ring is thinner than two bands, theirs merge.
 
     Args:
-        outer, inner: (K, 5) ellipses in pixels, the inner one inside. band: px. height, width: of the frame.
+        outer, inner: (K, 5) ellipses in pixels, the inner one inside. band: (K,) px. height, width: of the frame.
 
     Returns:
         ring (P,), u (P,), v (P,) int64, sorted by ring and row.
@@ -25,7 +25,7 @@ def band_pixels(outer: Tensor, inner: Tensor, band: float, height: int, width: i
     last = (outer[:, 1] + reach).floor().clamp(-1, height - 1).long()
     ring, offset = ragged_arange((last - first + 1).clamp_min(0))
     v = first[ring] + offset
-    spans = [_span(e[ring], sign * band, v.double(), width) for e in (outer, inner) for sign in (1, -1)]
+    spans = [_span(e[ring], sign * band[ring], v.double(), width) for e in (outer, inner) for sign in (1, -1)]
     (low0, high0), (low1, high1), (low2, high2), (low3, high3) = spans
     # nested, from outside inwards; a span that the row misses is empty in the middle of the one around it
     low1, high1 = _within(low1, high1, low0, high0)
@@ -38,12 +38,12 @@ def band_pixels(outer: Tensor, inner: Tensor, band: float, height: int, width: i
     return ring[row], start.flatten()[segment] + position, v[row]
 
 
-def _half_height(ellipse: Tensor, band: float) -> Tensor:
+def _half_height(ellipse: Tensor, band: Tensor) -> Tensor:
     a, b, theta = ellipse[:, 2] + band, ellipse[:, 3] + band, ellipse[:, 4]
     return torch.hypot(a * theta.sin(), b * theta.cos())
 
 
-def _span(ellipse: Tensor, grow: float, v: Tensor, width: int) -> tuple[Tensor, Tensor]:
+def _span(ellipse: Tensor, grow: Tensor, v: Tensor, width: int) -> tuple[Tensor, Tensor]:
     """First pixel inside and first one beyond it, int64, where rows ``v`` cut grown ellipses; equal where they miss."""
     a, b = (ellipse[:, 2] + grow).clamp_min(1e-3), (ellipse[:, 3] + grow).clamp_min(1e-3)
     cos, sin = ellipse[:, 4].cos(), ellipse[:, 4].sin()

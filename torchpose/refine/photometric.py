@@ -22,15 +22,20 @@ from torchpose.geometry.segments import segment_sum
 from torchpose.refine.result import Refined
 from torchpose.refine.ring_model import PixelBlocks, RingModel, gather_pixels, ring_model
 
-_COARSE = 4  # the first steps take one pixel of so many; both are whole numbers of tiles
+_COARSE = 6  # the first steps take one pixel of so many; both are whole numbers of tiles
 _STEPS = (3, 1)  # of Gauss-Newton, on some of the pixels and on all
+_BAND = 4.0  # px on either side of an edge
+_BAND_PER_BLUR = 4.6  # band of a wide blur, in its standard deviations
+_WIDEST = 12.0  # px, of all bands
 _START_BLUR = 0.8  # px
 _BLUR_RANGE = (0.3, 4.0)
 _CUT = 4.0  # robust standard deviations beyond which a pixel is left out
+_CLEAR_OF_LIMITS = 3.0  # standard deviations between what a pixel should show and where its noise is clipped
 _MISFIT = 0.02  # of the contrast: what a point-spread function that is not Gaussian leaves at the edges of quiet frames
 _TILE = 256  # pixels summed in float32 at a time; sums of tiles are float64, so padding changes no digit that counts
 _SECTORS = 48  # of a circle
 _SECTOR_KEPT = 0.9  # of a sector's pixels that must follow the model for it to count
+_LEAST_CLEAR = 0.55  # of the sectors of a marker, below which none of them counts
 _MOST_SPREAD = 1.5  # of a marker's residuals, in those of the best marker of its frame
 _LEVELS = 6  # ring and paper, each with a constant and a gradient over the plane
 _QUANTISATION = 1 / 12  # variance of rounding, in grey levels^2, below which no noise estimate falls
@@ -61,22 +66,56 @@ def refine_photometric(
             from the robot, or to hold what is known.
     """
     rows = rotation.shape[0]
-    blocks = gather_pixels(frames, camera, frame, mask, rings, centers, normals, radii, _TILE * _COARSE)
-    r, t = rotation, translation
-    blur = torch.full((rows,), _START_BLUR, dtype=torch.float64, device=r.device)
+    start = torch.full((rows,), _START_BLUR, dtype=torch.float64, device=rotation.device)
+    none = torch.zeros(rows, 6, 6, dtype=torch.float64, device=rotation.device)
+    known = none if prior is None else prior
+    narrow = torch.full_like(start, _BAND)
+    model = (centers, normals, radii)
+    first = _refine(frames, camera, frame, mask, rings, *model, rotation, translation, start, narrow, known)
+    # a wide blur needs a wider band, or it takes the levels on both sides of the edge for its own
+    w = (_BAND_PER_BLUR * first.blur > _BAND + 1).nonzero()[:, 0]
+    if w.numel() == 0:
+        return first
+    band = (_BAND_PER_BLUR * first.blur[w]).clamp_max(_WIDEST)
+    model = (centers[w], normals[w], radii[w])
+    again = _refine(
+        frames, camera, frame[w], mask[w], rings[w], *model, rotation[w], translation[w], first.blur[w], band, known[w]
+    )
+    good = again.good.nonzero()[:, 0]
+    return first.replaced(w[good], again[good])
+
+
+def _refine(
+    frames: Tensor,
+    camera: Camera,
+    frame: Tensor,
+    mask: Tensor,
+    rings: Tensor,
+    centers: Tensor,
+    normals: Tensor,
+    radii: Tensor,
+    r: Tensor,
+    t: Tensor,
+    blur: Tensor,
+    band: Tensor,
+    prior: Tensor,
+) -> Refined:
+    """`refine_photometric` by the pixels within ``band`` (N,) px of an edge, from a blur (N,) px."""
+    rows = r.shape[0]
+    blocks = gather_pixels(frames, camera, frame, mask, rings, centers, normals, radii, band, _TILE * _COARSE)
     coarse = blocks.every(_COARSE)
     levels = _first_levels(coarse, r, t, blur)
-    weight = blocks.valid
+    usable = weight = blocks.valid
     information = torch.zeros(rows, 7, 7, dtype=torch.float64, device=r.device)
     variance = torch.ones(rows, dtype=torch.float64, device=r.device)
-    known = torch.zeros_like(information) if prior is None else torch.nn.functional.pad(prior, (0, 1, 0, 1))
+    known = torch.nn.functional.pad(prior, (0, 1, 0, 1))
     moved = torch.zeros(rows, 7, dtype=torch.float64, device=r.device)
     for part in (*[coarse] * _STEPS[0], *[blocks] * _STEPS[1]):
         model = ring_model(part, r, t, blur)
         columns = _columns(part, model, levels)
-        weight = _inliers(columns[:, :, -1].flatten(1), part, levels)
+        usable, weight = _inliers(columns[:, :, -1].flatten(1), part, levels)
         if part is blocks:
-            weight = weight * _clear_sectors(weight, part, model)
+            weight = weight * _clear_sectors(usable, weight, part, model)
         step, level_step, information, variance = _gauss_newton(columns, weight, blocks.row, rows, known, moved)
         moved = moved + step
         r = rotations.exp(step[:, 3:6]) @ r
@@ -85,7 +124,7 @@ def refine_photometric(
         levels = levels + level_step
     inverse, info = torch.linalg.inv_ex(information)
     covariance = inverse[:, :6, :6] * variance[:, None, None]
-    kept = segment_sum(weight.sum(-1), blocks.row, rows) / segment_sum(blocks.valid.sum(-1), blocks.row, rows)
+    kept = segment_sum(weight.sum(-1), blocks.row, rows) / segment_sum(usable.sum(-1), blocks.row, rows)
     good = (info == 0) & covariance.isfinite().all(-1).all(-1) & (covariance.diagonal(dim1=-2, dim2=-1) > 0).all(-1)
     return Refined(r, t, covariance, blur, variance.sqrt(), kept, good)
 
@@ -127,7 +166,12 @@ def _first_levels(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor) -> Tensor:
     columns = _tiled((*_basis(model), b.grey), b.valid)
     none = torch.zeros_like(model.fraction[:, 0])
     ring, paper = _median(b.grey, b.valid * (model.fraction < 0.05)), _median(b.grey, b.valid * (model.fraction > 0.95))
-    levels = torch.stack([ring, none, none, paper, none, none], -1).nan_to_num(nan=0.0).double()
+    # a level beyond the range of grey values shows no pixel
+    low, high = b.limits.unbind(-1)
+    ring, paper = (
+        torch.where(x.isnan(), torch.where(y < 0.5 * high, high, low), x) for x, y in ((ring, paper), (paper, ring))
+    )
+    levels = torch.stack([ring, none, none, paper, none, none], -1).nan_to_num(0.0, 0.0, 0.0).double()
     for _ in range(3):
         predicted = (levels.float()[:, None, None] @ columns[:, :, :_LEVELS]).flatten(1)
         residual = b.grey - predicted
@@ -160,14 +204,19 @@ def _spread(residual: Tensor, b: PixelBlocks) -> Tensor:
     return torch.minimum(own, _MOST_SPREAD * least[b.row])
 
 
-def _inliers(residual: Tensor, b: PixelBlocks, levels: Tensor) -> Tensor:
-    contrast = (levels[:, 3] - levels[:, 0]).abs().to(residual.dtype)
-    cut = _CUT * _spread(residual, b) + _MISFIT * contrast
-    return b.valid * (residual.abs() < cut[:, None])
+def _inliers(residual: Tensor, b: PixelBlocks, levels: Tensor) -> tuple[Tensor, Tensor]:
+    """Pixels (K, P) whose noise is not clipped, by what they should show, and of these the ones that do show it."""
+    spread = _spread(residual, b)[:, None]
+    predicted = b.grey - residual
+    margin = _CLEAR_OF_LIMITS * spread
+    low, high = b.limits[:, :1], b.limits[:, 1:]
+    usable = b.valid * ((predicted > low + margin) & (predicted < high - margin))
+    contrast = (levels[:, 3] - levels[:, 0]).abs().to(residual.dtype)[:, None]
+    return usable, usable * (residual.abs() < _CUT * spread + _MISFIT * contrast)
 
 
-def _clear_sectors(weight: Tensor, b: PixelBlocks, m: RingModel) -> Tensor:
-    """0 for the pixels (K, P) of those sectors of either circle where many pixels do not follow the model, else 1.
+def _clear_sectors(usable: Tensor, weight: Tensor, b: PixelBlocks, m: RingModel) -> Tensor:
+    """0 for the pixels (K, P) of those sectors of either circle where many usable ones do not follow the model, else 1.
 
     What covers an edge agrees with it by chance wherever the edge passes through the cover's own grey.
     """
@@ -177,9 +226,12 @@ def _clear_sectors(weight: Tensor, b: PixelBlocks, m: RingModel) -> Tensor:
     block = torch.arange(len(b.row), device=b.row.device)[:, None]
     cell = ((2 * block + outer) * _SECTORS + turn.long().clamp(0, _SECTORS - 1)).flatten()
     count = 2 * _SECTORS * len(b.row)
-    total = torch.zeros(count, dtype=weight.dtype, device=weight.device).index_add_(0, cell, b.valid.flatten())
+    total = torch.zeros(count, dtype=weight.dtype, device=weight.device).index_add_(0, cell, usable.flatten())
     used = torch.zeros_like(total).index_add_(0, cell, weight.flatten())
-    return (used > _SECTOR_KEPT * total)[cell].view_as(weight).to(weight.dtype)
+    clear = (used > _SECTOR_KEPT * total).view(-1, 2 * _SECTORS)
+    # where half of a ring is gone, the rest of the marker is not to be trusted either
+    clear = clear & (clear.to(weight.dtype).mean(-1, keepdim=True) > _LEAST_CLEAR)
+    return clear.flatten()[cell].view_as(weight).to(weight.dtype)
 
 
 def _gauss_newton(

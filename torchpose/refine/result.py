@@ -26,3 +26,10 @@ class Refined:
     noise: Tensor
     kept: Tensor
     good: Tensor
+
+    def __getitem__(self, index: Tensor) -> Refined:
+        return Refined(*(getattr(self, n)[index] for n in self.__dataclass_fields__))
+
+    def replaced(self, index: Tensor, other: Refined) -> Refined:
+        """These rows, with the rows ``index`` taken from ``other``."""
+        return Refined(*(getattr(self, n).index_copy(0, index, getattr(other, n)) for n in self.__dataclass_fields__))

@@ -19,7 +19,7 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.refine.band import band_pixels
 
-_BAND = 3.5  # px on either side of an edge
+_FULL_SCALES = (255.0, 1023.0, 4095.0, 16383.0, 65520.0, 65535.0)  # of 8 to 16 bits; 12 bits in the upper ones of 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,8 @@ class PixelBlocks:
     """Pixels of K markers, padded to P; one plane of numbers (K, P) for every component.
 
     row: (K,) int64. ray_x, ray_y: on the plane z = 1. warp: 4 planes, d(ray)/d(pixel) row by row. grey, valid.
-    center, normal: (K, 3), target frame. radii: (K, 2).
+    center, normal: (K, 3), target frame. radii: (K, 2). limits: (K, 2), the grey levels at which the frame's noise is
+    clipped, -inf and inf where it is not.
     """
 
     row: Tensor
@@ -39,6 +40,7 @@ class PixelBlocks:
     center: Tensor
     normal: Tensor
     radii: Tensor
+    limits: Tensor
 
     def every(self, nth: int) -> PixelBlocks:
         """The same with one pixel of ``nth``."""
@@ -70,16 +72,17 @@ def gather_pixels(
     centers: Tensor,
     normals: Tensor,
     radii: Tensor,
+    band: Tensor,
     grain: int,
 ) -> PixelBlocks:
-    """The pixels within the band around either circle of every marker seen; arguments as in `refine_photometric`.
+    """The pixels within ``band`` (N,) px of either circle of every marker seen; arguments as in `refine_photometric`.
 
     ``grain``: the padded length P is a multiple of it.
     """
     height, width = frames.shape[-2:]
     row, marker = mask.nonzero().unbind(-1)
     both = rings[row, marker]  # (K, 2, 5)
-    block, u, v = band_pixels(both[:, 0], both[:, 1], _BAND, height, width)
+    block, u, v = band_pixels(both[:, 0], both[:, 1], band[row], height, width)
     uv = torch.stack([u, v], -1).double()
     count = row.numel()
     size = torch.bincount(block, minlength=count)
@@ -93,7 +96,9 @@ def gather_pixels(
 
     xy = camera.undistort_points(uv)
     grey = frames.reshape(-1)[(frame[row[block]] * height + v) * width + u].float()
-    sound = xy.isfinite().all(-1) & grey.isfinite()
+    limits = _clipping(grey, row[block], frame.numel())[row]
+    # what is clipped is no measurement
+    sound = xy.isfinite().all(-1) & grey.isfinite() & (grey > limits[block, 0]) & (grey < limits[block, 1])
     xy = torch.where(sound[:, None], xy, 0.0)
     j00, j01, j10, j11 = camera.J_distort(xy).flatten(-2).unbind(-1)
     det = j00 * j11 - j01 * j10
@@ -108,7 +113,18 @@ def gather_pixels(
         centers[row, marker],
         normals[row, marker],
         radii[row, marker],
+        limits,
     )
+
+
+def _clipping(grey: Tensor, row: Tensor, rows: int) -> Tensor:
+    """Limits (N, 2) at which each row's grey values are clipped: 0, and the full scale of its brightest pixel."""
+    ends = torch.tensor([torch.inf, -torch.inf], device=grey.device).repeat(rows, 1)
+    darkest = ends[:, 0].scatter_reduce(0, row, grey, "amin")
+    brightest = ends[:, 1].scatter_reduce(0, row, grey, "amax")
+    full = torch.isin(brightest, torch.tensor(_FULL_SCALES, dtype=grey.dtype, device=grey.device))
+    low = torch.where(darkest <= 0, 0.0, -torch.inf)
+    return torch.stack([low, torch.where(full, brightest, torch.inf)], -1)
 
 
 def ring_model(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor) -> RingModel:
