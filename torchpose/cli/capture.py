@@ -112,6 +112,7 @@ def _run(plan: CapturePlan, rig: Rig, session: Session, twin: Path | None, statu
             _say("interrupted: the robot is stopped", session, total)
             return INTERRUPTED
     if not quiet:
+        status.wait()
         found = ", ".join(f"{name} {count}" for name, count in status.counts.most_common())
         typer.echo(f"{len(session.done)} frames in {session.manifest}{found and f': {found}'}", err=True)
     return 0

@@ -6,6 +6,7 @@ A manifest is a file of JSON lines (``.jsonl``), appended to while capturing:
   report metres) and is required as soon as a frame has a robot pose.
 - ``{"record": "frame", "id": 7, "image": "images/0007.png", "robot_pose": [x, y, z, rx, ry, rz], ...}`` one a frame.
   ``image`` is relative to the manifest's folder, with forward slashes; null where the camera delivered none.
+  ``camera`` (optional) is the name of the camera, where there are several.
   ``robot_pose`` (optional) is the tool in the robot base: position in the session's unit, rotation vector in rad.
 - ``{"record": "end", ...}`` last. Its absence means that the capture was cut short.
 
@@ -34,14 +35,18 @@ class ManifestFrame:
     robot_pose: tuple[float, ...] | None
 
 
-def read_manifest(path: Path) -> list[ManifestFrame]:
+def read_manifest(path: Path, camera: str | None = None) -> list[ManifestFrame]:
     """Frames of a capture manifest in the order of capture.
 
+    Args:
+        camera: only frames of the camera of this name; required where there are several, which have little in common.
+
     Raises:
-        ConfigError: the file cannot be read, a line is not a JSON object, a field is missing or wrong, or an id or an
-            image occurs twice.
+        ConfigError: the file cannot be read, a line is not a JSON object, a field is missing or wrong, an id or an
+            image occurs twice, or it has frames of several cameras or none of the named one.
     """
     frames: list[ManifestFrame] = []
+    cameras: list[str] = []
     ids: set[Any] = set()
     images: set[str] = set()
     millimetres: float | None = None
@@ -62,8 +67,14 @@ def read_manifest(path: Path) -> list[ManifestFrame]:
             raise ConfigError(f"{where}: image: {image!r} occurs twice; one record for every image")
         ids.add(identifier)
         images.add(image)
+        cameras.append(str(record.get("camera", "")))
         frames.append(ManifestFrame(image, _robot_pose(record.get("robot_pose"), millimetres, where)))
-    return frames
+    known = sorted(set(cameras))
+    if camera is None and len(known) > 1:
+        raise ConfigError(f"{path}: INPUT: has frames of {len(known)} cameras; pick one: {path.name}#{known[0]}")
+    if camera is not None and camera not in known:
+        raise ConfigError(f"{path}: INPUT: has no frame of camera {camera!r}; known are {', '.join(known)}")
+    return [frame for frame, name in zip(frames, cameras, strict=True) if camera in (None, name)]
 
 
 def read_records(path: Path) -> list[tuple[int, dict[str, Any]]]:

@@ -74,11 +74,14 @@ def _sources_of(given: Path) -> Iterator[Source]:
         root = given.resolve()
         pairs = [(_text(path.relative_to(given).as_posix()), path) for path in _walk(given)]
         yield from (Source(name, path, root) for name, path in sorted(pairs, key=lambda pair: natural_key(pair[0])))
-    elif not given.exists():
-        raise ConfigError(f"{given}: INPUT: does not exist; give image files, folders or a capture manifest")
-    elif given.suffix.lower() == MANIFEST_SUFFIX:
+        return
+    name, _, camera = given.name.partition(f"{MANIFEST_SUFFIX}#")  # FILE#CAMERA
+    path = given.with_name(f"{name}{MANIFEST_SUFFIX}") if camera else given
+    if not path.exists():
+        raise ConfigError(f"{path}: INPUT: does not exist; give image files, folders or a capture manifest")
+    if path.suffix.lower() == MANIFEST_SUFFIX:
         root = given.parent.resolve()
-        for frame in read_manifest(given):
+        for frame in read_manifest(path, camera or None):
             yield Source(frame.image, given.parent / frame.image, root, frame.robot_pose)
     elif given.suffix.lower() in IMAGE_SUFFIXES:
         yield Source(_text(given.name), given, given.parent.resolve())

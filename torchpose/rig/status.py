@@ -62,15 +62,17 @@ class LiveStatus:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        self._worker.shutdown(cancel_futures=kind is not None)
-        if kind is None and self._last is not None:
+        self._worker.shutdown(cancel_futures=True)
+
+    def wait(self) -> None:
+        """Returns when the last frame is counted."""
+        if self._last is not None:
             self._last.result()
 
     def look(self, frame: Frame) -> None:
-        """Has a frame estimated; waits while the one before is not finished."""
+        """Has a frame estimated, after the one before."""
         if frame.camera in self._estimators:
-            if self._last is not None:
-                self._last.result()
+            self.wait()
             self._last = self._worker.submit(self._estimate, frame)
 
     def _estimate(self, frame: Frame) -> None:

@@ -177,12 +177,15 @@ class Twin:
         self._folder = folder
         self._formats = {camera.name: camera.pixel_format for camera in rig.cameras}
         self._number = number
+        self._tool = controller.true_pose()
 
     def look(self, name: str) -> Path:
         """Image file of what the camera ``name`` sees now."""
         bits = int(self._formats[name].removeprefix("Mono"))
         self._number += 1
-        seen = self.scene.frame(name, self.controller.true_pose(), self._number, bits)
+        with contextlib.suppress(ConnectionError):  # the controller has ended, as the robot's client will say
+            self._tool = self.controller.true_pose()
+        seen = self.scene.frame(name, self._tool, self._number, bits)
         path = self._folder / f"{name}.tiff"
         image = seen.numpy() << (16 - bits) if bits > 8 else seen.numpy()  # the emulator takes the upper bits
         if not cv2.imwrite(str(path), image, [cv2.IMWRITE_TIFF_COMPRESSION, 1]):  # none: the fastest to read
