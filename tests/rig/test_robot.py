@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import math
 import os
 import re
@@ -26,7 +27,7 @@ WORKSPACE = Workspace(min=[200.0, -200.0, 100.0], max=[600.0, 200.0, 800.0])
 FAR = (430.0, 0.0, 300.0, math.pi, 0.0, 0.0)  # 30 mm from the start: 0.85 s at the speed of these tests
 
 needs_ur_rtde = pytest.mark.skipif(
-    not __import__("importlib.util").util.find_spec("rtde_control"), reason="needs ur-rtde: pip install '.[rig]'"
+    importlib.util.find_spec("rtde_control") is None, reason="needs ur-rtde: pip install '.[rig]'"
 )
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -66,13 +64,14 @@ def _rows_of(path: Path, truth: Truth) -> list[dict[str, Any]]:
 
     Names of frames may have a folder before them, as they do where the data set itself was the input.
     """
+    from torchpose.io.tables import read_table
+
+    rows = read_table(path)
     try:
-        rows = _read(path)
         table = {(str(row["frame"]), str(row["target"])): row for row in rows}
         missing = [name for name in ("status", "tx", "rz", "sx", "srz") if rows and name not in rows[0]]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        detail = getattr(error, "strerror", None) or repr(error)
-        raise ConfigError(f"{path}: POSES: cannot be read ({detail}); give what torchpose estimate wrote") from None
+    except (KeyError, TypeError) as error:
+        raise ConfigError(f"{path}: POSES: cannot be read ({error!r}); give what torchpose estimate wrote") from None
     if missing:
         raise ConfigError(f"{path}: {missing[0]}: column is missing; give what torchpose estimate wrote")
     keys = list(zip(truth.frame, truth.target, strict=True))
@@ -85,19 +84,6 @@ def _rows_of(path: Path, truth: Truth) -> list[dict[str, Any]]:
             "missing; estimate all frames of the data set with its target.yaml"
         )
     return [table[key] for key in keys]
-
-
-def _read(path: Path) -> list[dict[str, Any]]:
-    if path.suffix == ".csv":
-        with path.open(newline="", encoding="utf-8") as file:
-            return [{name: cell or None for name, cell in row.items()} for row in csv.DictReader(file)]
-    if path.suffix == ".jsonl":
-        return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-    if path.suffix == ".parquet":
-        import pyarrow.parquet as pq
-
-        return pq.read_table(path).to_pylist()
-    raise ConfigError(f"{path}: POSES: of an unknown type; give .csv, .jsonl or .parquet")
 
 
 def _show(result: Evaluation, full_covariance: bool) -> None:

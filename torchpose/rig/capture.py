@@ -18,7 +18,8 @@ from torchpose.rig.camera import CameraFault
 from torchpose.rig.cameras import Cameras, Frame
 from torchpose.rig.plan import CapturePlan, Waypoint
 from torchpose.rig.robot import Robot
-from torchpose.rig.robot_settings import Pose, RobotFault, RobotReading, RobotReason, Settle
+from torchpose.rig.robot_faults import RobotFault, RobotReason
+from torchpose.rig.robot_settings import Pose, RobotReading, Settle
 from torchpose.rig.session import Session, SessionFault
 from torchpose.rig.settings import Rig
 

@@ -75,13 +75,13 @@ class Robot:
         tcp = self._call("upload", limit, frequency_hz=frequency, tcp=self.settings.tcp)
         reading = self.read()
         self._require_inside(reading.pose, "the tool stands")
-        for number, pose in enumerate(plan):
+        for pose in dict.fromkeys(plan):  # each once
             if not self._call("is_reachable", _CALL_S, pose=pose):
                 self._state()  # a stop or the end of the program explains it better
                 raise self._fault(
                     RobotReason.UNREACHABLE_POSE,
-                    f"pose {number} of the plan, {robot_faults.describe(pose)}, is beyond its reach or safety limits; "
-                    "move the plan",
+                    f"pose {plan.index(pose)} of the plan, {robot_faults.describe(pose)}, is beyond its reach or "
+                    "its safety limits; move the plan",
                 )
         return {**report, "tcp_offset": tcp, "pose": list(reading.pose)}
 

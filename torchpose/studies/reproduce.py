@@ -20,6 +20,8 @@ from torchpose.studies.study import RESULT
 # in the order of the paper
 STUDIES = (
     "fig02_pnp",
+    "table01_orientation",
+    "fig04_sensitivity",
     "table02_detection",
     "fig06_regions",
     "fig07_subpixel",
