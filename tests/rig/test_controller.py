@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import re
+import signal
 import subprocess
 import sys
 import textwrap
@@ -13,6 +15,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from torchpose.errors import ConfigError
+from torchpose.rig import dashboard
 from torchpose.rig.twin import wire
 from torchpose.rig.twin.controller import Fault, TwinController, TwinErrors
 from torchpose.rig.twin.machine import DONE, READY, Machine, Safety
@@ -204,6 +207,20 @@ def test_an_address_in_use_is_one_line(loopback: str) -> None:
         pytest.raises(ConfigError, match=r"^127[^\n]*: twin: cannot serve there .*; end the"),
     ):
         TwinController(loopback)
+
+
+def test_by_hand(loopback: str) -> None:
+    command = [sys.executable, "-m", "torchpose.rig.twin.controller", "--host", loopback]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == f"a UR controller's twin answers at {loopback}; Ctrl-C ends it\n"
+    assert dashboard.ask(loopback, ["get robot model"], 5.0) == ["UR5 torchpose twin"]
+    second = subprocess.run(command, capture_output=True, text=True, timeout=30)
+    assert second.returncode == 1
+    assert re.fullmatch(rf"error: {loopback}: twin: cannot serve there .*; end the other twin .*\n", second.stderr)
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=10)
+    assert process.returncode == 0
 
 
 def test_it_ends_with_its_parent(loopback: str) -> None:

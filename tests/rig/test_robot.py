@@ -17,6 +17,8 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from torchpose.errors import ConfigError
 from torchpose.rig.robot import Robot, RobotFault, RobotReason, RobotSettings, Settle, Workspace
@@ -125,6 +127,18 @@ def test_wrong_poses_are_rejected_without_a_robot(pose: list[float], reason: Rob
     for call in (robot.check, robot.move, lambda p: robot.preflight([p])):
         with fault_within(0.5, reason):
             call(pose)
+
+
+@given(st.lists(st.floats() | st.floats(150.0, 250.0), min_size=6, max_size=6))
+def test_a_pose_passes_exactly_when_it_is_finite_and_inside(pose: list[float]) -> None:
+    robot = Robot(settings("127.0.0.1"))
+    finite = all(map(math.isfinite, pose))
+    inside = all(a <= v <= b for v, a, b in zip(pose, WORKSPACE.min, WORKSPACE.max, strict=False))
+    if finite and inside:
+        assert robot.check(pose) == tuple(pose)
+    else:
+        with fault_within(0.5, RobotReason.OUTSIDE_WORKSPACE if finite else RobotReason.INVALID_POSE):
+            robot.check(pose)
 
 
 def test_poses_on_the_edge_of_the_workspace_are_inside() -> None:

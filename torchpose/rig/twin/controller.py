@@ -9,6 +9,7 @@ import argparse
 import json
 import queue
 import socket
+import sys
 import threading
 from collections.abc import Sequence
 from types import TracebackType
@@ -152,12 +153,14 @@ def main() -> None:
     parser.add_argument("--host", default="127.0.0.2", help="loopback address to serve on")
     parser.add_argument("--start-pose", type=float, nargs=6, default=START_POSE, help="x y z in mm, rx ry rz in rad")
     arguments = parser.parse_args()
-    with TwinController(arguments.host, start_pose=arguments.start_pose) as twin:
-        print(f"a UR controller's twin answers at {twin.host}; Ctrl-C ends it")
-        try:
+    try:
+        with TwinController(arguments.host, start_pose=arguments.start_pose) as twin:
+            print(f"a UR controller's twin answers at {twin.host}; Ctrl-C ends it", flush=True)
             threading.Event().wait()
-        except KeyboardInterrupt:
-            return
+    except KeyboardInterrupt:
+        return
+    except ConfigError as error:
+        sys.exit(f"error: {error}")
 
 
 if __name__ == "__main__":

@@ -85,7 +85,7 @@ class Machine:
         """The client's script has arrived and starts."""
         if self.safety is Safety.NORMAL and not self.faults & {Fault.REFUSE_SCRIPT, Fault.NOT_REMOTE}:
             self.program = True
-            self.executing = self.async_running = False
+            self.executing = self.async_running = self.blocking = False
             self._write_async(running=False)
             self._step(now)
 
@@ -230,7 +230,7 @@ class Machine:
             return int(self.registers[name]) if "_int_" in name else self.registers[name]
         if name == "actual_TCP_pose":
             noise = self.random.normal(size=3) * 1e-3 * self.errors.get("reading_noise_mm", 0.0)
-            return [*(self.pose(now)[:3] + noise), *self.pose(now)[3:]]
+            return self.pose(now) + np.append(noise, [0, 0, 0])
         if name == "target_TCP_pose":
             return self.pose(now)
         powered = self.safety is not Safety.EMERGENCY_STOP
