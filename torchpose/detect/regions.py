@@ -123,11 +123,11 @@ def _steep(frames: Tensor, threshold: Tensor) -> Tensor:
     batch, height, width = frames.shape
     if frames.device.type == "cpu":
         tall = frames.view(batch * height, width).numpy()
-        steep = np.zeros_like(tall)
-        cv2.absdiff(tall[1:, 1:], tall[:-1, :-1], steep[:-1, :-1])
-        cv2.max(steep[:-1, :-1], cv2.absdiff(tall[:-1, 1:], tall[1:, :-1]), steep[:-1, :-1])
-        limit = threshold.numpy()[:, None, None]
-        return torch.from_numpy(np.flatnonzero(steep.reshape(frames.shape) > limit))
+        differ = np.zeros_like(tall)
+        cv2.absdiff(tall[1:, 1:], tall[:-1, :-1], differ[:-1, :-1])
+        cv2.max(differ[:-1, :-1], cv2.absdiff(tall[:-1, 1:], tall[1:, :-1]), differ[:-1, :-1])
+        above = differ.reshape(batch, height, width) > threshold.numpy()[:, None, None]
+        return torch.from_numpy(np.flatnonzero(above))
     steep = torch.zeros_like(frames)
     diagonals = (frames[:, 1:, 1:] - frames[:, :-1, :-1]).abs(), (frames[:, :-1, 1:] - frames[:, 1:, :-1]).abs()
     steep[:, :-1, :-1] = torch.maximum(*diagonals)

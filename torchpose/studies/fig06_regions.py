@@ -54,7 +54,7 @@ def run(*, full: bool = False, seed: int = 0, progress: Progress = ignore_progre
         ("c, d", "phone", phone, phone_circles),
     ):
         found = find_shapes(frames)
-        ratio, inner = find_inner(frames, found.ellipses)
+        ratio, inner, _ = find_inner(frames, found.ellipses)
         hit = _same(found.ellipses.ellipse, truth)
         ring = measure_rings(frames, found.ellipses, _camera(*frames.shape[1:]))
         rows.append(
