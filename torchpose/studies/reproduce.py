@@ -28,6 +28,7 @@ STUDIES = (
     "table03_centers",
     "table04_compensation",
     "fig11_simulation",
+    "fig13_experiment",
 )
 REPORT = "report.html"
 _PACKAGES = ("torchpose", "torch", "kornia", "numpy", "opencv-python-headless", "scikit-image", "matplotlib")
