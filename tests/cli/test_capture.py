@@ -306,14 +306,15 @@ def test_a_robot_that_cannot_start(cell, fault, reason, monkeypatch):
     assert cell.is_complete()
 
 
-def test_ctrl_c_stops_the_robot_at_once(cell):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_stop_the_robot_at_once(cell, number):
     times = {}
 
     def interrupt(controller):
         while controller.state()["fraction"] < 0.2 or not controller.state()["moving"]:
             time.sleep(0.002)
         times["signal"] = time.monotonic()
-        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), number)
         while controller.state()["moving"]:
             time.sleep(0.002)
         times["stand"] = time.monotonic()

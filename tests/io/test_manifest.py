@@ -59,3 +59,14 @@ def test_broken_records_are_refused_by_line_and_field(tmp_path, records, field):
         read_manifest(path)
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
+
+
+def test_frames_of_one_camera(tmp_path):
+    path = tmp_path / "manifest.jsonl"
+    frames = [{"record": "frame", "id": i, "image": f"{i}.png", "camera": "ab"[i % 2]} for i in range(4)]
+    path.write_text("".join(json.dumps(frame) + "\n" for frame in frames))
+    assert [frame.image for frame in read_manifest(path, "b")] == ["1.png", "3.png"]
+    with pytest.raises(ConfigError, match=r"frames of 2 cameras; pick one: manifest.jsonl#a"):
+        read_manifest(path)
+    with pytest.raises(ConfigError, match="no frame of camera 'c'; known are a, b"):
+        read_manifest(path, "c")

@@ -73,7 +73,9 @@ def capture(
         KeyboardInterrupt: after SIGINT or SIGTERM.
     """
     robot = Robot(rig.robot)
+    sizes = {camera.name: camera.width * camera.height * camera.dtype().itemsize for camera in rig.cameras}
     try:
+        session.check_space(sum(sizes[name] for _, names in missing(plan, rig, session.done) for name in names))
         with stopped_by_signals(robot), Cameras(rig.cameras, scene) as cameras, robot:
             preflight = robot.preflight([waypoint.pose for waypoint in plan.waypoints])
             described = cameras.descriptions

@@ -12,6 +12,7 @@ import hashlib
 import json
 import os
 import platform
+import shutil
 import time
 from collections.abc import Mapping
 from enum import StrEnum
@@ -89,6 +90,15 @@ class Session:
         if self._file is not None:
             os.close(self._file)
             self._file = None
+
+    def check_space(self, size: int) -> None:
+        """Raises a SessionFault where the disk has less than ``size`` bytes left."""
+        free = shutil.disk_usage(self.folder).free
+        if free < size:
+            raise SessionFault(
+                SessionReason.DISK_FULL,
+                f"{self.folder}: {free / 1e9:.1f} GB are left and the images may need {size / 1e9:.1f} GB; free some",
+            )
 
     def begin(self, *, emulated: bool, record: Mapping[str, Any]) -> None:
         """Appends the session record: with what, in which units, whether any part of the rig is emulated.
@@ -204,12 +214,21 @@ class Session:
             if not image.is_file():
                 raise ConfigError(f"{image}: --resume: is missing, but the manifest lists it; restore it or start anew")
             self.done.add(record["id"])
-        whole = self.manifest.read_bytes()
-        if not whole.endswith(b"\n"):
-            torn = whole.rpartition(b"\n")[2]
-            os.truncate(self.manifest, len(whole) - len(torn))
-            kept = {r["id"] for _, r in read_records(self.manifest) if r.get("record") == "frame"}
-            self.done &= kept
+        self._close_last_line()
+
+    def _close_last_line(self) -> None:
+        """Ends a whole last line that lacks its newline, and cuts off one that is torn, as `read_records` drops it."""
+        content = self.manifest.read_bytes()
+        last = content.rpartition(b"\n")[2]
+        if not last:
+            return
+        try:
+            json.loads(last)
+        except ValueError:
+            os.truncate(self.manifest, len(content) - len(last))
+        else:
+            with self.manifest.open("ab") as file:
+                file.write(b"\n")
 
 
 def _fault(path: Path, error: OSError) -> SessionFault:

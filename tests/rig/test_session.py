@@ -1,0 +1,128 @@
+"""A session's folder: what is on the disk after every kind of failure."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import os
+
+import cv2
+import numpy as np
+import pytest
+
+from torchpose.errors import ConfigError
+from torchpose.rig.session import Session, SessionFault, SessionReason
+
+IMAGE = np.arange(48 * 64, dtype=np.uint16).reshape(48, 64)
+
+
+def opened(folder, **changes):
+    return Session(folder, **{"plan": "p", "images": {"camera": [64, 48, "Mono16"]}, **changes})
+
+
+def begun(folder, **changes):
+    session = opened(folder, **changes).__enter__()
+    session.begin(emulated=True, record={"plan": "small"})
+    return session
+
+
+def records(folder):
+    return [json.loads(line) for line in (folder / "manifest.jsonl").read_text().splitlines()]
+
+
+def test_a_frame_is_an_image_and_a_line(tmp_path):
+    with begun(tmp_path) as session:
+        session.write("0000", IMAGE, {"camera": "camera"})
+        session.end("complete")
+    first, frame, end = records(tmp_path)
+    assert (first["record"], first["emulated"], first["plan"], first["resumed"]) == ("session", True, "small", False)
+    data = (tmp_path / frame["image"]).read_bytes()
+    assert hashlib.sha256(data).hexdigest() == frame["sha256"]
+    np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED), IMAGE)
+    assert (frame["id"], frame["width"], frame["height"]) == ("0000", 64, 48)
+    assert (end["reason"], end["frames"]) == ("complete", 1)
+
+
+@pytest.mark.parametrize(
+    ("number", "reason"),
+    [
+        (errno.ENOSPC, SessionReason.DISK_FULL),
+        (errno.EDQUOT, SessionReason.DISK_FULL),
+        (errno.EIO, SessionReason.NOT_WRITABLE),
+    ],
+)
+def test_a_line_that_does_not_fit_leaves_nothing(tmp_path, monkeypatch, number, reason):
+    session = begun(tmp_path)
+    session.write("0000", IMAGE, {})
+    before = (tmp_path / "manifest.jsonl").read_bytes()
+    write = os.write
+
+    def full(file, data):
+        if len(data) > 20:
+            return write(file, data[:20])  # a part of it still fits
+        raise OSError(number, os.strerror(number))
+
+    with monkeypatch.context() as disk:
+        disk.setattr("torchpose.rig.session.os.write", full)
+        with pytest.raises(SessionFault) as caught:
+            session.write("0001", IMAGE, {"text": "x" * (14 - len(IMAGE) % 14)})
+        session.end("disk_full")  # says nothing where even that does not fit
+    assert caught.value.reason == reason
+    assert (tmp_path / "manifest.jsonl").read_bytes() == before
+    assert session.done == {"0000"}
+
+
+def test_an_image_that_does_not_fit_leaves_nothing(tmp_path):
+    with begun(tmp_path) as session:
+        (tmp_path / "images" / ".0000.png.tmp").symlink_to("/dev/full")
+        with pytest.raises(SessionFault, match="no space left") as caught:
+            session.write("0000", IMAGE, {})
+        session.end("disk_full")
+    assert caught.value.reason == SessionReason.DISK_FULL
+    assert list((tmp_path / "images").iterdir()) == []
+    assert [r["record"] for r in records(tmp_path)] == ["session", "end"]
+
+
+def test_a_resumed_session_knows_what_is_there(tmp_path):
+    with begun(tmp_path) as session:
+        session.write("0000", IMAGE, {})
+        session.write("0001", IMAGE, {})
+    manifest = tmp_path / "manifest.jsonl"
+    manifest.write_bytes(manifest.read_bytes()[:-30])  # the last line is torn
+    with begun(tmp_path, resume=True) as session:
+        assert session.done == {"0000"}
+        session.write("0001", IMAGE, {})
+    assert [r["record"] for r in records(tmp_path)] == ["session", "frame", "session", "frame"]
+    whole = manifest.read_bytes()
+    manifest.write_bytes(whole[:-1])  # only the newline is missing: the line is whole
+    with begun(tmp_path, resume=True) as session:
+        assert session.done == {"0000", "0001"}
+        session.end("complete")
+    assert [r["record"] for r in records(tmp_path)][2:] == ["session", "frame", "session", "end"]
+
+
+def test_what_cannot_be_resumed(tmp_path):
+    with pytest.raises(ConfigError, match="--resume: does not exist"):
+        opened(tmp_path, resume=True)
+    with begun(tmp_path):
+        pass
+    with pytest.raises(ConfigError, match="--out: holds a session already"):
+        opened(tmp_path)
+    with pytest.raises(ConfigError, match="has another plan"):
+        opened(tmp_path, resume=True, plan="q")
+    with pytest.raises(ConfigError, match="other cameras or image sizes"):
+        opened(tmp_path, resume=True, images={"camera": [64, 40, "Mono16"]})
+    with opened(tmp_path, resume=True) as session, pytest.raises(ConfigError, match="emulated is True there and False"):
+        session.begin(emulated=False, record={})
+
+
+def test_a_session_that_cannot_begin(tmp_path):
+    file = tmp_path / "file"
+    file.touch()
+    with pytest.raises(ConfigError, match="--out: cannot be made"):
+        opened(file).__enter__()
+    with opened(tmp_path / "run") as session, pytest.raises(SessionFault, match="free some"):
+        session.check_space(2**62)
+    session.end("disk_full")
+    assert not session.begun
