@@ -55,6 +55,15 @@ CASES = {
     ),
     "deep": Case(
         "acA5472_8mm_third",
+        WorkingVolume((140, 190), (5, 5), math.radians(20)),
+        (50, 50),
+        Need(1.0, 5.0),
+        Imaging(noise=1.0, lens=Defocus(4.0, 8.0, 160.0)),
+        "light",
+        6,
+    ),
+    "defocused": Case(
+        "acA5472_8mm_third",
         WorkingVolume((120, 240), (5, 5), math.radians(30)),
         (50, 50),
         Need(1.0, 5.0),
@@ -144,7 +153,7 @@ def markdown(rows: list[dict[str, object]]) -> list[str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--case", nargs="+", default=["robot", "oblong", "deep"], choices=[*CASES, "all"])
+    parser.add_argument("--case", nargs="+", default=["robot", "oblong", "deep", "defocused"], choices=[*CASES, "all"])
     parser.add_argument("--frames", type=int, default=600)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, help="CSV file of the rows")

@@ -95,7 +95,7 @@ def test_the_precision_of_an_existing_target(run, tmp_path):
         (["--camera", "camera.yaml", *GOOD, "--plate", "nanxnan"], "--plate: 'nanxnan' is not a size"),
         (["--camera", "camera.yaml", *GOOD, "--plate", "0x50"], "plate: 0 x 50 mm"),
         (["--camera", "camera.yaml", *GOOD, "--plate", "500x500"], "larger than what is in view"),
-        (["--camera", "camera.yaml", *GOOD, "--plate", "6x6"], "too small for 4 codes"),
+        (["--camera", "camera.yaml", *GOOD, "--plate", "6x6"], "4 codes need"),
         (["--camera", "camera.yaml", *GOOD, "--distance", "-150"], "distance: -150 to -150 mm"),
         (["--camera", "camera.yaml", *GOOD, "--distance", "nan"], "distance: nan"),
         (["--camera", "camera.yaml", *GOOD, "--distance-range", "160", "170"], "150 mm is not within the range"),

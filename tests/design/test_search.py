@@ -99,9 +99,9 @@ def test_a_plate_out_of_view_says_what_is_in_view():
 
 
 def test_a_plate_too_small_says_so():
-    with pytest.raises(ConfigError, match="too small for 4 codes"):
+    with pytest.raises(ConfigError, match="4 codes need"):
         design_target(camera(), VOLUME, (8.0, 8.0), Need(1, 5), IMAGING)
-    with pytest.raises(ConfigError, match="too small for 12 codes"):
+    with pytest.raises(ConfigError, match="12 codes need"):
         design_target(camera(), VOLUME, (40.0, 40.0), Need(1, 5), IMAGING, markers=12)
 
 

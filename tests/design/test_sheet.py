@@ -13,10 +13,14 @@ import numpy as np
 import pytest
 import torch
 
+from torchpose.camera import Camera
 from torchpose.cli.main import main
 from torchpose.design import make_sheet, plate_around
 from torchpose.design.drawing import Circle, Line, Page, Text
 from torchpose.errors import ConfigError
+from torchpose.geometry import rotations
+from torchpose.pipeline import PoseEstimator
+from torchpose.results import Status
 from torchpose.target import Target
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -151,6 +155,30 @@ def test_rasterised_pdf_measures_as_the_target_file(name, plate, tmp_path):
         near = np.hypot(mm[:, 0] - x, mm[:, 1] - y) < 0.01
         for radius in (outer, inner):
             assert (near & (np.abs(mm[:, 2:] - radius) < 0.01).all(1)).any(), (x, y, radius)
+
+
+@pytest.mark.parametrize("name", ["quad40", "quad40_dark", "hexa50"])
+def test_a_camera_that_faces_the_sheet_reads_its_ids(name, tmp_path):
+    pdfium = pytest.importorskip("pypdfium2")
+    target, dpi, distance = Target.load(name), 200, 160.0
+    sheet = make_sheet(target, plate_around(target))
+    _, path = sheet.save(tmp_path, name)
+    document = pdfium.PdfDocument(path)
+    picture = document[0].render(scale=dpi / 72, grayscale=True).to_numpy()
+    document.close()
+    # a raster is the frame of a camera of this focal length that faces the page
+    height, width = picture.shape[:2]
+    middle = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=torch.float64)
+    matrix = torch.eye(3, dtype=torch.float64)
+    matrix[:2, :2] *= distance * dpi / 25.4
+    matrix[:2, 2] = middle
+    frame = torch.from_numpy(picture.reshape(1, height, width).copy())
+    poses = PoseEstimator(Camera(width, height, matrix, torch.zeros(0)), target)(frame)
+    assert poses.status.tolist() == [Status.OK]
+    assert poses.markers.tolist() == [len(target)]
+    expected = [*(torch.tensor(sheet.origin) - (middle + 0.5) * 25.4 / dpi).tolist(), distance]
+    assert poses.t[0].tolist() == pytest.approx(expected, abs=0.01)
+    assert rotations.log(poses.R)[0].abs().max() < 1e-3
 
 
 def test_targets_that_are_not_flat_are_refused():

@@ -242,7 +242,9 @@ def _focus(scene: _Scene) -> str:
         return "depth of field: not counted; give --f-number and --focal-length"
     near, far = sharp_range(scene.camera, lens, psf)
     ends = zip(scene.imaging.blur_at(scene.camera, scene.volume.distance), scene.volume.distance, strict=True)
+    beyond = near > scene.volume.distance[0] or far < scene.volume.distance[1]
     return (
         f"depth of field: focused on {lens.focus_distance:.4g} mm, where the blur is {psf:g} px; {near:.4g} to "
         f"{far:.4g} mm with at most 1.41 times as much; {', '.join(f'{blur:.2f} px at {z:g} mm' for blur, z in ends)}"
+        + ("; beyond that range the depth errs by more than predicted" if beyond else "")
     )

@@ -17,6 +17,8 @@ from torchpose.io.rows import Row
 from torchpose.target import Target
 
 FRAME_MARGIN_PX = 10.0  # between rings and the border of the frame
+_TILTS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the largest one
+_DIRECTIONS = 8  # of the tilt, and turns about the axis, among which the weakest pose is searched
 _STEPS = 5  # of distance and tilt in a map
 _AZIMUTHS = 4  # directions of the tilt in a map
 _PLACES = 3  # across the offset, along x and y
@@ -104,17 +106,20 @@ def predict_volume(camera: Camera, target: Target, volume: WorkingVolume, imagin
             f"{target.name}: rings leave the frame within the working volume; narrow offset, tilt or roll, or keep "
             "farther away"
         )
-    # deviations do not grow steadily with the tilt: facing the camera, depth and tilt are weakest
-    halfway = volume.poses(
-        distances=sorted(set(volume.distance)),
-        tilts=[volume.tilt / 4, volume.tilt / 2] if volume.tilt else [0.0],
-        azimuths=6,
-        rolls=1,
-        offsets=[(0.0, 0.0)],
-    )
-    R, t = torch.cat([R, halfway[0]]), torch.cat([t, halfway[1]])
-    largest = deviations(edge_covariance(camera, target, R, t, imaging)).argmax(0)
-    R, t = (torch.cat([a, b[largest]]) for a, b in zip(volume.middle, (R, t), strict=True))
+    # the closed form finds the weakest pose of every axis at each tilt; the full prediction compares the tilts
+    tilts = [volume.tilt * part for part in _TILTS] if volume.tilt else [0.0]
+    chosen = [volume.middle]
+    for tilt in tilts:
+        R, t = volume.poses(
+            distances=sorted(set(volume.distance)),
+            tilts=[tilt],
+            azimuths=_DIRECTIONS,
+            rolls=_DIRECTIONS if volume.roll else 1,
+            offsets=volume.corners,
+        )
+        weakest = deviations(edge_covariance(camera, target, R, t, imaging)).argmax(0).unique()
+        chosen.append((R[weakest], t[weakest]))
+    R, t = (torch.cat(parts) for parts in zip(*chosen, strict=True))
     found = deviations(predicted_covariance(camera, target, R, t, imaging))
     worst = found.argmax(0)
     return Precision(found[0], found.amax(0), R[worst], t[worst])

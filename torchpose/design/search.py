@@ -170,10 +170,11 @@ def _no_room(
             "tilt or roll"
         )
     radius = limits.largest_radius(count, plate)
+    enough = next(px for px in range(1, 2000) if limits.ratios(count, px / limits.scale) is not None)
     return ConfigError(
         f"plate: {plate[0]:g} x {plate[1]:g} mm has room for {count} rings of {2 * radius:.3g} mm, whose "
-        f"semi-minor axis is {radius * limits.scale:.3g} px in the farthest, most tilted view; too small for "
-        f"{count} codes: enlarge the plate, come nearer, tilt less or take fewer markers"
+        f"semi-minor axis is {radius * limits.scale:.3g} px in the farthest, most tilted view; {count} codes "
+        f"need {enough} px: enlarge the plate, come nearer, tilt less or take fewer markers"
     )
 
 

@@ -55,6 +55,11 @@ class WorkingVolume:
         z = sum(self.distance) / 2 if self.nominal is None else self.nominal
         return torch.eye(3, dtype=torch.float64)[None], torch.tensor([[0.0, 0.0, z]], dtype=torch.float64)
 
+    @property
+    def corners(self) -> list[tuple[float, float]]:
+        """x, y of the corners of the offset, mm, each once."""
+        return _signs(self.offset)
+
     def extremes(self) -> tuple[Tensor, Tensor]:
         """R (N, 3, 3), t (N, 3): no and the largest tilt in all directions, at all rolls, at the borders of the volume.
 
@@ -65,7 +70,7 @@ class WorkingVolume:
             tilts=sorted({0.0, self.tilt}),
             azimuths=_TURNS,
             rolls=_TURNS if self.roll else 1,
-            offsets=_signs(self.offset),
+            offsets=self.corners,
         )
 
     def poses(
