@@ -19,8 +19,8 @@ from torchpose.target import Target
 FRAME_MARGIN_PX = 10.0  # between rings and the border of the frame
 _TILTS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the largest one
 _DIRECTIONS = 8  # of the tilt, and turns about the axis, among which the weakest pose is searched
-_STEPS = 5  # of distance and tilt in a map
-_AZIMUTHS = 4  # directions of the tilt in a map
+_STEPS = 4  # of distance and tilt in a map
+_AZIMUTHS = 8  # directions of the tilt in a map
 _PLACES = 3  # across the offset, along x and y
 
 

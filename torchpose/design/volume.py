@@ -128,7 +128,7 @@ class WorkingVolume:
 
 def _signs(half: tuple[float, float]) -> list[tuple[float, float]]:
     x, y = half
-    return sorted({(sx * x, sy * y) for sx in (-1, 1) for sy in (-1, 1)})
+    return sorted({(sx * x + 0.0, sy * y + 0.0) for sx in (-1, 1) for sy in (-1, 1)})  # no -0
 
 
 def _turns(roll: float, count: int) -> list[float]:
