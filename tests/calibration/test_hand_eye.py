@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 
 from torchpose.calibration import calibrate_hand_eye
 from torchpose.calibration.hand_eye import linear_start
+from torchpose.calibration.intrinsics import locate_views
+from torchpose.calibration.session import calibrate_robot
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 
@@ -96,3 +98,22 @@ def test_motion_that_is_not_enough_is_named() -> None:
         calibrate_hand_eye((rotations.exp(about_z), shift), seen, spread, "base")
     with pytest.raises(ConfigError, match="3 poses"):
         calibrate_hand_eye((same[:3], shift[:3]), (seen[0][:3], seen[1][:3]), spread[:3], "tool")
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_mount_follows_from_the_poses(mount: str) -> None:
+    camera = scenes.camera()
+    true = scenes.poses(camera, 10)
+    views, bundle = locate_views(scenes.views(camera, true, scenes.grid(), sigma=0.01), camera)
+    noise = torch.tensor([0.02] * 3 + [1e-4] * 3, dtype=torch.float64)
+    r, t = disturbed(scenes.robot_poses(mount, true), noise, 7)
+    poses = dict(zip(views.names, torch.cat([t, rotations.log(r)], -1).tolist(), strict=True))
+    fit = calibrate_robot(views, bundle, None, poses)
+    assert fit.hand_eye.mount == mount
+    assert fit.hand_eye.covariance is not None
+    error = fit.hand_eye.translation - scenes.rig(mount)[0][1]
+    assert float((error / fit.hand_eye.covariance.diagonal()[:3].sqrt()).abs().max()) < 5
+    # the poses of other frames
+    mixed = dict(zip(views.names, [*list(poses.values())[3:], *list(poses.values())[:3]], strict=True))
+    with pytest.raises(ConfigError, match="robot and target poses disagree"):
+        calibrate_robot(views, bundle, None, mixed)

@@ -80,3 +80,8 @@ def test_views_of_a_known_camera() -> None:
 def test_unknown_lens_is_named() -> None:
     with pytest.raises(ConfigError, match="brown6"):
         start_cameras(10, 10, "brown6")
+
+
+def test_errors_of_pixels_are_warned_of() -> None:
+    views = scenes.views(CAMERA, scenes.poses(CAMERA, 15), scenes.grid(20, 6, 4), sigma=3.0, said=0.01)
+    assert any("px off" in w for w in calibrate_intrinsics(views, [CAMERA], lens="brown4").warnings)

@@ -32,6 +32,7 @@ _MEDIAN = 2 * math.log(2)  # of chi-squared with two degrees of freedom
 _ROUNDS = 4  # of leaving out points and finding the common error
 _WIDE_SIGMA = 1e-3  # of a focal length, above which views are called too alike
 _LITTLE_TILT_DEG = 15.0  # between the views' normals, below which they are
+_LARGE_ERROR = 1.0  # px, of all points, above which something else than their noise is wrong
 _LITTLE_COVER = 0.5  # of the frame's width or height, below which distortion is extrapolated
 _SINGULAR = 1e-12  # least eigenvalue of the information, scaled to a unit diagonal
 
@@ -150,7 +151,7 @@ def calibrate_intrinsics(views: Views, starts: list[Camera], *, lens: str = "bro
         float(bundle.chi2.sum()),
         _degrees(views, len(names)),
         common,
-        _warnings(views, bundle, covariance),
+        _warnings(views, bundle, covariance, common),
     )
 
 
@@ -275,8 +276,13 @@ def tilt_spread_deg(rotation: Tensor) -> float:
     return float((normal @ normal.T).clamp(-1, 1).acos().max().rad2deg())
 
 
-def _warnings(views: Views, bundle: Bundle, covariance: Tensor) -> list[str]:
+def _warnings(views: Views, bundle: Bundle, covariance: Tensor, common: float) -> list[str]:
     notes = []
+    if common > _LARGE_ERROR:
+        notes.append(
+            f"the points are {common:.2g} px off, more than print and lens explain; check the target file, --model, "
+            "and that all frames are of one camera with one focus"
+        )
     focal, sigma = bundle.camera.matrix.diagonal()[:2], covariance.diagonal()[:2].sqrt()
     spread = tilt_spread_deg(bundle.R)
     if spread < _LITTLE_TILT_DEG:

@@ -29,9 +29,10 @@ def plot_residuals(c: Calibration) -> Figure:
     residual, pixels = c.bundle.residual, c.views.pixels
     camera = c.camera
 
-    # the longest arrow is a tenth of the frame
-    longest = float(residual.norm(dim=-1).max())
-    enlarged = 10 ** math.floor(math.log10(0.1 * camera.width / max(longest, 1e-9)))
+    # the longest arrow is at most a tenth of the frame; the factor is 1, 2 or 5 times a power of ten
+    most = 0.1 * camera.width / max(float(residual.norm(dim=-1).max()), 1e-9)
+    decade = 10 ** math.floor(math.log10(most))
+    enlarged = max(step * decade for step in (1, 2, 5) if step * decade <= most)
     frame.quiver(*pixels.T, *(enlarged * residual.T), angles="xy", scale_units="xy", scale=1, width=0.0018, color=_BLUE)
     frame.plot(*pixels.T, ".", ms=2, color=_GREY)
     frame.set(xlim=(-0.5, camera.width - 0.5), ylim=(camera.height - 0.5, -0.5), xlabel="u, px", ylabel="v, px")
