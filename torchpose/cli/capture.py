@@ -89,7 +89,7 @@ def _run(plan: CapturePlan, rig: Rig, session: Session, twin: Path | None, statu
     from torchpose.rig.capture import FAULTS, capture
     from torchpose.rig.plan import Waypoint
 
-    total = len(plan.waypoints) * len(rig.cameras)
+    total, ended, code = len(plan.waypoints) * len(rig.cameras), "", 0
 
     def on_frame(_waypoint: Waypoint, frame: Frame) -> None:
         status.look(frame)
@@ -106,23 +106,18 @@ def _run(plan: CapturePlan, rig: Rig, session: Session, twin: Path | None, statu
         try:
             capture(plan, rig, session, scene=scene, on_frame=on_frame, notes={"twin": twin and str(twin)})
         except FAULTS as fault:
-            _say(f"{fault.reason}: {fault}", session, total)
-            return 1
+            ended, code = f"{fault.reason}: {fault}", 1
         except KeyboardInterrupt:
-            _say("interrupted: the robot is stopped", session, total)
-            return INTERRUPTED
-    if not quiet:
+            ended, code = "interrupted: the robot is stopped", INTERRUPTED
+    if ended:
+        kept = f"{session.folder} keeps {len(session.done)} of {total} frames"
+        more = "; add --resume to go on" if session.begun else ""
+        typer.echo(f"torchpose: error: {ended} ({kept}{more})", err=True)
+    elif not quiet:
         status.wait()
         found = ", ".join(f"{name} {count}" for name, count in status.counts.most_common())
         typer.echo(f"{len(session.done)} frames in {session.manifest}{found and f': {found}'}", err=True)
-    return 0
-
-
-def _say(what: str, session: Session, total: int) -> None:
-    """The one line of a session that ended early."""
-    kept = f"{session.folder} keeps {len(session.done)} of {total} frames"
-    more = "; add --resume to go on" if session.begun else ""
-    typer.echo(f"torchpose: error: {what} ({kept}{more})", err=True)
+    return code
 
 
 def _show(plan: CapturePlan, rig: Rig, left: int, out: Path) -> None:
@@ -133,5 +128,5 @@ def _show(plan: CapturePlan, rig: Rig, left: int, out: Path) -> None:
     for line in plan.summary(rig.robot.workspace):
         typer.echo(line, err=True)
     out.mkdir(parents=True, exist_ok=True)
-    draw_path(plan, rig.robot.workspace, out / "path.png")
-    typer.echo(f"path drawn in {out / 'path.png'}", err=True)
+    draw_path(plan, rig.robot.workspace, out / "path.svg")
+    typer.echo(f"path drawn in {out / 'path.svg'}", err=True)

@@ -11,7 +11,7 @@ from torchpose.rig.robot_settings import Workspace
 
 
 def draw_path(plan: CapturePlan, workspace: Workspace, out: Path) -> None:
-    """Writes a PNG: the path from above and from two sides with the workspace, and every turn from the origin.
+    """Writes an SVG (which no command takes for a frame): the path from above and from two sides with the workspace, and every turn from the origin.
 
     Raises:
         ConfigError: the file cannot be written.
@@ -42,4 +42,4 @@ def draw_path(plan: CapturePlan, workspace: Workspace, out: Path) -> None:
     last.set(xlabel="waypoint", ylabel="angle from the origin (deg)")
     figure.suptitle(f"{plan.name}: {len(plan.waypoints)} waypoints")
     with atomic_path(out) as temporary:
-        figure.savefig(temporary, format="png", dpi=120)
+        figure.savefig(temporary, format="svg")
