@@ -11,7 +11,9 @@ from torchpose.rig.robot_settings import Workspace
 
 
 def draw_path(plan: CapturePlan, workspace: Workspace, out: Path) -> None:
-    """Writes an SVG (which no command takes for a frame): the path from above and from two sides with the workspace, and every turn from the origin.
+    """Draws the path from above and from two sides with the workspace, and every turn from the origin.
+
+    As SVG, which no command takes for a frame of the session that it lies beside.
 
     Raises:
         ConfigError: the file cannot be written.
