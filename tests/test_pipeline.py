@@ -241,3 +241,29 @@ def test_detections_in_raw_pixels(sample: tuple[tp.PoseEstimator, Tensor], poses
     assert e.square().mean().sqrt() < 0.02
     nees = (e[:, None] @ torch.linalg.inv(d.center_cov) @ e[..., None]).mean()
     assert 1.0 < nees < 3.5
+
+
+@pytest.mark.parametrize("method", ["photometric", "edges"])
+def test_refined_poses_follow_the_intrinsics_as_predicted(method: str) -> None:
+    """The gain of uncertain intrinsics, column by column: the whole chain again with fx, fy, cx or cy changed."""
+    camera, target = tp.Camera.load(SAMPLE / "camera.yaml"), QUAD
+    r = rotations.exp(torch.tensor([[0.4, 0.3, 0.5], [0.6, -0.1, 1.0]], dtype=F64))
+    t = torch.tensor([[10.0, -20, 160], [-20, 10, 200]], dtype=F64)
+    frames = render(camera, target, r, t).round().to(torch.uint8)
+
+    def solved(matrix: Tensor, covariance: Tensor | None = None) -> tp.Poses:
+        changed = dataclasses.replace(camera, matrix=matrix, covariance=covariance)
+        return tp.PoseEstimator(changed, target, method=method)(frames)
+
+    still = solved(camera.matrix)
+    for k, (i, j) in enumerate(((0, 0), (1, 1), (0, 2), (1, 2))):
+        shift = torch.zeros_like(camera.matrix)
+        shift[i, j] = 0.1
+        a, b = solved(camera.matrix + shift), solved(camera.matrix - shift)
+        change = torch.cat([a.t - b.t, rotations.log(a.R @ b.R.mT)], 1).abs() / 0.2
+        one = torch.zeros(4, 4, dtype=F64)
+        one[k, k] = 1
+        added = solved(camera.matrix, one).covariance - still.covariance
+        predicted = added.diagonal(dim1=1, dim2=2).clamp_min(0).sqrt()
+        scale = predicted.amax(0, keepdim=True)
+        assert ((change - predicted).abs() / (0.1 * predicted + 0.05 * scale)).max() < 1

@@ -107,12 +107,13 @@ class PoseEstimator(nn.Module):
 
         solvable = (evidence.mask.sum(-1) >= MIN_MARKERS).nonzero()[:, 0]
         solutions = solve_poses(evidence[solvable], (identified.R[solvable], identified.t[solvable]))
-        if self.method in ("photometric", "edges"):
+        refined = self.method in ("photometric", "edges")
+        if refined:
             solutions = self._refined(
                 frames, solutions, evidence[solvable], solvable // count, rings, identified.ring[solvable], camera
             )
         if camera.covariance is not None:
-            wider = intrinsics_covariance(evidence[solvable], solutions, camera.covariance)
+            wider = intrinsics_covariance(evidence[solvable], solutions, camera.covariance, refined=refined)
             solutions = replace(solutions, covariance=solutions.covariance + wider)
         return self._poses(target, solvable, solutions, evidence, identified, rings, table, camera)
 

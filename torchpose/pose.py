@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchpose import pnp
 from torchpose.geometry import conics, rotations
+from torchpose.geometry.rotations import plane_axes
 from torchpose.results import Reason, Status
 from torchpose.rings import Rings
 
@@ -24,6 +25,7 @@ _SHAPE_FLOOR = (0.03, 0.5)  # px, and times the curvature a / b^2: what blur and
 _SHAPE_LIMIT = 16.0  # mean chi-squared a shape component above which the rings contradict the pose
 _CENTER_LIMIT = (30.0, 10.0)  # chi-squared, and per degree of freedom, above which the centres contradict each other
 _ITERATIONS = (8, 60)  # of the solver: for most rows, and for those that need more
+_RIM_POINTS = 24  # of a circle: sums over it are exact up to the perspective's high orders
 _CENTER_RMS = 0.3  # px, below which they do not: small errors of calibration or print are no mix-up
 
 
@@ -251,18 +253,46 @@ def _shape_chi2(e: Evidence, r: Tensor, t: Tensor) -> Tensor:
 
 
 def _jacobian(e: Evidence, r: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Projections' derivatives by the pose (N, M, 2, 6), normalised points (N, M, 2), weights (N, M, 2, 2).
+    """Projected centres' derivatives by the pose (N, M, 2, 6) and by fx, fy, cx, cy (N, M, 2, 4), weights (N, M, 2, 2).
 
     Translation first, then the rotation from the left, R = exp(w) R_est.
     """
     turned = (r[:, None] @ e.points[..., None]).squeeze(-1)
-    x = turned + t[:, None]
+    by_point, n = _derivative(turned + t[:, None], e.matrix)
+    weight = torch.linalg.inv(_visible(e.covariance, e.mask)) * e.mask[..., None, None]
+    return torch.cat([by_point, -by_point @ rotations.skew(turned)], -1), _by_intrinsics(n), weight
+
+
+def _rim_jacobian(e: Evidence, r: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The same of points all along both rims of every marker, weighted by their length across the edge alone."""
+    angle = torch.arange(_RIM_POINTS, dtype=t.dtype, device=t.device) * (2 * torch.pi / _RIM_POINTS)
+    one, two = (x[..., None, None, :] for x in plane_axes(e.normals))
+    cos, sin = angle.cos()[:, None], angle.sin()[:, None]
+    radii = e.radii[..., None, None]
+    points = (e.points[:, :, None, None] + radii * (cos * one + sin * two)).flatten(1, 3)
+    along = (radii * (cos * two - sin * one)).flatten(1, 3)
+    turned = points @ r.mT
+    by_point, n = _derivative(turned + t[:, None], e.matrix)
+    tangent = (by_point @ (along @ r.mT)[..., None]).squeeze(-1)  # px per rad
+    length = torch.linalg.vector_norm(tangent, dim=-1)
+    normal = torch.stack([-tangent[..., 1], tangent[..., 0]], -1) / length[..., None]
+    seen = e.mask.repeat_interleave(2 * _RIM_POINTS, 1)
+    weight = normal[..., :, None] * normal[..., None, :] * (length * seen)[..., None, None]
+    return torch.cat([by_point, -by_point @ rotations.skew(turned)], -1), _by_intrinsics(n), weight
+
+
+def _derivative(x: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Pixels' derivatives (..., 2, 3) by points (..., 3) of the camera frame, and their normalised images (..., 2)."""
     n = x[..., :2] / x[..., 2:]
     zero, one = torch.zeros_like(n[..., 0]), torch.ones_like(n[..., 0])
     by_point = torch.stack([one, zero, -n[..., 0], zero, one, -n[..., 1]], -1).unflatten(-1, (2, 3))
-    by_point = by_point * (e.matrix.diagonal()[:2, None] / x[..., 2, None, None])
-    weight = torch.linalg.inv(_visible(e.covariance, e.mask)) * e.mask[..., None, None]
-    return torch.cat([by_point, -by_point @ rotations.skew(turned)], -1), n, weight
+    return by_point * (matrix.diagonal()[:2, None] / x[..., 2, None, None]), n
+
+
+def _by_intrinsics(n: Tensor) -> Tensor:
+    """Pixels' derivatives (..., 2, 4) by fx, fy, cx, cy."""
+    zero, one = torch.zeros_like(n[..., 0]), torch.ones_like(n[..., 0])
+    return torch.stack([n[..., 0], zero, one, zero, zero, n[..., 1], zero, one], -1).unflatten(-1, (2, 4))
 
 
 def center_rms(e: Evidence, r: Tensor, t: Tensor) -> Tensor:
@@ -276,7 +306,11 @@ def center_rms(e: Evidence, r: Tensor, t: Tensor) -> Tensor:
 def _covariance(e: Evidence, r: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
     """Pose covariance (J^T W J)^-1 (N, 6, 6), and whether the centres determine all six parameters (N,)."""
     jac, _, weight = _jacobian(e, r, t)
-    information = (jac.mT @ weight @ jac).sum(1)
+    return _inverse((jac.mT @ weight @ jac).sum(1))
+
+
+def _inverse(information: Tensor) -> tuple[Tensor, Tensor]:
+    """Inverse of (N, 6, 6), and whether it determines all six parameters (N,)."""
     # in units of each parameter's own information, so that mm and rad can be compared
     scale = information.diagonal(dim1=-2, dim2=-1).rsqrt()
     inverse, info = torch.linalg.inv_ex(information * scale[:, :, None] * scale[:, None, :])
@@ -285,18 +319,16 @@ def _covariance(e: Evidence, r: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
     return covariance, determined
 
 
-def intrinsics_covariance(e: Evidence, s: Solutions, intrinsics: Tensor) -> Tensor:
+def intrinsics_covariance(e: Evidence, s: Solutions, intrinsics: Tensor, *, refined: bool) -> Tensor:
     """What uncertain intrinsics add to the pose covariance (N, 6, 6): G Sigma_K G^T, G = d pose / d (fx, fy, cx, cy).
 
-    At the least-squares optimum G = -(J^T W J)^-1 J^T W J_K, J and J_K the Jacobians of the projected centres; a pose
-    refined on the grey values around them follows the intrinsics in the same way.
+    At the least-squares optimum G = -(J^T W J)^-1 J^T W J_K with the Jacobians J and J_K of what the pose is fitted to.
 
     Args:
         intrinsics: (4, 4) covariance of fx, fy, cx, cy, px^2 (`Camera.covariance`).
+        refined: the pose is fitted to the edges of the rings, which tell their size and shape too, not to the centres.
     """
-    seen = replace(e, mask=s.mask)
-    jac, n, weight = _jacobian(seen, s.R, s.t)
-    zero, one = torch.zeros_like(n[..., 0]), torch.ones_like(n[..., 0])
-    jac_k = torch.stack([n[..., 0], zero, one, zero, zero, n[..., 1], zero, one], -1).unflatten(-1, (2, 4))
-    gain = -_covariance(seen, s.R, s.t)[0] @ (jac.mT @ weight @ jac_k).sum(1)
+    jac, jac_k, weight = (_rim_jacobian if refined else _jacobian)(replace(e, mask=s.mask), s.R, s.t)
+    weighted = jac.mT @ weight
+    gain = -_inverse((weighted @ jac).sum(1))[0] @ (weighted @ jac_k).sum(1)
     return gain @ intrinsics.to(gain) @ gain.mT

@@ -12,9 +12,9 @@ from torchpose import pnp
 from torchpose.analysis.sensitivity import Uncertainty, markers_seen, radius_shift
 from torchpose.camera import Camera
 from torchpose.geometry import rotations
+from torchpose.geometry.rotations import plane_axes
 from torchpose.pipeline import Method, PoseEstimator
 from torchpose.sim import add_noise, render
-from torchpose.sim.shapes import plane_axes
 from torchpose.target import Target
 
 _FRAMES = 16  # estimated at a time

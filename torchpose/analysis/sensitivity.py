@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.geometry import rotations
-from torchpose.sim.shapes import plane_axes
+from torchpose.geometry.rotations import plane_axes
 from torchpose.target import Target
 
 Features = Literal["centers", "rings"]

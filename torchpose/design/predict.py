@@ -12,9 +12,9 @@ from torch import Tensor
 from torchpose import ellipse
 from torchpose.camera import Camera
 from torchpose.errors import ConfigError
+from torchpose.geometry.rotations import plane_axes
 from torchpose.refine import refine_photometric
 from torchpose.sim import Defocus, add_noise, render
-from torchpose.sim.shapes import plane_axes
 from torchpose.target import Target
 
 _SAMPLES = 48  # of a circle

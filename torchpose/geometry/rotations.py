@@ -77,3 +77,12 @@ def compose(ra: Tensor, ta: Tensor, rb: Tensor, tb: Tensor) -> tuple[Tensor, Ten
 def angle_between(ra: Tensor, rb: Tensor) -> Tensor:
     """Angle in rad of the rotation from ``rb`` to ``ra``, both (..., 3, 3)."""
     return torch.linalg.vector_norm(log(ra @ rb.mT), dim=-1)
+
+
+def plane_axes(normals: Tensor) -> tuple[Tensor, Tensor]:
+    """Unit vectors (M, 3), (M, 3) that complete unit normals (M, 3) to orthonormal frames (Duff et al. 2017)."""
+    x, y, z = normals.unbind(-1)
+    sign = torch.where(z < 0, -1.0, 1.0).to(z)
+    a = -1 / (sign + z)
+    b = x * y * a
+    return torch.stack([1 + sign * x * x * a, sign * b, -sign * x], -1), torch.stack([b, sign + y * y * a, -y], -1)

@@ -16,6 +16,7 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
+from torchpose.geometry.rotations import plane_axes
 from torchpose.sim.truth import Truth, read_truth
 from torchpose.target import Target
 from torchpose.yaml_files import beside, read_yaml, validate
@@ -277,8 +278,6 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
 
 def markers_in_view(camera: Camera, target: Target, R: Tensor, t: Tensor) -> Tensor:
     """(N,) int64: how many markers lie before the camera and in the frame as a whole, for poses (N, 3, 3), (N, 3)."""
-    from torchpose.sim.shapes import plane_axes
-
     e1, e2 = plane_axes(target.normals)
     angle = torch.arange(36, dtype=t.dtype) * (2 * math.pi / 36)
     rim = angle.cos()[:, None, None] * e1 + angle.sin()[:, None, None] * e2

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchpose.geometry.rotations import plane_axes
 from torchpose.target import Target
 
 
@@ -215,15 +216,6 @@ def text(
     return polygon(
         [_placed((loop - middle) * (height / 48), center, angle) for loop in traced if len(loop) > 2], level, frame
     )
-
-
-def plane_axes(normals: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit vectors (M, 3), (M, 3) that complete unit normals (M, 3) to orthonormal frames (Duff et al. 2017)."""
-    x, y, z = normals.unbind(-1)
-    sign = torch.where(z < 0, -1.0, 1.0).to(z)
-    a = -1 / (sign + z)
-    b = x * y * a
-    return torch.stack([1 + sign * x * x * a, sign * b, -sign * x], -1), torch.stack([b, sign + y * y * a, -y], -1)
 
 
 def _one(level: float, frame: int, center: Tensor) -> dict[str, Tensor]:
