@@ -1,0 +1,95 @@
+"""Parts of the capture loop that need no rig: what is missing, poses between readings, a robot that does not rest."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from torchpose.rig.camera import CameraSettings
+from torchpose.rig.capture import _expose, difference, frame_id, middle, missing
+from torchpose.rig.plan import CapturePlan, Waypoint
+from torchpose.rig.robot_faults import RobotFault, RobotReason
+from torchpose.rig.robot_settings import RobotReading, RobotSettings, Workspace
+from torchpose.rig.settings import Rig
+
+POSE = (400.0, 0.0, 300.0, math.pi, 0.0, 0.0)
+ROBOT = RobotSettings(host="127.0.0.2", workspace=Workspace(min=[0.0, -9.0, 0.0], max=[500.0, 9.0, 500.0]))
+PLAN = CapturePlan("p", "p.yaml", POSE, tuple(Waypoint(f"{i:04d}", POSE, "static", origin=True) for i in range(3)))
+
+
+def rig(*names):
+    return Rig(robot=ROBOT, cameras=[CameraSettings(name=n, width=8, height=6, exposure_us=1.0) for n in names])
+
+
+def test_what_is_missing():
+    one, two = rig("camera"), rig("left", "right")
+    assert [frame_id(w, "camera", one) for w in PLAN.waypoints] == ["0000", "0001", "0002"]
+    assert [w.id for w, _ in missing(PLAN, one, {"0001"})] == ["0000", "0002"]
+    done = {"0000_left", "0001_left", "0001_right"}
+    assert [(w.id, names) for w, names in missing(PLAN, two, done)] == [
+        ("0000", ["right"]),
+        ("0002", ["left", "right"]),
+    ]
+
+
+small = st.lists(st.floats(-1e-3, 1e-3), min_size=3, max_size=3)
+vectors = st.lists(st.floats(-3, 3), min_size=3, max_size=3)
+
+
+@given(rotation=vectors, shift=small, turn=small)
+@settings(max_examples=50, deadline=None)
+def test_the_middle_of_two_poses(rotation, shift, turn):
+    first = (1.0, 2.0, 3.0, *rotation)
+    turned = (Rotation.from_rotvec(turn) * Rotation.from_rotvec(rotation)).as_rotvec()
+    second = (*(a + b for a, b in zip(first[:3], shift, strict=True)), *turned)
+    distance, angle = difference(first, second)
+    assert distance == pytest.approx(math.hypot(*shift), abs=1e-12)
+    assert math.radians(angle) == pytest.approx(math.hypot(*turn), abs=1e-12)
+    for end in (first, second):
+        half = difference(middle(first, second), end)
+        assert half == pytest.approx((0.5 * distance, 0.5 * angle), abs=1e-9)
+
+
+def test_the_middle_of_two_names_of_one_rotation():
+    """A tool that points down may be reported as +pi or -pi about x."""
+    found = middle(POSE, (*POSE[:3], -math.pi, 0.0, 0.0))
+    assert difference(found, POSE) == pytest.approx((0, 0), abs=1e-12)
+
+
+class Drifting:
+    """A robot whose readings are the given poses."""
+
+    def __init__(self, poses):
+        self.poses = iter(poses)
+
+    def read(self, fresh=1):
+        return RobotReading(next(self.poses), POSE, 0.0, 0.0, 7, 1, 1, 2)
+
+
+class NoCameras:
+    def grab(self, names):
+        return []
+
+
+def moved(mm=0.0, deg=0.0):
+    turned = Rotation.from_euler("z", deg, degrees=True) * Rotation.from_rotvec(POSE[3:])
+    return (POSE[0] + mm, *POSE[1:3], *turned.as_rotvec())
+
+
+@pytest.mark.parametrize(
+    "readings", [[moved(mm=0.06)], [moved(deg=0.03)], [moved(mm=0.04), moved(mm=-0.02)], [moved(), moved(deg=-0.03)]]
+)
+def test_a_robot_that_does_not_rest(readings):
+    with pytest.raises(RobotFault, match=r"around the exposure of waypoint 0000 \(static\)") as caught:
+        _expose(PLAN.waypoints[0], ["camera"], rig("camera"), Drifting(readings), NoCameras())
+    assert caught.value.reason == RobotReason.NOT_SETTLED
+
+
+def test_a_robot_that_rests_well_enough():
+    poses = [moved(mm=0.04), moved(mm=-0.005, deg=0.01)]
+    before, frames, after = _expose(PLAN.waypoints[0], ["camera"], rig("camera"), Drifting(poses), NoCameras())
+    assert ([before.pose, after.pose], frames) == (poses, [])
