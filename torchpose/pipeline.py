@@ -113,7 +113,7 @@ class PoseEstimator(nn.Module):
                 frames, solutions, evidence[solvable], solvable // count, rings, identified.ring[solvable], camera
             )
         if camera.covariance is not None:
-            wider = intrinsics_covariance(evidence[solvable], solutions, camera.covariance, refined=refined)
+            wider = intrinsics_covariance(evidence[solvable], solutions, camera, refined=refined)
             solutions = replace(solutions, covariance=solutions.covariance + wider)
         return self._poses(target, solvable, solutions, evidence, identified, rings, table, camera)
 

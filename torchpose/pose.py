@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchpose import pnp
+from torchpose.camera import Camera
 from torchpose.geometry import conics, rotations
 from torchpose.geometry.rotations import plane_axes
 from torchpose.results import Reason, Status
@@ -253,14 +254,14 @@ def _shape_chi2(e: Evidence, r: Tensor, t: Tensor) -> Tensor:
 
 
 def _jacobian(e: Evidence, r: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Projected centres' derivatives by the pose (N, M, 2, 6) and by fx, fy, cx, cy (N, M, 2, 4), weights (N, M, 2, 2).
+    """Projected centres' derivatives by the pose (N, M, 2, 6), normalised points (N, M, 2), weights (N, M, 2, 2).
 
     Translation first, then the rotation from the left, R = exp(w) R_est.
     """
     turned = (r[:, None] @ e.points[..., None]).squeeze(-1)
     by_point, n = _derivative(turned + t[:, None], e.matrix)
     weight = torch.linalg.inv(_visible(e.covariance, e.mask)) * e.mask[..., None, None]
-    return torch.cat([by_point, -by_point @ rotations.skew(turned)], -1), _by_intrinsics(n), weight
+    return torch.cat([by_point, -by_point @ rotations.skew(turned)], -1), n, weight
 
 
 def _rim_jacobian(e: Evidence, r: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -278,7 +279,7 @@ def _rim_jacobian(e: Evidence, r: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Te
     normal = torch.stack([-tangent[..., 1], tangent[..., 0]], -1) / length[..., None]
     seen = e.mask.repeat_interleave(2 * _RIM_POINTS, 1)
     weight = normal[..., :, None] * normal[..., None, :] * (length * seen)[..., None, None]
-    return torch.cat([by_point, -by_point @ rotations.skew(turned)], -1), _by_intrinsics(n), weight
+    return torch.cat([by_point, -by_point @ rotations.skew(turned)], -1), n, weight
 
 
 def _derivative(x: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor]:
@@ -289,10 +290,15 @@ def _derivative(x: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor]:
     return by_point * (matrix.diagonal()[:2, None] / x[..., 2, None, None]), n
 
 
-def _by_intrinsics(n: Tensor) -> Tensor:
-    """Pixels' derivatives (..., 2, 4) by fx, fy, cx, cy."""
-    zero, one = torch.zeros_like(n[..., 0]), torch.ones_like(n[..., 0])
-    return torch.stack([n[..., 0], zero, one, zero, zero, n[..., 1], zero, one], -1).unflatten(-1, (2, 4))
+def _by_intrinsics(camera: Camera, n: Tensor) -> Tensor:
+    """How residuals in ideal pixels change with fx, fy, cx, cy (..., 2, 4), at normalised points n (..., 2).
+
+    Measured are the pixels of the frame: a changed matrix moves the ideal pixels made of them too.
+    """
+    focal = camera.matrix.diagonal()[:2]
+    d = (camera.distort(n) - camera.matrix[:2, 2]) / focal
+    by_raw = focal[:, None] * torch.linalg.inv(camera.J_distort(n))
+    return torch.cat([by_raw * d[..., None, :], by_raw], -1)
 
 
 def center_rms(e: Evidence, r: Tensor, t: Tensor) -> Tensor:
@@ -319,16 +325,18 @@ def _inverse(information: Tensor) -> tuple[Tensor, Tensor]:
     return covariance, determined
 
 
-def intrinsics_covariance(e: Evidence, s: Solutions, intrinsics: Tensor, *, refined: bool) -> Tensor:
+def intrinsics_covariance(e: Evidence, s: Solutions, camera: Camera, *, refined: bool) -> Tensor:
     """What uncertain intrinsics add to the pose covariance (N, 6, 6): G Sigma_K G^T, G = d pose / d (fx, fy, cx, cy).
 
     At the least-squares optimum G = -(J^T W J)^-1 J^T W J_K with the Jacobians J and J_K of what the pose is fitted to.
 
     Args:
-        intrinsics: (4, 4) covariance of fx, fy, cx, cy, px^2 (`Camera.covariance`).
+        camera: with a ``covariance``.
         refined: the pose is fitted to the edges of the rings, which tell their size and shape too, not to the centres.
     """
-    jac, jac_k, weight = (_rim_jacobian if refined else _jacobian)(replace(e, mask=s.mask), s.R, s.t)
+    if camera.covariance is None:
+        raise ValueError("the camera has no covariance")
+    jac, n, weight = (_rim_jacobian if refined else _jacobian)(replace(e, mask=s.mask), s.R, s.t)
     weighted = jac.mT @ weight
-    gain = -_inverse((weighted @ jac).sum(1))[0] @ (weighted @ jac_k).sum(1)
-    return gain @ intrinsics.to(gain) @ gain.mT
+    gain = -_inverse((weighted @ jac).sum(1))[0] @ (weighted @ _by_intrinsics(camera, n)).sum(1)
+    return gain @ camera.covariance.to(gain) @ gain.mT
