@@ -7,8 +7,8 @@ Every round times every contestant once, so that a change of the machine's speed
 median and the quartiles of the rounds. A contestant that has used up `--seconds` at a batch size sits out the rounds
 that are left. Loops are timed on at most `LOOP` poses, other torch libraries on at most `PEERS`. PyTorch3D, PyPose and
 Kornia take part where they can be imported. `peak_mb` is the rise of the process's high-water mark at the first call of
-a batch size, in growing order: with chunks it grows by the results alone. The profile at the end says which operations
-bound the rest.
+a batch size, in growing order; `result_mb` are the tensors returned, which no chunking can avoid. The profile at the
+end says which operations bound the rest; `--profile` prints that alone.
 """
 
 from __future__ import annotations
@@ -150,13 +150,16 @@ def measure(points: Tensor, batch: int, rounds: int, seconds: float, compile: bo
     spent = dict.fromkeys(table, 0.0)
     failed: dict[str, str] = {}
     peak: dict[str, float] = {}
+    size: dict[str, float] = {}
 
     def once(name: str) -> None:
         function, most = table[name]
         part = pixels[:most]
         start = time.perf_counter()
-        function(points, part)
+        result = function(points, part)
         elapsed = time.perf_counter() - start
+        if isinstance(result, pnp.PnPResult):
+            size[name] = sum(v.nbytes for v in vars(result).values()) / 2**20
         spent[name] += elapsed
         times.setdefault(name, []).append(elapsed / len(part))
 
@@ -191,6 +194,7 @@ def measure(points: Tensor, batch: int, rounds: int, seconds: float, compile: bo
                 "poses_per_s": 1 / middle,
                 "times_cv2_iterative": base / middle,
                 "peak_mb": peak[name],
+                **({"result_mb": size[name]} if name in size else {}),
             }
         )
     return rows
@@ -231,6 +235,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=1.0, help="most time of a contestant at one batch size")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--no-compile", dest="compile", action="store_false")
+    parser.add_argument("--profile", action="store_true", help="only what bounds it")
     parser.add_argument("--out", type=Path, help="Markdown file")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
@@ -243,9 +248,9 @@ def main() -> None:
     )
     print(machine)
     names = ["points", "batch", "method", "us_per_pose", "us_quartiles", "rounds", "poses_per_s"]
-    names += ["times_cv2_iterative", "peak_mb", "note"]
+    names += ["times_cv2_iterative", "peak_mb", "result_mb", "note"]
     rows: list[dict[str, object]] = []
-    for batch in sorted(args.batches):
+    for batch in () if args.profile else sorted(args.batches):
         for count in args.points:
             part = measure(TARGETS[count], batch, args.rounds, args.seconds, compile)
             print(markdown(part, names), flush=True)

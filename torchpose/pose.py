@@ -25,7 +25,7 @@ _MOST_INFLATION = 1e10  # of a parameter's variance by the others' freedom, beyo
 _SHAPE_FLOOR = (0.03, 0.5)  # px, and times the curvature a / b^2: what blur and mask do to an ellipse's shape
 _SHAPE_LIMIT = 16.0  # mean chi-squared a shape component above which the rings contradict the pose
 _CENTER_LIMIT = (30.0, 10.0)  # chi-squared, and per degree of freedom, above which the centres contradict each other
-_ITERATIONS = (8, 60)  # of the solver: for most rows, and for those that need more
+_ITERATIONS = (16, 60)  # of the solver: for most rows, and for those that need more
 _RIM_POINTS = 24  # of a circle: sums over it are exact up to the perspective's high orders
 _CENTER_RMS = 0.3  # px, below which they do not: small errors of calibration or print are no mix-up
 

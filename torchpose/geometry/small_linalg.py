@@ -13,15 +13,16 @@ import torch
 from torch import Tensor
 
 
-def solve_rows(rows: Sequence[Tensor], damping: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Solves a x = b for symmetric positive definite a by L D L^T without pivoting (Golub, Van Loan, section 4.1).
+def eliminate(rows: Sequence[Tensor], damping: Tensor | None = None) -> tuple[list[Tensor], Tensor]:
+    """L D L^T of symmetric positive definite a without pivoting (Golub, Van Loan, section 4.1), applied to [a | b].
 
     Args:
-        rows: n tensors; the i-th holds row i of [a | b] from the diagonal on, (n - i + m, B).
-        damping: (B,), the diagonal of a is multiplied by one plus this (Marquardt).
+        rows: n tensors; the i-th holds row i of [a | b] from the diagonal on, (n - i + m, ...).
+        damping: (...), the diagonal of a is multiplied by one plus this (Marquardt).
 
     Returns:
-        x (n, m, B) and the pivots D (n, B); a pivot that is not clearly positive says that the matrix is singular.
+        Rows of L^-1 [a | b] from the diagonal on, (n - i + m, ...), and the pivots D (n, ...); a pivot that is not
+        clearly positive says that the matrix is singular.
     """
     n = len(rows)
     block = list(rows)
@@ -32,13 +33,20 @@ def solve_rows(rows: Sequence[Tensor], damping: Tensor | None = None) -> tuple[T
         factors = block[k][1 : n - k] / pivot
         for i in range(k + 1, n):
             block[i] = torch.addcmul(block[i], factors[i - k - 1], block[k][i - k :], value=-1)
+    return block, torch.stack(pivots)
+
+
+def solve_rows(rows: Sequence[Tensor], damping: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Solves a x = b for symmetric positive definite a, by `eliminate`: x (n, m, ...) and the pivots (n, ...)."""
+    n = len(rows)
+    block, pivots = eliminate(rows, damping)
     x = [block[-1][1:] / pivots[-1]]
     for k in range(n - 2, -1, -1):
         value = block[k][n - k :]
         for i in range(k + 1, n):
             value = torch.addcmul(value, block[k][i - k], x[n - 1 - i], value=-1)
         x.append(value / pivots[k])
-    return torch.stack(x[::-1]), torch.stack(pivots)
+    return torch.stack(x[::-1]), pivots
 
 
 def solve_spd(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
@@ -48,7 +56,8 @@ def solve_spd(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 
 def cross(a: Tensor, b: Tensor) -> Tensor:
     """Cross product along the first dimension of (3, ...) tensors that broadcast against each other."""
-    return torch.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    pairs = ((1, 2), (2, 0), (0, 1))
+    return torch.stack([torch.addcmul(a[i] * b[k], a[k], b[i], value=-1) for i, k in pairs])
 
 
 def det3(a: Tensor) -> Tensor:
@@ -87,4 +96,4 @@ def cayley(w: Tensor) -> Tensor:
 
 def matmul3(a: Tensor, b: Tensor) -> Tensor:
     """Products of matrices (3, 3, ...) and (3, m, ...)."""
-    return a[:, 0, None] * b[0] + a[:, 1, None] * b[1] + a[:, 2, None] * b[2]
+    return torch.addcmul(torch.addcmul(a[:, 0, None] * b[0], a[:, 1, None], b[1]), a[:, 2, None], b[2])

@@ -23,12 +23,13 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     if not any(shutil.which(name) for name in (os.environ.get("CXX", ""), "g++", "clang++", "cl") if name):
         raise ConfigError("compile: needs a C++ compiler and found none; install g++ or clang++, or use compile=False")
     # one thread in a kernel: chunks of poses already run in parallel
-    fast = torch.compile(function, options={"cpp.threads": 1})
+    # and no limit to what is fused: a chunk is worked on in few loops, or not in the cache
+    fast = torch.compile(function, options={"cpp.threads": 1, "max_fusion_size": 4096})
 
     def call(*args: Any) -> Any:
         _mark(args)
         # one graph for every number of points, dtype and kind of weights in use
-        with torch._dynamo.config.patch(recompile_limit=64):
+        with torch._dynamo.config.patch(recompile_limit=64, automatic_dynamic_shapes=False):
             return fast(*args)
 
     return call

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from torchpose.pnp.candidates import Candidates
 from torchpose.pnp.dlt import least_eigenvectors, nearest_rotation
-from torchpose.pnp.iterative import Observations, minimise
+from torchpose.pnp.iterative import minimise
+from torchpose.pnp.normal_equations import Observations
 from torchpose.pnp.planar import COLLINEARITY, FLATNESS, plane_frame
 
 
@@ -80,8 +81,8 @@ def lines(
     observed = Observations(offset, foot, whitening)
     valid = torch.ones_like(flat)
     if max_iterations > 0:
-        estimate = minimise(observed, r, t, max_iterations=max_iterations, rtol=1e-10)
-        r, t, valid = estimate.r, estimate.t, estimate.converged
+        estimate = minimise(observed, torch.cat([r, t[:, None]], 1), max_iterations=max_iterations)
+        r, t, valid = estimate.pose[:, :3], estimate.pose[:, 3], estimate.converged
     x, y, z = r[:, 0, None] * offset[0] + r[:, 1, None] * offset[1] + r[:, 2, None] * offset[2] + t[:, None]
     distance = n[0] * x / z + n[1] * y / z + n[2]
     seen = 2 * count if weight is None else weight.sum(0)

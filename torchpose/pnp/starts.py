@@ -1,0 +1,61 @@
+"""Starts of the iterative method: every pose that a closed form finds."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchpose.pnp._compile import compiled
+from torchpose.pnp.candidates import Candidates
+from torchpose.pnp.epnp import epnp
+from torchpose.pnp.normal_equations import Observations
+from torchpose.pnp.p3p import p3p
+from torchpose.pnp.planar import ippe
+from torchpose.pnp.problem import Problem
+
+# root mean square of a start, in normalised coordinates, above which points may lie behind the camera
+_SUSPICIOUS = 1e-3
+
+
+def starts(problem: Problem, single: Observations, compile: bool) -> Tensor:
+    """Poses [R | t] (3, 4, 2, B) in float32, about the centroid, in units of the extent.
+
+    NaN where there is none; infinite where the points lie behind the camera.
+    """
+    body, weight = problem.body, problem.weight
+    ours = compiled(ippe) if compile else ippe
+    center = torch.zeros_like(body.center).to(single.xy)
+    mask = None if weight is None else weight.to(single.xy)
+    r, t = ours(single.points, single.xy, mask, body.frame.to(single.xy), center)
+    pose = torch.cat([r, t[:, None]], 1)
+    planar = body.flat & ~body.line
+    if bool(planar.all()):
+        return pose
+    pose = torch.where(planar, pose, torch.nan)
+    rows = (~(body.flat | body.line)).expand(pose.shape[-1]).nonzero().squeeze(1)
+    return pose if len(rows) == 0 else pose.index_copy(3, rows, _in_space(problem, rows).to(pose))
+
+
+def batch_first(observed: Observations, weight: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Object points, image points and mask, as the closed forms want them."""
+    points = observed.points.permute(2, 1, 0)
+    points = points[0] if points.shape[0] == 1 else points
+    return points, observed.xy.permute(2, 1, 0), None if weight is None else weight.T > 0
+
+
+def _in_space(problem: Problem, rows: Tensor) -> Tensor:
+    """Poses (3, 4, 2, B) of points in no plane: from three of them, and from all at once where there are enough."""
+    weight = problem.weight
+    points, xy, mask = batch_first(problem.observed.select(rows), None if weight is None else weight[:, rows])
+    found = p3p(points, xy, mask)
+    solutions = [Candidates(*(v[:, :2] for v in found))]
+    if xy.shape[1] >= 6:
+        solutions = [epnp(points, xy, mask), Candidates(*(v[:, :1] for v in found))]
+        # points behind the camera have the image of their reflection at the centroid, in front of it
+        if bool((solutions[0].rms > _SUSPICIOUS).any()):
+            reflected = epnp(-points, xy, mask).rms < 0.1 * solutions[0].rms
+            solutions = [
+                Candidates(torch.where(reflected[..., None, None], torch.inf, s.R), s.t, s.rms) for s in solutions
+            ]
+    r, t = torch.cat([s.R for s in solutions], 1), torch.cat([s.t for s in solutions], 1)
+    return torch.cat([r, t[..., None]], 3).permute(2, 3, 1, 0)

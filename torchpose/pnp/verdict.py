@@ -1,0 +1,222 @@
+"""From minima to the result: covariance in camera axes, the other pose, and a code for every pose."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchpose.geometry.small_linalg import cross, eliminate, matmul3
+from torchpose.pnp import scalar
+from torchpose.pnp._compile import compiled
+from torchpose.pnp.iterative import Estimate
+from torchpose.pnp.normal_equations import COST, Observations, camera_points, distance, residuals, rows_of
+from torchpose.pnp.problem import Problem
+from torchpose.pnp.result import PnPCode, PnPResult
+
+# chi-squared difference below which two minima are called ambiguous
+DECISION = 20.0
+# squared Mahalanobis distance below which two minima are one
+COINCIDENCE = 1.0
+# least 1 - (multiple correlation)^2 of a parameter below which the points do not fix the pose
+INDEPENDENCE = 1e-11
+
+
+class Minima(NamedTuple):
+    """The best minimum, and the other one: pose (3, 4, B), cost (B,), is there one, and is enough known of it?"""
+
+    best: Estimate
+    other: Tensor
+    other_cost: Tensor
+    different: Tensor
+    reached: Tensor
+
+
+class Table(NamedTuple):
+    """The result as rows of one vector each, so that every chunk writes its own columns.
+
+    Attributes:
+        floats: (65, B) [R | t], R_alt | t_alt, covariance, chi2, rms, chi2_alt, rms_alt, ratio.
+        integers: (2, B) iterations, code.
+    """
+
+    floats: Tensor
+    integers: Tensor
+
+    @staticmethod
+    def empty(batch: int, like: Tensor) -> Table:
+        return Table(like.new_empty(65, batch), torch.empty(2, batch, dtype=torch.int64, device=like.device))
+
+    def columns(self, rows: slice) -> Table:
+        return Table(self.floats[:, rows], self.integers[:, rows])
+
+    def replace(self, index: Tensor, part: Table) -> None:
+        self.floats.index_copy_(1, index, part.floats)
+        self.integers.index_copy_(1, index, part.integers)
+
+    def result(self) -> PnPResult:
+        """As views."""
+        pose, alt = (self.floats[k : k + 12].unflatten(0, (3, 4)) for k in (0, 12))
+        chi2, rms, chi2_alt, rms_alt, ratio = self.floats[60:]
+        return PnPResult(
+            R=pose[:, :3].permute(2, 0, 1),
+            t=pose[:, 3].T,
+            covariance=self.floats[24:60].unflatten(0, (6, 6)).permute(2, 0, 1),
+            rms=rms,
+            chi2=chi2,
+            iterations=self.integers[0],
+            code=self.integers[1],
+            R_alt=alt[:, :3].permute(2, 0, 1),
+            t_alt=alt[:, 3].T,
+            rms_alt=rms_alt,
+            chi2_alt=chi2_alt,
+            ratio=ratio,
+        )
+
+
+def relevant(chi2: Tensor) -> Tensor:
+    """Chi-squared above which another minimum matters no more, given that of the best."""
+    return 2 * chi2 + 2 * DECISION
+
+
+def choose(estimate: Estimate) -> Minima:
+    """The best of S minima (..., S, B), and the next one that is not the same."""
+    options, batch = estimate.converged.shape
+    chi2, order = estimate.normal[COST].nan_to_num(nan=torch.inf, posinf=torch.inf).sort(0)
+
+    def pick(k: int) -> Estimate:
+        return Estimate(*(v.gather(-2, order[k].expand(*v.shape[:-2], 1, batch)).squeeze(-2) for v in estimate))
+
+    best = pick(0)
+    other, cost = best.pose, torch.full_like(chi2[0], torch.nan)
+    different = torch.zeros_like(best.converged)
+    reached = torch.ones_like(different)
+    for k in range(1, options):
+        candidate = pick(k)
+        new = chi2[k].isfinite() & ~_coincide(best, candidate.pose) & ~different
+        other = torch.where(new, candidate.pose, other)
+        cost, reached = torch.where(new, chi2[k], cost), torch.where(new, candidate.converged, reached)
+        different = different | new
+    return Minima(best, other, cost, different, reached)
+
+
+def _coincide(a: Estimate, b: Tensor) -> Tensor:
+    """(B,): is a pose (3, 4, B) within a standard deviation of the estimate, by its information?"""
+    back = a.pose[:, :3].transpose(0, 1)
+    relative = matmul3(back, torch.cat([b[:, :3], (b[:, 3] - a.pose[:, 3])[:, None]], 1))
+    axis = torch.stack(
+        [relative[2, 1] - relative[1, 2], relative[0, 2] - relative[2, 0], relative[1, 0] - relative[0, 1]]
+    )
+    trace = relative[0, 0] + relative[1, 1] + relative[2, 2]
+    # twice the tangent of half the angle; Cayley's vector, as in the steps of the minimiser
+    step = torch.cat([relative[:, 3], 2 * axis / (1 + trace).clamp_min(1e-12)])
+    return distance(a.normal, step) < COINCIDENCE
+
+
+def write(
+    problem: Problem, minima: Minima, bad: tuple[tuple[Tensor, PnPCode], ...], table: Table, compile: bool = False
+) -> None:
+    """Writes the columns of ``table``; ``bad`` are the codes of poses without a sensible problem, the last one wins."""
+    best, body, pixel = minima.best, problem.body, problem.pixel
+    squares = None
+    if isinstance(pixel, Observations):
+        squares = tuple(_mean_square(pixel, problem.weight, pose.to(best.pose)) for pose in (best.pose, minima.other))
+    mixed = None if problem.calibration is None else problem.calibration(best.pose)
+    columns = compiled(_columns) if compile else _columns
+    scale = 1.0 if isinstance(pixel, Observations) else pixel
+    floats, code = columns(minima, body.center, body.unit, mixed, squares, scale, problem.seen, bad)
+    table.floats.copy_(floats)
+    table.integers[0], table.integers[1] = best.iterations, code
+    failed = (code > PnPCode.AMBIGUOUS).nonzero().squeeze(1)
+    table.floats.index_fill_(1, failed, torch.nan)
+    alone = (~minima.different).nonzero().squeeze(1)
+    for part in (table.floats[12:24], table.floats[62:]):
+        part.index_fill_(1, alone, torch.nan)
+
+
+def _columns(
+    minima: Minima,
+    center: Tensor,
+    unit: Tensor,
+    mixed: Tensor | None,
+    squares: tuple[Tensor, ...] | None,
+    sigma_px: float,
+    seen: Tensor,
+    bad: tuple[tuple[Tensor, PnPCode], ...],
+) -> tuple[Tensor, Tensor]:
+    """The floats (65, B) of `Table`, and the codes (B,)."""
+    best, other, other_cost, different, reached = minima
+    chi2 = best.normal[COST]
+    matrix, independence = covariance(best, center, unit, mixed)
+    chi2_alt = other_cost.to(chi2)
+    if squares is None:  # of equal weights and squares: chi-squared says it all
+        squares = chi2 / seen, chi2_alt / seen
+    rms, rms_alt = (sigma_px * v.sqrt() for v in squares)
+    poses = [place(pose, center, unit).flatten(0, 1) for pose in (best.pose, other.to(chi2))]
+    rest = torch.stack([chi2, rms, chi2_alt, rms_alt, rms_alt / rms])
+
+    finite = chi2 < torch.inf
+    verdicts = (
+        (different & (chi2_alt - chi2 < DECISION), PnPCode.AMBIGUOUS),
+        # another minimum that was not reached may be lower than where its search ended
+        (~(best.converged & reached), PnPCode.NOT_CONVERGED),
+        (~finite, PnPCode.BEHIND_CAMERA),
+        (finite & ~(independence > INDEPENDENCE), PnPCode.DEGENERATE),
+        *bad,
+    )
+    code = torch.zeros_like(best.iterations)
+    for failed, verdict in verdicts:
+        code = torch.where(failed, int(verdict), code)
+    return torch.cat([*poses, matrix, rest]), code
+
+
+def place(pose: Tensor, center: Tensor, unit: Tensor) -> Tensor:
+    """Poses (3, 4, B) from the centroid in units of the extent to the origin of the object: t = unit t' - R c."""
+    r = pose[:, :3]
+    t = unit * pose[:, 3] - (r[:, 0] * center[0] + r[:, 1] * center[1] + r[:, 2] * center[2])
+    return torch.cat([r, t[:, None]], 1)
+
+
+def covariance(best: Estimate, center: Tensor, unit: Tensor, mixed: Tensor | None) -> tuple[Tensor, Tensor]:
+    """The covariance (36, B), translation first, rotation from the left, and the independence (B,).
+
+    The latter is the least pivot over its diagonal entry, that is the least 1 - (multiple correlation)^2: 0 where a
+    parameter is not fixed. With J^T J = L D L^T and T the derivative of (t, R) by a step, the covariance is the square
+    of D^-1/2 L^-1 T^T. ``mixed`` (6, 4, B) adds what uncertain intrinsics do, see `Problem.calibration`.
+    """
+    columns = best.pose[:, :3].transpose(0, 1)
+    arm = cross(columns, center[:, None])
+    zero = torch.zeros_like(columns[0])
+    transfer = [torch.cat([row, zero]) for row in columns * unit]
+    transfer += [torch.cat(pair) for pair in zip(arm, columns, strict=True)]
+    rows = rows_of(best.normal)
+    more = () if mixed is None else (mixed,)
+    rhs = [torch.cat([row[:-1], transfer[k], *(m[k] for m in more)]) for k, row in enumerate(rows)]
+    if torch.compiler.is_compiling():
+        lists, diagonal = scalar.eliminate([list(row) for row in rhs], None)
+        entries = {}
+        for i in range(6):
+            for k in range(i, 6):
+                # what is left of the rotation's part lies in the last three rows
+                terms = [lists[n][6 - n + i] * lists[n][6 - n + k] / diagonal[n] for n in range(3 if k >= 3 else 0, 6)]
+                entries[i, k] = entries[k, i] = sum(terms[1:], terms[0])
+        least = torch.stack([p / row[0] for p, row in zip(diagonal, rows, strict=True)]).amin(0)
+        return torch.stack([entries[i, k] for i in range(6) for k in range(6)]), least
+    block, pivots = eliminate(rhs)
+    y = torch.stack([row[6 - k :] for k, row in enumerate(block)]) * pivots.rsqrt()[:, None]  # (6, 6 + 4, B)
+    out = torch.empty((6, 6, y.shape[-1]), dtype=y.dtype, device=y.device)
+    for i in range(6):
+        first = 3 if i >= 3 else 0
+        torch.sum(y[first:, i, None] * y[first:, i:6], 0, out=out[i, i:])
+        out[i + 1 :, i] = out[i, i + 1 :]
+    if mixed is not None:
+        shift = (y[:, :6, None] * y[:, None, 6:]).sum(0)  # (6, 4, B), of the pose by the intrinsics
+        out += (shift[:, None] * shift).sum(2)
+    return out.flatten(0, 1), (pivots / torch.stack([row[0] for row in rows])).amin(0)
+
+
+def _mean_square(pixel: Observations, weight: Tensor | None, pose: Tensor) -> Tensor:
+    p = camera_points(pixel, pose)
+    square = residuals(pixel, p[:2] / p[2]).square().sum(0)
+    return square.mean(0) if weight is None else (square * weight).sum(0) / weight.sum(0)
