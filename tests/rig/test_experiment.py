@@ -153,7 +153,7 @@ def test_script_writes_tables_and_plot(tmp_path: Path) -> None:
     with (tmp_path / "out" / "focal.csv").open() as file:
         paper = list(csv.DictReader(file))[-1]
     # eq. (5): 0.25 % of the distance, to the difference between 1 / f and 1 / f_true
-    assert float(paper["error of Z, um"]) == pytest.approx(1e3 * 165 * 0.0025, rel=0.02)
+    assert float(paper["error_of_z_um"]) == pytest.approx(1e3 * 165 * 0.0025, rel=0.02)
     done = subprocess.run([*command[:-1], str(tmp_path / "none.csv")], capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert len(done.stderr.strip().splitlines()) == 1
