@@ -4,9 +4,9 @@
     python scripts/precision_statistics.py --case all --frames 200 --method photometric edges
 
 Simulated 2-megapixel frames of the built-in target quad40, 8 bit. One row a case and method: frames with a pose, RMS
-error over RMS bound across and along the optical axis and of the rotation, the RMS errors, mean NEES (ideal 6), the
-share inside the 99 % ellipsoid. Point-spread functions outside the model are mixtures of shifted frames: a shift of
-the principal point is a shift of the picture. The bound of a covered ring takes the covered part of that marker's
+error over RMS bound across and along the optical axis and of the rotation, the claimed deviation across over the same
+bound, the RMS errors, mean NEES (ideal 6), the share inside the 99 % ellipsoid. Point-spread functions outside the
+model are mixtures of shifted frames: a shift of the principal point is a shift of the picture. The bound of a covered ring takes the covered part of that marker's
 information off; that of a foreign point-spread function is the bound of a Gaussian of the same variance.
 """
 
@@ -208,14 +208,15 @@ def run(name: str, case: Case, methods: list[Method], frames: int, seed: int) ->
         for m, estimator in estimators.items():
             poses = estimator(noisy)
             e = pose_errors(poses, _Pose(r[s], t[s]))
-            parts[m].append((poses.status, e.translation, e.rotation, e.nees))
+            claimed = poses.covariance.diagonal(dim1=-2, dim2=-1)
+            parts[m].append((poses.status, e.translation, e.rotation, e.nees, claimed))
         if sys.stderr.isatty():
             print(f"\r{name}: {a + len(clean)} of {frames}", end="", file=sys.stderr)
     bound = torch.cat(bounds).diagonal(dim1=-2, dim2=-1)
     limit = chi2.ppf(0.99, 6)
     rows = []
     for m in methods:
-        status, translation, rotation, nees = (torch.cat(x) for x in zip(*parts[m], strict=True))
+        status, translation, rotation, nees, claimed = (torch.cat(x) for x in zip(*parts[m], strict=True))
         ok = status == tp.Status.OK
         e2, b2 = torch.cat([translation, rotation], -1)[ok].square().mean(0), bound[ok].mean(0)
         ratio = [math.sqrt(e2[i].sum() / b2[i].sum()) for i in (slice(0, 2), slice(2, 3), slice(3, 6))]
@@ -227,6 +228,7 @@ def run(name: str, case: Case, methods: list[Method], frames: int, seed: int) ->
             "lateral_ratio": ratio[0],
             "depth_ratio": ratio[1],
             "rotation_ratio": ratio[2],
+            "claimed_ratio": math.sqrt(claimed[ok][:, :2].mean(0).sum() / b2[:2].sum()),
             "lateral_um": 1e3 * math.sqrt(e2[:2].sum()),
             "depth_um": 1e3 * math.sqrt(e2[2]),
             "rotation_mdeg": math.degrees(1e3 * math.sqrt(e2[3:].sum())),
