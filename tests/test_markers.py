@@ -10,7 +10,7 @@ from exact import F64, exact_ellipses, pinhole, random_poses, rings_of
 from torch import Tensor
 
 from torchpose.geometry import rotations
-from torchpose.markers import Identified, MarkerTable, identify
+from torchpose.markers import Identified, MarkerTable, crossed_out, identify
 from torchpose.rings import Rings
 from torchpose.target import Target
 
@@ -145,3 +145,16 @@ def test_table_pads_shorter_targets() -> None:
     assert table.valid.sum(-1).tolist() == [4, 6]
     assert table.ids[0, 4:].tolist() == [-1, -1]
     assert table.centers.dtype == F64
+
+
+def test_no_marker_lies_across_a_ring():
+    """A pose whose unseen marker would lie half across a measured ring is doubted; one concentric with it is not."""
+    r, t = torch.eye(3, dtype=F64)[None], torch.tensor([[0.0, 0.0, 300.0]], dtype=F64)
+    truth = exact_ellipses(QUAD, CAMERA, r, t)[0]
+    seen, frame = torch.tensor([[True, True, True, False]]), torch.zeros(1, dtype=torch.int64)
+    for shift, expected in ((0.0, False), (0.7, True), (3.0, False)):
+        ring = truth[3:].clone()
+        ring[..., 0] += shift * ring[:, 0, 2]
+        rings = rings_of(ring, frame)
+        across = crossed_out(rings, frame, r, t, QUAD.centers[None], QUAD.radii[None], seen, CAMERA)
+        assert across.tolist() == [expected]

@@ -28,6 +28,7 @@ _RATIO_TOLERANCE_PX = 0.35  # over the semi-minor axis of the outer ellipse: wha
 # px, of the ring's semi-major axis, of the distance to the ring the pose comes from
 _PLACE_TOLERANCE = (2.0, 0.3, 0.05)
 _SIZE_TOLERANCE = 1.25
+_OVERLAP, _CONCENTRIC = 0.3, 0.4  # of the semi-major axis: two rings so far across each other are not both there
 _SEEDS = 24  # assignments of one target in one frame whose pairs are tried
 
 
@@ -227,3 +228,27 @@ def _support(
     fits = (seen[:, 2] > least / _SIZE_TOLERANCE) & (seen[:, 2] < most * _SIZE_TOLERANCE)
     agrees = (miss < 1) & fits & (x[:, 2] > 0)
     return miss[agrees], hypothesis[agrees], member[agrees]
+
+
+def crossed_out(
+    rings: Rings, frame: Tensor, R: Tensor, t: Tensor, points: Tensor, radii: Tensor, seen: Tensor, camera: Camera
+) -> Tensor:
+    """Poses (N,) bool under which a marker that was not seen would lie across a ring that was, where none can be.
+
+    Args:
+        rings: K rings, ideal px. frame: (N,) int64. R, t: (N, 3, 3), (N, 3). points, radii: (N, M, 3), (N, M, 2) of
+            the markers. seen: (N, M) bool, the others are asked for; padded ones must count as seen.
+    """
+    k = camera.matrix.to(t)
+    x = (R[:, None] @ points[..., None]).squeeze(-1) + t[:, None]
+    at = (x @ k.T)[..., :2] / x[..., 2:]
+    size = k[0, 0] * radii[..., 0] / x[..., 2]
+    # every unseen marker with every ring of its frame
+    row, marker, ring = ((frame[:, None] == rings.frame)[:, None] & ~seen[..., None]).nonzero().unbind(-1)
+    outer = rings.outer.params[ring]
+    apart = torch.linalg.vector_norm(at[row, marker] - outer[:, :2], dim=-1)
+    reach = torch.minimum(size[row, marker], outer[:, 2])
+    across = (apart < outer[:, 3] + _OVERLAP * reach) & (apart > _CONCENTRIC * reach) & (x[row, marker, 2] > 0)
+    out = torch.zeros_like(frame, dtype=torch.bool)
+    out[row[across]] = True
+    return out

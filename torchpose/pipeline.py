@@ -13,7 +13,7 @@ from torchpose.camera import Camera
 from torchpose.centers import common_center, compensate
 from torchpose.detect import find_candidates
 from torchpose.errors import ConfigError, FrameError
-from torchpose.markers import Identified, MarkerTable, identify
+from torchpose.markers import Identified, MarkerTable, crossed_out, identify
 from torchpose.pose import (
     Evidence,
     Solutions,
@@ -107,6 +107,7 @@ class PoseEstimator(nn.Module):
 
         solvable = (evidence.mask.sum(-1) >= MIN_MARKERS).nonzero()[:, 0]
         solutions = solve_poses(evidence[solvable], (identified.R[solvable], identified.t[solvable]))
+        solutions = self._doubted(solutions, evidence[solvable], solvable // count, rings, table, target[solvable])
         refined = self.method in ("photometric", "edges")
         if refined:
             solutions = self._refined(
@@ -158,6 +159,16 @@ class PoseEstimator(nn.Module):
             table.coplanar[target],
             camera.matrix,
         )
+
+    def _doubted(
+        self, s: Solutions, e: Evidence, frame: Tensor, rings: Rings, table: MarkerTable, target: Tensor
+    ) -> Solutions:
+        """Rejects poses from three markers that put a fourth across a ring: three centres fit many a mix-up."""
+        seen = s.mask | ~table.valid[target]
+        across = crossed_out(rings, frame, s.R, s.t, e.points, e.radii, seen, self.camera)
+        bad = across & (s.mask.sum(-1) == MIN_MARKERS) & (s.status != Status.REJECTED)
+        status = torch.where(bad, int(Status.REJECTED), s.status)
+        return replace(s, status=status, reason=torch.where(bad, int(Reason.RESIDUAL), s.reason))
 
     def _refined(
         self,

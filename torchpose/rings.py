@@ -26,6 +26,7 @@ _LEAST_PEAK = 0.25  # of the outer edge's slope in the mean radial profile
 _LEAST_EDGE = 0.5  # of the median rise at the outer edge over all directions, for a direction that counts
 _LEAST_COVER = (0.4, 0.33)  # of the perimeter with edge points, outer and inner circle
 _SMALL = 4.0  # px: circles of a smaller semi-minor axis fill the mask of an edge
+_LEAST_SEMI_MINOR = (4.0, 1.2)  # px, outer and inner circle: smaller ones are letters and specks as well as rings
 _LARGE = 20.0  # px, of the outer semi-minor axis, from which on a fit of all pixels costs too much
 _EDGE_APART = 0.8  # ... and so do two edges closer than 5 px
 _STEP_RANGE = (0.4, 2.5)  # inner to outer grey step
@@ -183,7 +184,9 @@ def _measure_small(frames: Tensor, candidates: Candidates, ratio: Tensor, seen: 
     """Rings whose circles are too close to each other, or too small, to be measured one by one."""
     focal = camera.matrix.diagonal()[:2].mean()
     found = fit_small_rings(frames, candidates.frame, candidates.ellipse, ratio, seen, candidates.polarity, focal)
-    index = found.good.nonzero()[:, 0]
+    least_outer, least_inner = _LEAST_SEMI_MINOR
+    large = (found.outer.params[:, 3] > least_outer) & (found.inner.params[:, 3] > least_inner)
+    index = (found.good & large).nonzero()[:, 0]
     outer, inner = found.outer[index], found.inner[index]
     return Rings(
         candidates.frame[index],

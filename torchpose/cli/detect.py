@@ -73,7 +73,7 @@ def detect(
             FrameProgress(len(sources), 0, quiet=quiet) as progress,
             torch.inference_mode(),
         ):
-            for some, frames in _batches(sources, unreadable):
+            for some, frames in _batches(sources, unreadable, threads or cores()):
                 found = _rows(some, frames, explain)
                 if overlay is not None:
                     _draw(overlay, some, frames, found)
@@ -92,19 +92,17 @@ def detect(
     return 0
 
 
-def _batches(sources: Sequence[Source], unreadable: dict[str, str]) -> Iterator[tuple[list[Source], np.ndarray]]:
+def _batches(
+    sources: Sequence[Source], unreadable: dict[str, str], threads: int
+) -> Iterator[tuple[list[Source], np.ndarray]]:
     """Frames (B, H, W) of consecutive sources of one size and type; those that cannot be read go to ``unreadable``."""
     import numpy as np
 
-    from torchpose.io.images import UnreadableImageError, decode
-
     waiting: list[Source] = []
     images: list[np.ndarray] = []
-    for source in sources:
-        try:
-            image = decode(source.path)
-        except UnreadableImageError as error:
-            unreadable[source.name] = error.reason
+    for source, image in _decoded(sources, threads):
+        if isinstance(image, str):
+            unreadable[source.name] = image
             continue
         fits = not images or (image.shape == images[0].shape and image.dtype == images[0].dtype)
         if images and not (fits and (len(images) + 1) * image.size <= _BATCH_PIXELS):
@@ -114,6 +112,26 @@ def _batches(sources: Sequence[Source], unreadable: dict[str, str]) -> Iterator[
         images.append(image)
     if images:
         yield waiting, np.stack(images)
+
+
+def _decoded(sources: Sequence[Source], threads: int) -> Iterator[tuple[Source, np.ndarray | str]]:
+    """Every source in order with its frame (H, W), or the reason why there is none; threads decode ahead."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    from torchpose.io.images import UnreadableImageError, decode
+
+    def load(source: Source) -> np.ndarray | str:
+        try:
+            return decode(source.path)
+        except UnreadableImageError as error:
+            return error.reason
+
+    with ThreadPoolExecutor(threads, thread_name_prefix="decode") as pool:
+        ahead = [pool.submit(load, source) for source in sources[: 2 * threads]]
+        for number, source in enumerate(sources):
+            yield source, ahead.pop(0).result()
+            if number + 2 * threads < len(sources):
+                ahead.append(pool.submit(load, sources[number + 2 * threads]))
 
 
 def _rows(sources: Sequence[Source], images: np.ndarray, explain: bool) -> list[Row]:

@@ -181,14 +181,15 @@ def follow(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor, ro
 
 
 def perimeter_samples(ellipses: Tensor, most: int | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """One sample a pixel of perimeter, of at most ``most``: ellipse (S,), position (S, 2), outward unit normal (S, 2).
+    """About one sample a pixel of perimeter, ``most`` at most: ellipse (S,), position (S, 2), outward normal (S, 2).
 
     And how far along the perimeter each lies, (S,) in [0, 1). Ellipses that are NaN have none.
     """
-    n = conics.perimeter(ellipses).nan_to_num(nan=0.0).ceil().long()
+    # an even number, half a step off the axes: the samples of a mirrored ellipse are the mirrored samples
+    n = 2 * (0.5 * conics.perimeter(ellipses).nan_to_num(nan=0.0)).ceil().long()
     n = n if most is None else n.clamp_max(most)
     which, position = ragged_arange(n)
-    turn = position.double() / n[which]
+    turn = (position.double() + 0.5) / n[which]
     angle = 2 * torch.pi * turn
     of = ellipses[which]
     a, b, theta = of[:, 2], of[:, 3], of[:, 4]
