@@ -6,8 +6,9 @@
 Simulated 2-megapixel frames of the built-in target quad40, 8 bit. One row a case and method: frames with a pose, RMS
 error over RMS bound across and along the optical axis and of the rotation, the claimed deviation across over the same
 bound, the RMS errors, mean NEES (ideal 6), the share inside the 99 % ellipsoid. Point-spread functions outside the
-model are mixtures of shifted frames: a shift of the principal point is a shift of the picture. The bound of a covered ring takes the covered part of that marker's
-information off; that of a foreign point-spread function is the bound of a Gaussian of the same variance.
+model are mixtures of shifted frames: a shift of the principal point is a shift of the picture. The bound of a covered
+ring takes the covered part of that marker's information off; that of a foreign point-spread function is the bound of a
+Gaussian of the same variance.
 """
 
 from __future__ import annotations

@@ -22,9 +22,9 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """
     if not any(shutil.which(name) for name in (os.environ.get("CXX", ""), "g++", "clang++", "cl") if name):
         raise ConfigError("compile: needs a C++ compiler and found none; install g++ or clang++, or use compile=False")
-    # one thread in a kernel: chunks of poses already run in parallel
-    # and no limit to what is fused: a chunk is worked on in few loops, or not in the cache
-    fast = torch.compile(function, options={"cpp.threads": 1, "max_fusion_size": 4096})
+    # as many threads as torch has at the call, not at the compilation; and no limit to what is fused: a chunk is
+    # worked on in few loops, or not in the cache
+    fast = torch.compile(function, options={"cpp.dynamic_threads": True, "max_fusion_size": 4096})
 
     def call(*args: Any) -> Any:
         _mark(args)

@@ -1,9 +1,12 @@
-"""Chunks of a batch, in parallel."""
+"""Chunks of a batch, one after the other; torch's own threads share the work inside of each.
+
+Threads of Python that took a chunk each gained nothing: an operation on a chunk that fits the cache takes some
+microseconds, and handing Python's lock over takes longer (decision 0004).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 import torch
@@ -14,24 +17,10 @@ _Rows = TypeVar("_Rows")
 _KEPT = 30 << 20
 
 
-def each(function: Callable[[_Rows], _T], chunks: Sequence[_Rows], device: torch.device) -> list[_T]:
-    """The function of every chunk, in parallel on the CPU; the first one alone, as it may compile."""
-    if device.type != "cpu":
-        return [function(rows) for rows in chunks]
-    # a chunk is made to fit the cache of one core: no threads inside, they would only wait for each other
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        if len(chunks) > 1:
-            # glibc gives freed memory above a threshold back to the system, and every chunk would fault it in again;
-            # freeing one large block raises that threshold to its size. Not touched, it costs nothing.
-            torch.empty(_KEPT, dtype=torch.uint8)
-        results = [function(rows) for rows in chunks[:1]]
-        workers = min(threads, len(chunks) - 1)
-        if workers < 2:
-            return results + [function(rows) for rows in chunks[1:]]
-        with ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-            results.extend(pool.map(function, chunks[1:]))
-        return results
-    finally:
-        torch.set_num_threads(threads)
+def each(function: Callable[[_Rows], _T], chunks: Sequence[_Rows]) -> list[_T]:
+    """The function of every chunk."""
+    if len(chunks) > 1:
+        # glibc gives freed memory above a threshold back to the system, and every chunk would fault it in again;
+        # freeing one large block raises that threshold to its size. Not touched, it costs nothing.
+        torch.empty(_KEPT, dtype=torch.uint8)
+    return [function(rows) for rows in chunks]

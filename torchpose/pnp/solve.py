@@ -37,10 +37,8 @@ _CLOSED_FORMS: dict[str, Callable[[Tensor, Tensor, Tensor | None], Candidates]] 
 # points that each method needs, and that a pose needs whose start is given
 _LEAST = {"iterative": 4, "planar": 4, "dlt": 6, "p3p": 3, "epnp": 4, "posit": 4}
 _LEAST_STARTED = 3
-# poses whose working set fits the cache of one core
-_CHUNK = 4096
-# poses beyond the first pass that are solved at once: their many iterations are bound by the number of calls
-_LATE = 2048
+# poses solved at once: enough for torch to share an operation among its threads, few enough for the cache
+_CHUNK = 16384
 
 
 def solve(
@@ -136,7 +134,7 @@ def _solve(
 ) -> PnPResult:
     """Chunk by chunk; then those that the first pass has left over, together."""
     inputs = inputs.with_body()
-    batch, device = len(inputs.pixels), inputs.pixels.device
+    batch = len(inputs.pixels)
     table = Table.empty(batch, inputs.pixels)
 
     def first(rows: slice) -> Late | None:
@@ -149,11 +147,11 @@ def _solve(
         _finish(prepare(inputs.rows(late.which)), late, max_iterations, compile, columns)
         return late.which, columns
 
-    parts = chunks.each(first, [slice(k, min(k + _CHUNK, batch)) for k in range(0, batch, _CHUNK)], device)
+    parts = chunks.each(first, [slice(k, min(k + _CHUNK, batch)) for k in range(0, batch, _CHUNK)])
     left = [part for part in parts if part is not None]
     if left:
-        every = zip(*(torch.cat(v, -1).split(_LATE, -1) for v in zip(*left, strict=True)), strict=True)
-        for index, columns in chunks.each(second, [Late(*fields) for fields in every], device):
+        every = zip(*(torch.cat(v, -1).split(_CHUNK, -1) for v in zip(*left, strict=True)), strict=True)
+        for index, columns in chunks.each(second, [Late(*fields) for fields in every]):
             table.replace(index, columns)
     return table.result()
 

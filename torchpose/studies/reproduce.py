@@ -22,6 +22,7 @@ STUDIES = (
     "fig02_pnp",
     "table01_orientation",
     "fig04_sensitivity",
+    "fig05_shapes",
     "table02_detection",
     "fig06_regions",
     "fig07_subpixel",
