@@ -28,7 +28,8 @@ a { color: var(--accent); }
 table { border-collapse: collapse; width: 100%; font-size: .875rem; font-variant-numeric: tabular-nums; }
 th, td { padding: .35rem .7rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line); }
 th { background: var(--tint); font-weight: 600; }
-td.text, th.text { text-align: left; white-space: normal; min-width: 9rem; }
+td.text, th.text { text-align: left; }
+td.long, th.long { white-space: normal; min-width: 9rem; }
 tr:last-child td { border-bottom: 0; }
 td.ours { font-weight: 600; }
 figure { margin: 1rem 0; }
@@ -41,6 +42,7 @@ summary { cursor: pointer; color: var(--accent); }
 @media print { nav { display: none; } section { break-inside: avoid-page; } }
 """
 _SHOWN_ROWS = 24  # of a table; longer ones fold
+_LONG = 20  # letters, from which on a cell may break
 
 
 def report(folders: Sequence[Path], failed: dict[str, str], environment: dict[str, str]) -> str:
@@ -103,7 +105,7 @@ def _table(rows: list[dict[str, Any]], fold: bool = True) -> str:
     if not rows:
         return '<p class="soft">No rows.</p>'
     columns = list(rows[0])
-    text = {c for c in columns if any(isinstance(row[c], str) for row in rows)}
+    text = {c: max((len(row[c]) for row in rows if isinstance(row[c], str)), default=0) for c in columns}
     head = "".join(f"<th{_class(c, text)}>{escape(c.replace('_', ' '))}</th>" for c in columns)
     body = "".join(
         "<tr>" + "".join(f"<td{_class(c, text)}>{_cell(row[c])}</td>" for c in columns) + "</tr>" for row in rows
@@ -114,8 +116,13 @@ def _table(rows: list[dict[str, Any]], fold: bool = True) -> str:
     return table
 
 
-def _class(column: str, text: set[str]) -> str:
-    names = [name for name, holds in (("text", column in text), ("ours", column == "ours")) if holds]
+def _class(column: str, text: dict[str, int]) -> str:
+    """Classes of a column's cells, by the length of its longest text; numbers have none."""
+    names = [
+        name
+        for name, holds in (("text", text[column]), ("long", text[column] > _LONG), ("ours", column == "ours"))
+        if holds
+    ]
     return f' class="{" ".join(names)}"' if names else ""
 
 
