@@ -97,9 +97,7 @@ def scenes(
 def circles(lens: Camera, target: Target, r: Tensor, t: Tensor) -> Tensor:
     """Projected circles (M, 2, 5) of every marker."""
     center = (r @ target.centers[..., None]).squeeze(-1) + t
-    conic = conics.circle_image(r[:, None], center[:, None], target.normals[:, None], target.radii)
-    to_px = torch.linalg.inv(lens.matrix)
-    return conics.ellipse_from_conic(conics.from_matrix(to_px.T @ conic @ to_px))
+    return conics.circle_ellipse(lens.matrix, r[:, None], center[:, None], target.normals[:, None], target.radii)
 
 
 def cover(frame: np.ndarray, outer: Tensor, condition: Condition, rng: np.random.Generator) -> np.ndarray:

@@ -131,9 +131,7 @@ def _pose(rng: np.random.Generator, camera: tp.Camera, target: tp.Target) -> tup
         x = (r @ target.centers[..., None]).squeeze(-1) + t
         if bool((x[:, 2] < 0.2 * z).any()):
             continue
-        conic = conics.circle_image(r[:, None], x[:, None], target.normals[:, None], target.radii)
-        to_px = torch.linalg.inv(camera.matrix)
-        circles = conics.ellipse_from_conic(conics.from_matrix(to_px.T @ conic @ to_px))
+        circles = conics.circle_ellipse(camera.matrix, r[:, None], x[:, None], target.normals[:, None], target.radii)
         if not bool(circles.isfinite().all()):
             continue
         reach = circles[:, 0, 2] + 12

@@ -18,7 +18,7 @@ from pathlib import Path
 from torchpose.camera import Camera
 from torchpose.errors import TorchposeError
 from torchpose.studies import fig13_experiment
-from torchpose.studies.script import show
+from torchpose.studies.script import finish
 from torchpose.target import Target
 
 
@@ -43,10 +43,7 @@ def main() -> int:
                 camera, target = Camera.load(options.camera), Target.load(options.target)
                 bound = fig13_experiment.crlb(camera, target, options.noise, options.psf)
             result = fig13_experiment.evaluated(options.manifest, options.poses, bound)
-        show(result)
-        if options.out:
-            for path in result.save(options.out):
-                print(path)
+        finish(result, options.out)
     except TorchposeError as error:
         print(f"fig13_experiment: error: {error}", file=sys.stderr)
         return 2

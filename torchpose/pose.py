@@ -232,11 +232,9 @@ def _visible(covariance: Tensor, mask: Tensor) -> Tensor:
 def _shape_chi2(e: Evidence, r: Tensor, t: Tensor) -> Tensor:
     """Chi-squared (N, S) of the rings' shapes: elongation and its direction, which blur and threshold hardly touch."""
     x = (r[:, :, None] @ e.points[:, None, ..., None]).squeeze(-1) + t[:, :, None]  # (N, S, M, 3)
-    conic = conics.circle_image(
-        r[:, :, None, None], x[..., None, :], e.normals[:, None, :, None], e.radii[:, None]
-    )  # (N, S, M, 2, 3, 3)
-    to_px = torch.linalg.inv(e.matrix)
-    predicted = conics.ellipse_from_conic(conics.from_matrix(to_px.T @ conic @ to_px))
+    predicted = conics.circle_ellipse(
+        e.matrix, r[:, :, None, None], x[..., None, :], e.normals[:, None, :, None], e.radii[:, None]
+    )  # (N, S, M, 2, 5)
     difference = conics.shape_matrix(e.shape)[:, None] - conics.shape_matrix(predicted)
     theta = e.shape[..., 4]
     cos, sin = theta.cos(), theta.sin()

@@ -55,6 +55,12 @@ class Camera:
     model: Model = "brown_conrady"
     covariance: Tensor | None = None
 
+    @classmethod
+    def pinhole(cls, width: int, height: int, focal: float) -> Camera:
+        """A camera without distortion, its optical axis in the middle of the frame; all in px."""
+        matrix = [[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]]
+        return cls(width, height, torch.tensor(matrix, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))
+
     def __post_init__(self) -> None:
         for name, field in (
             ("matrix", "camera_matrix"),

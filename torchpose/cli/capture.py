@@ -86,7 +86,8 @@ def _run(plan: CapturePlan, rig: Rig, session: Session, twin: Path | None, statu
     """Captures what is missing; returns the exit code."""
     from torchpose.cli.terminal import FrameProgress
     from torchpose.rig.cameras import Frame
-    from torchpose.rig.capture import FAULTS, capture
+    from torchpose.rig.capture import capture
+    from torchpose.rig.faults import RigFault
     from torchpose.rig.plan import Waypoint
 
     total, ended, code = len(plan.waypoints) * len(rig.cameras), "", 0
@@ -105,7 +106,7 @@ def _run(plan: CapturePlan, rig: Rig, session: Session, twin: Path | None, statu
         progress = stack.enter_context(FrameProgress(total, len(session.done), quiet=quiet))
         try:
             capture(plan, rig, session, scene=scene, on_frame=on_frame, notes={"twin": twin and str(twin)})
-        except FAULTS as fault:
+        except RigFault as fault:
             ended, code = f"{fault.reason}: {fault}", 1
         except KeyboardInterrupt:
             ended, code = "interrupted: the robot is stopped", INTERRUPTED

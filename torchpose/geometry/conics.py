@@ -102,6 +102,12 @@ def circle_image(rotation: Tensor, center: Tensor, normal: Tensor, radius: Tenso
     return adj.mT @ (weight[..., None] * adj)
 
 
+def circle_ellipse(matrix: Tensor, rotation: Tensor, center: Tensor, normal: Tensor, radius: Tensor) -> Tensor:
+    """Ellipses (..., 5) in px of circles seen by a pinhole of this matrix (3, 3); the rest as for `circle_image`."""
+    to_ray = torch.linalg.inv(matrix)
+    return ellipse_from_conic(from_matrix(to_ray.mT @ circle_image(rotation, center, normal, radius) @ to_ray))
+
+
 def circle_poses(conic: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
     """Both poses of a circle of known radius from its image (Forsyth et al. 1991, by the cone's eigenvectors).
 

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from torchpose.camera import Camera
+from torchpose.geometry.rotations import plane_axes
 from torchpose.refine.band import band_pixels
 
 _FULL_SCALES = (255.0, 1023.0, 4095.0, 16383.0, 65520.0, 65535.0)  # of 8 to 16 bits; 12 bits in the upper ones of 16
@@ -133,7 +134,7 @@ def ring_model(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor) -> RingModel:
     normal = (rk @ b.normal[..., None]).squeeze(-1)
     arm = (rk @ b.center[..., None]).squeeze(-1)  # marker's centre about the target's origin, camera axes
     center = arm + t[b.row]
-    one, two = _plane_axes(normal).unbind(1)
+    one, two = plane_axes(normal)
 
     def scalar(value: Tensor) -> Tensor:
         return value[:, None]
@@ -191,14 +192,6 @@ def ring_model(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor) -> RingModel:
         x / size,
         y / size,
     )
-
-
-def _plane_axes(normal: Tensor) -> Tensor:
-    """Two unit vectors (K, 2, 3) across ``normal`` (K, 3)."""
-    axis = torch.nn.functional.one_hot(normal.abs().argmin(-1), 3).to(normal)
-    first = torch.linalg.cross(normal, axis)
-    first = first / torch.linalg.vector_norm(first, dim=-1, keepdim=True)
-    return torch.stack([first, torch.linalg.cross(normal, first)], 1)
 
 
 def _edge(z: Tensor, square: Tensor) -> tuple[Tensor, Tensor]:

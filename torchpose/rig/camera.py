@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator, model_validator
 
-from torchpose.errors import TorchposeError
+from torchpose.rig.faults import RigFault
 
 EMULATOR = "BaslerCamEmu"  # device class of the emulated cameras
 _FROZEN = ConfigDict(extra="forbid", frozen=True)
@@ -36,12 +36,10 @@ class CameraReason(StrEnum):
     DRIVER_ERROR = "camera_driver_error"
 
 
-class CameraFault(TorchposeError):
-    """A camera cannot go on. One line with the fix; `reason` is its name."""
+class CameraFault(RigFault):
+    """A camera cannot go on."""
 
-    def __init__(self, reason: CameraReason, message: str) -> None:
-        super().__init__(message)
-        self.reason = reason
+    reason: CameraReason
 
 
 class CameraSettings(BaseModel):

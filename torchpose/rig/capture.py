@@ -14,20 +14,17 @@ from typing import Any
 import torch
 
 from torchpose.geometry import rotations
-from torchpose.rig.camera import CameraFault
 from torchpose.rig.cameras import Cameras, Frame
+from torchpose.rig.faults import RigFault
 from torchpose.rig.plan import CapturePlan, Waypoint
-from torchpose.rig.robot import Robot
+from torchpose.rig.robot import Robot, difference
 from torchpose.rig.robot_faults import RobotFault, RobotReason
 from torchpose.rig.robot_settings import Pose, RobotReading, Settle
-from torchpose.rig.session import Session, SessionFault
+from torchpose.rig.session import Session
 from torchpose.rig.settings import Rig
 
 COMPLETE = "complete"
 INTERRUPTED = "interrupted"
-
-Fault = CameraFault | RobotFault | SessionFault
-FAULTS = (CameraFault, RobotFault, SessionFault)
 
 OnFrame = Callable[[Waypoint, Frame], None]
 
@@ -83,7 +80,7 @@ def capture(
             record = {"plan": plan.name, "waypoints": len(plan.waypoints), "robot": preflight, "cameras": described}
             session.begin(emulated=emulated, record=record | dict(notes or {}))
             _take_all(plan, rig, session, robot, cameras, on_frame)
-    except FAULTS as fault:
+    except RigFault as fault:
         session.end(fault.reason.value, str(fault))
         raise
     except KeyboardInterrupt:
@@ -135,13 +132,6 @@ def _check_rest(waypoint: Waypoint, reading: RobotReading, pose: Pose, settle: S
             f"robot: moved by {distance:.3f} mm and {angle:.3f} deg around the exposure of waypoint {waypoint.label}; "
             "look for vibration, or raise robot.settle of the rig file",
         )
-
-
-def difference(a: Pose, b: Pose) -> tuple[float, float]:
-    """Distance in mm and angle in degrees between two poses."""
-    first, second = (torch.tensor(pose, dtype=torch.float64) for pose in (a, b))
-    turn = rotations.angle_between(rotations.exp(first[3:]), rotations.exp(second[3:]))
-    return float((first[:3] - second[:3]).norm()), float(turn.rad2deg())
 
 
 def middle(a: Pose, b: Pose) -> Pose:

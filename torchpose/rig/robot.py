@@ -178,8 +178,8 @@ class Robot:
         """Sends the move and waits until the controller reports its end."""
         s, before = self.settings, state["move_changes"]
         # the slider at the pendant slows the robot down; the controller takes the same number as m/s and rad/s
-        distance, turn = _distance(state["pose"], goal)
-        path = max(distance, 1e3 * turn)
+        distance, turn_deg = difference(state["pose"], goal)
+        path = max(distance, 1e3 * math.radians(turn_deg))
         expected = path / s.speed_mm_s + s.speed_mm_s / s.acceleration_mm_s2
         limit = expected / max(state["speed_fraction"], 0.01) + s.move_margin_s
         deadline = time.monotonic() + limit
@@ -191,7 +191,7 @@ class Robot:
             if time.monotonic() > deadline:
                 raise self._fault(
                     RobotReason.TIMED_OUT,
-                    f"has not finished a move of {_words(distance, turn)} within {limit:.3g} s; "
+                    f"has not finished a move of {_words(distance, turn_deg)} within {limit:.3g} s; "
                     "see what slows it down, or raise move_margin_s",
                 )
             state = self._state()
@@ -204,14 +204,14 @@ class Robot:
         deadline, good = time.monotonic() + rule.timeout_s, 0
         while True:
             reading = self.read()
-            distance, turn = _distance(reading.pose, goal)
-            good = good + 1 if distance <= rule.tolerance_mm and math.degrees(turn) <= rule.tolerance_deg else 0
+            distance, turn_deg = difference(reading.pose, goal)
+            good = good + 1 if distance <= rule.tolerance_mm and turn_deg <= rule.tolerance_deg else 0
             if good >= rule.samples:
                 return reading
             if time.monotonic() > deadline:
                 raise self._fault(
                     RobotReason.NOT_SETTLED,
-                    f"stands {_words(distance, turn)} from the commanded pose {rule.timeout_s:g} s after the move; "
+                    f"stands {_words(distance, turn_deg)} from the commanded pose {rule.timeout_s:g} s after the move; "
                     "check the tool offset and the payload, or widen settle",
                 )
 
@@ -266,14 +266,14 @@ class Robot:
         return self._fault(*robot_faults.of_link(name, error, answers))
 
 
-def _distance(a: Sequence[float], b: Sequence[float]) -> tuple[float, float]:
-    """mm and rad between two poses."""
+def difference(a: Sequence[float], b: Sequence[float]) -> tuple[float, float]:
+    """Distance in mm and angle in degrees between two poses."""
     ra, rb = rotations.exp(torch.tensor([list(a[3:]), list(b[3:])], dtype=torch.float64))
-    return math.dist(a[:3], b[:3]), float(rotations.angle_between(ra, rb))
+    return math.dist(a[:3], b[:3]), math.degrees(float(rotations.angle_between(ra, rb)))
 
 
-def _words(distance_mm: float, turn: float) -> str:
-    return f"{distance_mm:.3g} mm and {math.degrees(turn):.3g} deg"
+def _words(distance_mm: float, turn_deg: float) -> str:
+    return f"{distance_mm:.3g} mm and {turn_deg:.3g} deg"
 
 
 def _reading(state: dict[str, Any]) -> RobotReading:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from enum import StrEnum
 
-from torchpose.errors import TorchposeError
+from torchpose.rig.faults import RigFault
 from torchpose.rig.robot_link import LinkEnded, LinkError, LinkLate
 
 
@@ -32,12 +32,10 @@ class RobotReason(StrEnum):
     STOPPED = "stopped"
 
 
-class RobotFault(TorchposeError):
-    """The robot cannot go on. The message is one line with the fix; `reason` names the kind."""
+class RobotFault(RigFault):
+    """The robot cannot go on."""
 
-    def __init__(self, reason: RobotReason, message: str) -> None:
-        super().__init__(message)
-        self.reason = reason
+    reason: RobotReason
 
 
 Cause = tuple[RobotReason, str]  # what is wrong; the fix

@@ -24,8 +24,9 @@ from typing import Any, Self
 import cv2
 import numpy as np
 
-from torchpose.errors import ConfigError, TorchposeError
+from torchpose.errors import ConfigError
 from torchpose.io.manifest import read_records
+from torchpose.rig.faults import RigFault
 
 SCHEMA = "torchpose.capture/1"
 MANIFEST = "manifest.jsonl"
@@ -39,12 +40,10 @@ class SessionReason(StrEnum):
     NOT_WRITABLE = "not_writable"
 
 
-class SessionFault(TorchposeError):
-    """A file of the session cannot be written. One line with the fix; `reason` is its name."""
+class SessionFault(RigFault):
+    """A file of the session cannot be written."""
 
-    def __init__(self, reason: SessionReason, message: str) -> None:
-        super().__init__(message)
-        self.reason = reason
+    reason: SessionReason
 
 
 class Session:

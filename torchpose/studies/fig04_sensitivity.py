@@ -30,9 +30,7 @@ DISTANCES_MM = (12.0, 32.0)
 
 def paper_camera() -> Camera:
     """Basler acA5472-17um, 2.4 um pixels, with an 8 mm lens without distortion."""
-    focal = FOCAL_MM / PITCH_MM
-    matrix = torch.tensor([[focal, 0, 2735.5], [0, focal, 1823.5], [0, 0, 1]], dtype=torch.float64)
-    return Camera(5472, 3648, matrix, torch.zeros(0, dtype=torch.float64))
+    return Camera.pinhole(5472, 3648, FOCAL_MM / PITCH_MM)
 
 
 def run(*, full: bool = False, seed: int = 0, progress: Progress = ignore_progress) -> StudyResult:

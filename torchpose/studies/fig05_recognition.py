@@ -63,8 +63,7 @@ def recognition(frames: int, seed: int) -> list[dict[str, Any]]:
 
 def frame_camera() -> Camera:
     """Camera of the frames with clutter."""
-    matrix = [[FOCAL_PX, 0, (WIDTH - 1) / 2], [0, FOCAL_PX, (HEIGHT - 1) / 2], [0, 0, 1]]
-    return Camera(WIDTH, HEIGHT, torch.tensor(matrix, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))
+    return Camera.pinhole(WIDTH, HEIGHT, FOCAL_PX)
 
 
 def clutter(target: Target, frames: int, seed: int) -> Shapes:
@@ -171,9 +170,7 @@ def capacities(count: int, seed: int) -> list[dict[str, Any]]:
         "cross": (lambda code: cross(AREA_MM2, code, 150), read_cross),
         "rectangle": (lambda code: square(math.sqrt(AREA_MM2), 150), read_rectangle),
     }
-    size, focal = 161, 2 * FOCAL_PX
-    matrix = [[focal, 0, (size - 1) / 2], [0, focal, (size - 1) / 2], [0, 0, 1]]
-    camera = Camera(size, size, torch.tensor(matrix, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))
+    camera = Camera.pinhole(161, 161, 2 * FOCAL_PX)
     rows: list[dict[str, Any]] = []
     for noise in CODE_NOISE:
         for name, (build, read) in readers.items():

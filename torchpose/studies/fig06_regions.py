@@ -39,6 +39,7 @@ MARKERS = ((-26.0, -52.0, 2.4), (26.0, -52.0, 3.2), (26.0, 52.0, 4.0), (-26.0, 5
 OUTER_RADIUS = 8.0
 LENSES = ((-16.0, -24.0, 6.0), (0.0, -24.0, 6.0), (12.0, -30.0, 1.8))  # x, y, radius, mm
 NOISE = 2.0
+FOCAL_PX = 1400.0
 
 
 def run(*, full: bool = False, seed: int = 0, progress: Progress = ignore_progress) -> StudyResult:
@@ -98,8 +99,7 @@ def phone_target() -> Target:
 
 
 def _camera(height: int, width: int) -> Camera:
-    matrix = torch.tensor([[1400.0, 0, (width - 1) / 2], [0, 1400, (height - 1) / 2], [0, 0, 1]], dtype=torch.float64)
-    return Camera(width, height, matrix, torch.zeros(5, dtype=torch.float64))
+    return Camera.pinhole(width, height, FOCAL_PX)
 
 
 def phone_scene(seed: int) -> tuple[Tensor, Tensor]:
@@ -151,9 +151,7 @@ def _images(camera: Camera, r: Tensor, t: Tensor, circles: list[tuple[float, flo
     centers = torch.nn.functional.pad(known[:, :2], (0, 1)) @ r.mT + t
     count = len(known)
     normal = torch.tensor([0.0, 0, 1], dtype=torch.float64).expand(count, 3)
-    conic = conics.circle_image(r.expand(count, 3, 3), centers, normal, known[:, 2])
-    to_ray = torch.linalg.inv(camera.matrix)
-    return conics.ellipse_from_conic(conics.from_matrix(to_ray.mT @ conic @ to_ray))
+    return conics.circle_ellipse(camera.matrix, r.expand(count, 3, 3), centers, normal, known[:, 2])
 
 
 def _same(found: Tensor, truth: Tensor) -> Tensor:

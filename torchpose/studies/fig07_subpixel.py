@@ -90,9 +90,7 @@ def _truth(camera: Camera, r: Tensor, t: Tensor) -> Tensor:
     """(2, 5) exact ellipses of both circles, px."""
     normal = torch.tensor([0.0, 0, 1], dtype=torch.float64).expand(2, 3)
     radii = torch.tensor([OUTER, INNER], dtype=torch.float64)
-    conic = conics.circle_image(r.expand(2, 3, 3), t.expand(2, 3), normal, radii)
-    to_ray = torch.linalg.inv(camera.matrix)
-    return conics.ellipse_from_conic(conics.from_matrix(to_ray.mT @ conic @ to_ray))
+    return conics.circle_ellipse(camera.matrix, r.expand(2, 3, 3), t.expand(2, 3), normal, radii)
 
 
 def _steps(frame: Tensor, edges: RingEdges) -> Figure:

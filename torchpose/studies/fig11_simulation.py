@@ -126,10 +126,8 @@ def run(
 
 def paper_plan() -> Plan:
     """The 875 frames of the paper."""
-    width, height, focal = CAMERA
-    matrix = torch.tensor([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]], dtype=torch.float64)
     with TemporaryDirectory() as folder:
-        Camera(width, height, matrix, torch.zeros(5, dtype=torch.float64)).save(Path(folder) / "camera.yaml")
+        Camera.pinhole(*CAMERA).save(Path(folder) / "camera.yaml")
         (Path(folder) / "plan.yaml").write_text(PLAN, encoding="utf-8")
         return load_plan(Path(folder) / "plan.yaml")
 

@@ -88,7 +88,7 @@ def run(*, full: bool = False, seed: int = 0, progress: Progress = ignore_progre
     degrees = [-5, -4, -3, -2, -1, 1, 2, 3, 4, 5] if full else [-5, -2.5, 2.5, 5]
     with TemporaryDirectory(prefix="torchpose-experiment-") as place:
         folder = Path(place)
-        camera = _camera()
+        camera = Camera.pinhole(*CAMERA)
         camera.save(folder / "camera.yaml")
         for name, text in (
             ("rig.yaml", RIG),
@@ -221,12 +221,6 @@ def _comparisons(e: Experiment) -> list[Comparison]:
         rows.append(Comparison(f"{'angle' if m.turn else 'distance'}, {m.axis}, RMS error", name, None,
                                scale * rms(m.error), bound))  # fmt: skip
     return rows
-
-
-def _camera() -> Camera:
-    width, height, focal = CAMERA
-    matrix = torch.tensor([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]], dtype=torch.float64)
-    return Camera(width, height, matrix, torch.zeros(5, dtype=torch.float64))
 
 
 def _capture(folder: Path, progress: Progress) -> Path:

@@ -30,14 +30,19 @@ def main(study: ModuleType) -> int:
     options = parser.parse_args()
     try:
         result = study.run(full=options.full, seed=options.seed, **{name: getattr(options, name) for name in own})
-        show(result)
-        if options.out:
-            for path in result.save(options.out):
-                print(path)
+        finish(result, options.out)
     except ConfigError as error:
         print(f"{study.NAME}: error: {error}", file=sys.stderr)
         return 2
     return 0
+
+
+def finish(result: StudyResult, out: Path | None) -> None:
+    """Prints a result and writes its files, where there is a folder for them."""
+    show(result)
+    if out:
+        for path in result.save(out):
+            print(path)
 
 
 def show(result: StudyResult) -> None:

@@ -87,8 +87,7 @@ def run(
 
 
 def camera() -> tp.Camera:
-    matrix = torch.tensor([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]], dtype=F64)
-    return tp.Camera(width=WIDTH, height=HEIGHT, matrix=matrix, distortion=torch.zeros(4, dtype=F64))
+    return tp.Camera.pinhole(WIDTH, HEIGHT, FOCAL)
 
 
 def scene(shift: Tensor, cam: tp.Camera) -> tuple[tp.Target, Tensor, Tensor]:

@@ -146,9 +146,8 @@ def _ring_picture() -> Figure:
 def projected(rotation: Tensor) -> tuple[EllipseFit, EllipseFit]:
     """Exact ellipses of both circles, with the optical axis at pixel (0, 0)."""
     center, normal = torch.tensor([0.0, 0, DISTANCE], dtype=F64), torch.tensor([0.0, 0, 1], dtype=F64)
-    to_pixels = torch.diag(torch.tensor([1 / FOCAL, 1 / FOCAL, 1], dtype=F64))
-    conic = to_pixels @ conics.circle_image(rotation, center, normal, RADII[0]) @ to_pixels
-    ellipse = conics.ellipse_from_conic(conics.from_matrix(conic))
+    matrix = torch.diag(torch.tensor([FOCAL, FOCAL, 1], dtype=F64))
+    ellipse = conics.circle_ellipse(matrix, rotation, center, normal, RADII[0])
     one = torch.ones(1, dtype=F64)
     outer, inner = (EllipseFit(e[None], torch.eye(5, dtype=F64)[None], one, one) for e in ellipse)
     return outer, inner
@@ -162,9 +161,7 @@ def measured(
     Args:
         rotation: (B, 3, 3) of the ring. shift: (B, 2) px of its centre from the optical axis.
     """
-    principal = (SIZE - 1) / 2
-    matrix = torch.tensor([[FOCAL, 0, principal], [0, FOCAL, principal], [0, 0, 1]], dtype=F64)
-    camera = tp.Camera(width=SIZE, height=SIZE, matrix=matrix, distortion=torch.zeros(4, dtype=F64))
+    camera = tp.Camera.pinhole(SIZE, SIZE, FOCAL)
     # a target has three markers at least: the others lie outside of the frame
     centers = torch.tensor([[0.0, 0, 0], [60, 0, 0], [0, 60, 0]], dtype=F64)
     radii = torch.cat([RADII, torch.tensor([[5.0, 2.0], [5, 1.5]], dtype=F64)])
@@ -178,7 +175,7 @@ def measured(
     order = rings.frame.argsort()
     outer, inner = rings.outer[order], rings.inner[order]
     for fit in (outer, inner):
-        fit.params[:, :2] -= principal + shift
+        fit.params[:, :2] -= camera.matrix[:2, 2] + shift
     return outer, inner
 
 
