@@ -3,17 +3,20 @@
 Where the two circles are closer than an edge mask, or the inner one fits into the mask, each edge bends the other's
 measurement. The whole ring as one model has no such limit:
 
-    I = paper + slope . x + contrast (E(1) - E(q)),   E(s) = Phi(d_s / sigma - sigma k_s / 2),
+    I = paper + slope . x + contrast (E(1) - E(q)),
 
-d_s the first-order distance inside the ellipse scaled by s, k_s its curvature, Phi the normal distribution, q the ratio
-of the radii. The circles share their shape; perspective parts their centres by about a^2 (1 - q^2) / f at most (a the
-semi-major axis, f the focal length, px), the standard deviation of a prior at zero. What covers a part of the ring, or
-touches it, is left out by robust weights.
+E(s) the blurred indicator of the ellipse scaled by s, q the ratio of the radii. To first order in the distance it is
+Phi(d_s / sigma - sigma k_s / 2), d_s the distance inside the ellipse, k_s its curvature, Phi the normal distribution.
+Where the blur is more than a fifth of the inner circle, that is off by up to a quarter of the contrast, and the ring is
+fitted once more with the exact integral (`geometry.blurred_ellipse`). The circles share their shape; perspective parts
+their centres by about a^2 (1 - q^2) / f at most (a the semi-major axis, f the focal length, px), the standard deviation
+of a prior at zero. What covers a part of the ring, or touches it, is left out by robust weights.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -22,18 +25,24 @@ from torch import Tensor
 
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import conics
+from torchpose.geometry.blurred_ellipse import blurred_ellipse, nodes_needed
 from torchpose.geometry.segments import ragged_arange, segment_mean, segment_sum
 
-_MARGIN = 3  # px around the outer ellipse
-_ITERATIONS = 14
-_HOLD = 3  # of the iterations find grey levels and weights only, so that a cover does not pull from the start
-_ROBUST = 10  # of the iterations are reweighted softly, the rest keeps or drops a pixel
+_MARGIN = 3.0  # px around the outer ellipse
+_HOLD = 3  # first iterations that find grey levels and weights only, so that a cover does not pull from the start
+_ITERATIONS = (10, 4)  # reweighted softly, then keeping or dropping each pixel
+_DAMPING = 1e-3
 _SOFT, _CUT = 2.5, 4.0  # standard deviations: scale of the soft weights, and from where on a pixel is dropped
 _LEAST_KEPT = 0.5  # of the pixels
-_DAMPING = 1e-3
 _MOST_MOVE = 0.7  # px of an iteration
 _START_SIGMA = 0.8  # px
+_BLURRED = 0.2  # blur over inner semi-minor axis above which edges are no edges any more
+_BLURRED_MARGIN = 2.5  # blurs around the outer ellipse
+_BLURRED_DAMPING = 1e-5  # blur, width and contrast of a ring much blurred differ by little: no step is to be shortened
 _LEAST_EXPLAINED = 0.75  # of the variance of grey around the ring
+_PROMISING = 0.5  # of it, from the first fit, for a second one
+_MOST_NODES = 96  # of the exact integral: enough for a semi-major axis of 20 blurs
+_PART = 400_000  # pixels times nodes at a time
 _RATIO_RANGE = (0.12, 0.93)  # beyond it, a plain disc or its rim
 _RATIO_SIGMA = 0.1  # of the ratio: an inner circle that is not sure is none
 _NONLINEAR = 9  # centre 2, shape 3, ratio, blur, inner from outer centre 2; then the four grey ones
@@ -59,43 +68,85 @@ def fit_small_rings(
         ratio: (K,) rough ratio of the radii. seen: (K, A) bool, the directions in which the outer edge shows, see
             `rings.find_inner`; the others do not count. polarity: (K,) +1 for a dark ring. focal: () focal length, px.
     """
-    count = frame.numel()
-    index, xy, grey, whole = _windows(frames, frame, outer)
     shape = conics.shape_matrix(outer)
     start = [outer[:, :2], shape[:, 0, :1], shape[:, 0, 1:], shape[:, 1, 1:], ratio[:, None]]
     theta = torch.cat([*start, torch.full_like(ratio, _START_SIGMA)[:, None], torch.zeros_like(outer[:, :2])], -1)
     parted = (outer[:, 2].square() * (1 - ratio.square()) / focal).clamp_min(_LEAST_PARTED)
     known = torch.nn.functional.pad(parted.pow(-2)[:, None].expand(-1, 2), (_NONLINEAR - 2, 4))
-    origin = outer[:, :2]
-    local = (xy - origin[index]) / outer[index, 2:3]
-    eye = torch.eye(_NONLINEAR + 4, dtype=torch.float64, device=frames.device)
+    margin = torch.full_like(ratio, _MARGIN)
+    fit = _gauss_newton(_windows(frames, frame, outer, margin), theta, seen, known, _first_order, _DAMPING, _HOLD)
+    for part in _blurred(fit, outer, polarity):
+        reach = (_BLURRED_MARGIN * fit.theta[part, 6]).clamp_min(_MARGIN)
+        window = _windows(frames, frame[part], outer[part], reach)
+        again = _gauss_newton(window, fit.theta[part], seen[part], known[part], _exact, _BLURRED_DAMPING, 0)
+        fit = _Fit(*(every.index_copy(0, part, some) for every, some in zip(fit, again, strict=True)))
+    return _judged(fit, outer, polarity)
+
+
+def _blurred(fit: _Fit, outer: Tensor, polarity: Tensor) -> Sequence[Tensor]:
+    """Which of K fits may be rings whose blur is wide for their size, in parts that fit the cache."""
+    blur, inner = fit.theta[:, 6], fit.theta[:, 5] * outer[:, 3]
+    promising = fit.sound & (fit.contrast * polarity < 0) & (fit.explained > _PROMISING)
+    which = (promising & (blur > _BLURRED * inner)).nonzero()[:, 0]
+    pixels = (2 * (outer[which, 2] + _BLURRED_MARGIN * blur[which]) + 1).square()
+    order = torch.argsort(pixels)  # those of a part are padded to the largest of them
+    part = (pixels[order].cumsum(0) * _MOST_NODES / _PART).long()
+    return which[order].split(part.unique_consecutive(return_counts=True)[1].tolist())
+
+
+class _Fit(NamedTuple):
+    """K fits: parameters (K, 9), their covariance (K, 9, 9), contrast, residual variance, pixels kept, all as (K,).
+
+    And the share of the pixels that is kept, of the grey values' variance that is explained, and (K,) bool, whether the
+    window is on the frame and the normal equations could be solved.
+    """
+
+    theta: Tensor
+    covariance: Tensor
+    contrast: Tensor
+    variance: Tensor
+    pixels: Tensor
+    kept: Tensor
+    explained: Tensor
+    sound: Tensor
+
+
+def _gauss_newton(
+    window: _Window, theta: Tensor, seen: Tensor, known: Tensor, coverage: Coverage, damping: float, hold: int
+) -> _Fit:
+    """Damped Gauss-Newton from parameters (K, 9), with ``known`` (K, 13) the information that is there before."""
+    index, xy, grey, whole = window
+    count = theta.shape[0]
+    origin = theta[:, :2]
+    semi_major = _ellipses(theta)[0][:, 2]
+    local = (xy - origin[index]) / semi_major[index, None]
     linear = theta.new_zeros(count, 4)
-    normal = eye.expand(count, -1, -1)
+    normal = torch.eye(_NONLINEAR + 4, dtype=theta.dtype, device=theta.device).expand(count, -1, -1)
     residual = grey
     at = _depth(theta, index, xy)
     direction = (torch.atan2(at.v, at.u) * (seen.shape[1] / (2 * math.pi))).round().long() % seen.shape[1]
     clear = seen[index, direction].to(grey)
     weight = clear
-    spread = torch.ones_like(ratio)
-    for step_number in range(_ITERATIONS):
-        value, derivative = _coverage(theta, index, xy)
+    spread = torch.ones_like(theta[:, 0])
+    softly, last = _ITERATIONS
+    for step_number in range(softly + last):
+        value, derivative = coverage(theta, index, xy)
         basis = torch.cat([torch.ones_like(local[:, :1]), local, value[:, None]], -1)
         # grey levels first, so that the derivatives have their contrast
         linear = _solve(basis, grey, index, count, weight)
         residual = grey - (basis * linear[index]).sum(-1)
-        last = step_number >= _ROBUST
-        if not last:  # later it would grow with what it lets in
+        if step_number < softly:  # later it would grow with what it lets in
             spread = segment_mean(residual.square(), index, count, weight).sqrt()
-        weight = clear * _weights(residual / spread[index], keep=last)
+        weight = clear * _weights(residual / spread[index], keep=step_number >= softly)
         jacobian = torch.cat([derivative * linear[index, 3:], basis], -1)
         weighted = jacobian * weight[:, None]
         normal = segment_sum((weighted[:, :, None] * jacobian[:, None]).flatten(1), index, count)
         normal = normal.view(count, _NONLINEAR + 4, -1) + torch.diag_embed(known * spread.square()[:, None])
         gradient = segment_sum(weighted * residual[:, None], index, count)
         gradient[:, 7:9] -= (known[:, 7:9] * spread.square()[:, None]) * theta[:, 7:9]
-        damped = normal + torch.diag_embed(_DAMPING * normal.diagonal(dim1=-2, dim2=-1) + 1e-12)
+        damped = normal + torch.diag_embed(damping * normal.diagonal(dim1=-2, dim2=-1) + 1e-12)
         step = torch.linalg.solve_ex(damped, gradient[..., None]).result.squeeze(-1)[:, :_NONLINEAR]
-        step = step.nan_to_num(nan=0.0).clamp(-_MOST_MOVE, _MOST_MOVE) * (step_number >= _HOLD)
+        step = step.nan_to_num(nan=0.0).clamp(-_MOST_MOVE, _MOST_MOVE) * (step_number >= hold)
         step[:, 5] = step[:, 5].clamp(-0.1, 0.1)
         theta = theta + step
         ratio, sigma = theta[:, 5:6].clamp(0.05, 0.97), theta[:, 6:7].clamp(0.3, 6.0)
@@ -107,56 +158,73 @@ def fit_small_rings(
     total = segment_sum(weight * (grey - mean[index]).square(), index, count) / pixels
     inverse, info = torch.linalg.inv_ex(normal)
     covariance = inverse[:, :_NONLINEAR, :_NONLINEAR] * variance[:, None, None]
+    kept = pixels / torch.bincount(index, minlength=count)
+    sound = whole & (info == 0) & covariance.isfinite().all(-1).all(-1)
+    return _Fit(theta, covariance, linear[:, 3], variance, pixels, kept, 1 - variance / total, sound)
+
+
+def _judged(fit: _Fit, outer: Tensor, polarity: Tensor) -> SmallRings:
+    """Both ellipses of each fit, and whether it is a ring of this polarity where the rough one (K, 5) was."""
+    theta, covariance = fit.theta, fit.covariance
     params, shape_ok = _ellipses(theta)
+    ratio = theta[:, 5]
     good = (
         shape_ok
-        & whole
-        & (pixels > _LEAST_KEPT * torch.bincount(index, minlength=count))
-        & (info == 0)
-        & covariance.isfinite().all(-1).all(-1)
-        & (variance < (1 - _LEAST_EXPLAINED) * total)
-        & (linear[:, 3] * polarity < 0)
-        & (theta[:, 5] > _RATIO_RANGE[0])
-        & (theta[:, 5] < _RATIO_RANGE[1])
-        & (covariance[:, 5, 5].sqrt() < _RATIO_SIGMA * theta[:, 5])
+        & fit.sound
+        & (fit.kept > _LEAST_KEPT)
+        & (fit.explained > _LEAST_EXPLAINED)
+        & (fit.contrast * polarity < 0)
+        & (ratio > _RATIO_RANGE[0])
+        & (ratio < _RATIO_RANGE[1])
+        & (covariance[:, 5, 5].sqrt() < _RATIO_SIGMA * ratio)
         & (torch.linalg.vector_norm(params[:, :2] - outer[:, :2], dim=-1) < 0.3 * outer[:, 3] + 1)
     )
     to_axes = _to_axes(params)
-    outer_jacobian = torch.zeros(count, 5, _NONLINEAR, dtype=torch.float64, device=frames.device)
-    outer_jacobian[:, :2, :2] = torch.eye(2, dtype=torch.float64, device=frames.device)
+    outer_jacobian = theta.new_zeros(theta.shape[0], 5, _NONLINEAR)
+    outer_jacobian[:, :2, :2] = torch.eye(2, dtype=theta.dtype, device=theta.device)
     outer_jacobian[:, 2:, 2:5] = to_axes
     inner_jacobian = outer_jacobian.clone()
     inner_jacobian[:, :2, 7:] = inner_jacobian[:, :2, :2]
-    inner_jacobian[:, 2:, 2:5] *= theta[:, 5, None, None]
+    inner_jacobian[:, 2:, 2:5] *= ratio[:, None, None]
     inner_jacobian[:, 2, 5], inner_jacobian[:, 4, 5] = params[:, 2], params[:, 3]
-    inner = torch.cat([params[:, :2] + theta[:, 7:], params[:, 2:4] * theta[:, 5:6], params[:, 4:]], -1)
+    inner = torch.cat([params[:, :2] + theta[:, 7:], params[:, 2:4] * ratio[:, None], params[:, 4:]], -1)
     # both circles tell the same shape and nearly the same centre: as independent ones each has twice the variance
     fits = [
-        EllipseFit(p, 2 * j @ covariance @ j.mT, variance.sqrt(), pixels)
+        EllipseFit(p, 2 * j @ covariance @ j.mT, fit.variance.sqrt(), fit.pixels)
         for p, j in ((params, outer_jacobian), (inner, inner_jacobian))
     ]
     return SmallRings(fits[0], fits[1], good)
 
 
-def _windows(frames: Tensor, frame: Tensor, outer: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Pixels within the margin of each ring: ring (P,), position (P, 2), grey value (P,) float64.
+class _Window(NamedTuple):
+    """Pixels around K rings: ring (P,), sorted, position (P, 2), grey value (P,) float64.
 
-    Also whether all of them are on the frame (K,) bool: what the border cuts off leaves the shape open.
+    And whether all of them are on the frame (K,) bool: what the border cuts off leaves the shape open.
     """
+
+    ring: Tensor
+    xy: Tensor
+    grey: Tensor
+    whole: Tensor
+
+
+def _windows(frames: Tensor, frame: Tensor, outer: Tensor, margin: Tensor) -> _Window:
+    """Pixels of frames (B, H, W) within a margin (K,) px of rough outer ellipses (K, 5)."""
     height, width = frames.shape[-2:]
-    half = outer[:, 2].ceil().long() + _MARGIN
+    half = (outer[:, 2] + margin).ceil().long()
     side = 2 * half + 1
     index, position = ragged_arange(side.square())
     corner = outer[:, :2].round().long() - half[:, None]
     u, v = corner[index, 0] + position % side[index], corner[index, 1] + position // side[index]
     xy = torch.stack([u, v], -1).double()
     theta = torch.cat([outer[:, :2], conics.shape_matrix(outer).flatten(1)[:, [0, 1, 3]]], -1)
-    near = _depth(theta, index, xy).depth > -_MARGIN
+    near = _depth(theta, index, xy).depth > -margin[index]
     seen = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     cut = segment_sum((near & ~seen).double(), index, frame.numel()) > 0
     keep = near & seen
     index, xy, u, v = index[keep], xy[keep], u[keep], v[keep]
-    return index, xy, frames.reshape(-1)[(frame[index] * height + v) * width + u].double(), ~cut
+    grey = frames.reshape(-1)[(frame[index] * height + v) * width + u].double()
+    return _Window(index, xy, grey, ~cut)
 
 
 class _Depth(NamedTuple):
@@ -187,8 +255,34 @@ def _depth(theta: Tensor, index: Tensor, xy: Tensor, inner: bool = False) -> _De
     return _Depth((scale - rho) / length, gx / length, gy / length, u, v, length, curvature)
 
 
-def _coverage(theta: Tensor, index: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
-    """E(1) - E(q) at every pixel (P,), and its derivatives (P, 9) to first order in the distance."""
+Coverage = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+
+
+def _exact(theta: Tensor, index: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
+    """E(1) - E(q) at every pixel (P,), sorted by ring, and its derivatives (P, 9)."""
+    count = theta.shape[0]
+    size = torch.bincount(index, minlength=count)
+    position = torch.arange(index.numel(), device=index.device) - (size.cumsum(0) - size)[index]
+    # about the centre, float32 is exact to a millionth of the contrast, and twice as fast
+    near = (xy - theta[index, :2]).float()
+    padded = near.new_zeros(count, int(size.max()), 2).index_put((index, position), near)
+    ellipses, (ratio, sigma) = _ellipses(theta)[0], theta[:, 5:7].float().unbind(-1)
+    shape, parted = theta[:, (2, 3, 3, 4)].float().unflatten(-1, (2, 2)), theta[:, 7:9].float()
+
+    def blurred(center: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
+        nodes = min(nodes_needed(ellipses[:, 2] * scale, sigma), _MOST_NODES)
+        return blurred_ellipse(padded, center, shape, scale, sigma, nodes)
+
+    outer, by_outer = blurred(torch.zeros_like(parted), torch.ones_like(ratio))
+    inner, by_inner = blurred(parted, ratio)
+    none = torch.zeros_like(by_outer[..., :1])
+    derivative = torch.cat([by_outer[..., :5], none, by_outer[..., 6:], none, none], -1)
+    derivative = derivative - torch.cat([by_inner, by_inner[..., :2]], -1)
+    return (outer - inner)[index, position].double(), derivative[index, position].double()
+
+
+def _first_order(theta: Tensor, index: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
+    """The same to first order in the distance."""
     sigma = theta[index, 6]
     value, columns = [], []
     for inner in (False, True):
