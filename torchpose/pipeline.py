@@ -25,6 +25,7 @@ from torchpose.pose import (
 from torchpose.refine import refine_edges, refine_photometric
 from torchpose.results import Detections, Poses, Reason, Status
 from torchpose.rings import Rings, measure_rings
+from torchpose.second_look import look_again
 from torchpose.target import Target
 
 _FRAME_TYPES = (torch.uint8, torch.uint16, torch.float16, torch.bfloat16, torch.float32, torch.float64)
@@ -103,10 +104,11 @@ class PoseEstimator(nn.Module):
         rings = measure_rings(frames, candidates, camera, correct=self.method != "paper")
         identified = identify(rings, table, camera, batch)
         target = torch.arange(batch * count, device=frames.device) % count
-        evidence = self._evidence(rings, identified, table, target, camera)
-
-        solvable = (evidence.mask.sum(-1) >= MIN_MARKERS).nonzero()[:, 0]
-        solutions = solve_poses(evidence[solvable], (identified.R[solvable], identified.t[solvable]))
+        evidence, solvable, solutions = self._solved(rings, identified, table, target, camera)
+        before = len(rings)
+        rings, identified = self._second_look(frames, rings, identified, table, camera, solvable, solutions)
+        if len(rings) > before:
+            evidence, solvable, solutions = self._solved(rings, identified, table, target, camera)
         solutions = self._doubted(solutions, evidence[solvable], solvable // count, rings, table, target[solvable])
         refined = self.method in ("photometric", "edges")
         if refined:
@@ -135,6 +137,37 @@ class PoseEstimator(nn.Module):
             # the detector's least contrast counts in 1/255 of white
             frames = frames.float() * (255.0 / self.float_range)
         return frames.contiguous()
+
+    def _solved(
+        self, rings: Rings, identified: Identified, table: MarkerTable, target: Tensor, camera: Camera
+    ) -> tuple[Evidence, Tensor, Solutions]:
+        """Evidence of every row, which rows (S,) have enough of it, and the solutions of these."""
+        evidence = self._evidence(rings, identified, table, target, camera)
+        solvable = (evidence.mask.sum(-1) >= MIN_MARKERS).nonzero()[:, 0]
+        rough = identified.R[solvable], identified.t[solvable]
+        return evidence, solvable, solve_poses(evidence[solvable], rough)
+
+    def _second_look(
+        self,
+        frames: Tensor,
+        rings: Rings,
+        identified: Identified,
+        table: MarkerTable,
+        camera: Camera,
+        solvable: Tensor,
+        s: Solutions,
+    ) -> tuple[Rings, Identified]:
+        """Looks for missing markers where the solutions put them, or the rough pose where there is none."""
+        solved = s.status != Status.REJECTED
+        index = solvable[solved]
+        seen = (identified.ring >= 0).index_copy(0, index, s.mask[solved])
+        nowhere = torch.full_like(identified.R, torch.nan), torch.full_like(identified.t, torch.nan)
+        R, t = (torch.stack(v, 1) for v in zip((identified.R, identified.t), nowhere, strict=True))
+        twofold = (s.status[solved] == Status.AMBIGUOUS)[:, None]
+        alternative = torch.where(twofold[..., None], s.R_alt[solved], torch.nan)
+        R = R.index_copy(0, index, torch.stack([s.R[solved], alternative], 1))
+        t = t.index_copy(0, index, torch.stack([s.t[solved], s.t_alt[solved]], 1))
+        return look_again(frames, rings, identified, table, camera, seen, R, t, correct=self.method != "paper")
 
     def _evidence(
         self, rings: Rings, identified: Identified, table: MarkerTable, target: Tensor, camera: Camera

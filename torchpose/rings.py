@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -51,6 +51,9 @@ class Rings:
 
     def __len__(self) -> int:
         return self.frame.shape[0]
+
+    def __getitem__(self, index: Tensor) -> Rings:
+        return Rings(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
     @classmethod
     def cat(cls, parts: Sequence[Self]) -> Self:
@@ -115,7 +118,21 @@ def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera, *, cor
         correct: free the edges from what blur and curvature do to them; False leaves them as the moments read them.
     """
     ratio, found, seen = find_inner(frames, candidates)
-    candidates, ratio, clear = candidates[found], ratio[found], clear_directions(seen[found])
+    return _measure(frames, candidates[found], camera, ratio[found], seen[found], correct)[0]
+
+
+def measure_found(
+    frames: Tensor, candidates: Candidates, camera: Camera, ratio: Tensor, *, correct: bool = True
+) -> tuple[Rings, Tensor]:
+    """The same for candidates whose ratio of radii (M,) is known; also which of them each ring is of, (K,) int64."""
+    return _measure(frames, candidates, camera, ratio, find_inner(frames, candidates)[2], correct)
+
+
+def _measure(
+    frames: Tensor, candidates: Candidates, camera: Camera, ratio: Tensor, seen: Tensor, correct: bool
+) -> tuple[Rings, Tensor]:
+    """Rings of candidates with a rough ratio (M,), see `find_inner`, and their indices into the candidates."""
+    clear = clear_directions(seen)
     count = len(candidates)
     outer = candidates.ellipse
     inner = torch.cat([outer[:, :2], outer[:, 2:4] * ratio[:, None], outer[:, 4:]], -1)
@@ -160,8 +177,10 @@ def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera, *, cor
     second = index + count
     large = Rings(candidates.frame[index], candidates.polarity[index], raw[index], raw[second], fit[index], fit[second])
     if not bool(small.any()):
-        return large
-    return Rings.cat([large, _measure_small(frames, candidates[small], ratio[small], clear[small], camera)])
+        return large, index
+    rest = small.nonzero()[:, 0]
+    measured, which = _measure_small(frames, candidates[rest], ratio[rest], clear[rest], camera)
+    return Rings.cat([large, measured]), torch.cat([index, rest[which]])
 
 
 def clear_directions(seen: Tensor) -> Tensor:
@@ -180,15 +199,17 @@ def _direction(edges: RingEdges, ellipses: Tensor) -> Tensor:
     return (torch.atan2(y, x) * (_ANGLES / (2 * torch.pi))).round().long() % _ANGLES
 
 
-def _measure_small(frames: Tensor, candidates: Candidates, ratio: Tensor, seen: Tensor, camera: Camera) -> Rings:
-    """Rings whose circles are too close to each other, or too small, to be measured one by one."""
+def _measure_small(
+    frames: Tensor, candidates: Candidates, ratio: Tensor, seen: Tensor, camera: Camera
+) -> tuple[Rings, Tensor]:
+    """The same for rings whose circles are too close to each other, or too small, to be measured one by one."""
     focal = camera.matrix.diagonal()[:2].mean()
     found = fit_small_rings(frames, candidates.frame, candidates.ellipse, ratio, seen, candidates.polarity, focal)
     least_outer, least_inner = _LEAST_SEMI_MINOR
     large = (found.outer.params[:, 3] > least_outer) & (found.inner.params[:, 3] > least_inner)
     index = (found.good & large).nonzero()[:, 0]
     outer, inner = found.outer[index], found.inner[index]
-    return Rings(
+    rings = Rings(
         candidates.frame[index],
         candidates.polarity[index],
         outer.params,
@@ -196,14 +217,20 @@ def _measure_small(frames: Tensor, candidates: Candidates, ratio: Tensor, seen: 
         replace(outer, params=_ideal(camera, outer.params)),
         replace(inner, params=_ideal(camera, inner.params)),
     )
+    return rings, index
 
 
 def _ideal(camera: Camera, ellipses: Tensor) -> Tensor:
-    """Ellipses (K, 5) of raw pixels in ideal ones; they are small, so that the distortion is affine across them."""
+    """Ellipses (K, 5) of raw pixels in ideal ones."""
+    return mapped(ellipses, lambda points: ideal_pixels(camera, points))
+
+
+def mapped(ellipses: Tensor, mapping: Callable[[Tensor], Tensor]) -> Tensor:
+    """Images (K, 5) of ellipses under a mapping of points (P, 2) that is nearly affine across each of them."""
     angle = torch.arange(_ANGLES, dtype=torch.float64, device=ellipses.device) * (2 * torch.pi / _ANGLES)
     points = conics.points_on(ellipses[:, None], angle.expand(ellipses.shape[0], -1)).flatten(0, 1)
     ring = torch.arange(ellipses.shape[0], device=ellipses.device).repeat_interleave(_ANGLES)
-    return ellipse.fit(ideal_pixels(camera, points), ring, ellipses.shape[0])
+    return ellipse.fit(mapping(points), ring, ellipses.shape[0])
 
 
 def _unbiased(edges: RingEdges, fitted: Tensor, keep: Tensor, outward: Tensor, frame: Tensor, frames: int) -> Tensor:
