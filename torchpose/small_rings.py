@@ -25,23 +25,18 @@ from torch import Tensor
 
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import conics
-from torchpose.geometry.blurred_ellipse import blurred_ellipse, nodes_needed
 from torchpose.geometry.segments import ragged_arange, segment_mean, segment_sum
+from torchpose.small_ring_model import MOST_NODES, depth, exact, first_order, outer_ellipses
 
 _MARGIN = 3.0  # px around the outer ellipse
-_HOLD = 3  # first iterations that find grey levels and weights only, so that a cover does not pull from the start
-_ITERATIONS = (10, 4)  # reweighted softly, then keeping or dropping each pixel
-_DAMPING = 1e-3
 _SOFT, _CUT = 2.5, 4.0  # standard deviations: scale of the soft weights, and from where on a pixel is dropped
 _LEAST_KEPT = 0.5  # of the pixels
 _MOST_MOVE = 0.7  # px of an iteration
 _START_SIGMA = 0.8  # px
 _BLURRED = 0.2  # blur over inner semi-minor axis above which edges are no edges any more
 _BLURRED_MARGIN = 2.5  # blurs around the outer ellipse
-_BLURRED_DAMPING = 1e-5  # blur, width and contrast of a ring much blurred differ by little: no step is to be shortened
 _LEAST_EXPLAINED = 0.75  # of the variance of grey around the ring
 _PROMISING = 0.5  # of it, from the first fit, for a second one
-_MOST_NODES = 96  # of the exact integral: enough for a semi-major axis of 20 blurs
 _PART = 400_000  # pixels times nodes at a time
 _RATIO_RANGE = (0.12, 0.93)  # beyond it, a plain disc or its rim
 _RATIO_SIGMA = 0.1  # of the ratio: an inner circle that is not sure is none
@@ -74,11 +69,15 @@ def fit_small_rings(
     parted = (outer[:, 2].square() * (1 - ratio.square()) / focal).clamp_min(_LEAST_PARTED)
     known = torch.nn.functional.pad(parted.pow(-2)[:, None].expand(-1, 2), (_NONLINEAR - 2, 4))
     margin = torch.full_like(ratio, _MARGIN)
-    fit = _gauss_newton(_windows(frames, frame, outer, margin), theta, seen, known, _first_order, _DAMPING, _HOLD)
+    # grey levels and weights alone at first, so that a cover does not pull from the start
+    rough = _Scheme(first_order, damping=1e-3, hold=3, soft=10, hard=4)
+    # blur, width and contrast of a ring much blurred are hard to tell apart: no step is to be shortened
+    precise = _Scheme(exact, damping=1e-5, hold=0, soft=6, hard=4)
+    fit = _gauss_newton(_windows(frames, frame, outer, margin), theta, seen, known, rough)
     for part in _blurred(fit, outer, polarity):
         reach = (_BLURRED_MARGIN * fit.theta[part, 6]).clamp_min(_MARGIN)
         window = _windows(frames, frame[part], outer[part], reach)
-        again = _gauss_newton(window, fit.theta[part], seen[part], known[part], _exact, _BLURRED_DAMPING, 0)
+        again = _gauss_newton(window, fit.theta[part], seen[part], known[part], precise)
         fit = _Fit(*(every.index_copy(0, part, some) for every, some in zip(fit, again, strict=True)))
     return _judged(fit, outer, polarity)
 
@@ -90,7 +89,7 @@ def _blurred(fit: _Fit, outer: Tensor, polarity: Tensor) -> Sequence[Tensor]:
     which = (promising & (blur > _BLURRED * inner)).nonzero()[:, 0]
     pixels = (2 * (outer[which, 2] + _BLURRED_MARGIN * blur[which]) + 1).square()
     order = torch.argsort(pixels)  # those of a part are padded to the largest of them
-    part = (pixels[order].cumsum(0) * _MOST_NODES / _PART).long()
+    part = (pixels[order].cumsum(0) * MOST_NODES / _PART).long()
     return which[order].split(part.unique_consecutive(return_counts=True)[1].tolist())
 
 
@@ -111,42 +110,53 @@ class _Fit(NamedTuple):
     sound: Tensor
 
 
-def _gauss_newton(
-    window: _Window, theta: Tensor, seen: Tensor, known: Tensor, coverage: Coverage, damping: float, hold: int
-) -> _Fit:
+class _Scheme(NamedTuple):
+    """How the rings are modelled and solved: model, damping, and numbers of iterations.
+
+    The first ``hold`` of them keep the ring where it is; ``soft`` ones weigh the pixels smoothly, then ``hard`` ones
+    keep or drop each.
+    """
+
+    coverage: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+    damping: float
+    hold: int
+    soft: int
+    hard: int
+
+
+def _gauss_newton(window: _Window, theta: Tensor, seen: Tensor, known: Tensor, scheme: _Scheme) -> _Fit:
     """Damped Gauss-Newton from parameters (K, 9), with ``known`` (K, 13) the information that is there before."""
     index, xy, grey, whole = window
     count = theta.shape[0]
     origin = theta[:, :2]
-    semi_major = _ellipses(theta)[0][:, 2]
+    semi_major = outer_ellipses(theta)[0][:, 2]
     local = (xy - origin[index]) / semi_major[index, None]
     linear = theta.new_zeros(count, 4)
     normal = torch.eye(_NONLINEAR + 4, dtype=theta.dtype, device=theta.device).expand(count, -1, -1)
     residual = grey
-    at = _depth(theta, index, xy)
+    at = depth(theta, index, xy)
     direction = (torch.atan2(at.v, at.u) * (seen.shape[1] / (2 * math.pi))).round().long() % seen.shape[1]
     clear = seen[index, direction].to(grey)
     weight = clear
     spread = torch.ones_like(theta[:, 0])
-    softly, last = _ITERATIONS
-    for step_number in range(softly + last):
-        value, derivative = coverage(theta, index, xy)
+    for step_number in range(scheme.soft + scheme.hard):
+        value, derivative = scheme.coverage(theta, index, xy)
         basis = torch.cat([torch.ones_like(local[:, :1]), local, value[:, None]], -1)
         # grey levels first, so that the derivatives have their contrast
         linear = _solve(basis, grey, index, count, weight)
         residual = grey - (basis * linear[index]).sum(-1)
-        if step_number < softly:  # later it would grow with what it lets in
+        if step_number < scheme.soft:  # later it would grow with what it lets in
             spread = segment_mean(residual.square(), index, count, weight).sqrt()
-        weight = clear * _weights(residual / spread[index], keep=step_number >= softly)
+        weight = clear * _weights(residual / spread[index], keep=step_number >= scheme.soft)
         jacobian = torch.cat([derivative * linear[index, 3:], basis], -1)
         weighted = jacobian * weight[:, None]
         normal = segment_sum((weighted[:, :, None] * jacobian[:, None]).flatten(1), index, count)
         normal = normal.view(count, _NONLINEAR + 4, -1) + torch.diag_embed(known * spread.square()[:, None])
         gradient = segment_sum(weighted * residual[:, None], index, count)
         gradient[:, 7:9] -= (known[:, 7:9] * spread.square()[:, None]) * theta[:, 7:9]
-        damped = normal + torch.diag_embed(damping * normal.diagonal(dim1=-2, dim2=-1) + 1e-12)
+        damped = normal + torch.diag_embed(scheme.damping * normal.diagonal(dim1=-2, dim2=-1) + 1e-12)
         step = torch.linalg.solve_ex(damped, gradient[..., None]).result.squeeze(-1)[:, :_NONLINEAR]
-        step = step.nan_to_num(nan=0.0).clamp(-_MOST_MOVE, _MOST_MOVE) * (step_number >= hold)
+        step = step.nan_to_num(nan=0.0).clamp(-_MOST_MOVE, _MOST_MOVE) * (step_number >= scheme.hold)
         step[:, 5] = step[:, 5].clamp(-0.1, 0.1)
         theta = theta + step
         ratio, sigma = theta[:, 5:6].clamp(0.05, 0.97), theta[:, 6:7].clamp(0.3, 6.0)
@@ -166,7 +176,7 @@ def _gauss_newton(
 def _judged(fit: _Fit, outer: Tensor, polarity: Tensor) -> SmallRings:
     """Both ellipses of each fit, and whether it is a ring of this polarity where the rough one (K, 5) was."""
     theta, covariance = fit.theta, fit.covariance
-    params, shape_ok = _ellipses(theta)
+    params, shape_ok = outer_ellipses(theta)
     ratio = theta[:, 5]
     good = (
         shape_ok
@@ -218,88 +228,13 @@ def _windows(frames: Tensor, frame: Tensor, outer: Tensor, margin: Tensor) -> _W
     u, v = corner[index, 0] + position % side[index], corner[index, 1] + position // side[index]
     xy = torch.stack([u, v], -1).double()
     theta = torch.cat([outer[:, :2], conics.shape_matrix(outer).flatten(1)[:, [0, 1, 3]]], -1)
-    near = _depth(theta, index, xy).depth > -margin[index]
+    near = depth(theta, index, xy).depth > -margin[index]
     seen = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     cut = segment_sum((near & ~seen).double(), index, frame.numel()) > 0
     keep = near & seen
     index, xy, u, v = index[keep], xy[keep], u[keep], v[keep]
     grey = frames.reshape(-1)[(frame[index] * height + v) * width + u].double()
     return _Window(index, xy, grey, ~cut)
-
-
-class _Depth(NamedTuple):
-    """Of pixels (P,) in an ellipse: first-order distance inside, unit normal, S^-1 (x - c), curvature."""
-
-    depth: Tensor
-    nx: Tensor
-    ny: Tensor
-    u: Tensor
-    v: Tensor
-    length: Tensor
-    curvature: Tensor
-
-
-def _depth(theta: Tensor, index: Tensor, xy: Tensor, inner: bool = False) -> _Depth:
-    cx, cy, s11, s12, s22 = theta[:, :5].unbind(-1)
-    if inner:
-        cx, cy = cx + theta[:, 7], cy + theta[:, 8]
-    det = s11 * s22 - s12 * s12
-    i11, i12, i22 = (s22 / det)[index], (-s12 / det)[index], (s11 / det)[index]
-    dx, dy = xy[:, 0] - cx[index], xy[:, 1] - cy[index]
-    u, v = i11 * dx + i12 * dy, i12 * dx + i22 * dy
-    rho = torch.hypot(u, v).clamp_min(1e-6)
-    gx, gy = (i11 * u + i12 * v) / rho, (i12 * u + i22 * v) / rho
-    length = torch.hypot(gx, gy).clamp_min(1e-9)
-    scale = theta[index, 5] if inner else 1.0
-    curvature = 1 / (length**3 * det[index].square() * scale).clamp_min(1e-9)
-    return _Depth((scale - rho) / length, gx / length, gy / length, u, v, length, curvature)
-
-
-Coverage = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
-
-
-def _exact(theta: Tensor, index: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
-    """E(1) - E(q) at every pixel (P,), sorted by ring, and its derivatives (P, 9)."""
-    count = theta.shape[0]
-    size = torch.bincount(index, minlength=count)
-    position = torch.arange(index.numel(), device=index.device) - (size.cumsum(0) - size)[index]
-    # about the centre, float32 is exact to a millionth of the contrast, and twice as fast
-    near = (xy - theta[index, :2]).float()
-    padded = near.new_zeros(count, int(size.max()), 2).index_put((index, position), near)
-    ellipses, (ratio, sigma) = _ellipses(theta)[0], theta[:, 5:7].float().unbind(-1)
-    shape, parted = theta[:, (2, 3, 3, 4)].float().unflatten(-1, (2, 2)), theta[:, 7:9].float()
-
-    def blurred(center: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
-        nodes = min(nodes_needed(ellipses[:, 2] * scale, sigma), _MOST_NODES)
-        return blurred_ellipse(padded, center, shape, scale, sigma, nodes)
-
-    outer, by_outer = blurred(torch.zeros_like(parted), torch.ones_like(ratio))
-    inner, by_inner = blurred(parted, ratio)
-    none = torch.zeros_like(by_outer[..., :1])
-    derivative = torch.cat([by_outer[..., :5], none, by_outer[..., 6:], none, none], -1)
-    derivative = derivative - torch.cat([by_inner, by_inner[..., :2]], -1)
-    return (outer - inner)[index, position].double(), derivative[index, position].double()
-
-
-def _first_order(theta: Tensor, index: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
-    """The same to first order in the distance."""
-    sigma = theta[index, 6]
-    value, columns = [], []
-    for inner in (False, True):
-        d = _depth(theta, index, xy, inner)
-        # blur draws the edge of a disc of curvature k inwards by sigma^2 k / 2
-        at = d.depth / sigma - 0.5 * sigma * d.curvature
-        value.append(torch.special.ndtr(at))
-        slope = torch.exp(-0.5 * at.square()) / math.sqrt(2 * math.pi)
-        by_d = slope / sigma
-        none = torch.zeros_like(by_d)
-        by_center = (by_d * d.nx, by_d * d.ny)
-        by_shape = (by_d * d.nx * d.u, by_d * (d.nx * d.v + d.ny * d.u), by_d * d.ny * d.v)
-        by_ratio = by_d / d.length if inner else none
-        by_sigma = -slope * (d.depth / sigma.square() + 0.5 * d.curvature)
-        own = by_center if inner else (none, none)
-        columns.append(torch.stack([*by_center, *by_shape, by_ratio, by_sigma, *own], -1))
-    return value[0] - value[1], columns[0] - columns[1]
 
 
 def _weights(deviation: Tensor, keep: bool) -> Tensor:
@@ -316,15 +251,6 @@ def _solve(basis: Tensor, grey: Tensor, index: Tensor, count: int, weight: Tenso
     gram = segment_sum((weighted[:, :, None] * basis[:, None]).flatten(1), index, count).unflatten(1, (c, c))
     right = segment_sum(weighted * grey[:, None], index, count)
     return torch.linalg.solve_ex(gram, right[..., None]).result.squeeze(-1).nan_to_num(nan=0.0)
-
-
-def _ellipses(theta: Tensor) -> tuple[Tensor, Tensor]:
-    """Ellipses (K, 5) of centre and shape parameters, and whether the shape is one."""
-    s11, s12, s22 = theta[:, 2], theta[:, 3], theta[:, 4]
-    mean, diff = 0.5 * (s11 + s22), torch.hypot(0.5 * (s11 - s22), s12)
-    angle = torch.remainder(0.5 * torch.atan2(2 * s12, s11 - s22), torch.pi)
-    params = torch.stack([theta[:, 0], theta[:, 1], mean + diff, mean - diff, angle], -1)
-    return params, params.isfinite().all(-1) & (mean > diff)
 
 
 def _to_axes(ellipses: Tensor) -> Tensor:

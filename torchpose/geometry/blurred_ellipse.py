@@ -16,7 +16,7 @@ import math
 import torch
 from torch import Tensor
 
-_STEP = 1.3  # standard deviations of the blur from node to node: an error below 1e-4
+_STEP = 1.0  # standard deviations of the blur from node to node: an error below 1e-8
 
 
 def nodes_needed(semi_major: Tensor, sigma: Tensor) -> int:

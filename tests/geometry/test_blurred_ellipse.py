@@ -1,0 +1,74 @@
+"""Blurred indicators against a supersampled and filtered picture, derivatives against central differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter
+from torch import Tensor
+
+from torchpose.geometry import conics
+from torchpose.geometry.blurred_ellipse import blurred_ellipse, nodes_needed
+
+
+@pytest.mark.parametrize("axes", [(2.1, 2.1), (6.0, 3.0), (9.6, 8.0)])
+@pytest.mark.parametrize("sigma", [0.7, 1.73, 3.6])
+def test_values(axes: tuple[float, float], sigma: float) -> None:
+    fine, size, scale = 16, 48, 0.8
+    params = torch.tensor([[0.3, -0.2, *axes, 0.6]], dtype=torch.float64)
+    grid = (np.arange(size * fine) + 0.5) / fine - size / 2
+    x, y = np.meshgrid(grid - 0.3, grid + 0.2)
+    p, q = np.cos(0.6) * x + np.sin(0.6) * y, np.cos(0.6) * y - np.sin(0.6) * x
+    rho = np.hypot(p / axes[0], q / axes[1])
+    slope = np.hypot(p / axes[0] ** 2, q / axes[1] ** 2) / rho
+    inside = np.clip((scale - rho) / slope * fine + 0.5, 0, 1)
+    picture = gaussian_filter(inside, sigma * fine, truncate=6)[::8, ::8]
+    xy = torch.from_numpy(np.stack(np.meshgrid(grid[::8], grid[::8]), -1).reshape(1, -1, 2))
+    blur = torch.full((1,), sigma, dtype=torch.float64)
+    value, _ = blurred_ellipse(
+        xy,
+        params[:, :2],
+        conics.shape_matrix(params),
+        torch.full_like(blur, scale),
+        blur,
+        nodes_needed(scale * params[:, 2], blur),
+    )
+    # what is left is the supersampling of the witness
+    assert np.abs(value.numpy().reshape(picture.shape) - picture).max() < 1e-3
+
+
+def test_derivatives() -> None:
+    g = torch.Generator().manual_seed(0)
+    center = torch.randn(3, 2, generator=g, dtype=torch.float64)
+    entries = torch.tensor([[5.0, 1, 3], [4, -0.5, 2.5], [7, 2, 6]], dtype=torch.float64)
+    scale, sigma = torch.tensor([0.4, 1, 0.7]).double(), torch.tensor([1.2, 2, 3]).double()
+    xy = 8 * torch.randn(3, 20, 2, generator=g, dtype=torch.float64)
+
+    def both(center: Tensor, entries: Tensor, scale: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
+        shape = entries[:, (0, 1, 1, 2)].unflatten(-1, (2, 2))
+        return blurred_ellipse(xy, center, shape, scale, sigma, 200)
+
+    parameters = (center, entries, scale, sigma)
+    step, columns = 1e-5, []
+    for k, value in enumerate(parameters):
+        for entry in range(value[0].numel()):
+            move = torch.zeros_like(value).flatten(1) if value.ndim > 1 else torch.zeros_like(value)[:, None]
+            move[:, entry] = step
+            ahead, behind = (
+                both(*(p + sign * move.view_as(p) if i == k else p for i, p in enumerate(parameters)))[0]
+                for sign in (1, -1)
+            )
+            columns.append((ahead - behind) / (2 * step))
+    torch.testing.assert_close(both(*parameters)[1], torch.stack(columns, -1), rtol=0, atol=1e-9)
+
+
+def test_as_many_nodes_as_needed() -> None:
+    """Twice as many change nothing."""
+    semi, sigma = torch.tensor([12.0]).double(), torch.tensor([0.9]).double()
+    xy = torch.linspace(0, 20, 101, dtype=torch.float64)[None, :, None] * torch.tensor([0.6, 0.8])
+    shape, one = torch.diag_embed(torch.stack([semi, 0.5 * semi], -1)), torch.ones(1, dtype=torch.float64)
+    nodes = nodes_needed(semi, sigma)
+    few = blurred_ellipse(xy, torch.zeros(1, 2).double(), shape, one, sigma, nodes)[0]
+    many = blurred_ellipse(xy, torch.zeros(1, 2).double(), shape, one, sigma, 2 * nodes)[0]
+    torch.testing.assert_close(few, many, rtol=0, atol=1e-7)
