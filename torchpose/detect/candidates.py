@@ -28,6 +28,8 @@ _MIN_CELLS = 0.35  # of a region on its ellipse, a pixel of perimeter; an edge i
 _PART_ROUNDS = 2  # of following the ellipse of a region that is only a part of it
 _FOLLOW = ((0.4, 1), (0.5, 2))  # least cover to be followed further, and rounds of it
 _ON_ELLIPSE = 1.5  # reduced px
+_TAPER = 2.0  # reduced px, where the weight of a cell in the second fit has fallen to 0
+_FLANK, _FLANK_COS = 4.0, 0.8  # reduced px, and of the gradient with the normal: a blurred edge of a whole ellipse
 _ARC_RMS = 1.2  # reduced px, of the cells of an arc, which is a few cells wide
 _OCTAVES = 2
 
@@ -48,7 +50,7 @@ def find_candidates(frames: Tensor, factor: int | None = None, *, explain: bool 
     known = None
     for octave in range(_OCTAVES):
         if octave:
-            reduced, scale = area_reduce(reduced, 2), 2 * scale
+            reduced, scale = area_reduce(reduced.float(), 2), 2 * scale
         grad = gradient(reduced)
         some = find_ellipses(grad, known, explain=True)
         if octave == 0 and factor > 1:
@@ -125,9 +127,10 @@ def fit_regions(grad: Gradient, regions: Regions, explain: bool = False) -> tupl
     count = regions.frame.numel()
     magnitude = torch.linalg.vector_norm(regions.gradient, dim=-1).double()
     params = ellipse.fit(xy, regions.region, count, magnitude)
-    # once more with the pixels near the ellipse only
-    r = ellipse.distance(xy, regions.region, params)
-    params = ellipse.fit(xy, regions.region, count, magnitude * (r.abs() < _ON_ELLIPSE))
+    # once more with what is near the ellipse; weights that fall to 0 smoothly leave it where it is when the threshold,
+    # and with it the rim of the region, changes a little
+    r = ellipse.distance(xy, regions.region, params).nan_to_num(nan=_TAPER)
+    params = ellipse.fit(xy, regions.region, count, magnitude * (1 - (r / _TAPER).square()).clamp_min(0).square())
     follows = ellipse.distance(xy, regions.region, params).abs() < _ON_ELLIPSE
     length = segment_sum(follows.double(), regions.region, count)
     polarity = region_polarity(regions, params[:, :2], xy).sign()
@@ -146,7 +149,13 @@ def fit_regions(grad: Gradient, regions: Regions, explain: bool = False) -> tupl
     found = found.replaced(part[sound], again)
     whole = torch.zeros(count, dtype=torch.bool, device=xy.device)
     whole[good[(found.verdict == Verdict.ACCEPTED) & (found.cover > WHOLE)]] = True
-    explained = follows & whole[regions.region]
+    explained = whole[regions.region]
+    cell = explained.nonzero()[:, 0]
+    index = regions.region[cell]
+    off, normal = conics.signed_distance(params[index], xy[cell])
+    rise = (normal * regions.gradient[cell]).sum(-1) * polarity[index]
+    flank = (off.abs() < _FLANK) & (rise > _FLANK_COS * magnitude[cell])
+    explained[cell] = follows[cell] | flank
     if not explain:
         return accepted(found), explained
     bad = ((verdict != Verdict.ACCEPTED) & params.isfinite().all(-1)).nonzero()[:, 0]

@@ -61,13 +61,8 @@ def _explained(samples: Samples, weak: Candidates, every: Candidates) -> tuple[T
     start = size.cumsum(0) - size
     pair, offset = ragged_arange(size[i])
     sample, other = start[i[pair]] + offset, j[pair]
-    # value and gradient of the other one's conic: the distance to first order, and the way out
-    a, b, c, d, e, f = conics.conic_from_ellipse(every.ellipse)[other].unbind(-1)
-    x, y = samples.xy[sample].unbind(-1)
-    px, py = 2 * a * x + b * y + d, b * x + 2 * c * y + e
-    steep = torch.hypot(px, py)
-    off = (0.5 * ((px + d) * x + (py + e) * y) + f).abs() / steep
-    gx, gy = samples.gradient[sample].unbind(-1)
-    along = (gx * px + gy * py) * every.polarity[other] > _COS * steep * torch.hypot(gx, gy)
-    on = (off < _NEAR) & along
+    off, normal = conics.signed_distance(every.ellipse[other], samples.xy[sample])
+    gradient = samples.gradient[sample]
+    rise = (gradient * normal).sum(-1) * every.polarity[other]
+    on = (off.abs() < _NEAR) & (rise > _COS * torch.linalg.vector_norm(gradient, dim=-1))
     return sample[on], other[on]
