@@ -101,7 +101,8 @@ def test_batch_equals_single_frames(sample):
             # not the angles, which a circle leaves open
             shapes = conics.shape_matrix(one.params), conics.shape_matrix(other.params)
             torch.testing.assert_close(*shapes, rtol=0, atol=1e-6)
-            torch.testing.assert_close(one.center_covariance, other.center_covariance, rtol=1e-6, atol=1e-12)
+            # the offsets are products in float32, whose last digit depends on the size of the batch
+            torch.testing.assert_close(one.center_covariance, other.center_covariance, rtol=1e-5, atol=1e-12)
 
 
 def scene(outer=30.0, ratio=0.5, background="light", width=400, height=300):
