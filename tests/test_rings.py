@@ -13,7 +13,8 @@ from exact import exact_ellipses
 from torchpose.camera import Camera
 from torchpose.detect import find_candidates
 from torchpose.geometry import conics, rotations
-from torchpose.rings import find_inner, ideal_pixels, measure_rings
+from torchpose.inner_circles import find_inner
+from torchpose.rings import ideal_pixels, measure_rings
 from torchpose.sim import add_noise, read_truth, render
 from torchpose.target import Target
 
@@ -96,8 +97,12 @@ def test_batch_equals_single_frames(sample):
         alone, mine = measured(frames[k : k + 1], camera), rings.frame == k
         for name in ("outer", "inner"):
             one, other = getattr(alone, name), getattr(rings, name)[mine]
-            torch.testing.assert_close(one.params, other.params, rtol=0, atol=1e-6)
-            torch.testing.assert_close(one.covariance, other.covariance, rtol=1e-6, atol=1e-12)
+            torch.testing.assert_close(one.params[:, :2], other.params[:, :2], rtol=0, atol=1e-6)
+            # not the angles, which a circle leaves open
+            shapes = conics.shape_matrix(one.params), conics.shape_matrix(other.params)
+            torch.testing.assert_close(*shapes, rtol=0, atol=1e-6)
+            # the offsets are products in float32, whose last digit depends on the size of the batch
+            torch.testing.assert_close(one.center_covariance, other.center_covariance, rtol=1e-5, atol=1e-12)
 
 
 def scene(outer=30.0, ratio=0.5, background="light", width=400, height=300):
@@ -155,9 +160,9 @@ def test_find_inner():
         frames = render(camera, target, *poses(OFFSETS))
         found = find_candidates(frames)
         found = found[(found.polarity == 1) & (found.ellipse[:, 2] > 35)]
-        measured_ratio, ok, _ = find_inner(frames, found)
-        assert ok.all()
-        torch.testing.assert_close(measured_ratio, torch.full_like(measured_ratio, ratio), rtol=0, atol=0.03)
+        inner = find_inner(frames, found)
+        assert inner.found.all()
+        torch.testing.assert_close(inner.ratio, torch.full_like(inner.ratio, ratio), rtol=0, atol=0.03)
 
 
 def test_full_disc_is_no_ring():

@@ -16,7 +16,7 @@ from torchpose.camera import Camera
 from torchpose.detect import Candidates, Verdict
 from torchpose.geometry import conics
 from torchpose.markers import Identified, MarkerTable, ratio_tolerance
-from torchpose.rings import Rings, mapped, measure_found
+from torchpose.rings import Rings, mapped, measure_predicted
 
 _LEAST_FOUND = 2  # markers whose rings give a pose
 _PLACE_TOLERANCE = (1.5, 0.15)  # px, and of the semi-major axis
@@ -48,28 +48,31 @@ def look_again(
     of = target[row]
     rotation = R[row, option]
     center = (rotation @ table.centers[of, marker][..., None]).squeeze(-1) + t[row, option]
-    ideal = conics.circle_ellipse(
-        camera.matrix, rotation, center, table.normals[of, marker], table.radii[of, marker, 0]
-    )
+    normal, radii = table.normals[of, marker], table.radii[of, marker]
+    ideal, inner = (conics.circle_ellipse(camera.matrix, rotation, center, normal, r) for r in radii.unbind(-1))
     k = camera.matrix
-    raw = mapped(ideal, lambda points: camera.distort((points - k[:2, 2]) / k.diagonal()[:2]))
+
+    def raw(ellipses: Tensor) -> Tensor:
+        return mapped(ellipses, lambda points: camera.distort((points - k[:2, 2]) / k.diagonal()[:2]))
+
+    outer = raw(ideal)
     limit = torch.tensor([camera.width - 1, camera.height - 1], device=R.device)
     # a circle that reaches behind the camera, or a plane seen edge-on, has no ellipse
-    inside = ((raw[:, :2] > 0) & (raw[:, :2] < limit)).all(-1) & (raw[:, 2] < limit.amin()) & (center[:, 2] > 0)
-    kept = inside.nonzero()[:, 0]
+    in_view = ((outer[:, :2] > 0) & (outer[:, :2] < limit)).all(-1) & (outer[:, 2] < limit.amin()) & (center[:, 2] > 0)
+    kept = in_view.nonzero()[:, 0]
     if kept.numel() == 0:
         return rings, identified
     frame = row[kept] // table.ids.shape[0]
-    unknown = torch.full_like(raw[kept, 0], torch.nan)
+    unknown = torch.full_like(outer[kept, 0], torch.nan)
     verdict = torch.full_like(frame, int(Verdict.ACCEPTED))
-    candidates = Candidates(frame, raw[kept], table.polarity[of[kept]], unknown, unknown, verdict)
-    expected = (table.radii[..., 1] / table.radii[..., 0])[of[kept], marker[kept]]
-    found, which = measure_found(frames, candidates, camera, expected, correct=correct)
+    candidates = Candidates(frame, outer[kept], table.polarity[of[kept]], unknown, unknown, verdict)
+    found, which = measure_predicted(frames, candidates, raw(inner[kept]), camera, correct=correct)
     where = kept[which]
-    outer = found.outer.params
-    miss = torch.linalg.vector_norm(outer[:, :2] - ideal[where, :2], dim=-1)
+    measured = found.outer.params
+    miss = torch.linalg.vector_norm(measured[:, :2] - ideal[where, :2], dim=-1)
+    off = (found.ratio - radii[where, 1] / radii[where, 0]).abs()
     px, of_size = _PLACE_TOLERANCE
-    good = (miss < px + of_size * outer[:, 2]) & ((found.ratio - expected[which]).abs() < ratio_tolerance(outer[:, 3]))
+    good = (miss < px + of_size * measured[:, 2]) & (off < ratio_tolerance(measured[:, 3]))
     # of several poses of a row, the one that was nearest
     slot = row[where] * table.ids.shape[1] + marker[where]
     nearest = torch.full((identified.ring.numel(),), torch.inf, dtype=miss.dtype, device=miss.device)

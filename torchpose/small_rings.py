@@ -61,7 +61,7 @@ def fit_small_rings(
     Args:
         frames: (B, H, W) grey, any real dtype. frame: (K,) int64. outer: (K, 5) rough outer ellipses, px.
         ratio: (K,) rough ratio of the radii. seen: (K, A) bool, the directions in which the outer edge shows, see
-            `rings.find_inner`; the others do not count. polarity: (K,) +1 for a dark ring. focal: () focal length, px.
+            `inner_circles.find_inner`; the others do not count. polarity: (K,) +1 for a dark ring. focal: () px.
     """
     shape = conics.shape_matrix(outer)
     start = [outer[:, :2], shape[:, 0, :1], shape[:, 0, 1:], shape[:, 1, 1:], ratio[:, None]]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import skimage.data
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from torchpose.camera import Camera
@@ -19,6 +19,7 @@ from torchpose.results import Status
 from torchpose.target import Target
 
 WIDTH, HEIGHT = 240, 200
+CHANGES = ("flip_u", "flip_v", "transpose")
 
 
 def picture(seed: int, width: int = WIDTH, height: int = HEIGHT, bar: bool = False) -> torch.Tensor:
@@ -51,23 +52,26 @@ def changed(frame: torch.Tensor, uv: torch.Tensor, change: str) -> tuple[torch.T
     return frame.mT.contiguous(), uv.flip(1)
 
 
-def assert_same(found: Candidates, uv: torch.Tensor, axes: torch.Tensor) -> None:
+def is_same(found: Candidates, uv: torch.Tensor, axes: torch.Tensor) -> bool:
     """One candidate for each expected centre, within 0.05 px, and its axes within 0.5 px."""
-    assert len(found) == len(uv)
+    if len(found) != len(uv):
+        return False
     apart = torch.linalg.vector_norm(found.ellipse[:, None, :2] - uv, dim=-1)
     apart = torch.maximum(apart, 0.1 * (found.ellipse[:, None, 2:4] - axes).abs().amax(-1))
-    assert apart.amin(0).max() < 0.05
-    assert apart.amin(1).max() < 0.05
+    return bool((apart.amin(0) < 0.05).all() and (apart.amin(1) < 0.05).all())
 
 
 @settings(deadline=None, max_examples=10)
-@given(st.integers(0, 2**31), st.sampled_from(["flip_u", "flip_v", "transpose"]))
+@given(st.integers(0, 2**31), st.sampled_from(CHANGES))
+@example(1035067, "transpose")  # a centre moved by 0.053 px: sectors of 60 degrees turned into others
+@example(510779, "transpose")  # an ellipse bridged two rings in one of the frames
+@example(28, "flip_u")  # an ellipse between both circles of a ring
 def test_flips_and_transposition(seed: int, change: str) -> None:
     frame = picture(seed)
     original = find_candidates(frame)
     moved, uv = changed(frame, original.ellipse[:, :2], change)
     assert len(original) == 6
-    assert_same(find_candidates(moved), uv, original.ellipse[:, 2:4])
+    assert is_same(find_candidates(moved), uv, original.ellipse[:, 2:4])
 
 
 @settings(deadline=None, max_examples=10)
@@ -78,7 +82,7 @@ def test_integer_shifts(seed: int, right: int, down: int) -> None:
     first, second = wide[:, 8 : 8 + HEIGHT, 8 : 8 + WIDTH], wide[:, down : down + HEIGHT, right : right + WIDTH]
     original = find_candidates(first.contiguous())
     uv = original.ellipse[:, :2] + torch.tensor([8.0 - right, 8.0 - down])
-    assert_same(find_candidates(second.contiguous()), uv, original.ellipse[:, 2:4])
+    assert is_same(find_candidates(second.contiguous()), uv, original.ellipse[:, 2:4])
 
 
 @settings(deadline=None, max_examples=10)
@@ -87,22 +91,43 @@ def test_gain_and_offset(seed: int, gain: float, offset: float) -> None:
     frame = picture(seed)
     original = find_candidates(frame)
     found = find_candidates(gain * frame + offset)
-    assert_same(found, original.ellipse[:, :2], original.ellipse[:, 2:4])
+    assert is_same(found, original.ellipse[:, :2], original.ellipse[:, 2:4])
     assert found.polarity.sort().values.tolist() == original.polarity.sort().values.tolist()
 
 
 @settings(deadline=None, max_examples=8)
-@given(st.integers(0, 2**31), st.sampled_from(["flip_u", "flip_v", "transpose"]))
+@given(st.integers(0, 2**31), st.sampled_from(CHANGES))
 def test_a_covered_ring_stays(seed: int, change: str) -> None:
-    """Its best ellipse; weak ones that bridge ring and bar may come and go."""
+    """And nothing that bridges ring and bar comes or goes."""
     frame = picture(seed, bar=True)
     original = find_candidates(frame)
     near = torch.linalg.vector_norm(original.ellipse[:, :2] - torch.tensor([70.0, 145.0]), dim=-1) < 12
-    best = original[near & (original.polarity == 1)][:1]  # by false alarms
-    moved, uv = changed(frame, best.ellipse[:, :2], change)
-    found = find_candidates(moved)
-    assert len(best) == 1
-    assert torch.linalg.vector_norm(found.ellipse[:, :2] - uv, dim=-1).min() < 0.5
+    assert (near & (original.polarity == 1)).any()
+    moved, uv = changed(frame, original.ellipse[:, :2], change)
+    assert is_same(find_candidates(moved), uv, original.ellipse[:, 2:4])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bar", [False, True])
+def test_invariance_by_brute_force(bar: bool) -> None:
+    """The same, over a thousand pictures, a batch at a time: what random draws of a few meet once in a while."""
+    failed = []
+    for first in range(0, 1000, 25):
+        frames = torch.cat([picture(seed, WIDTH + 16, HEIGHT + 16, bar) for seed in range(first, first + 25)])
+        middle = frames[:, 8 : 8 + HEIGHT, 8 : 8 + WIDTH].contiguous()
+        original = find_candidates(middle)
+        views = {change: find_candidates(changed(middle, original.ellipse[:, :2], change)[0]) for change in CHANGES}
+        right, down = (int(v) for v in np.random.default_rng(first).integers(0, 17, 2))
+        views["shift"] = find_candidates(frames[:, down : down + HEIGHT, right : right + WIDTH].contiguous())
+        for change, found in views.items():
+            for k in range(25):
+                mine, other = original[original.frame == k], found[found.frame == k]
+                uv = mine.ellipse[:, :2] + torch.tensor([8.0 - right, 8.0 - down])
+                if change != "shift":
+                    uv = changed(middle, mine.ellipse[:, :2], change)[1]
+                if not is_same(other, uv, mine.ellipse[:, 2:4]):
+                    failed.append((first + k, change))
+    assert not failed
 
 
 @settings(deadline=None, max_examples=5)

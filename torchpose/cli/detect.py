@@ -138,15 +138,15 @@ def _rows(sources: Sequence[Source], images: np.ndarray, explain: bool) -> list[
     import torch
 
     from torchpose.detect import Verdict, find_shapes
+    from torchpose.inner_circles import find_inner
     from torchpose.io.shape_rows import shape_rows
-    from torchpose.rings import find_inner
 
     frames = torch.from_numpy(images)
     shapes = find_shapes(frames, explain=explain)
     ratios = torch.full_like(shapes.ellipses.log10_nfa, torch.nan)
     valid = (shapes.ellipses.verdict == Verdict.ACCEPTED).nonzero()[:, 0]
-    ratio, found, _ = find_inner(frames, shapes.ellipses[valid])
-    ratios[valid[found]] = ratio[found]
+    inner = find_inner(frames, shapes.ellipses[valid])
+    ratios[valid[inner.found]] = inner.ratio[inner.found]
     return shape_rows(shapes, ratios, [source.name for source in sources])
 
 

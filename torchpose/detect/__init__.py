@@ -1,7 +1,8 @@
 """Stage: candidate ellipses in whole batches of frames, by parallel region growing and a-contrario validation."""
 
-from torchpose.detect.candidates import Candidates, Verdict, find_candidates
+from torchpose.detect.candidates import find_candidates
 from torchpose.detect.lines import Segments
 from torchpose.detect.shapes import Shapes, find_shapes
+from torchpose.detect.validation import Candidates, Verdict
 
 __all__ = ["Candidates", "Segments", "Shapes", "Verdict", "find_candidates", "find_shapes"]

@@ -180,13 +180,18 @@ def follow(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor, ro
     return ellipses
 
 
-def perimeter_samples(ellipses: Tensor, most: int | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def perimeter_samples(
+    ellipses: Tensor, most: int | None = None, multiple: int = 2
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """About one sample a pixel of perimeter, ``most`` at most: ellipse (S,), position (S, 2), outward normal (S, 2).
 
     And how far along the perimeter each lies, (S,) in [0, 1). Ellipses that are NaN have none.
+
+    Args:
+        multiple: even; the number of samples is a multiple of it, so that none lies on the border of that many sectors.
     """
     # an even number, half a step off the axes: the samples of a mirrored ellipse are the mirrored samples
-    n = 2 * (0.5 * conics.perimeter(ellipses).nan_to_num(nan=0.0)).ceil().long()
+    n = multiple * (conics.perimeter(ellipses).nan_to_num(nan=0.0) / multiple).ceil().long()
     n = n if most is None else n.clamp_max(most)
     which, position = ragged_arange(n)
     turn = (position.double() + 0.5) / n[which]

@@ -3,94 +3,35 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from enum import IntEnum
-from typing import Self
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from torchpose import ellipse
-from torchpose.detect.arcs import cells_at, chain_pairs, describe_arcs, fit_joint, follow, perimeter_samples
+from torchpose.detect.arcs import chain_pairs, describe_arcs, fit_joint, follow
+from torchpose.detect.exclusion import explain_once
 from torchpose.detect.finer import SIDE, cut_outs, promising_places
 from torchpose.detect.partial import free_of_stumps
 from torchpose.detect.reduce import area_reduce, reduction_factor
-from torchpose.detect.regions import (
-    Gradient,
-    Regions,
-    gradient,
-    level_line_regions,
-    region_polarity,
-    strong_cells,
-)
+from torchpose.detect.regions import Gradient, Regions, gradient, level_line_regions, region_polarity, strong_cells
+from torchpose.detect.validation import SAME, WHOLE, Candidates, Verdict, accepted, merge_duplicates, score
 from torchpose.geometry import conics
 from torchpose.geometry.segments import ragged_arange, segment_mean, segment_sum
 
 MIN_PIXELS = 10
-_SECTORS = 6  # arcs turn by up to 60 degrees
+_SECTORS = 8  # arcs turn by up to 45 degrees
+_PHASE = 0.5  # sectors centred on the axes and diagonals turn into each other when a frame is mirrored or transposed
 _MIN_SEMI_MINOR = 2.0  # reduced px
 _MIN_ASPECT = 0.12
 _MIN_CELLS = 0.35  # of a region on its ellipse, a pixel of perimeter; an edge is two to three cells wide
-_WHOLE = 0.9  # cover from which on a region needs no chaining, if it has no more cells elsewhere
-_LEAST_COVER = 0.58  # a circle in a square is covered by 0.5
 _PART_ROUNDS = 2  # of following the ellipse of a region that is only a part of it
 _FOLLOW = ((0.4, 1), (0.5, 2))  # least cover to be followed further, and rounds of it
 _ON_ELLIPSE = 1.5  # reduced px
+_TAPER = 2.0  # reduced px, where the weight of a cell in the second fit has fallen to 0
+_FLANK, _FLANK_COS = 4.0, 0.8  # reduced px, and of the gradient with the normal: a blurred edge of a whole ellipse
 _ARC_RMS = 1.2  # reduced px, of the cells of an arc, which is a few cells wide
-_COVER_ERROR = 0.125  # 22.5 degrees in units of pi: a sample with a smaller error belongs to the arc
-_SAME = 0.08  # of the semi-minor axis, plus a pixel: ellipses nearer than that are one
 _OCTAVES = 2
-
-
-class Verdict(IntEnum):
-    """What became of an ellipse that was looked at."""
-
-    ACCEPTED = 0
-    TOO_SMALL = 1  # semi-minor axis below 2 reduced px
-    TOO_FLAT = 2  # axes' ratio below 0.12
-    TOO_LARGE = 3  # wider than the frame
-    OFF_ELLIPSE = 4  # most of the region is not on its ellipse
-    FALSE_ALARM = 5  # noise would give as much
-    DUPLICATE = 6  # the same ellipse was found better
-    FRAGMENT = 7  # too little of its perimeter is there
-    POLYGON = 8  # straight sides explain it better
-
-
-@dataclass(frozen=True, eq=False)
-class Candidates:
-    """Ellipses found in B frames, flat, in full-frame pixels (pixel centre at integer coordinates).
-
-    Attributes:
-        frame: (M,) int64. ellipse: (M, 5) float64, cx, cy, a, b, theta.
-        polarity: (M,) float64, +1 where the inside is darker than the outside, -1 where lighter.
-        log10_nfa: (M,) float64, log10 of the number of false alarms, negative for each candidate.
-        cover: (M,) float64, fraction of the perimeter with the gradient of the ellipse.
-        verdict: (M,) int64, `Verdict`.
-    """
-
-    frame: Tensor
-    ellipse: Tensor
-    polarity: Tensor
-    log10_nfa: Tensor
-    cover: Tensor
-    verdict: Tensor
-
-    def __len__(self) -> int:
-        return self.frame.shape[0]
-
-    def __getitem__(self, index: Tensor) -> Candidates:
-        return Candidates(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
-
-    def replaced(self, index: Tensor, other: Candidates) -> Candidates:
-        """These candidates, with the rows ``index`` taken from ``other``."""
-        names = self.__dataclass_fields__
-        return Candidates(*(getattr(self, name).index_copy(0, index, getattr(other, name)) for name in names))
-
-    @classmethod
-    def cat(cls, parts: Sequence[Self]) -> Self:
-        """The candidates of all parts."""
-        return cls(*(torch.cat([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
 
 
 def find_candidates(frames: Tensor, factor: int | None = None, *, explain: bool = False) -> Candidates:
@@ -106,14 +47,17 @@ def find_candidates(frames: Tensor, factor: int | None = None, *, explain: bool 
     """
     factor = reduction_factor(*frames.shape[-2:]) if factor is None else factor
     found, reduced, scale = [], area_reduce(frames, factor), factor
+    known = None
     for octave in range(_OCTAVES):
         if octave:
-            reduced, scale = area_reduce(reduced, 2), 2 * scale
+            reduced, scale = area_reduce(reduced.float(), 2), 2 * scale
         grad = gradient(reduced)
-        some = find_ellipses(grad, explain=True)
+        some = find_ellipses(grad, known, explain=True)
         if octave == 0 and factor > 1:
             found.append(find_finer(frames, factor, grad.threshold, some))
         found.append(replace(some, ellipse=full_frame(some.ellipse, scale)))
+        known = accepted(some)
+        known = replace(known, ellipse=half_frame(known.ellipse))
     every = Candidates.cat(found)
     return merge_duplicates(every if explain else accepted(every), explain=explain)
 
@@ -126,7 +70,7 @@ def find_finer(frames: Tensor, factor: int, threshold: Tensor, coarse: Candidate
             there, in its pixels.
     """
     fine = factor // 2
-    whole = (coarse.verdict == Verdict.ACCEPTED) & (coarse.cover > _WHOLE)
+    whole = (coarse.verdict == Verdict.ACCEPTED) & (coarse.cover > WHOLE)
     place = promising_places(coarse.frame, coarse.ellipse, whole)
     height, width = frames.shape[-2:]
     if place.numel() == 0 or min(height, width) < SIDE * fine:
@@ -151,12 +95,21 @@ def full_frame(ellipses: Tensor, factor: int) -> Tensor:
     return torch.cat([center, factor * ellipses[:, 2:4], ellipses[:, 4:]], -1)
 
 
-def find_ellipses(grad: Gradient, explain: bool = False) -> Candidates:
-    """Validated ellipses of one scale, in its own pixels; with ``explain`` the rejected ones, too."""
+def half_frame(ellipses: Tensor) -> Tensor:
+    """Ellipses (M, 5) in the pixels of the frame reduced by 2."""
+    return torch.cat([0.5 * ellipses[:, :2] - 0.25, 0.5 * ellipses[:, 2:4], ellipses[:, 4:]], -1)
+
+
+def find_ellipses(grad: Gradient, known: Candidates | None = None, explain: bool = False) -> Candidates:
+    """Validated ellipses of one scale, in its own pixels; with ``explain`` the rejected ones, too.
+
+    Args:
+        known: accepted ellipses of a finer scale in the pixels of this one, which may explain edges better.
+    """
     regions = level_line_regions(grad, strong_cells(grad), MIN_PIXELS)
     whole, explained = fit_regions(grad, regions, explain)
     rest = regions.cell[~explained].sort().values
-    pieces = fit_arcs(grad, level_line_regions(grad, rest, MIN_PIXELS, _SECTORS))
+    pieces = fit_arcs(grad, level_line_regions(grad, rest, MIN_PIXELS, _SECTORS, _PHASE))
     found = merge_duplicates(Candidates.cat([whole, pieces]), explain=explain)
     valid = (found.verdict == Verdict.ACCEPTED).nonzero()[:, 0]
     some = found[valid]
@@ -164,7 +117,8 @@ def find_ellipses(grad: Gradient, explain: bool = False) -> Candidates:
     moved = ((freed != some.ellipse).any(-1) & (plausible(grad, freed) == Verdict.ACCEPTED)).nonzero()[:, 0]
     again = score(grad, some.frame[moved], freed[moved], some.polarity[moved])
     found = found.replaced(valid[moved], again)
-    return merge_duplicates(found if explain else accepted(found), explain=explain)
+    found = explain_once(grad, merge_duplicates(found if explain else accepted(found), explain=explain), known)
+    return found if explain else accepted(found)
 
 
 def fit_regions(grad: Gradient, regions: Regions, explain: bool = False) -> tuple[Candidates, Tensor]:
@@ -173,9 +127,10 @@ def fit_regions(grad: Gradient, regions: Regions, explain: bool = False) -> tupl
     count = regions.frame.numel()
     magnitude = torch.linalg.vector_norm(regions.gradient, dim=-1).double()
     params = ellipse.fit(xy, regions.region, count, magnitude)
-    # once more with the pixels near the ellipse only
-    r = ellipse.distance(xy, regions.region, params)
-    params = ellipse.fit(xy, regions.region, count, magnitude * (r.abs() < _ON_ELLIPSE))
+    # once more with what is near the ellipse; weights that fall to 0 smoothly leave it where it is when the threshold,
+    # and with it the rim of the region, changes a little
+    r = ellipse.distance(xy, regions.region, params).nan_to_num(nan=_TAPER)
+    params = ellipse.fit(xy, regions.region, count, magnitude * (1 - (r / _TAPER).square()).clamp_min(0).square())
     follows = ellipse.distance(xy, regions.region, params).abs() < _ON_ELLIPSE
     length = segment_sum(follows.double(), regions.region, count)
     polarity = region_polarity(regions, params[:, :2], xy).sign()
@@ -185,16 +140,22 @@ def fit_regions(grad: Gradient, regions: Regions, explain: bool = False) -> tupl
     good = (verdict == Verdict.ACCEPTED).nonzero()[:, 0]
     found = score(grad, regions.frame[good], params[good], polarity[good])
     # a region that is not a whole ellipse runs along something else as well: only what lies along the ellipse counts
-    beyond = length < _WHOLE * torch.bincount(regions.region, minlength=count)
-    part = ((found.cover <= _WHOLE) | beyond[good]).nonzero()[:, 0]
+    beyond = length < WHOLE * torch.bincount(regions.region, minlength=count)
+    part = ((found.cover <= WHOLE) | beyond[good]).nonzero()[:, 0]
     some = found[part]
     refit = follow(grad, some.frame, some.ellipse, some.polarity, _PART_ROUNDS)
     sound = (plausible(grad, refit) == Verdict.ACCEPTED).nonzero()[:, 0]
     again = score(grad, some.frame[sound], refit[sound], some.polarity[sound])
     found = found.replaced(part[sound], again)
     whole = torch.zeros(count, dtype=torch.bool, device=xy.device)
-    whole[good[(found.verdict == Verdict.ACCEPTED) & (found.cover > _WHOLE)]] = True
-    explained = follows & whole[regions.region]
+    whole[good[(found.verdict == Verdict.ACCEPTED) & (found.cover > WHOLE)]] = True
+    explained = whole[regions.region]
+    cell = explained.nonzero()[:, 0]
+    index = regions.region[cell]
+    off, normal = conics.signed_distance(params[index], xy[cell])
+    rise = (normal * regions.gradient[cell]).sum(-1) * polarity[index]
+    flank = (off.abs() < _FLANK) & (rise > _FLANK_COS * magnitude[cell])
+    explained[cell] = follows[cell] | flank
     if not explain:
         return accepted(found), explained
     bad = ((verdict != Verdict.ACCEPTED) & params.isfinite().all(-1)).nonzero()[:, 0]
@@ -224,7 +185,7 @@ def fit_arcs(grad: Gradient, arcs: Regions) -> Candidates:
     frame, polarity = about.frame[pair[good, 0]], about.curvature[pair[good, 0]].sign()
     found = score(grad, frame, params[good], polarity)
     for least_cover, rounds in _FOLLOW:
-        found = merge_duplicates(found[found.cover > least_cover], 2 * _SAME)
+        found = merge_duplicates(found[found.cover > least_cover], 2 * SAME)
         params = follow(grad, found.frame, found.ellipse, found.polarity, rounds)
         good = plausible(grad, params) == Verdict.ACCEPTED
         found = score(grad, found.frame[good], params[good], found.polarity[good])
@@ -239,68 +200,8 @@ def plausible(grad: Gradient, ellipses: Tensor) -> Tensor:
     return torch.where(b < _MIN_SEMI_MINOR, int(Verdict.TOO_SMALL), verdict)
 
 
-def accepted(found: Candidates) -> Candidates:
-    """Those that were accepted."""
-    return found[found.verdict == Verdict.ACCEPTED]
-
-
 def cell_centers(grad: Gradient, cell: Tensor) -> Tensor:
     """Positions (P, 2) float64 of flat cells in reduced px."""
     _, height, width = grad.shape
     inside = cell % (height * width)
     return torch.stack([inside % width, inside // width], -1).double() + 0.5
-
-
-def score(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> Candidates:
-    """Ellipses with their numbers of false alarms, of which noise gives less than one a frame below 1.
-
-    One sample a pixel of perimeter: under the null hypothesis its angle error, divided by pi, is uniform in [0, 1], and
-    the sum k of n of them is below its value with probability at most k^n / n!. The number of tests is the number of
-    distinguishable ellipses, (h w)^(5/2): five parameters, each with as many values as the frame has pixels on a side.
-    """
-    _, height, width = grad.shape
-    which, xy, normal, _ = perimeter_samples(ellipses)
-    cell, on_frame = cells_at(grad, frame[which], xy)
-    g = grad.at(cell).double()
-    cos = (g * normal).sum(-1) * polarity[which] / torch.linalg.vector_norm(g, dim=-1).clamp_min(1e-6)
-    error = torch.where(on_frame, cos.clamp(-1, 1).acos() / torch.pi, 0.5)  # 0.5: neither for nor against
-    count = ellipses.shape[0]
-    size, k, on_arc = segment_sum(
-        torch.stack([torch.ones_like(error), error, (error < _COVER_ERROR).double()], -1), which, count
-    ).unbind(-1)
-    log_tests = 2.5 * math.log10(max(1, height * width))
-    log10_nfa = log_tests + size * k.clamp_min(1e-12).log10() - torch.lgamma(size + 1) / math.log(10)
-    verdict = torch.where(log10_nfa < 0, int(Verdict.ACCEPTED), int(Verdict.FALSE_ALARM))
-    verdict = torch.where((log10_nfa < 0) & (on_arc < _LEAST_COVER * size), int(Verdict.FRAGMENT), verdict)
-    return Candidates(frame, ellipses, polarity, log10_nfa, on_arc / size, verdict)
-
-
-def merge_duplicates(found: Candidates, tolerance: float = _SAME, *, explain: bool = False) -> Candidates:
-    """Of candidates that are the same ellipse the one with the fewest false alarms, sorted by frame and false alarms.
-
-    Two are the same if neither centre nor shape differ by more than a pixel plus ``tolerance`` of the semi-minor axis.
-
-    Args:
-        explain: mark the others as `Verdict.DUPLICATE` instead of leaving them out; what was rejected before stays as
-            it is and never counts as better.
-    """
-    order = torch.argsort(found.log10_nfa, stable=True)  # NaN, of those rejected without a score, comes last
-    found = found[order[torch.argsort(found.frame[order], stable=True)]]
-    frames = int(found.frame[-1]) + 1 if len(found) else 0
-    per_frame = torch.bincount(found.frame, minlength=frames)
-    start = (per_frame.cumsum(0) - per_frame)[found.frame]
-    position = torch.arange(len(found), device=start.device) - start
-    # each against those before it in its frame, which have fewer false alarms
-    later, rank = ragged_arange(position)
-    better = start[later] + rank
-    p, q = found.ellipse[later], found.ellipse[better]
-    shape = (conics.shape_matrix(p) - conics.shape_matrix(q)).flatten(1).abs().amax(-1)
-    apart = torch.maximum(torch.linalg.vector_norm(p[:, :2] - q[:, :2], dim=-1), shape)
-    same = (found.polarity[later] == found.polarity[better]) & (apart < 1.0 + tolerance * q[:, 3])
-    if explain:
-        same &= (found.verdict[later] == Verdict.ACCEPTED) & (found.verdict[better] == Verdict.ACCEPTED)
-    again = torch.zeros(len(found), dtype=torch.bool, device=start.device)
-    again[later[same]] = True
-    if not explain:
-        return found[~again]
-    return replace(found, verdict=torch.where(again, int(Verdict.DUPLICATE), found.verdict))

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchpose.detect.reduce import area_reduce
-from torchpose.geometry.segments import ragged_arange, rank_in_group
+from torchpose.geometry.segments import pairs_in_group, rank_in_group
 
 SIDE = 64  # px of a cut-out
 _LARGEST = 10.0  # reduced px of semi-major axis: whatever is larger needs no finer look
@@ -33,25 +33,17 @@ def promising_places(frame: Tensor, ellipses: Tensor, whole: Tensor) -> Tensor:
     frames = int(frame.max()) + 1 if frame.numel() else 0
     known = whole.nonzero()[:, 0]
     known = known[torch.argsort(frame[known], stable=True)]
-    i, j = _pairs(frame[place], frame[known], frames)
+    i, j = pairs_in_group(frame[place], frame[known])
     apart = torch.linalg.vector_norm(ellipses[place[i], :2] - ellipses[known[j], :2], dim=-1)
     inside = torch.zeros_like(place, dtype=torch.bool)
     inside[i[apart < 0.5 * b[known[j]]]] = True
     place = place[~inside]
-    i, j = _pairs(frame[place], frame[place], frames)
+    i, j = pairs_in_group(frame[place], frame[place])
     apart = torch.linalg.vector_norm(ellipses[place[i], :2] - ellipses[place[j], :2], dim=-1)
     again = torch.zeros_like(place, dtype=torch.bool)
     again[i[(apart < _SAME_PLACE) & (j < i)]] = True
     place = place[~again]
     return place[rank_in_group(frame[place], frames) < _MOST_PLACES]
-
-
-def _pairs(first: Tensor, second: Tensor, frames: int) -> tuple[Tensor, Tensor]:
-    """All pairs (i, j) of the same frame; ``second`` is sorted."""
-    per_frame = torch.bincount(second, minlength=frames)
-    start = per_frame.cumsum(0) - per_frame
-    i, offset = ragged_arange(per_frame[first])
-    return i, start[first[i]] + offset
 
 
 def cut_outs(frames: Tensor, frame: Tensor, center: Tensor, factor: int) -> tuple[Tensor, Tensor]:

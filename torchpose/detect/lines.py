@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchpose.detect.arcs import cells_at
 from torchpose.detect.regions import Gradient, Regions, connected_components, level_line_regions
-from torchpose.geometry.segments import ragged_arange, segment_mean, segment_sum
+from torchpose.geometry.segments import pairs_in_group, ragged_arange, segment_mean, segment_sum
 
 _SECTORS = 8  # directions of one edge stay within 45 degrees
 _MIN_CELLS = 10
@@ -115,17 +115,9 @@ def _straight(grad: Gradient, regions: Regions) -> tuple[Tensor, Tensor, Tensor,
     return frame, ends, n, k
 
 
-def _pairs(frame: Tensor) -> tuple[Tensor, Tensor]:
-    """All ordered pairs (i, j) within a frame; ``frame`` (N,) is sorted."""
-    per_frame = torch.bincount(frame, minlength=1)
-    start = per_frame.cumsum(0) - per_frame
-    i, offset = ragged_arange(per_frame[frame])
-    return i, start[frame[i]] + offset
-
-
 def _repeated(frame: Tensor, ends: Tensor) -> Tensor:
     """Segments (N,) bool that lie along an earlier one of their frame, which has fewer false alarms."""
-    i, j = _pairs(frame)
+    i, j = pairs_in_group(frame, frame)
     earlier = j < i
     i, j = i[earlier], j[earlier]
     axis = ends[j, 1] - ends[j, 0]
@@ -148,7 +140,7 @@ def _repeated(frame: Tensor, ends: Tensor) -> Tensor:
 def _chains(frame: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
     """Polygon (N,) int64 of each segment, -1 for none, and its place along it, by mutually nearest ends."""
     count = frame.numel()
-    i, j = _pairs(frame)
+    i, j = pairs_in_group(frame, frame)
     gap = torch.linalg.vector_norm(ends[j, 0] - ends[i, 1], dim=-1)
     meets = ((gap < _JOIN) & (i != j)).nonzero()[:, 0]
     i, j, gap = i[meets], j[meets], gap[meets]

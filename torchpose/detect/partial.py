@@ -21,7 +21,7 @@ _SECTORS = 16
 _RUN = 9  # sectors of a run: what leaves 65 % of a perimeter in view leaves a run in view, wherever it begins
 _REACH = 3  # cells to either side in which the ridge of an edge is looked for
 _COS = 0.9  # of a gradient with the normal of the ellipse: 26 degrees
-_MOST_SAMPLES = 96  # of an ellipse
+_MOST_SAMPLES = 96  # of an ellipse, a multiple of the sectors
 _WELL = 0.9  # support from which on an ellipse is left as it is
 _ROUNDS = 2
 _SETTLE = 4  # fits to what agrees
@@ -78,7 +78,7 @@ def free_of_stumps(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Te
 def find_ridge(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> Ridge:
     """The strongest edge of the right direction beside each sample; arguments as in `free_of_stumps`."""
     count = ellipses.shape[0]
-    of, xy, normal, turn = perimeter_samples(ellipses, _MOST_SAMPLES)
+    of, xy, normal, turn = perimeter_samples(ellipses, _MOST_SAMPLES, _SECTORS)
     band = torch.arange(-_REACH, _REACH + 1, dtype=torch.float64, device=xy.device)
     at = xy[:, None] + band[:, None] * normal[:, None]
     cell, inside = cells_at(grad, frame[of].repeat_interleave(band.numel()), at.flatten(0, 1))

@@ -30,7 +30,7 @@ class Gradient:
     """2 x 2 gradient of (B, h, w) frames, formed where it is asked for; cell (x, y) is centred at (x + 0.5, y + 0.5).
 
     Attributes:
-        frames: (B, h, w) float32, contiguous.
+        frames: (B, h, w) uint8 or float32, contiguous.
         threshold: (B,) float32, magnitude that pure white noise exceeds in one cell of a thousand at most.
     """
 
@@ -50,8 +50,8 @@ class Gradient:
         inside = (x < width - 1) & (y < height - 1)
         first = torch.where(inside, cells, 0)
         right, below = torch.where(inside, cells + 1, 0), torch.where(inside, cells + width, 0)
-        diag = flat[torch.where(inside, cells + width + 1, 0)] - flat[first]
-        anti = flat[right] - flat[below]
+        diag = flat[torch.where(inside, cells + width + 1, 0)].float() - flat[first].float()
+        anti = flat[right].float() - flat[below].float()
         g = torch.stack([0.5 * (diag + anti), 0.5 * (diag - anti)], -1)
         return torch.where(g.isfinite().all(-1, keepdim=True), g, 0.0)
 
@@ -72,7 +72,7 @@ class Regions:
 
 
 def gradient(frames: Tensor) -> Gradient:
-    """Gradient and noise threshold of frames (B, h, w) float32 in grey levels (0..255 or more).
+    """Gradient and noise threshold of frames (B, h, w), uint8 or float32 in grey levels (0..255 or more).
 
     The noise is estimated from the median squared gradient of a sample of the cells, which edges hardly touch; pixels
     that are NaN or infinite do not count.
@@ -123,11 +123,15 @@ def _steep(frames: Tensor, threshold: Tensor) -> Tensor:
     batch, height, width = frames.shape
     if frames.device.type == "cpu":
         tall = frames.view(batch * height, width).numpy()
+        limit = threshold.numpy()
+        if tall.dtype == np.uint8:  # whole levels: above the threshold is above its whole part, and bytes are quick
+            limit = limit.clip(0, 255).astype(np.uint8)
         differ = np.zeros_like(tall)
         cv2.absdiff(tall[1:, 1:], tall[:-1, :-1], differ[:-1, :-1])
         cv2.max(differ[:-1, :-1], cv2.absdiff(tall[:-1, 1:], tall[1:, :-1]), differ[:-1, :-1])
-        above = differ.reshape(batch, height, width) > threshold.numpy()[:, None, None]
+        above = differ.reshape(batch, height, width) > limit[:, None, None]
         return torch.from_numpy(np.flatnonzero(above))
+    frames = frames.float()
     steep = torch.zeros_like(frames)
     diagonals = (frames[:, 1:, 1:] - frames[:, :-1, :-1]).abs(), (frames[:, :-1, 1:] - frames[:, 1:, :-1]).abs()
     steep[:, :-1, :-1] = torch.maximum(*diagonals)
@@ -143,31 +147,16 @@ def level_line_regions(grad: Gradient, cell: Tensor, min_pixels: int, sectors: i
             n sectors neighbours join if their directions fall into the same n-th of the circle: curves break into arcs
             of known turn, and corners part from what they join. phase: fraction of a sector that the first starts at.
     """
-    batch, height, width = grad.shape
-    count = cell.numel()
+    _, height, width = grad.shape
     g = grad.at(cell)
     unit = g / torch.linalg.vector_norm(g, dim=-1, keepdim=True)
-
-    # a sparse set (Briggs and Torczon 1993): what the table holds elsewhere is never read as a member, so no fill
-    position = torch.empty(batch * height * width + width + 2, dtype=torch.int32, device=cell.device)
-    position[cell] = torch.arange(count, dtype=torch.int32, device=cell.device)
-    # half of the 8-neighbourhood; the last row and column hold no strong cell, so a wrapped index meets none
-    step = torch.tensor([1, width - 1, width, width + 1], device=cell.device)
-    place = cell[:, None] + step
-    neighbour = position[place].long()
-    del position
-    known = (neighbour >= 0) & (neighbour < count)
-    if count:
-        known &= cell[neighbour.clamp(0, count - 1)] == place
-    neighbour = torch.where(known, neighbour, -1)
-    met = neighbour.clamp_min(0)
+    a, b = _neighbours(cell, width)
     if sectors:
         sector = ((torch.atan2(g[:, 1], g[:, 0]) / (2 * math.pi) + 1) * sectors + phase).long() % sectors
-        agree = sector[:, None] == sector[met]
+        agree = sector[a] == sector[b]
     else:
-        agree = (unit[:, None] * unit[met]).sum(-1) > _JOIN_COS
-    a, k = ((neighbour >= 0) & agree).nonzero().unbind(-1)
-    label = connected_components(a, neighbour[a, k], cell.numel())
+        agree = (unit[a] * unit[b]).sum(-1) > _JOIN_COS
+    label = connected_components(a[agree], b[agree], cell.numel())
 
     size = torch.bincount(label, minlength=cell.numel())
     large = size >= min_pixels
@@ -176,6 +165,25 @@ def level_line_regions(grad: Gradient, cell: Tensor, min_pixels: int, sectors: i
     region = number[label[keep]]
     frame = large.nonzero()[:, 0]
     return Regions(cell[keep], region, g[keep], cell[frame] // (height * width))
+
+
+def _neighbours(cell: Tensor, width: int) -> tuple[Tensor, Tensor]:
+    """Pairs of positions in ``cell`` (P,), rising, that are neighbours, by 8-connectivity; each once.
+
+    The three neighbours below a cell follow each other in the list, wherever they begin: no table of all cells is
+    needed. The last row and column hold no cell, so that an index that wraps around meets none.
+    """
+    padded = torch.nn.functional.pad(cell, (0, 3), value=torch.iinfo(cell.dtype).max)
+    below = torch.searchsorted(cell, cell + (width - 1))
+    at = torch.arange(cell.numel(), device=cell.device)
+    pairs = [(at, at + 1, 1, 1), *((at, below + k, width - 1, width + 1) for k in range(3))]
+    found = []
+    for first, second, least, most in pairs:
+        step = padded[second] - cell
+        index = ((step >= least) & (step <= most)).nonzero()[:, 0]
+        found.append(torch.stack([first[index], second[index]]))
+    a, b = torch.cat(found, 1)
+    return a, b
 
 
 def connected_components(a: Tensor, b: Tensor, count: int) -> Tensor:

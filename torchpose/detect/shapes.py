@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 
 from torchpose import ellipse
-from torchpose.detect.candidates import Candidates, Verdict, find_candidates
+from torchpose.detect.candidates import find_candidates
 from torchpose.detect.lines import Segments, find_segments
 from torchpose.detect.reduce import area_reduce, reduction_factor
 from torchpose.detect.regions import gradient, strong_cells
+from torchpose.detect.validation import Candidates, Verdict
 from torchpose.geometry import conics
 from torchpose.geometry.segments import ragged_arange, segment_sum
 

@@ -75,6 +75,19 @@ def points_on(ellipse: Tensor, angle: Tensor) -> Tensor:
     return torch.stack([cx + cos * x - sin * y, cy + sin * x + cos * y], -1)
 
 
+def signed_distance(ellipse: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+    """First-order (Sampson's) distances (...) of points (..., 2) outside ellipses (..., 5), and unit normals (..., 2).
+
+    The normals point outwards, across the conic of the same centre and proportions through each point.
+    """
+    a, b, c, d, e, f = conic_from_ellipse(ellipse).unbind(-1)
+    x, y = points.unbind(-1)
+    px, py = 2 * a * x + b * y + d, b * x + 2 * c * y + e
+    steep = torch.hypot(px, py)
+    value = 0.5 * ((px + d) * x + (py + e) * y) + f
+    return value / steep, torch.stack([px, py], -1) / steep[..., None]
+
+
 def perimeter(ellipse: Tensor) -> Tensor:
     """Perimeters (...) of ellipses (..., 5) (Ramanujan's second formula; relative error below 4e-4 at b/a = 0.1)."""
     a, b = ellipse[..., 2], ellipse[..., 3]

@@ -36,3 +36,11 @@ def rank_in_group(group: Tensor, count: int) -> Tensor:
     rank = torch.empty_like(group)
     rank[order] = torch.arange(group.numel(), device=group.device) - starts[group[order]]
     return rank
+
+
+def pairs_in_group(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+    """All pairs (i, j) int64 of the same group: first[i] == second[j]; ``second`` is sorted."""
+    sizes = torch.bincount(second, minlength=int(first.max()) + 1 if first.numel() else 0)
+    starts = sizes.cumsum(0) - sizes
+    i, offset = ragged_arange(sizes[first])
+    return i, starts[first[i]] + offset

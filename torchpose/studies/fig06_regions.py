@@ -18,12 +18,13 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.detect import find_shapes
 from torchpose.geometry import conics, rotations
+from torchpose.inner_circles import find_inner
 from torchpose.io.shape_rows import shape_rows
 from torchpose.pipeline import PoseEstimator
 from torchpose.report.detection_overlay import draw_shapes
 from torchpose.report.figures import subplots
 from torchpose.results import Status
-from torchpose.rings import find_inner, measure_rings
+from torchpose.rings import measure_rings
 from torchpose.sim import add_noise, render, shapes
 from torchpose.sim.sensor import Lighting
 from torchpose.studies import table02_detection
@@ -55,7 +56,7 @@ def run(*, full: bool = False, seed: int = 0, progress: Progress = ignore_progre
         ("c, d", "phone", phone, phone_circles),
     ):
         found = find_shapes(frames)
-        ratio, inner, _ = find_inner(frames, found.ellipses)
+        inner = find_inner(frames, found.ellipses)
         hit = _same(found.ellipses.ellipse, truth)
         ring = measure_rings(frames, found.ellipses, _camera(*frames.shape[1:]))
         rows.append(
@@ -69,7 +70,9 @@ def run(*, full: bool = False, seed: int = 0, progress: Progress = ignore_progre
                 "polygons": len(found.segments.chain[found.segments.chain >= 0].unique()),
             }
         )
-        overlay = draw_shapes(frames[0].numpy(), shape_rows(found, torch.where(inner, ratio, torch.nan), [name]))
+        overlay = draw_shapes(
+            frames[0].numpy(), shape_rows(found, torch.where(inner.found, inner.ratio, torch.nan), [name])
+        )
         title = f"Fig. 6 ({letters}): the {name} and what was found in it"
         pictures.append(Picture(f"fig06_{name}", title, _side_by_side(frames[0], overlay)))
         progress(len(rows) / 2)

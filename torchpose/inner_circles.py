@@ -1,0 +1,108 @@
+"""The circle inside each candidate, from the mean radial profile of grey: ratio of the radii, and where it shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchpose.camera import Camera
+from torchpose.detect import Candidates
+from torchpose.geometry import conics
+
+ANGLES = 64
+_RADII = 72
+_INNERMOST, _OUTERMOST = 0.08, 1.12  # of the outer ellipse, the range of the radial profile
+_RATIO_RANGE = (0.12, 0.93)  # of inner to outer radius
+_LEAST_PEAK = 0.25  # of the outer edge's slope in the mean radial profile
+_LEAST_EDGE = 0.5  # of the median rise at the outer edge over all directions, for a direction that counts
+_PARTED = 0.02  # of the semi-minor axis: from which shift of the centres on perspective smears the profile
+
+
+@dataclass(frozen=True, eq=False)
+class InnerCircles:
+    """What is inside each of M candidates.
+
+    Attributes:
+        ratio: (M,) float64, of the radii. found: (M,) bool. ellipse: (M, 5), the inner circle, about.
+        seen: (M, 64) bool, the directions, evenly spaced in eccentric anomaly from +u on the circle that the candidate
+            is the image of, in which its own edge shows.
+    """
+
+    ratio: Tensor
+    found: Tensor
+    ellipse: Tensor
+    seen: Tensor
+
+
+def find_inner(frames: Tensor, candidates: Candidates, camera: Camera | None = None) -> InnerCircles:
+    """The circle inside each candidate, from the mean radial profile of grey.
+
+    The profile is taken along radii scaled by the candidate's own ellipse, so it averages over the whole ring: an inner
+    circle of two pixels that no region growing would hold together still stands out. Perspective parts the centres of
+    concentric circles: the one scaled by q is shifted by (1 - q^2) d, where d is where the centre of the outer circle
+    is seen, relative to the centre of its ellipse. Both planes that the ellipse may lie in are tried, and the profile
+    with the steeper edge counts.
+
+    Args:
+        camera: for d; without one the centres are taken to coincide.
+    """
+    height, width = frames.shape[-2:]
+    device = frames.device
+    rho = torch.linspace(_INNERMOST, _OUTERMOST, _RADII, dtype=torch.float64, device=device)
+    angle = torch.arange(ANGLES, dtype=torch.float64, device=device) * (2 * torch.pi / ANGLES)
+    circle = torch.stack([angle.cos(), angle.sin()])
+    own, apart = _planes(candidates, camera)
+    outer = candidates.ellipse[own]
+    shape = conics.shape_matrix(outer)
+    shift = (1 - rho.square()).clamp_min(0) * apart[..., None]  # (P, 2, R)
+    uv = (shape @ circle)[:, :, None, :] * rho[:, None] + (outer[:, :2, None] + shift)[..., None]
+    u, v = uv.round().long().unbind(1)
+    cell = (candidates.frame[own, None, None] * height + v.clamp(0, height - 1)) * width + u.clamp(0, width - 1)
+    grey = frames.reshape(-1)[cell].float()
+    at, polarity = rho[1:-1], candidates.polarity[own]
+    # what covers the outer circle on one side hides the inner one there too: only directions that show the outer count
+    edge = ((grey[:, 2:] - grey[:, :-2]) * polarity[:, None, None].float())[:, at > _RATIO_RANGE[1]].amax(1)
+    seen = edge > _LEAST_EDGE * edge.nanmedian(-1, keepdim=True).values
+    profile = torch.where(seen[:, None], grey, torch.nan).nanmean(-1).double()
+    rise = (profile[:, 2:] - profile[:, :-2]) * polarity[:, None]
+    outermost = rise.masked_fill(at < _RATIO_RANGE[1], -torch.inf).amax(-1)
+    fall = (-rise).masked_fill((at < _RATIO_RANGE[0]) | (at > _RATIO_RANGE[1]), -torch.inf)
+    peak, best = fall.nan_to_num(nan=-torch.inf).max(-1)
+    # of both planes the one with the steeper edge
+    count = len(candidates)
+    steepest = torch.full((count,), -torch.inf, dtype=peak.dtype, device=device).scatter_reduce_(0, own, peak, "amax")
+    number = torch.arange(own.numel(), device=device)
+    first = torch.full_like(candidates.frame, own.numel())
+    first.scatter_reduce_(0, own, torch.where(peak == steepest[own], number, own.numel()), "amin")
+    ratio = at[best[first]]
+    center = candidates.ellipse[:, :2] + (1 - ratio.square())[:, None] * apart[first]
+    inner = torch.cat([center, candidates.ellipse[:, 2:4] * ratio[:, None], candidates.ellipse[:, 4:]], -1)
+    found = (outermost[first] > 0) & (steepest > _LEAST_PEAK * outermost[first])
+    return InnerCircles(ratio, found, inner, seen[first])
+
+
+def _planes(candidates: Candidates, camera: Camera | None) -> tuple[Tensor, Tensor]:
+    """The planes to try, one or two for each candidate: candidate (P,) int64 and shift d (P, 2) px."""
+    index = torch.arange(len(candidates), device=candidates.frame.device)
+    none = torch.zeros_like(candidates.ellipse[:, :2])
+    if camera is None:
+        return index, none
+    k = camera.matrix.to(candidates.ellipse)
+    conic = k.T @ conics.to_matrix(conics.conic_from_ellipse(candidates.ellipse)) @ k
+    where = conics.circle_poses(conic, torch.ones_like(candidates.log10_nfa))[0] @ k.T
+    apart = where[..., :2] / where[..., 2:] - candidates.ellipse[:, None, :2]
+    far = torch.linalg.vector_norm(apart, dim=-1).amax(-1) > _PARTED * candidates.ellipse[:, 3]
+    far &= apart.isfinite().flatten(1).all(-1)
+    own = torch.cat([index[~far], index[far].repeat_interleave(2)])
+    return own, torch.cat([none[~far], apart[far].flatten(0, 1)])
+
+
+def clear_directions(seen: Tensor) -> Tensor:
+    """Directions (M, A) bool whose neighbours mostly show the outer edge, too, and neither next one hides it.
+
+    Single ones that noise hides stay clear; next to a cover, its own edge may pass for the circle's.
+    """
+    around = torch.stack([seen.roll(k, 1) for k in range(-2, 3)]).sum(0) > 2
+    return around & around.roll(1, 1) & around.roll(-1, 1)
