@@ -29,6 +29,7 @@ _ITERATIONS = 14
 _HOLD = 3  # of the iterations find grey levels and weights only, so that a cover does not pull from the start
 _ROBUST = 10  # of the iterations are reweighted softly, the rest keeps or drops a pixel
 _SOFT, _CUT = 2.5, 4.0  # standard deviations: scale of the soft weights, and from where on a pixel is dropped
+_SECTORS, _SECTOR_CUT = 16, 4.0  # and standard deviations of the mean square of a sector
 _LEAST_KEPT = 0.5  # of the pixels
 _DAMPING = 1e-3
 _MOST_MOVE = 0.7  # px of an iteration
@@ -75,6 +76,7 @@ def fit_small_rings(
     at = _depth(theta, index, xy)
     direction = (torch.atan2(at.v, at.u) * (seen.shape[1] / (2 * math.pi))).round().long() % seen.shape[1]
     clear = seen[index, direction].to(grey)
+    sector = direction * _SECTORS // seen.shape[1]
     weight = clear
     spread = torch.ones_like(ratio)
     for step_number in range(_ITERATIONS):
@@ -86,7 +88,8 @@ def fit_small_rings(
         last = step_number >= _ROBUST
         if not last:  # later it would grow with what it lets in
             spread = segment_mean(residual.square(), index, count, weight).sqrt()
-        weight = clear * _weights(residual / spread[index], keep=last)
+        fits = _agreeing(residual, clear, index * _SECTORS + sector, count) if step_number >= _HOLD else clear
+        weight = clear * fits * _weights(residual / spread[index], keep=last)
         jacobian = torch.cat([derivative * linear[index, 3:], basis], -1)
         weighted = jacobian * weight[:, None]
         normal = segment_sum((weighted[:, :, None] * jacobian[:, None]).flatten(1), index, count)
@@ -213,6 +216,20 @@ def _weights(deviation: Tensor, keep: bool) -> Tensor:
     if keep:
         return (deviation.abs() < _CUT).to(deviation)
     return (1 + (deviation / _SOFT).square()).reciprocal().square().nan_to_num(nan=0.0)
+
+
+def _agreeing(residual: Tensor, clear: Tensor, sector: Tensor, count: int) -> Tensor:
+    """Pixels (P,) 0 or 1 whose sector of the ring leaves no more than the median sector does, and chance.
+
+    A cover of nearly the grey of the ring leaves residuals that no single pixel betrays, but all of a sector do.
+
+    Args:
+        residual, clear: (P,). sector: (P,) int64, in [0, 16 ``count``).
+    """
+    sums = segment_sum(torch.stack([clear * residual.square(), clear], -1), sector, count * _SECTORS)
+    square = (sums[:, 0] / sums[:, 1]).view(count, _SECTORS)  # NaN for a sector that is not seen
+    limit = square.nanmedian(-1, keepdim=True).values * (1 + _SECTOR_CUT * (2 / sums[:, 1].view_as(square)).sqrt())
+    return (square <= limit).flatten()[sector].to(residual)
 
 
 def _solve(basis: Tensor, grey: Tensor, index: Tensor, count: int, weight: Tensor) -> Tensor:
