@@ -18,6 +18,7 @@ from torchpose.geometry.segments import segment_mean, segment_sum
 
 _SOLVABLE_POINTS = 6  # five parameters and one point to spare
 _CHUNK = 1 << 15  # points summed at a time: blocks that stay in the processor's cache
+_MOST_PADDING = 4  # places a point: beyond, points are summed one by one
 _FLAT = 1e-12  # squared ratio of the extents of a point set across and along, below which it is a line
 
 Method = Literal["halir-flusser", "taubin"]
@@ -74,6 +75,8 @@ def fit(
     if weights is None and _is_blocked(index, count):
         blocks = points.view(count, -1, 2).split(max(1, _CHUNK * count // index.numel()))
         parts = [_moments(block) for block in blocks]
+    elif count * int(torch.bincount(index).max() if index.numel() else 0) > _MOST_PADDING * index.numel():
+        return _from_moments(*_flat_moments(points, index, count, weights), method=method)
     else:
         parts = [_moments(block, weight) for block, weight in _padded(points, index, count, weights)]
     return _from_moments(*(torch.cat(part) for part in zip(*parts, strict=True)), method=method)
@@ -133,6 +136,20 @@ def _moments(points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Ten
     # writing in place saves a copy, and leaves no gradient
     sums = _fused_sums if torch.compiler.is_compiling() or xy.requires_grad else _gram_sums
     return center, sums(xy, center[..., None], w) / total, enough
+
+
+def _flat_moments(points: Tensor, index: Tensor, count: int, weights: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """As `_moments`, for ellipses whose numbers of points differ so much that padding would cost more than sums."""
+    w = torch.ones_like(index, dtype=torch.float64) if weights is None else weights.double()
+    xy = torch.where(w[:, None] > 0, points.double(), 0.0)
+    total = segment_sum(w, index, count)
+    center = segment_sum(xy * w[:, None], index, count) / total[:, None]
+    x, y = (xy - center[index]).unbind(-1)
+    xx, xy_, yy = x * x, x * y, y * y
+    terms = (xx, xy_, yy, xx * x, xx * y, yy * x, yy * y, xx * xx, xx * xy_, xx * yy, xy_ * yy, yy * yy)
+    sums = segment_sum(torch.stack(terms, -1) * w[:, None], index, count)
+    enough = segment_sum((w > 0).to(index), index, count) >= _SOLVABLE_POINTS
+    return center, sums / total[:, None], enough
 
 
 def _gram_sums(xy: Tensor, center: Tensor, weights: Tensor | None) -> Tensor:

@@ -30,6 +30,7 @@ from torchpose.small_ring_model import MOST_NODES, depth, exact, first_order, ou
 
 _MARGIN = 3.0  # px around the outer ellipse
 _SOFT, _CUT = 2.5, 4.0  # standard deviations: scale of the soft weights, and from where on a pixel is dropped
+_SECTORS, _SECTOR_CUT = 16, 4.0  # and standard deviations of the mean square of a sector
 _LEAST_KEPT = 0.5  # of the pixels
 _MOST_MOVE = 0.7  # px of an iteration
 _START_SIGMA = 0.8  # px
@@ -137,6 +138,7 @@ def _gauss_newton(window: _Window, theta: Tensor, seen: Tensor, known: Tensor, s
     at = depth(theta, index, xy)
     direction = (torch.atan2(at.v, at.u) * (seen.shape[1] / (2 * math.pi))).round().long() % seen.shape[1]
     clear = seen[index, direction].to(grey)
+    sector = direction * _SECTORS // seen.shape[1]
     weight = clear
     spread = torch.ones_like(theta[:, 0])
     for step_number in range(scheme.soft + scheme.hard):
@@ -147,7 +149,8 @@ def _gauss_newton(window: _Window, theta: Tensor, seen: Tensor, known: Tensor, s
         residual = grey - (basis * linear[index]).sum(-1)
         if step_number < scheme.soft:  # later it would grow with what it lets in
             spread = segment_mean(residual.square(), index, count, weight).sqrt()
-        weight = clear * _weights(residual / spread[index], keep=step_number >= scheme.soft)
+        fits = _agreeing(residual, clear, index * _SECTORS + sector, count) if step_number >= scheme.hold else clear
+        weight = clear * fits * _weights(residual / spread[index], keep=step_number >= scheme.soft)
         jacobian = torch.cat([derivative * linear[index, 3:], basis], -1)
         weighted = jacobian * weight[:, None]
         normal = segment_sum((weighted[:, :, None] * jacobian[:, None]).flatten(1), index, count)
@@ -242,6 +245,20 @@ def _weights(deviation: Tensor, keep: bool) -> Tensor:
     if keep:
         return (deviation.abs() < _CUT).to(deviation)
     return (1 + (deviation / _SOFT).square()).reciprocal().square().nan_to_num(nan=0.0)
+
+
+def _agreeing(residual: Tensor, clear: Tensor, sector: Tensor, count: int) -> Tensor:
+    """Pixels (P,) 0 or 1 whose sector of the ring leaves no more than the median sector does, and chance.
+
+    A cover of nearly the grey of the ring leaves residuals that no single pixel betrays, but all of a sector do.
+
+    Args:
+        residual, clear: (P,). sector: (P,) int64, in [0, 16 ``count``).
+    """
+    sums = segment_sum(torch.stack([clear * residual.square(), clear], -1), sector, count * _SECTORS)
+    square = (sums[:, 0] / sums[:, 1]).view(count, _SECTORS)  # NaN for a sector that is not seen
+    limit = square.nanmedian(-1, keepdim=True).values * (1 + _SECTOR_CUT * (2 / sums[:, 1].view_as(square)).sqrt())
+    return (square <= limit).flatten()[sector].to(residual)
 
 
 def _solve(basis: Tensor, grey: Tensor, index: Tensor, count: int, weight: Tensor) -> Tensor:

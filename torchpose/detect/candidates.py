@@ -50,7 +50,7 @@ def find_candidates(frames: Tensor, factor: int | None = None, *, explain: bool 
     known = None
     for octave in range(_OCTAVES):
         if octave:
-            reduced, scale = area_reduce(reduced.float(), 2), 2 * scale
+            reduced, scale = area_reduce(reduced, 2, exact=True), 2 * scale
         grad = gradient(reduced)
         some = find_ellipses(grad, known, explain=True)
         if octave == 0 and factor > 1:

@@ -19,17 +19,18 @@ def reduction_factor(height: int, width: int) -> int:
     return factor
 
 
-def area_reduce(frames: Tensor, factor: int) -> Tensor:
+def area_reduce(frames: Tensor, factor: int, *, exact: bool = False) -> Tensor:
     """Means over factor x factor blocks: (B, H, W) -> (B, H // factor, W // factor), uint8 as it came, else float32.
 
     Reduced pixel (x, y) is centred at full-frame u = factor * x + (factor - 1) / 2, v likewise. Rows and columns beyond
-    the last whole block are left out. uint8 and uint16 are rounded to whole levels, once for each factor of 2.
+    the last whole block are left out. uint8 and uint16 are rounded to whole levels, once for each factor of 2, unless
+    ``exact`` asks for float32.
 
     On the CPU frames go through cv2.resize(INTER_AREA), the batch seen as one tall picture, a few rows at a time:
     reduction by 2 is the one that OpenCV has vector code for, three times as fast as by 4 at once, and what it leaves
     stays in the cache for the next (scripts/bench_pipeline.py).
     """
-    whole = frames.dtype == torch.uint8
+    whole = frames.dtype == torch.uint8 and not exact
     if factor == 1:
         return frames if whole else frames.float()
     batch, height, width = frames.shape
@@ -39,10 +40,10 @@ def area_reduce(frames: Tensor, factor: int) -> Tensor:
     cropped = frames[:, : h * factor, : w * factor]
     if frames.device.type == "cpu" and frames.dtype in (torch.uint8, torch.uint16, torch.float32):
         tall = cropped.reshape(batch * h * factor, w * factor).numpy()  # a view unless rows were cropped
-        reduced = np.empty((batch * h, w), tall.dtype)
+        reduced = np.empty((batch * h, w), np.float32 if exact else tall.dtype)
         rows = max(1, _PART_PIXELS // (w * factor * factor))
         for start in range(0, batch * h, rows):
-            part, left = tall[start * factor : (start + rows) * factor], factor
+            part, left = tall[start * factor : (start + rows) * factor].astype(reduced.dtype, copy=False), factor
             while left > 1:
                 by = 2 if left % 2 == 0 else left
                 left //= by

@@ -189,16 +189,15 @@ def _neighbours(cell: Tensor, width: int) -> tuple[Tensor, Tensor]:
 def connected_components(a: Tensor, b: Tensor, count: int) -> Tensor:
     """Smallest member (count,) int64 of each node's component in the graph with edges (a_i, b_i)."""
     parent = torch.arange(count, device=a.device)
-    while True:
-        low = torch.minimum(parent[a], parent[b])
-        hooked = parent.clone()
-        hooked.scatter_reduce_(0, parent[a], low, "amin")
-        hooked.scatter_reduce_(0, parent[b], low, "amin")
-        for _ in range(4):
-            hooked = hooked[hooked]
-        if torch.equal(hooked, parent):
-            return parent
-        parent = hooked
+    while a.numel():
+        first, second = parent[a], parent[b]
+        low = torch.minimum(first, second)
+        parent = parent.scatter_reduce(0, first, low, "amin").scatter_reduce_(0, second, low, "amin")
+        while not torch.equal(shorter := parent[parent], parent):
+            parent = shorter
+        apart = (parent[a] != parent[b]).nonzero()[:, 0]  # what is joined stays so
+        a, b = a[apart], b[apart]
+    return parent
 
 
 def region_polarity(regions: Regions, center: Tensor, cells_xy: Tensor) -> Tensor:
