@@ -21,6 +21,7 @@ from torchpose.camera import Camera
 from torchpose.edges import ring_edges
 from torchpose.geometry import rotations
 from torchpose.geometry.segments import segment_mean, segment_sum
+from torchpose.refine.gauss_newton import solve_scaled
 from torchpose.refine.result import Refined
 
 _REACH = 2.0  # px searched to either side of the fitted ellipses
@@ -107,7 +108,7 @@ def refine_edges(
         variance = _CHAIN * zernike.edge_correlation() * sums[:, 42] / (sums[:, 43] - 7).clamp_min(1)
         information = information + known * variance[:, None, None]
         pull = variance[:, None] * (known @ moved[..., None]).squeeze(-1)
-        step_pose = _solve_scaled(information, -right[..., 0] - pull)
+        step_pose = solve_scaled(information, -right - pull[..., None]).squeeze(-1)
         moved = moved + step_pose
         r, t = rotations.exp(step_pose[:, 3:]) @ r, t + step_pose[:, :3]
     inverse, info = torch.linalg.inv_ex(information)
@@ -155,11 +156,3 @@ def circle_distance(
     bend = area.square() / (slope.pow(3) * reach)
     by_pose = -torch.cat([m, torch.linalg.cross(point - translation, m)], -1) / slope[:, None]
     return (reach - radius) / slope, bend, by_pose
-
-
-def _solve_scaled(matrix: Tensor, right: Tensor) -> Tensor:
-    """Solves (N, 6, 6) x = (N, 6) after scaling every unknown by its own information: mm and rad differ by orders."""
-    scale = matrix.diagonal(dim1=-2, dim2=-1).clamp_min(1e-30).rsqrt()
-    scaled = matrix * scale[:, :, None] * scale[:, None, :]
-    eye = torch.eye(6, dtype=matrix.dtype, device=matrix.device)
-    return scale * torch.linalg.solve(scaled + 1e-12 * eye, right * scale)
