@@ -23,14 +23,18 @@ from torchpose.geometry import rotations
 from torchpose.geometry.segments import segment_mean, segment_sum
 from torchpose.refine.gauss_newton import solve_scaled
 from torchpose.refine.result import Refined
+from torchpose.refine.step_filter import step_offsets, window_correlation
 
 _REACH = 2.0  # px searched to either side of the fitted ellipses
 _CHAIN = 2 * math.sqrt(2) / math.pi  # edge pixels per px of a circle: mean of max(|cos|, |sin|)
 _START_SPREAD = 0.3  # px
 _SOFT = 3.0  # Geman-McClure scale in standard deviations
 _SOFT_BIAS = 1.17  # of a normal distribution, standard deviation over its RMS under these weights
-_STEPS = 6
+_STEPS = 6  # on Zernike edges
 _SOFT_STEPS = 2  # of these, the first, that weigh all points instead of leaving some out
+_FILTER_STEPS = 2  # on matched filters
+_LEAST_BLUR = 0.3  # px, point-spread function and pixel: a pixel alone
+_MOST_CHANGE = 0.3  # px, of the blur in a step
 _CUT = 4.0  # robust standard deviations beyond which an edge point is left out
 _CUT_FLOOR = 0.02  # px, added to the cut: what pixels alias to
 
@@ -84,50 +88,91 @@ def refine_edges(
     trust = sound * (step / segment_mean(step, of, rows)[of]).square()
 
     r, t = rotation, translation
-    keep = sound
-    spread = torch.full((rows,), _START_SPREAD, dtype=torch.float64, device=r.device)
-    slope = torch.ones(rows, dtype=torch.float64, device=r.device)
-    information = torch.zeros(rows, 6, 6, dtype=torch.float64, device=r.device)
-    variance = torch.ones(rows, dtype=torch.float64, device=r.device)
-    known = torch.zeros_like(information) if prior is None else prior
+    known = torch.zeros(rows, 6, 6, dtype=torch.float64, device=r.device) if prior is None else prior
     moved = torch.zeros(rows, 6, dtype=torch.float64, device=r.device)
+    spread = torch.full((rows,), _START_SPREAD, dtype=torch.float64, device=r.device)
+    keep = sound
     for i in range(_STEPS):
-        distance, bend, by_pose = circle_distance(ray, warp, r[of], t[of], center, normal, radius)
+        distance, bend, _, by_pose = circle_distance(ray, warp, r[of], t[of], center, normal, radius)
         true = edges.offset - sign * distance  # of the projected circle from the pixel's centre
         slope = zernike.blur_slope(edges.offset * keep, true * keep, of, rows)
         read = zernike.deblur(edges.offset, slope[of]) - zernike.curvature_shift(slope[of]) * bend * sign
         error = (sign * (read - true)).nan_to_num(nan=0.0)  # outside the circle where positive
-        soft = sound * (1 + (error / (_SOFT * spread)[of]).square()).reciprocal().square()
-        spread = _SOFT_BIAS * segment_mean(error.square(), of, rows, soft).sqrt()
-        keep = sound * (error.abs() < (_CUT * spread + _CUT_FLOOR)[of])
+        soft, keep, spread = _robust(error, spread, sound, of, rows)
         weight = trust * (soft if i < _SOFT_STEPS else keep)
-        products = by_pose[:, :, None] * torch.cat([by_pose, error[:, None]], -1)[:, None, :]
-        extra = torch.stack([weight * error.square(), (weight > 0).double()], -1)
-        sums = segment_sum(torch.cat([weight[:, None] * products.flatten(1), extra], -1), of, rows)
-        information, right = sums[:, :42].unflatten(1, (6, 7)).split([6, 1], -1)
-        variance = _CHAIN * zernike.edge_correlation() * sums[:, 42] / (sums[:, 43] - 7).clamp_min(1)
-        information = information + known * variance[:, None, None]
-        pull = variance[:, None] * (known @ moved[..., None]).squeeze(-1)
-        step_pose = solve_scaled(information, -right - pull[..., None]).squeeze(-1)
+        correlation = _CHAIN * zernike.edge_correlation()
+        step_pose, information, variance = _step(error, by_pose, weight, of, rows, known, moved, correlation)
         moved = moved + step_pose
         r, t = rotations.exp(step_pose[:, 3:]) @ r, t + step_pose[:, :3]
+
+    blur = ((1 - slope) * zernike.MASK**2 / 12).clamp_min(_LEAST_BLUR**2).sqrt()
+    pixel = (edges.points - edges.offset[:, None] * edges.normal).round()
+    one = torch.ones_like(step)
+    for _ in range(_FILTER_STEPS):
+        distance, bend, across, by_pose = circle_distance(ray, warp, r[of], t[of], center, normal, radius)
+        middle = distance + (across * (pixel - edges.points)).sum(-1)
+        found = step_offsets(frames, frame[of], pixel.long(), across, middle, bend, blur[of])
+        error = found.error.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
+        _, keep, spread = _robust(error, spread, sound, of, rows)
+        weight = keep * found.information * step.square()
+        told = (keep * found.blur_information * step.square())[:, None] * torch.stack([found.widening, one], -1)
+        change, total = segment_sum(told.nan_to_num(nan=0.0), of, rows).unbind(-1)
+        blur = (blur + (change / total).nan_to_num(nan=0.0).clamp(-_MOST_CHANGE, _MOST_CHANGE)).clamp_min(_LEAST_BLUR)
+        # a pixel beside the edge takes part in as many windows as they are wide
+        step_pose, information, variance = _step(error, by_pose, weight, of, rows, known, moved, window_correlation())
+        moved = moved + step_pose
+        r, t = rotations.exp(step_pose[:, 3:]) @ r, t + step_pose[:, :3]
+
     inverse, info = torch.linalg.inv_ex(information)
     covariance = inverse * variance[:, None, None]
     kept = segment_mean(keep, of, rows, sound)
     good = (info == 0) & covariance.isfinite().all(-1).all(-1) & (covariance.diagonal(dim1=-2, dim2=-1) > 0).all(-1)
-    blur = ((1 - slope) * zernike.MASK**2 - 1).clamp_min(0).div(12).sqrt()
-    noise = (
-        (variance / (_CHAIN * zernike.edge_correlation())).sqrt()
-        * slope
-        * segment_mean(step, of, rows)
-        / zernike.offset_noise()
+    return Refined(
+        r,
+        t,
+        covariance,
+        (blur.square() - 1 / 12).clamp_min(0).sqrt(),
+        (variance / window_correlation()).sqrt(),
+        kept,
+        good,
     )
-    return Refined(r, t, covariance, blur, noise, kept, good)
+
+
+def _robust(error: Tensor, spread: Tensor, sound: Tensor, of: Tensor, rows: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Geman-McClure weights (E,) of errors, the hard choice (E,) by their spread, and that spread (N,)."""
+    soft = sound * (1 + (error / (_SOFT * spread)[of]).square()).reciprocal().square()
+    spread = _SOFT_BIAS * segment_mean(error.square(), of, rows, soft).sqrt()
+    return soft, sound * (error.abs() < (_CUT * spread + _CUT_FLOOR)[of]), spread
+
+
+def _step(
+    error: Tensor,
+    by_pose: Tensor,
+    weight: Tensor,
+    of: Tensor,
+    rows: int,
+    known: Tensor,
+    moved: Tensor,
+    correlation: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Gauss-Newton step (N, 6), information (N, 6, 6) at unit variance, and the variance (N,).
+
+    Errors of neighbouring points are correlated: ``correlation`` of them tell as much as one that is independent.
+    """
+    products = by_pose[:, :, None] * torch.cat([by_pose, error[:, None]], -1)[:, None, :]
+    extra = torch.stack([weight * error.square(), (weight > 0).double()], -1)
+    sums = segment_sum(torch.cat([weight[:, None] * products.flatten(1), extra], -1), of, rows)
+    information, right = sums[:, :42].unflatten(1, (6, 7)).split([6, 1], -1)
+    chi2, count = sums[:, 42:].unbind(-1)
+    variance = correlation * chi2 / (count - 7 * correlation).clamp_min(1)
+    information = information + known * variance[:, None, None]
+    pull = variance[:, None, None] * (known @ moved[..., None])
+    return solve_scaled(information, -right - pull).squeeze(-1), information, variance
 
 
 def circle_distance(
     ray: Tensor, warp: Tensor, rotation: Tensor, translation: Tensor, center: Tensor, normal: Tensor, radius: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Distances of image points from projected circles, in pixels and to first order.
 
     Args:
@@ -136,8 +181,8 @@ def circle_distance(
         center, normal: (E, 3) of the circle, target frame. radius: (E,).
 
     Returns:
-        distance (E,) px, positive outside; curvature (E,) 1/px of the circle's image; derivative (E, 6) of the distance
-        by the pose: translation, then rotation from the left.
+        distance (E,) px, positive outside; curvature (E,) 1/px of the circle's image; its unit normal (E, 2) there;
+        derivative (E, 6) of the distance by the pose: translation, then rotation from the left.
     """
     n = (rotation @ normal[..., None]).squeeze(-1)
     c = (rotation @ center[..., None]).squeeze(-1) + translation
@@ -155,4 +200,4 @@ def circle_distance(
     area = depth.square() * torch.linalg.det(warp).abs() / along.abs()
     bend = area.square() / (slope.pow(3) * reach)
     by_pose = -torch.cat([m, torch.linalg.cross(point - translation, m)], -1) / slope[:, None]
-    return (reach - radius) / slope, bend, by_pose
+    return (reach - radius) / slope, bend, gradient / slope[:, None], by_pose
