@@ -3,9 +3,9 @@
     python scripts/bench_precision.py --frames 64 --noise 2
     python scripts/bench_precision.py --distance 78 84
 
-Simulated 2-megapixel frames of quad40, tilt up to 45 degrees; at 78 to 84 mm its rings have a radius of 70 px. Cost: CPU milliseconds a frame on one thread, of the
-whole estimator and of the refinement alone (less what "centers" takes). Peers measure centres, which cv2.solvePnP
-(IPPE, then iterative) turns into poses with the true correspondence:
+Simulated 2-megapixel frames of quad40, tilt up to 45 degrees; at 78 to 84 mm its rings have a radius of 70 px. Cost:
+CPU milliseconds a frame on one thread, of the whole estimator and of the refinement alone (less what "centers" takes).
+Peers measure centres, which cv2.solvePnP (IPPE, then iterative) turns into poses with the true correspondence:
 
 - OpenCV: the blob detector that findCirclesGrid uses, blobs nearest to the markers;
 - ringgrid (pip install ringgrid), where it is installed: proposals (first stage) nearest to the markers.
