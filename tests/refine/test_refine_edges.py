@@ -116,9 +116,9 @@ def test_frames_without_noise() -> None:
     out, r, t = refined(0.0)
     assert out.good.all()
     assert (out.kept > 0.99).all()
-    assert (out.t - t).abs().max() < 2e-3
-    assert rotations.log(out.R @ r.mT).norm(dim=-1).max() < math.radians(2e-3)
-    assert (out.blur - math.sqrt(0.8**2 + 1 / 12)).abs().max() < 0.1
+    assert (out.t - t).abs().max() < 6e-4
+    assert rotations.log(out.R @ r.mT).norm(dim=-1).max() < math.radians(1e-3)
+    assert (out.blur - math.sqrt(0.8**2 + 1 / 12)).abs().max() < 0.01
 
 
 def test_covariance_and_noise() -> None:

@@ -6,24 +6,26 @@ read at the offset o from its pixel's centre, along the normal of increasing gre
     deblurred(o) - kappa k = l,
 
 l the offset of the projected circle, k its curvature, kappa the shift of `zernike.curvature_shift`. The blur of each
-frame is found along with its pose: the slope of o over l (`zernike.blur_slope`).
+frame is found along with its pose: the slope of o over l (`zernike.blur_slope`). Once pose and blur are nearly known,
+the last steps read the same edges, and the blur, with matched filters, which scatter less (`step_filter`).
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchpose import zernike
 from torchpose.camera import Camera
-from torchpose.edges import ring_edges
+from torchpose.edges import RingEdges, ring_edges
 from torchpose.geometry import rotations
 from torchpose.geometry.segments import segment_mean, segment_sum
 from torchpose.refine.gauss_newton import solve_scaled
 from torchpose.refine.result import Refined
-from torchpose.refine.step_filter import step_offsets, window_correlation
+from torchpose.refine.step_filter import StepOffsets, step_offsets, window_correlation
 
 _REACH = 2.0  # px searched to either side of the fitted ellipses
 _CHAIN = 2 * math.sqrt(2) / math.pi  # edge pixels per px of a circle: mean of max(|cos|, |sin|)
@@ -74,14 +76,9 @@ def refine_edges(
     edges = ring_edges(frames, frame[row].repeat_interleave(2), both.flatten(0, 1), outward, reach)
 
     block = edges.ring // 2
-    of = row[block]
-    sign, radius = outward[edges.ring], radii[row, marker].flatten()[edges.ring]
-    center, normal = centers[row, marker][block], normals[row, marker][block]
-    xy = camera.undistort_points(edges.points)
-    warp = torch.linalg.inv(camera.J_distort(xy))
-    ray = torch.cat([xy, torch.ones_like(xy[:, :1])], -1)
-    sound = ray.isfinite().all(-1).double()
-    ray = ray.nan_to_num(nan=0.0)
+    circles = (centers[row, marker][block], normals[row, marker][block], radii[row, marker].flatten()[edges.ring])
+    seen = _seen(edges, camera, outward, row[block], *circles)
+    of, sound = seen.of, seen.sound
     # the error of an edge point falls with the height of its step, taken from the whole circle: a high one by chance
     # must not count more
     step = segment_mean(edges.step, edges.ring, 2 * row.numel())[edges.ring]
@@ -91,35 +88,21 @@ def refine_edges(
     known = torch.zeros(rows, 6, 6, dtype=torch.float64, device=r.device) if prior is None else prior
     moved = torch.zeros(rows, 6, dtype=torch.float64, device=r.device)
     spread = torch.full((rows,), _START_SPREAD, dtype=torch.float64, device=r.device)
-    keep = sound
-    for i in range(_STEPS):
-        distance, bend, _, by_pose = circle_distance(ray, warp, r[of], t[of], center, normal, radius)
-        true = edges.offset - sign * distance  # of the projected circle from the pixel's centre
-        slope = zernike.blur_slope(edges.offset * keep, true * keep, of, rows)
-        read = zernike.deblur(edges.offset, slope[of]) - zernike.curvature_shift(slope[of]) * bend * sign
-        error = (sign * (read - true)).nan_to_num(nan=0.0)  # outside the circle where positive
-        soft, keep, spread = _robust(error, spread, sound, of, rows)
-        weight = trust * (soft if i < _SOFT_STEPS else keep)
-        correlation = _CHAIN * zernike.edge_correlation()
+    blur, keep = torch.zeros_like(spread), sound
+    for i in range(_STEPS + _FILTER_STEPS):
+        if i < _STEPS:
+            error, by_pose, blur = _zernike_errors(seen, r, t, keep, rows)
+            soft, keep, spread = _robust(error, spread, sound, of, rows)
+            weight, correlation = trust * (soft if i < _SOFT_STEPS else keep), _CHAIN * zernike.edge_correlation()
+        else:
+            by_pose, found = _filter_errors(seen, frames, frame, r, t, blur)
+            error = found.error
+            _, keep, spread = _robust(error, spread, sound, of, rows)
+            weight, correlation = keep * found.information * step.square(), window_correlation()
+            blur_weight = keep * found.blur_information * step.square()
+            blur = blur + segment_mean(found.widening, of, rows, blur_weight).clamp(-_MOST_CHANGE, _MOST_CHANGE)
+            blur = blur.clamp_min(_LEAST_BLUR)
         step_pose, information, variance = _step(error, by_pose, weight, of, rows, known, moved, correlation)
-        moved = moved + step_pose
-        r, t = rotations.exp(step_pose[:, 3:]) @ r, t + step_pose[:, :3]
-
-    blur = ((1 - slope) * zernike.MASK**2 / 12).clamp_min(_LEAST_BLUR**2).sqrt()
-    pixel = (edges.points - edges.offset[:, None] * edges.normal).round()
-    one = torch.ones_like(step)
-    for _ in range(_FILTER_STEPS):
-        distance, bend, across, by_pose = circle_distance(ray, warp, r[of], t[of], center, normal, radius)
-        middle = distance + (across * (pixel - edges.points)).sum(-1)
-        found = step_offsets(frames, frame[of], pixel.long(), across, middle, bend, blur[of])
-        error = found.error.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
-        _, keep, spread = _robust(error, spread, sound, of, rows)
-        weight = keep * found.information * step.square()
-        told = (keep * found.blur_information * step.square())[:, None] * torch.stack([found.widening, one], -1)
-        change, total = segment_sum(told.nan_to_num(nan=0.0), of, rows).unbind(-1)
-        blur = (blur + (change / total).nan_to_num(nan=0.0).clamp(-_MOST_CHANGE, _MOST_CHANGE)).clamp_min(_LEAST_BLUR)
-        # a pixel beside the edge takes part in as many windows as they are wide
-        step_pose, information, variance = _step(error, by_pose, weight, of, rows, known, moved, window_correlation())
         moved = moved + step_pose
         r, t = rotations.exp(step_pose[:, 3:]) @ r, t + step_pose[:, :3]
 
@@ -127,15 +110,63 @@ def refine_edges(
     covariance = inverse * variance[:, None, None]
     kept = segment_mean(keep, of, rows, sound)
     good = (info == 0) & covariance.isfinite().all(-1).all(-1) & (covariance.diagonal(dim1=-2, dim2=-1) > 0).all(-1)
-    return Refined(
-        r,
-        t,
-        covariance,
-        (blur.square() - 1 / 12).clamp_min(0).sqrt(),
-        (variance / window_correlation()).sqrt(),
-        kept,
-        good,
-    )
+    return Refined(r, t, covariance, blur, (variance / correlation).sqrt(), kept, good)
+
+
+class _Seen(NamedTuple):
+    """Edge points, flat, their rows ``of`` and their circles; 0 in ``sound`` where unusable.
+
+    ray: (E, 3). warp: (E, 2, 2), d(ray)/d(pixel). center, normal: (E, 3), radius: (E,), of the circle. sign: (E,), +1
+    where grey rises outwards.
+    """
+
+    edges: RingEdges
+    of: Tensor
+    ray: Tensor
+    warp: Tensor
+    center: Tensor
+    normal: Tensor
+    radius: Tensor
+    sign: Tensor
+    sound: Tensor
+
+    def circles(self, r: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """`circle_distance` of the poses (N, 3, 3), (N, 3)."""
+        return circle_distance(self.ray, self.warp, r[self.of], t[self.of], self.center, self.normal, self.radius)
+
+
+def _seen(
+    edges: RingEdges, camera: Camera, outward: Tensor, of: Tensor, center: Tensor, normal: Tensor, radius: Tensor
+) -> _Seen:
+    xy = camera.undistort_points(edges.points)
+    warp = torch.linalg.inv(camera.J_distort(xy))
+    ray = torch.cat([xy, torch.ones_like(xy[:, :1])], -1)
+    sound = ray.isfinite().all(-1).double()
+    return _Seen(edges, of, ray.nan_to_num(nan=0.0), warp, center, normal, radius, outward[edges.ring], sound)
+
+
+def _zernike_errors(seen: _Seen, r: Tensor, t: Tensor, keep: Tensor, rows: int) -> tuple[Tensor, Tensor, Tensor]:
+    """How far Zernike edges lie outside the circles (E,), px, derivatives (E, 6) of the distance, and blur (N,)."""
+    edges, of, sign = seen.edges, seen.of, seen.sign
+    distance, bend, _, by_pose = seen.circles(r, t)
+    true = edges.offset - sign * distance  # of the projected circle from the pixel's centre
+    slope = zernike.blur_slope(edges.offset * keep, true * keep, of, rows)
+    read = zernike.deblur(edges.offset, slope[of]) - zernike.curvature_shift(slope[of]) * bend * sign
+    # the slope tells of two pixels: the image's and the kernel's
+    blur = (((1 - slope) * zernike.MASK**2 - 1) / 12).clamp_min(_LEAST_BLUR**2).sqrt()
+    return (sign * (read - true)).nan_to_num(nan=0.0), by_pose, blur
+
+
+def _filter_errors(
+    seen: _Seen, frames: Tensor, frame: Tensor, r: Tensor, t: Tensor, blur: Tensor
+) -> tuple[Tensor, StepOffsets]:
+    """Derivatives (E, 6) of the distance, and what the matched filters see in the windows of the same pixels."""
+    edges = seen.edges
+    pixel = (edges.points - edges.offset[:, None] * edges.normal).round()
+    distance, bend, across, by_pose = seen.circles(r, t)
+    middle = distance + (across * (pixel - edges.points)).sum(-1)
+    found = step_offsets(frames, frame[seen.of], pixel.long(), across, middle, bend, blur[seen.of])
+    return by_pose, StepOffsets(*(x.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0) for x in found))
 
 
 def _robust(error: Tensor, spread: Tensor, sound: Tensor, of: Tensor, rows: int) -> tuple[Tensor, Tensor, Tensor]:
