@@ -55,7 +55,8 @@ def test_each_frame_is_the_same_alone(sample: tuple[tp.PoseEstimator, Tensor], p
     estimator, frames = sample
     for i in range(len(frames)):
         alone = estimator(frames[i : i + 1])
-        assert (alone.t[0] - poses.t[i]).abs().max() < 1e-8  # mm: padding changes the order of sums, not their terms
+        # mm: float32 sums of pixels depend on how a matrix product is cut up, to a hundred-thousandth of the noise
+        assert (alone.t[0] - poses.t[i]).abs().max() < 5e-8
         assert (alone.R[0] - poses.R[i]).abs().max() < 1e-9
         assert alone.status[0] == poses.status[i]
 

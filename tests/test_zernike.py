@@ -223,12 +223,3 @@ def test_curvature_shift_equals_its_integral(sigma):
     slope = torch.tensor(-1.5 * zeroth / (weight * h**3).sum())
     expected = -0.5 * (s * s + second / zeroth) * (zernike.MASK / 2) ** 2
     assert float(zernike.curvature_shift(slope)) == pytest.approx(expected, rel=0.01)
-
-
-def test_offset_noise():
-    """Scatter of the offset at a straight edge through the middle of the window, per unit of noise and step."""
-    generator = torch.Generator().manual_seed(4)
-    clean = torch.cat([torch.full((7,), 40.0), torch.tensor([110.0]), torch.full((7,), 180.0)])
-    frames = clean + 2 * torch.randn(20_000, 15, 15, generator=generator)
-    scatter = locate_middle(frames).offset.std()
-    assert float(scatter) == pytest.approx(zernike.offset_noise() * 2 / 140, rel=0.05)

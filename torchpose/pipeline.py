@@ -22,7 +22,7 @@ from torchpose.pose import (
     intrinsics_covariance,
     solve_poses,
 )
-from torchpose.refine import refine_edges, refine_photometric
+from torchpose.refine import refine_centers, refine_edges, refine_photometric
 from torchpose.results import Detections, Poses, Reason, Status
 from torchpose.rings import Rings, measure_rings
 from torchpose.second_look import look_again
@@ -41,8 +41,8 @@ class PoseEstimator(nn.Module):
         camera: intrinsics and distortion; frames must have its size.
         target: one target or several; each gets a row for every frame.
         method: "photometric" refines every pose on the grey values around its rings, "edges" on all their edge points;
-            "centers" stops at the pose of the ring centres; "paper" is the paper's chain: Zernike edges as read,
-            centres by eq. (7), PnP.
+            "centers" stops at the pose of the centres of their ellipses; "paper" is the paper's chain: Zernike edges as
+            read, centres by eq. (7), PnP.
         float_range: grey value of white in floating-point frames: 1.0 or 255.0.
         srgb: the grey values are sRGB-encoded and are taken back to linear ones first. Edges are half-way in linear
             grey, so encoded frames that are taken as linear ones shift them (docs/precision.md).
@@ -115,6 +115,8 @@ class PoseEstimator(nn.Module):
             solutions = self._refined(
                 frames, solutions, evidence[solvable], solvable // count, rings, identified.ring[solvable], camera
             )
+        elif self.method == "centers":
+            solutions = _on_centers(solutions, evidence[solvable])
         if camera.covariance is not None:
             wider = intrinsics_covariance(evidence[solvable], solutions, camera, refined=refined)
             solutions = replace(solutions, covariance=solutions.covariance + wider)
@@ -301,6 +303,18 @@ class PoseEstimator(nn.Module):
             detections=detections,
             **{n: spread(getattr(s, n)) for n in names},
         )
+
+
+def _on_centers(s: Solutions, e: Evidence) -> Solutions:
+    """Solutions refined on the ellipses' own centres, where that holds."""
+    r, t, covariance, good = refine_centers(replace(e, mask=s.mask), s.R, s.t)
+    better = good & (s.status != Status.REJECTED)
+    return replace(
+        s,
+        R=torch.where(better[:, None, None], r, s.R),
+        t=torch.where(better[:, None], t, s.t),
+        covariance=torch.where(better[:, None, None], covariance, s.covariance),
+    )
 
 
 def _linear(frames: Tensor, white: float) -> Tensor:

@@ -198,10 +198,3 @@ def edge_correlation(size: int = MASK) -> float:
     """
     kernel = kernels(size, ((2, 0),))[0]
     return float(kernel.sum(1).square().sum() / kernel.square().sum())
-
-
-@lru_cache(maxsize=8)
-def offset_noise(size: int = MASK) -> float:
-    """Standard deviation in px of an offset as measured at the middle of a step of height 1 in white noise of 1."""
-    kernel = kernels(size, ((2, 0),))[0]
-    return 0.75 * size * float(kernel.square().sum().sqrt())

@@ -49,7 +49,7 @@ def test_photometric_is_near_the_bound(case: str, ratio: float) -> None:
 def test_edges_stay_within_their_covariance(case: str) -> None:
     found = row(case, "edges")
     assert found["ok"] == FRAMES
-    assert max(found[name] for name in RATIOS) < 2.8
+    assert max(found[name] for name in RATIOS) < 2.2
     assert 2.5 < found["nees"] < 9.0
 
 
@@ -58,5 +58,5 @@ def test_methods_in_order_of_precision() -> None:
         "tilt", statistics.CASES["tilt"], ["photometric", "edges", "centers", "paper"], FRAMES, seed=7
     )
     ratios = [found["lateral_ratio"] for found in rows]
-    assert ratios == sorted(ratios)
-    assert ratios[2] > 1.5 * ratios[1]
+    # 12 frames do not tell the first two apart
+    assert 1.2 * max(ratios[:2]) < ratios[2] < 0.5 * ratios[3]

@@ -1,7 +1,8 @@
 """Stage: refinement of poses beyond the marker centres."""
 
+from torchpose.refine.centers import refine_centers
 from torchpose.refine.edges import refine_edges
 from torchpose.refine.photometric import refine_photometric
 from torchpose.refine.result import Refined
 
-__all__ = ["Refined", "refine_edges", "refine_photometric"]
+__all__ = ["Refined", "refine_centers", "refine_edges", "refine_photometric"]

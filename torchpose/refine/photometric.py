@@ -5,7 +5,7 @@ Every pixel in a band around the edges of a frame's rings is predicted as
     grey = ring + (paper - ring) F
 
 with the fraction of paper F of `ring_model`. Pose and blur (one for each frame) are found by Gauss-Newton; the two grey
-levels of each marker, with linear gradients over the plane, are linear unknowns, eliminated by the Schur complement.
+levels of each marker, with linear gradients over the plane, are linear unknowns (`gauss_newton`).
 Frames and markers are padded blocks of pixels: one sequence of tensor operations for the whole batch.
 """
 
@@ -19,6 +19,7 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.geometry import rotations
 from torchpose.geometry.segments import segment_sum
+from torchpose.refine.gauss_newton import LEVELS, QUANTISATION, gauss_newton_step, solve_ridged
 from torchpose.refine.result import Refined
 from torchpose.refine.ring_model import PixelBlocks, RingModel, gather_pixels, ring_model
 
@@ -37,8 +38,6 @@ _SECTORS = 48  # of a circle
 _SECTOR_KEPT = 0.9  # of a sector's pixels that must follow the model for it to count
 _LEAST_CLEAR = 0.55  # of the sectors of a marker, below which none of them counts
 _MOST_SPREAD = 1.5  # of a marker's residuals, in those of the best marker of its frame
-_LEVELS = 6  # ring and paper, each with a constant and a gradient over the plane
-_QUANTISATION = 1 / 12  # variance of rounding, in grey levels^2, below which no noise estimate falls
 
 
 def refine_photometric(
@@ -116,7 +115,10 @@ def _refine(
         usable, weight = _inliers(columns[:, :, -1].flatten(1), part, levels)
         if part is blocks:
             weight = weight * _clear_sectors(usable, weight, part, model)
-        step, level_step, information, variance = _gauss_newton(columns, weight, blocks.row, rows, known, moved)
+        sums = _products(columns, weight)
+        step, level_step, information, variance = gauss_newton_step(
+            sums, weight.sum(-1), levels, blocks.row, rows, known, moved
+        )
         moved = moved + step
         r = rotations.exp(step[:, 3:6]) @ r
         t = t + step[:, :3]
@@ -173,19 +175,12 @@ def _first_levels(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor) -> Tensor:
     )
     levels = torch.stack([ring, none, none, paper, none, none], -1).nan_to_num(0.0, 0.0, 0.0).double()
     for _ in range(3):
-        predicted = (levels.float()[:, None, None] @ columns[:, :, :_LEVELS]).flatten(1)
+        predicted = (levels.float()[:, None, None] @ columns[:, :, :LEVELS]).flatten(1)
         residual = b.grey - predicted
         weight = b.valid / (1 + (residual / (2 * _spread(residual, b)[:, None])).square()).square()
         sums = _products(columns, weight)
-        levels = _solve(sums[:, :_LEVELS, :_LEVELS], sums[:, :_LEVELS, _LEVELS])
+        levels = solve_ridged(sums[:, :LEVELS, :LEVELS], sums[:, :LEVELS, LEVELS:]).squeeze(-1)
     return levels
-
-
-def _solve(matrix: Tensor, right: Tensor) -> Tensor:
-    """Solutions of small symmetric systems (K, n, n), (K, n); a trace of the diagonal keeps empty blocks solvable."""
-    eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
-    ridge = 1e-12 * matrix.diagonal(dim1=-2, dim2=-1).mean(-1) + 1e-12
-    return torch.linalg.solve(matrix + ridge[:, None, None] * eye, right)
 
 
 def _median(values: Tensor, where: Tensor) -> Tensor:
@@ -198,7 +193,7 @@ def _spread(residual: Tensor, b: PixelBlocks) -> Tensor:
 
     All markers of a frame share its noise, so none may claim much more than the best of them: cover would.
     """
-    own = (1.4826 * _median(residual.abs(), b.valid)).nan_to_num(nan=1.0).clamp_min(math.sqrt(_QUANTISATION))
+    own = (1.4826 * _median(residual.abs(), b.valid)).nan_to_num(nan=1.0).clamp_min(math.sqrt(QUANTISATION))
     least = torch.full((int(b.row.max()) + 1 if len(own) else 0,), torch.inf, dtype=own.dtype, device=own.device)
     least = least.scatter_reduce(0, b.row, own, "amin")
     return torch.minimum(own, _MOST_SPREAD * least[b.row])
@@ -232,32 +227,3 @@ def _clear_sectors(usable: Tensor, weight: Tensor, b: PixelBlocks, m: RingModel)
     # where half of a ring is gone, the rest of the marker is not to be trusted either
     clear = clear & (clear.to(weight.dtype).mean(-1, keepdim=True) > _LEAST_CLEAR)
     return clear.flatten()[cell].view_as(weight).to(weight.dtype)
-
-
-def _gauss_newton(
-    columns: Tensor, weight: Tensor, row: Tensor, rows: int, known: Tensor, moved: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Step (N, 7), level step (K, 6), reduced information (N, 7, 7) and residual variance (N,)."""
-    sums = _products(columns, weight)  # (K, 14, 14)
-    nn, nb, bb = sums[:, :7, :7], sums[:, :7, 7:13], sums[:, 7:13, 7:13]
-    gn, gb = sums[:, :7, 13], sums[:, 7:13, 13]
-    ridge = 1e-9 * bb.diagonal(dim1=-2, dim2=-1).mean(-1) + 1e-12
-    bb = bb + ridge[:, None, None] * torch.eye(_LEVELS, dtype=bb.dtype, device=bb.device)
-    eliminated = torch.linalg.solve(bb, torch.cat([nb.mT, gb[..., None]], -1))  # (K, 6, 8)
-    information = segment_sum(nn - nb @ eliminated[..., :7], row, rows)
-    right = segment_sum(gn - (nb @ eliminated[..., 7:]).squeeze(-1), row, rows)
-    used = segment_sum(weight.sum(-1), row, rows)
-    unknowns = 7 + _LEVELS * torch.bincount(row, minlength=rows)
-    chi2 = segment_sum(sums[:, 13, 13], row, rows)
-    variance = (chi2 / (used - unknowns).clamp_min(1)).clamp_min(_QUANTISATION)
-    known = known * variance[:, None, None]
-    information = information + known
-    step = _solve_scaled(information, right - (known @ moved[..., None]).squeeze(-1))
-    level_step = eliminated[..., 7] - (eliminated[..., :7] @ step[row][..., None]).squeeze(-1)
-    return step, level_step, information, variance
-
-
-def _solve_scaled(matrix: Tensor, right: Tensor) -> Tensor:
-    """Solves after scaling every unknown by its own information: millimetres and radians differ by orders."""
-    scale = matrix.diagonal(dim1=-2, dim2=-1).clamp_min(1e-30).rsqrt()
-    return scale * _solve(matrix * scale[:, :, None] * scale[:, None, :], right * scale)

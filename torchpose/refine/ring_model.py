@@ -177,10 +177,9 @@ def ring_model(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor) -> RingModel:
     d_outer, d_inner = d_outer + second * d_outer.square(), d_inner + second * d_inner.square()
     pull = 0.5 * q * bend
     z_outer, z_inner = d_outer / q + pull, d_inner / q + pull
-    # the pixel's square is not Gaussian: its fourth cumulant along the edge's normal, -(c^4 + s^4) / 120 px^4
-    square = (1 - 2 * (nu * nv).square()) / (24 * 120) / q.square().square()
-    f_outer, p_outer = _edge(z_outer, square)
-    f_inner, p_inner = _edge(z_inner, square)
+    square = square_cumulant(nu, nv, q)
+    f_outer, p_outer = blurred_step(z_outer, square)
+    f_inner, p_inner = blurred_step(z_inner, square)
     px, py, pz = x * ax + y * bx + cx, x * ay + y * by + cy, x * az + y * bz + cz
     by_pose = tuple(-per_mm * v for v in (mx, my, mz, py * mz - pz * my, pz * mx - px * mz, px * my - py * mx))
     size = scalar(b.radii[:, 0]).float()
@@ -194,7 +193,15 @@ def ring_model(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor) -> RingModel:
     )
 
 
-def _edge(z: Tensor, square: Tensor) -> tuple[Tensor, Tensor]:
+def square_cumulant(nu: Tensor, nv: Tensor, blur: Tensor) -> Tensor:
+    """What a pixel, a square and no Gaussian, adds to an edge of the normal (nu, nv): for `blurred_step`.
+
+    Its fourth cumulant along the normal, -(nu^4 + nv^4) / 120 px^4, over -24 blur^4.
+    """
+    return (1 - 2 * (nu * nv).square()) / (24 * 120) / blur.square().square()
+
+
+def blurred_step(z: Tensor, square: Tensor) -> tuple[Tensor, Tensor]:
     """Blurred step and its slope at ``z`` standard deviations: the normal law and its fourth-order Edgeworth term."""
     z2 = z.square()
     density = torch.exp(-0.5 * z2) * (1 / math.sqrt(2 * math.pi))

@@ -1,0 +1,88 @@
+"""Centre refinement against exact conics, finite differences, and poses from compensated centres."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from exact import F64, exact_ellipses, pinhole, random_poses, rings_of
+
+import torchpose as tp
+from torchpose.centers import common_center
+from torchpose.geometry import rotations
+from torchpose.pose import Evidence, gather_evidence, solve_poses
+from torchpose.refine import refine_centers
+from torchpose.refine.centers import ellipse_centers
+
+CAMERA = pinhole()
+QUAD = tp.Target.load("quad40")
+
+
+def evidence(r: torch.Tensor, t: torch.Tensor, sigma: float) -> Evidence:
+    count, markers = len(r), len(QUAD)
+    ellipses = exact_ellipses(QUAD, CAMERA, r, t).flatten(0, 1)
+    rings = rings_of(ellipses, torch.arange(count).repeat_interleave(markers), sigma, seed=3)
+    center, covariance = common_center(rings.outer, rings.inner, QUAD.radii.repeat(count, 1))
+    return gather_evidence(
+        rings,
+        torch.arange(count * markers).view(count, markers),
+        center.view(count, markers, 2),
+        covariance.view(count, markers, 2, 2),
+        QUAD.centers.expand(count, -1, -1),
+        QUAD.normals.expand(count, -1, -1),
+        QUAD.radii.expand(count, -1, -1),
+        torch.ones(count, dtype=torch.bool),
+        CAMERA.matrix,
+    )
+
+
+def errors(found_r: torch.Tensor, found_t: torch.Tensor, r: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+    return torch.cat([found_t - t, rotations.log(found_r @ r.mT)], -1)
+
+
+def test_ellipse_centers_are_those_of_the_conics() -> None:
+    r, t = random_poses(20, 70, (120, 400))
+    center, _ = ellipse_centers(r, t, *(x.expand(20, *x.shape) for x in (QUAD.centers, QUAD.normals, QUAD.radii)))
+    px = CAMERA.matrix.diagonal()[:2] * center + CAMERA.matrix[:2, 2]
+    torch.testing.assert_close(px, exact_ellipses(QUAD, CAMERA, r, t)[..., :2], rtol=0, atol=1e-8)
+
+
+def test_derivatives() -> None:
+    r, t = random_poses(1, 60, (120, 200))
+    model = [x[None] for x in (QUAD.centers, QUAD.normals, QUAD.radii)]
+    numeric = torch.func.jacfwd(
+        lambda d: ellipse_centers(rotations.exp(d[3:]) @ r, t + d[:3], *model)[0]
+    )(torch.zeros(6, dtype=F64))  # fmt: skip
+    torch.testing.assert_close(ellipse_centers(r, t, *model)[1], numeric, rtol=1e-9, atol=1e-12)
+
+
+def test_exact_centers_give_the_exact_pose() -> None:
+    r, t = random_poses(20, 60, (120, 300))
+    off = rotations.exp(torch.full((3,), 2e-3, dtype=F64))
+    found_r, found_t, _, good = refine_centers(evidence(r, t, 1e-9), off @ r, t + 0.1)
+    assert good.all()
+    assert errors(found_r, found_t, r, t).abs().max() < 1e-6
+
+
+def test_better_than_compensated_centers_and_says_so() -> None:
+    r, t = random_poses(400, 60, (130, 200))
+    e = evidence(r, t, 0.02)
+    s = solve_poses(e, (r, t))
+    found_r, found_t, covariance, good = refine_centers(e, s.R, s.t)
+    assert good.all()
+    error = errors(found_r, found_t, r, t)
+    before = errors(s.R, s.t, r, t).square().mean(0).sqrt()
+    assert (error.square().mean(0).sqrt() < 0.7 * before).all()
+    nees = (error[:, None] @ torch.linalg.inv(covariance) @ error[..., None]).flatten()
+    assert 5.5 < nees.mean() < 6.5  # 400 poses: 6, deviation 0.17
+
+
+def test_markers_not_seen_do_not_count() -> None:
+    r, t = random_poses(8, 45, (130, 200))
+    e = evidence(r, t, 0.01)
+    hidden = e.without(torch.zeros(8, dtype=torch.int64))
+    wrong = dataclasses.replace(hidden, shape=hidden.shape.clone())
+    wrong.shape[:, 0] += 50.0
+    a, b = refine_centers(hidden, r, t), refine_centers(wrong, r, t)
+    assert torch.equal(a[0], b[0])
+    assert torch.equal(a[1], b[1])
