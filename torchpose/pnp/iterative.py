@@ -98,7 +98,7 @@ def minimise(
     pose: Tensor,
     *,
     max_iterations: int,
-    rtol: float = 1e-10,
+    rtol: float = 1e-12,
     enough: Tensor | None = None,
     compile: bool = False,
 ) -> Estimate:
