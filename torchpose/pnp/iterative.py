@@ -74,9 +74,12 @@ def _advance(obs: Observations, state: _State, rtol: float, floor: Tensor, enoug
     # never so small that many rejections in a row would be needed to matter again
     damping = torch.where(lower, (0.1 * state.damping).clamp_min(1e-6), (10 * state.damping).clamp_min(1e-2))
     step, decrease, definite = damped_step(normal, damping)
-    if torch.compiler.is_compiling() or not bool(definite.all()):
+    if torch.compiler.is_compiling():
         plain, promise, _ = damped_step(normal_equations(obs, pose), damping)
         step, decrease = torch.where(definite, step, plain), torch.where(definite, decrease, promise)
+    elif len(rows := (~definite).nonzero().squeeze(1)):
+        plain, promise, _ = damped_step(normal_equations(obs.select(rows), pose[..., rows]), damping[rows])
+        step, decrease = step.index_copy(1, rows, plain), decrease.index_copy(0, rows, promise)
     trial = moved(pose, step)
     left = normal[COST] - RESERVE * decrease > enough
     trial, decrease = torch.where(left, pose, trial), torch.where(left, 0, decrease)
@@ -100,13 +103,14 @@ def minimise(
     max_iterations: int,
     rtol: float = 1e-12,
     enough: Tensor | None = None,
+    report: bool = True,
     compile: bool = False,
 ) -> Estimate:
     """Minima reached from poses (3, 4, B) in the dtype of ``obs``; those that stay above the costs ``enough`` (B,) are
-    only followed until this is sure.
+    only followed until this is sure. Without ``report``, of the normal equations only the cost is of use.
 
     A pose has converged when the step promises to lower its cost by no more than ``rtol`` of it, or than rounding
-    could; that step is still taken. Converged poses leave the batch when half of it is done.
+    could; that step is still taken. Converged poses leave the batch when a quarter of it is done.
     """
     # the distortion model is left to eager mode: its Python would be traced anew for every camera
     advance = compiled(_advance) if compile and obs.camera is None else _advance
@@ -125,7 +129,7 @@ def minimise(
         over = state.done | ~((state.damping < 1e8) & (state.normal[COST] < torch.inf))
         remaining = (~over).nonzero().squeeze(1)
         last = iteration == max_iterations or len(remaining) == 0
-        if last or (len(over) > 64 and 2 * len(remaining) <= len(over)):
+        if last or (len(over) > 64 and 4 * len(remaining) <= 3 * len(over)):
             pose, normal = settled(state.pose, state.normal, state.trial, state.decrease, state.done)
             if result is None or index is None:
                 count = torch.full_like(over, iteration, dtype=torch.int64)
@@ -135,6 +139,8 @@ def minimise(
                 result.normal.index_copy_(-1, index, normal)
                 result.iterations.index_fill_(0, index, iteration)
                 result.converged.index_copy_(0, index, state.done)
+            if last and not report:
+                return result
             if last:
                 normal = normal_equations(whole, result.pose)
                 # behind the camera from the start: not evaluated anew, the pose may not be one

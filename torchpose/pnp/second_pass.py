@@ -60,7 +60,13 @@ def second_pass(problem: Problem, late: Late, max_iterations: int, compile: bool
     single = problem.observed.to(torch.float32).select(index)
     bound = relevant(known[index])
     found = minimise(
-        single, other[..., index], max_iterations=max_iterations, rtol=1e-6, enough=bound.to(single.xy), compile=compile
+        single,
+        other[..., index],
+        max_iterations=max_iterations,
+        rtol=1e-6,
+        enough=bound.to(single.xy),
+        report=False,
+        compile=compile,
     )
     cost = found.normal[COST].to(known)
     other_cost[index], enough[index] = cost, found.converged & (cost > bound)
