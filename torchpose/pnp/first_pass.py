@@ -100,12 +100,13 @@ def _finish(
     # the cost has never risen by more than rounding can make it: it is still the minimum of this start
     sane = not_above(cost, before, 1e-3 * before + 1) & not_above(before, least, 1e-3 * least + 1)
     done = (decrease <= _RTOL * cost + floor) & definite & sane
-    found, normal = settled(pose, normal, moved(pose, step.to(pose)), decrease, done)
+    trial = moved(pose, step.to(pose))
+    found, normal = settled(pose, normal, trial, decrease, done)
     known = torch.where(sane, cost, least)
     different = other_cost < torch.inf
     decided = ~different | (bound > relevant(known))
     count = torch.full_like(done, EVALUATIONS, dtype=torch.int64)
-    return found, normal, done, torch.where(sane, pose, start.to(pose)), known, different, decided, count
+    return found, normal, done, torch.where(sane & definite, trial, start.to(pose)), known, different, decided, count
 
 
 def upright(pose: Tensor) -> Tensor:

@@ -17,6 +17,9 @@ from torchpose.pnp.normal_equations import COST
 from torchpose.pnp.problem import Problem
 from torchpose.pnp.verdict import Minima, choose, relevant
 
+# iterations in float32: the few poses that take more, off a saddle, would do so once more in float64
+_SINGLE = 8
+
 
 class Late(NamedTuple):
     """Poses that the first pass has left over.
@@ -62,7 +65,7 @@ def second_pass(problem: Problem, late: Late, max_iterations: int, compile: bool
     found = minimise(
         single,
         other[..., index],
-        max_iterations=max_iterations,
+        max_iterations=min(max_iterations, _SINGLE),
         rtol=1e-6,
         enough=bound.to(single.xy),
         report=False,
