@@ -113,13 +113,17 @@ def minimise(
     could; that step is still taken. Converged poses leave the batch when a quarter of it is done.
     """
     # the distortion model is left to eager mode: its Python would be traced anew for every camera
-    advance = compiled(_advance) if compile and obs.camera is None else _advance
+    compile = compile and obs.camera is None
+    advance = compiled(_advance) if compile else _advance
+    if compile:
+        obs = obs._replace(sums=None)
     whole, floor = obs, rounding(obs).expand(pose.shape[2:])
     if enough is None:
         enough = torch.full_like(pose[0, 0], torch.inf)
     unknown = pose.new_full((28, pose.shape[-1]), torch.inf)
     lam = torch.full_like(unknown[0], 1e-3)
-    state = _State(pose, unknown, lam, pose, lam, lam < 0)
+    # copies: torch.compile would make one more graph for tensors that are the same
+    state = _State(pose, unknown, lam, pose.clone(), lam.clone(), lam < 0)
     result: Estimate | None = None
     index: Tensor | None = None  # of the poses still under way; None: all
 
