@@ -349,7 +349,7 @@ def main() -> None:
         args.out.parent.mkdir(parents=True, exist_ok=True)
         text = f"# Batched PnP: time of a pose\n\nBy `scripts/bench_pnp.py`. {machine}.\n\n{markdown(rows, names)}\n"
         text += (
-            f"## What bounds it\n\nThe eager solve of {LARGE} poses: its operations, the bytes that they read and write,"
+            f"## What bounds it\n\nThe eager solve of {LARGE} poses: operations, the bytes that they read and write,"
             " and what these take at the rate of `addcmul_` on eight vectors of a chunk in float64, repeated.\n\n"
             f"{markdown(limits, limit_columns)}\n"
             f"CPU time of {LARGE} poses on one thread, by operation or compiled graph, profiler included.\n\n"
