@@ -6,27 +6,32 @@
 Every round times every contestant once, so that a change of the machine's speed meets all of them; the table gives the
 median and the quartiles of the rounds. A contestant that has used up `--seconds` at a batch size sits out the rounds
 that are left. Loops are timed on at most `LOOP` poses, other torch libraries on at most `PEERS`. PyTorch3D, PyPose and
-Kornia take part where they can be imported. `peak_mb` is the rise of the process's high-water mark at the first call of
-a batch size, in growing order; `result_mb` are the tensors returned, which no chunking can avoid. The profile at the
-end says which operations bound the rest; `--profile` prints that alone.
+Kornia take part where they can be imported. `result_mb` are the tensors returned, which no chunking can avoid,
+`working_mb` is what a call needs besides: the process's high-water mark over its size before. What bounds the eager
+code follows at the end: the bytes that its operations read and write, and the rate at which one operation alone does
+so; then the operations and graphs that take most of the time. `--profile` prints only that.
 """
 
 from __future__ import annotations
 
 import argparse
+import ctypes
 import math
 import platform
-import resource
 import shutil
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 from torchpose import pnp
 from torchpose.geometry import rotations
@@ -149,7 +154,6 @@ def measure(points: Tensor, batch: int, rounds: int, seconds: float, compile: bo
     times: dict[str, list[float]] = {}
     spent = dict.fromkeys(table, 0.0)
     failed: dict[str, str] = {}
-    peak: dict[str, float] = {}
     size: dict[str, float] = {}
 
     def once(name: str) -> None:
@@ -164,12 +168,10 @@ def measure(points: Tensor, batch: int, rounds: int, seconds: float, compile: bo
         times.setdefault(name, []).append(elapsed / len(part))
 
     for name in table:  # caches, compilation
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         try:
             once(name)
         except Exception as error:  # a peer that rejects planar points is a result, not a fault of the benchmark
             failed[name] = str(error).splitlines()[0][:60] if str(error) else type(error).__name__
-        peak[name] = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
         if batch <= LARGE:
             times.pop(name, None)
             spent[name] = 0.0
@@ -177,6 +179,11 @@ def measure(points: Tensor, batch: int, rounds: int, seconds: float, compile: bo
         for name in table:
             if name not in failed and (spent[name] < seconds or (k == 0 and name not in times)):
                 once(name)
+    peak = {
+        name: working_mb(partial(table[name][0], points, pixels[: table[name][1]]))
+        for name in table
+        if name.startswith("torchpose")
+    }
     base = statistics.median(times["cv2 ITERATIVE"])
     rows = []
     for name in table:
@@ -193,11 +200,80 @@ def measure(points: Tensor, batch: int, rounds: int, seconds: float, compile: bo
                 "rounds": len(times[name]),
                 "poses_per_s": 1 / middle,
                 "times_cv2_iterative": base / middle,
-                "peak_mb": peak[name],
-                **({"result_mb": size[name]} if name in size else {}),
+                **({"working_mb": peak[name], "result_mb": size[name]} if name in size else {}),
             }
         )
     return rows
+
+
+def working_mb(call: Callable[[], object]) -> float:
+    """What a call needs besides its result, MB; NaN where the system does not tell."""
+    try:
+        ctypes.CDLL("libc.so.6").malloc_trim(0)
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return math.nan
+
+    def status(key: str) -> float:
+        return int(Path("/proc/self/status").read_text().split(key + ":")[1].split()[0]) / 1024
+
+    before = status("VmRSS")
+    result = call()
+    size = sum(v.nbytes for v in vars(result).values()) / 2**20 if isinstance(result, pnp.PnPResult) else 0.0
+    return status("VmHWM") - before - size
+
+
+class Traffic(TorchDispatchMode):
+    """Counts the operations, and the bytes of the tensors that they read and write, of views none."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls = self.bytes = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        self.calls += 1
+        if not func.is_view:
+            leaves = tree_leaves((args, kwargs, result))
+            tensors = {id(v): v for v in leaves if isinstance(v, Tensor)}
+            self.bytes += sum(v.numel() * v.element_size() for v in tensors.values())
+        return result
+
+
+def bound(points: Tensor) -> dict[str, object]:
+    """The eager solve of `LARGE` poses beside its traffic at the rate of one operation repeated in the same chunks."""
+    pixels = scene(points, LARGE)
+
+    def run() -> None:
+        pnp.solve(points, pixels, MATRIX, sigma_px=SIGMA_PX)
+
+    with Traffic() as traffic:
+        run()
+    # a typical operation of a chunk, 8 vectors in float64, into memory at hand; and the least that any call takes
+    a, b, c = (torch.rand(8, 16384, dtype=torch.float64) for _ in range(3))
+    least = torch.rand(1, dtype=torch.float64)
+
+    def median_s(call: Callable[[], object], repeat: int) -> float:
+        times = []
+        for _ in range(9):
+            start = time.perf_counter()
+            for _ in range(repeat):
+                call()
+            times.append((time.perf_counter() - start) / repeat)
+        return statistics.median(times)
+
+    per_call = median_s(lambda: least.add_(least), 2000)
+    per_byte = (median_s(lambda: c.addcmul_(a, b), 200) - per_call) / (4 * a.nbytes)
+    return {
+        "points": len(points),
+        "threads": torch.get_num_threads(),
+        "calls": traffic.calls,
+        "kb_per_pose": traffic.bytes / LARGE / 1000,
+        "us_per_call": 1e6 * per_call,
+        "gb_per_s": 1e-9 / per_byte,
+        "bound_us_per_pose": 1e6 * (traffic.calls * per_call + traffic.bytes * per_byte) / LARGE,
+        "us_per_pose": 1e6 * median_s(run, 1) / LARGE,
+    }
 
 
 def profile(points: Tensor, compile: bool, most: int = 12) -> list[dict[str, object]]:
@@ -206,6 +282,7 @@ def profile(points: Tensor, compile: bool, most: int = 12) -> list[dict[str, obj
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
+        pnp.solve(points, pixels, MATRIX, sigma_px=SIGMA_PX, compile=compile)  # compiles, for this number of threads
         with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as record:
             pnp.solve(points, pixels, MATRIX, sigma_px=SIGMA_PX, compile=compile)
     finally:
@@ -248,7 +325,7 @@ def main() -> None:
     )
     print(machine)
     names = ["points", "batch", "method", "us_per_pose", "us_quartiles", "rounds", "poses_per_s"]
-    names += ["times_cv2_iterative", "peak_mb", "result_mb", "note"]
+    names += ["times_cv2_iterative", "working_mb", "result_mb", "note"]
     rows: list[dict[str, object]] = []
     for batch in () if args.profile else sorted(args.batches):
         for count in args.points:
@@ -259,12 +336,24 @@ def main() -> None:
     for fast in (False, True) if compile else (False,):
         for count in args.points:
             operations += profile(TARGETS[count], fast)
+    limits: list[dict[str, object]] = []
+    for threads in sorted({1, args.threads}):
+        torch.set_num_threads(threads)
+        limits += [bound(TARGETS[count]) for count in args.points]
+    limit_columns = ["points", "threads", "calls", "kb_per_pose", "us_per_call", "gb_per_s", "bound_us_per_pose"]
+    limit_columns.append("us_per_pose")
+    print(markdown(limits, limit_columns))
     columns = ["points", "compiled", "operation", "calls", "us_per_pose", "share"]
     print(markdown(operations, columns))
     if args.out is not None:
         args.out.parent.mkdir(parents=True, exist_ok=True)
         text = f"# Batched PnP: time of a pose\n\nBy `scripts/bench_pnp.py`. {machine}.\n\n{markdown(rows, names)}\n"
-        text += f"## What bounds it\n\nCPU time of {LARGE} poses on one thread, by operation, profiler included.\n\n"
+        text += (
+            f"## What bounds it\n\nThe eager solve of {LARGE} poses: operations, the bytes that they read and write,"
+            " and what these take at the rate of `addcmul_` on eight vectors of a chunk in float64, repeated.\n\n"
+            f"{markdown(limits, limit_columns)}\n"
+            f"CPU time of {LARGE} poses on one thread, by operation or compiled graph, profiler included.\n\n"
+        )
         args.out.write_text(text + markdown(operations, columns))
 
 

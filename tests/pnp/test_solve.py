@@ -223,6 +223,14 @@ def test_code_of_points_behind_the_camera() -> None:
     assert bool((start.code == PnPCode.BEHIND_CAMERA).all())
 
 
+def test_six_points_of_which_epnp_makes_little_are_not_behind_the_camera() -> None:
+    g = torch.Generator().manual_seed(3)
+    points = 40 * (torch.rand(1000, 6, 3, generator=g, dtype=F64) - 0.5)
+    r, t, _ = views(points[0], 1000, near=3)
+    result = pnp.solve(points, pixels(project(points, r, t), 0.5), MATRIX, sigma_px=0.5)
+    assert bool(result.converged.all())
+
+
 def test_code_of_poses_that_need_more_iterations() -> None:
     r, t, xy = views(GRID, 10)
     away = rotations.exp(torch.full((10, 3), 0.2, dtype=F64)) @ r

@@ -7,6 +7,7 @@ microseconds, and handing Python's lock over takes longer (decision 0004).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import TypeVar
 
 import torch
@@ -19,8 +20,12 @@ _KEPT = 30 << 20
 
 def each(function: Callable[[_Rows], _T], chunks: Sequence[_Rows]) -> list[_T]:
     """The function of every chunk."""
-    if len(chunks) > 1:
-        # glibc gives freed memory above a threshold back to the system, and every chunk would fault it in again;
-        # freeing one large block raises that threshold to its size. Not touched, it costs nothing.
-        torch.empty(_KEPT, dtype=torch.uint8)
+    _keep_memory()
     return [function(rows) for rows in chunks]
+
+
+@cache
+def _keep_memory() -> None:
+    """glibc gives freed memory above a threshold back to the system, and every chunk would fault it in again: twice the
+    time. Freeing one large block raises that threshold to its size for good; not touched, it costs nothing."""
+    torch.empty(_KEPT, dtype=torch.uint8)

@@ -1,12 +1,14 @@
 """The same few steps for every pose: enough for nearly all of them, and no bookkeeping.
 
-Two evaluations in float32 of both starts say which minimum is the better one, and nearly always that the other one is
-out of the question. The better one gets two more in float64, the last of which gives the covariance too. What has not
-arrived then, and what is not decided, is left to `iterative.minimise`.
+One evaluation in float32 of both starts says which minimum is the better one, and mostly that the other one is out of
+the question. Then only the better one goes on: a Newton step with residuals in float64 and all the rest in float32, and
+an evaluation in float64, which gives the covariance and says whether the pose has arrived. What has not, and what is
+not decided, is left to `second_pass`.
 """
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -14,9 +16,10 @@ from torch import Tensor
 
 from torchpose.geometry.small_linalg import orthonormalise
 from torchpose.pnp._compile import compiled
-from torchpose.pnp.iterative import Estimate, not_above, rounding, settled
+from torchpose.pnp.iterative import RESERVE, Estimate, not_above, rounding, settled
 from torchpose.pnp.normal_equations import (
     COST,
+    STARTS,
     Observations,
     damped_step,
     moved,
@@ -24,95 +27,86 @@ from torchpose.pnp.normal_equations import (
 )
 from torchpose.pnp.verdict import Minima, relevant
 
-EVALUATIONS = 4
-# promised decreases by which the cost of a minimum may yet fall
-_RESERVE = 10.0
+EVALUATIONS = 3
+# promised decrease over cost below which a pose has arrived; the step that promises it is taken
+_RTOL = 1e-12
 
 
 class FirstPass(NamedTuple):
-    """Minima found; (B,) bool, is there a start? and (3, 4, B), from where the better one may go on."""
+    """Minima found; (B,) bool, is there a start? and where the better one may go on, (3, 4, B) of cost (B,) at most."""
 
     minima: Minima
     ahead: Tensor
     fallback: Tensor
+    least: Tensor
 
 
-def first_pass(single: Observations, final: Observations, start: Tensor, compile: bool) -> FirstPass:
-    """From starts (3, 4, S, B), S one or two, on the observations in float32 and those in float64."""
+def first_pass(
+    single: Observations, double: Observations, final: Observations, start: Tensor, compile: bool
+) -> FirstPass:
+    """From starts (3, 4, S, B), S one or two; the observations without distortion in both dtypes, and as they are."""
     # the distortion model is left to eager mode: its Python would be traced anew for every camera
     fast = compile and final.camera is None
-    evaluate = compiled(_evaluate) if fast else _evaluate
-    decide = compiled(_decide) if fast else _decide
-    finish = compiled(_finish) if fast else _finish
-    several, exact = single.each(), final
     if fast:
-        several, exact = several._replace(sums=None), final._replace(sums=None)
-    pose, first, _ = evaluate(several, start, False)
-    trial, cost, decrease = evaluate(several, pose, False)
-    better, fallback, other, least, other_cost, different, undecided = decide(
-        start, pose, trial, first, cost, decrease, final.xy.new_empty(0)
+        single, double, final = (v._replace(sums=None) for v in (single, double, final))
+    begin = compiled(_begin) if fast else _begin
+    improve = compiled(_improve) if fast else _improve
+    finish = compiled(_finish) if fast else _finish
+    better, pose, least, other, other_cost, bound = begin(single.each(), start)
+    pose, newton = improve(single, double, pose)
+    found, normal, done, going, known, different, decided, count = finish(
+        final, better, pose, newton, least, other_cost, bound
     )
-    ahead = first.isfinite().any(0)
-    better, before, _ = evaluate(exact, better, True)
-    pose, normal, done = finish(exact, better, before, least, ahead)
-    count = torch.full_like(ahead, EVALUATIONS, dtype=torch.int64)
-    minima = Minima(Estimate(pose, normal, count, done), other, other_cost, different, ~undecided)
-    return FirstPass(minima, ahead, fallback)
+    minima = Minima(Estimate(found, normal, count, done), other, other_cost, different, decided)
+    return FirstPass(minima, least < torch.inf, going, known)
 
 
-def _evaluate(obs: Observations, pose: Tensor, newton: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """The next pose, by a step that is not damped; the cost of this one, and the decrease that the step promises."""
-    normal = normal_equations(obs, pose, newton)
+def _begin(obs: Observations, start: Tensor) -> tuple[Tensor, ...]:
+    """The better start (3, 4, B), its next pose, its cost; the other one, its cost, and what this may fall to."""
+    normal = normal_equations(obs, start)
     step, decrease, _ = damped_step(normal)
-    return moved(pose, step), normal[COST], decrease
-
-
-def _decide(
-    start: Tensor, pose: Tensor, trial: Tensor, first: Tensor, cost: Tensor, decrease: Tensor, like: Tensor
-) -> tuple[Tensor, ...]:
-    """The better pose, in the dtype of ``like``, and its fallback; the other one; both costs; is there another minimum,
-    and is it undecided?"""
-    ahead = first.isfinite()
-    worse = ~(cost <= first)
-    # a start that Gauss-Newton leaves for the worse says nothing about its minimum
-    cost = torch.where(ahead, torch.where(worse, first, cost), torch.inf)
-    if torch.compiler.is_compiling() or bool(worse.any()):
-        pose, trial = torch.where(worse, start, pose), torch.where(worse, start, trial)
+    cost = normal[COST]
     if start.shape[2] == 1:
-        nothing = torch.zeros_like(ahead[0])
-        better, fallback = trial[:, :, 0], pose[:, :, 0]
-        return (
-            upright(better.to(like)),
-            fallback,
-            fallback,
-            cost[0],
-            torch.full_like(cost[0], torch.nan),
-            nothing,
-            nothing,
-        )
+        better, none = start[:, :, 0], torch.full_like(cost[0], torch.inf)
+        return better, moved(better, step[:, 0]), cost[0], better, none, none
     swap = cost[1] < cost[0]
-    better = torch.where(swap, trial[:, :, 1], trial[:, :, 0])
-    fallback, other = (torch.where(swap, pose[:, :, k], pose[:, :, 1 - k]) for k in (1, 0))
-    least, other_cost = torch.minimum(cost[0], cost[1]), torch.maximum(cost[0], cost[1])
-    bound = other_cost - _RESERVE * torch.where(swap, decrease[0], decrease[1])
-    different = other_cost.isfinite()
-    undecided = different & (~(bound > relevant(least)) | worse[0] | worse[1])
-    return upright(better.to(like)), fallback, other, least, other_cost, different, undecided
+    better, other = (torch.where(swap, start[:, :, 1 - k], start[:, :, k]) for k in (0, 1))
+    pose = moved(better, torch.where(swap, step[:, 1], step[:, 0]))
+    least, most = torch.minimum(cost[0], cost[1]), torch.maximum(cost[0], cost[1])
+    return better, pose, least, other, most, most - RESERVE * torch.where(swap, decrease[0], decrease[1])
+
+
+def _improve(single: Observations, double: Observations, pose: Tensor) -> tuple[Tensor, Tensor]:
+    """The next pose, in float64, and Newton's equations (28, B) at this one."""
+    pose = upright(pose.to(double.xy))
+    newton = normal_equations(single, pose, newton=True, fine=double)
+    step, _, _ = damped_step(newton)
+    return moved(pose, step.to(pose)), newton
 
 
 def _finish(
-    obs: Observations, pose: Tensor, before: Tensor, least: Tensor, ahead: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The last evaluation: pose, normal equations, and has it arrived?"""
+    obs: Observations, start: Tensor, pose: Tensor, newton: Tensor, least: Tensor, other_cost: Tensor, bound: Tensor
+) -> tuple[Tensor, ...]:
+    """The last evaluation; its step takes the matrix of the one before, which has hardly changed.
+
+    Pose, normal equations, has it arrived? Where else to go on and the least cost known; is there another minimum, and
+    is enough known of it? Iterations.
+    """
     normal = normal_equations(obs, pose)
-    step, decrease, _ = damped_step(normal)
-    floor, cost = rounding(obs), normal[COST]
-    done = (decrease <= 1e-10 * cost + floor) & not_above(cost, before, floor)
-    # nor has it jumped to another minimum
-    done = done & not_above(before, least, 1e-3 * least + 1)
-    pose, normal = settled(pose, normal, moved(pose, step), decrease, done)
-    cost = torch.where(ahead, normal[COST], torch.inf)
-    return pose, torch.cat([normal[:COST], cost[None]]), done
+    rows = [v for a, b in pairwise(STARTS) for v in (newton[a : b - 1], normal[b - 1 : b].to(newton))]
+    step, decrease, definite = damped_step(torch.cat([*rows, newton[COST:]]))
+    cost, before, floor = torch.where(least < torch.inf, normal[COST], torch.inf), newton[COST], rounding(obs)
+    normal = torch.cat([normal[:COST], cost[None]])
+    # the cost has never risen by more than rounding can make it: it is still the minimum of this start
+    sane = not_above(cost, before, 1e-3 * before + 1) & not_above(before, least, 1e-3 * least + 1)
+    done = (decrease <= _RTOL * cost + floor) & definite & sane
+    trial = moved(pose, step.to(pose))
+    found, normal = settled(pose, normal, trial, decrease, done)
+    known = torch.where(sane, cost, least)
+    different = other_cost < torch.inf
+    decided = ~different | (bound > relevant(known))
+    count = torch.full_like(done, EVALUATIONS, dtype=torch.int64)
+    return found, normal, done, torch.where(sane & definite, trial, start.to(pose)), known, different, decided, count
 
 
 def upright(pose: Tensor) -> Tensor:

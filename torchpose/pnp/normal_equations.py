@@ -123,12 +123,17 @@ def product2(a: Tensor, b: Tensor) -> Tensor:
     return a[:, 0, None] * b[0] + a[:, 1, None] * b[1]
 
 
-def differentiate(obs: Observations, pose: Tensor) -> Derivatives:
-    """Residuals and their derivatives by the position of the point, at poses (3, 4, ...)."""
-    p = camera_points(obs, pose)
-    z = p[2]
-    d = 1 / z
+def differentiate(obs: Observations, pose: Tensor, fine: Observations | None = None) -> Derivatives:
+    """Residuals and their derivatives by the position of the point, at poses (3, 4, ...).
+
+    With ``fine``, the same observations in a longer dtype, which is that of the poses, residuals are computed in this
+    and then rounded to the dtype of ``obs``, as is all the rest.
+    """
+    p = camera_points(fine or obs, pose)
+    d = 1 / p[2]
     uv = p[:2] * d
+    residual = residuals(fine or obs, uv)
+    pose, z, d, uv, residual = (v.to(obs.xy) for v in (pose, p[2], d, uv, residual))
     rows = torch.empty((4, *uv.shape), dtype=uv.dtype, device=uv.device)
     b = rows[:3]
     # (du/dX_cam) R z, the unwhitened derivatives of u and v by the three axes of the object
@@ -142,7 +147,7 @@ def differentiate(obs: Observations, pose: Tensor) -> Derivatives:
     else:
         weight = weight * d
         b.copy_(weight[:, 0] * b[:, 0, None] + weight[:, 1] * b[:, 1, None])
-    rows[3] = residual = residuals(obs, uv)
+    rows[3] = residual
     cost = residual[0].square().addcmul_(residual[1], residual[1])
     if obs.huber != float("inf"):
         length = cost.sqrt()
@@ -152,18 +157,19 @@ def differentiate(obs: Observations, pose: Tensor) -> Derivatives:
     return Derivatives(z, rows, cost)
 
 
-def normal_equations(obs: Observations, pose: Tensor, newton: bool = False) -> Tensor:
+def normal_equations(obs: Observations, pose: Tensor, newton: bool = False, fine: Observations | None = None) -> Tensor:
     """Packed J^T J, J^T r and cost (28, ...) at the poses (3, 4, ...); the cost is infinite with a point behind.
 
     With ``newton`` the second derivatives of the projections times r are added to J^T J. That of u along two motions of
     the point is -(du dz' + du' dz) / z; the distortion of a camera is taken as linear.
+    ``fine`` as in `differentiate`: a step has then the accuracy of its dtype, but for an error in proportion to itself.
     """
     if torch.compiler.is_compiling():
-        return scalar.normal_equations(obs, pose, newton)
-    z, rows, cost = differentiate(obs, pose)
+        return scalar.normal_equations(obs, pose, newton, fine)
+    z, rows, cost = differentiate(obs, pose, fine)
     u, v = rows.unbind(1)
     products = torch.empty((_PRODUCTS, *cost.shape), dtype=cost.dtype, device=cost.device)
-    depth = pose[2, :3, None] / z if newton else None
+    depth = pose[2, :3, None].to(z) / z if newton else None
     gradient = [products[k] for k in _BR]
     start = 0
     for m in range(3):

@@ -87,7 +87,7 @@ def ippe(points: Tensor, xy: Tensor, weight: Tensor | None, frame: Tensor, cente
 
     # Harker, O'Leary: with h3 given, the first two rows of H follow by linear least squares from u (h3 . m)
     products = (xy[:, None] * plane).flatten(0, 1)  # u x, u y, u, v x, v y, v: (6, N, B)
-    coefficients = (basis[:, None] * products).sum(2)  # (3, 6, B)
+    coefficients = moments(basis, products).transpose(0, 1)  # (3, 6, B)
     residual = products - basis[0] * coefficients[0, :, None]
     residual = residual - basis[1] * coefficients[1, :, None] - basis[2] * coefficients[2, :, None]
     a, b, c = residual.unflatten(0, (2, 3)).transpose(0, 1).flatten(1, 2)  # (2N, B) each
@@ -146,11 +146,18 @@ def translation(r: Tensor, points: Tensor, xy: Tensor, weight: Tensor | None, ce
     if weight is not None:
         offset, xy_offset = offset * weight, xy_offset * weight
     count = xy.shape[1] if weight is None else weight.sum(0)
-    px, py, pz = offset[:, :, None]
-    rotated = r[:, 0, None] * px + r[:, 1, None] * py + r[:, 2, None] * pz  # (3, N, S, B), about the centroid
-    e = xy[:, :, None] * rotated[2] - rotated[:2]  # (2, N, S, B) = (tx, ty) - tz (x, y)
-    tz = -(xy_offset[:, :, None] * e).sum(1).sum(0) / xy_offset.square().sum(1).sum(0)
-    txy = e.sum(1) / count + mean[:, None] * tz
+    # the points are about their centroid: their moments with (x, y), and with its square, are all that is needed
+    mixed = moments(offset, xy_offset)[:, :, None]  # (2, 3, 1, B)
+    square = moments(offset, (xy_offset * xy).sum(0)[None])[0, :, None]  # (3, 1, B)
+    tz = ((r[:2] * mixed).sum(1).sum(0) - (r[2] * square).sum(0)) / xy_offset.square().sum(1).sum(0)
+    txy = (r[2] * mixed).sum(1) / count + mean[:, None] * tz
     t = torch.cat([txy, tz[None]])
     cx, cy, cz = center[:, None]
     return t - (r[:, 0] * cx + r[:, 1] * cy + r[:, 2] * cz)
+
+
+def moments(points: Tensor, values: Tensor) -> Tensor:
+    """Sums (k, m, B) over the points (m, N, B|1) times values (k, N, B)."""
+    if points.shape[2] == 1:
+        return points[:, :, 0] @ values
+    return (points * values[:, None]).sum(2)

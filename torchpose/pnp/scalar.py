@@ -23,19 +23,22 @@ def cross(a: Vector, b: Vector) -> list[Any]:
     return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
-def differentiate(obs: Observations, pose: Tensor) -> tuple[Tensor, list[list[Tensor]], Tensor]:
+def differentiate(
+    obs: Observations, pose: Tensor, fine: Observations | None
+) -> tuple[Tensor, list[list[Tensor]], Tensor]:
     """Depth (N, ...), rows b and residual, each for u and v, (4, 2) of (N, ...), and cost (N, ...)."""
-    x, y, z = obs.points
+    exact = fine or obs
+    x, y, z = exact.points
     px, py, pz = (pose[i, 0] * x + pose[i, 1] * y + pose[i, 2] * z + pose[i, 3] for i in range(3))
     d = 1 / pz
     u, v = px * d, py * d
-    rows = [[(pose[0, m] - u * pose[2, m]) * d, (pose[1, m] - v * pose[2, m]) * d] for m in range(3)]
-    rows.append([u - obs.xy[0], v - obs.xy[1]])
-    w = obs.whitening
-    if w.ndim == obs.xy.ndim:
-        rows = [[a * w[0], b * w[-1]] for a, b in rows]
-    else:
-        rows = [[w[0, 0] * a + w[0, 1] * b, w[1, 0] * a + w[1, 1] * b] for a, b in rows]
+    residual = _whitened(exact.whitening, u - exact.xy[0], v - exact.xy[1], exact.xy.ndim)
+    pose, pz, d, u, v, *residual = (value.to(obs.xy.dtype) for value in (pose, pz, d, u, v, *residual))
+    rows = []
+    for m in range(3):
+        a, b = (pose[0, m] - u * pose[2, m]) * d, (pose[1, m] - v * pose[2, m]) * d
+        rows.append(_whitened(obs.whitening, a, b, obs.xy.ndim))
+    rows.append(residual)
     cost = rows[3][0] * rows[3][0] + rows[3][1] * rows[3][1]
     if obs.huber != float("inf"):
         length = cost.sqrt()
@@ -46,14 +49,21 @@ def differentiate(obs: Observations, pose: Tensor) -> tuple[Tensor, list[list[Te
     return pz, rows, cost
 
 
-def normal_equations(obs: Observations, pose: Tensor, newton: bool) -> Tensor:
+def _whitened(w: Tensor, u: Tensor, v: Tensor, diagonal: int) -> list[Tensor]:
+    """Whitening (2, N, ...), of ``diagonal`` dimensions, or (2, 2, N, ...) times the vector (u, v)."""
+    if w.ndim == diagonal:
+        return [u * w[0], v * w[-1]]
+    return [w[0, 0] * u + w[0, 1] * v, w[1, 0] * u + w[1, 1] * v]
+
+
+def normal_equations(obs: Observations, pose: Tensor, newton: bool, fine: Observations | None) -> Tensor:
     """Packed (28, ...)."""
-    z, rows, cost = differentiate(obs, pose)
+    z, rows, cost = differentiate(obs, pose, fine)
     x = obs.points.unbind()
     u, v = ([row[k] for row in rows] for k in (0, 1))
     ju, jv = [*u[:3], *cross(x, u), u[3]], [*v[:3], *cross(x, v), v[3]]
     c = [a * u[3] + b * v[3] for a, b in rows[:3]]
-    q = [pose[2, m] / z for m in range(3)]
+    q = [pose[2, m].to(z) / z for m in range(3)]
     s, depth = [*c, *cross(x, c)], [*q, *cross(x, q)]
     along = c[0] * x[0] + c[1] * x[1] + c[2] * x[2]
     sums = []

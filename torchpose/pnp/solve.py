@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from torchpose.pnp import chunks
 from torchpose.pnp.candidates import Candidates
 from torchpose.pnp.dlt import dlt
 from torchpose.pnp.epnp import epnp
-from torchpose.pnp.first_pass import EVALUATIONS, FirstPass, first_pass, upright
+from torchpose.pnp.first_pass import EVALUATIONS, first_pass, upright
 from torchpose.pnp.implicit import attach_gradient
 from torchpose.pnp.iterative import Estimate, minimise
 from torchpose.pnp.normal_equations import COST, normal_equations
@@ -23,6 +23,7 @@ from torchpose.pnp.planar import planar
 from torchpose.pnp.posit import posit
 from torchpose.pnp.problem import Inputs, Problem, prepare
 from torchpose.pnp.result import PnPCode, PnPError, PnPResult
+from torchpose.pnp.second_pass import Late, left_over, second_pass
 from torchpose.pnp.starts import batch_first, starts
 from torchpose.pnp.verdict import Table, choose, write
 
@@ -144,7 +145,13 @@ def _solve(
 
     def second(late: Late) -> tuple[Tensor, Table]:
         columns = Table.empty(len(late.which), inputs.pixels)
-        _finish(prepare(inputs.rows(late.which)), late, max_iterations, compile, columns)
+        problem = prepare(inputs.rows(late.which))
+        write(
+            problem,
+            second_pass(problem, late, max_iterations, compile),
+            _bad(problem, late.pose[:, :, None], 0),
+            columns,
+        )
         return late.which, columns
 
     parts = chunks.each(first, [slice(k, min(k + _CHUNK, batch)) for k in range(0, batch, _CHUNK)])
@@ -154,22 +161,6 @@ def _solve(
         for index, columns in chunks.each(second, [Late(*fields) for fields in every]):
             table.replace(index, columns)
     return table.result()
-
-
-class Late(NamedTuple):
-    """Poses that the first pass has left over.
-
-    Attributes:
-        which: (L,) int64.
-        poses: (3, 4, 2, L) of the better minimum and of the other one, or from where to go on.
-        normal: (28, 2, L), the cost alone for the other one.
-        arrived: (2, L) bool, is enough known of this minimum?
-    """
-
-    which: Tensor
-    poses: Tensor
-    normal: Tensor
-    arrived: Tensor
 
 
 def _solve_chunk(
@@ -207,45 +198,10 @@ def _solve_chunk(
         flat = minimise(every, upright(poses.double()).flatten(2), max_iterations=max_iterations)
         write(problem, choose(Estimate(*(v.unflatten(-1, (options, batch)) for v in flat))), bad, table)
         return None
-    state = first_pass(single, problem.final, poses.float(), compile)
+    state = first_pass(single, problem.observed, problem.final, poses.float(), compile)
     write(problem, state.minima, bad, table, compile and problem.calibration is None)
-    return _left(state, bad)
-
-
-def _left(state: FirstPass, bad: tuple[tuple[Tensor, PnPCode], ...]) -> Late | None:
-    best, other, other_cost, different, decided = state.minima
-    late = ~(best.converged & decided) & state.ahead
-    for failed, _ in bad:
-        late = late & ~failed
-    index = late.nonzero().squeeze(1)
-    if len(index) == 0:
-        return None
-    done, decided = best.converged[index], decided[index]
-    going = torch.where(done, best.pose[..., index], state.fallback[..., index].to(best.pose))
-    poses = torch.stack([going, other[..., index].to(going)], 2)
-    normal = torch.stack([best.normal[:, index], best.normal.new_full((28, len(index)), torch.inf)], 1)
-    normal[COST, 1] = torch.where(different[index] & decided, other_cost[index].to(normal), torch.inf)
-    return Late(index, poses, normal, torch.stack([done, decided]))
-
-
-def _finish(problem: Problem, late: Late, max_iterations: int, compile: bool, table: Table) -> None:
-    """Writes the results of poses left over."""
-    batch = len(late.which)
-    going = (~late.arrived).flatten().nonzero().squeeze(1)
-    poses, normal = upright(late.poses).flatten(2), late.normal.flatten(1)
-    part = problem.final.select(going % batch)
-    if compile:
-        part = part._replace(sums=None)
-    found = minimise(part, poses[..., going], max_iterations=max_iterations, compile=compile)
-    count = torch.full((2 * batch,), EVALUATIONS, dtype=torch.int64, device=going.device)
-    estimate = Estimate(
-        poses.index_copy_(-1, going, found.pose),
-        normal.index_copy_(-1, going, found.normal),
-        count.index_add_(0, going, found.iterations),
-        late.arrived.flatten().index_copy_(0, going, found.converged),
-    )
-    minima = choose(Estimate(*(v.unflatten(-1, (2, batch)) for v in estimate)))
-    write(problem, minima, _bad(problem, late.poses, 0), table)
+    failed = torch.stack([flag.expand(len(inputs.pixels)) for flag, _ in bad]).any(0)
+    return left_over(state, failed)
 
 
 def _bad(problem: Problem, poses: Tensor, least: int) -> tuple[tuple[Tensor, PnPCode], ...]:

@@ -52,8 +52,9 @@ def _in_space(problem: Problem, rows: Tensor) -> Tensor:
     if xy.shape[1] >= 6:
         solutions = [epnp(points, xy, mask), Candidates(*(v[:, :1] for v in found))]
         # points behind the camera have the image of their reflection at the centroid, in front of it
-        if bool((solutions[0].rms > _SUSPICIOUS).any()):
-            reflected = epnp(-points, xy, mask).rms < 0.1 * solutions[0].rms
+        rms = torch.fmin(*(s.rms[:, :1] for s in solutions))
+        if bool((rms > _SUSPICIOUS).any()):
+            reflected = epnp(-points, xy, mask).rms < 0.1 * rms
             solutions = [
                 Candidates(torch.where(reflected[..., None, None], torch.inf, s.R), s.t, s.rms) for s in solutions
             ]
