@@ -57,6 +57,22 @@ def test_codes_of_much_blurred_rings(blur):
     assert off[found.good].quantile(0.95) < 1
 
 
+def test_codes_without_noise():
+    """A blur of 0.37 of the outer radius; to first order in the distance the codes would be wrong by 0.1 to 0.2."""
+    camera, target = pinhole(1111.11, 200, 200), Target.load("quad40")
+    r = torch.eye(3, dtype=torch.float64)[None]
+    frame = render(camera, target, r, torch.tensor([[0.0, 0, 790]], dtype=torch.float64), psf_sigma=2.6)
+    truth = exact_ellipses(target, camera, r, torch.tensor([[0.0, 0, 790]], dtype=torch.float64))[0]
+    rough = truth[:, 0] + torch.tensor([0.2, -0.1, 0.4, 0.4, 0], dtype=torch.float64)
+    seen, one = torch.ones(4, 64, dtype=torch.bool), torch.ones(4, dtype=torch.float64)
+    nought, start = torch.zeros(4, dtype=torch.int64), torch.full((4,), 0.4, dtype=torch.float64)
+    found = fit_small_rings(frame, nought, rough, start, seen, one, torch.tensor(1111.11))
+    code = (found.inner.params[:, 2:4].prod(-1) / found.outer.params[:, 2:4].prod(-1)).sqrt()
+    assert found.good.all()
+    assert (code - truth[:, 1, 3] / truth[:, 0, 3])[:3].abs().max() < 0.005
+    assert abs(code[3] - 0.6) < 0.05
+
+
 def test_refuses_what_is_no_ring():
     frames = 128 + 20 * torch.randn(1, 80, 80, generator=torch.Generator().manual_seed(1))
     frames[0, 30:50, 30:50] = 20.0  # a square without a hole
