@@ -58,7 +58,7 @@ def solve(
     compile: bool = False,
     raise_on_failure: bool = False,
 ) -> PnPResult:
-    """Poses of B sets of N points.
+    """Poses of B sets of N points. Line features have a solver of their own, `torchpose.pnp.lines`.
 
     Args:
         object_points: (N, 3) shared by all poses, or (B, N, 3).
