@@ -12,6 +12,7 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.geometry import rotations
 from torchpose.geometry.small_linalg import matmul3
+from torchpose.pnp.iterative import minimise
 from torchpose.pnp.normal_equations import (
     COST,
     STARTS,
@@ -96,6 +97,41 @@ def test_what_is_compiled_is_the_same_arithmetic(kind: str) -> None:
         scalar = run()
     for a, b in zip(plain, scalar, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("tracing", [False, True], ids=["eager", "scalar"])
+@pytest.mark.parametrize("kind", ["shared", "own", "full"])
+def test_float32_with_fine_residuals_steps_as_float64_does(kind: str, tracing: bool) -> None:
+    obs, pose = setting(kind)
+    # residuals of 1e-7, below the rounding of float32
+    p = camera_points(obs, pose)
+    obs = obs._replace(xy=p[:2] / p[2] + 1e-6 * obs.xy)
+    with mock.patch("torch.compiler.is_compiling", return_value=tracing):
+        mixed = normal_equations(obs.to(torch.float32), pose, newton=True, fine=obs)
+        plain = normal_equations(obs.to(torch.float32), pose.float(), newton=True)
+        exact, _, _ = damped_step(normal_equations(obs, pose, newton=True))
+        steps = [damped_step(normal)[0].double() for normal in (mixed, plain)]
+    assert mixed.dtype == torch.float32
+    errors = [float(((step - exact).norm(dim=0) / exact.norm(dim=0)).max()) for step in steps]
+    assert errors[0] < 1e-3
+    assert errors[1] > 10 * errors[0], "float32 alone could not"
+
+
+def test_minima_out_of_the_question_are_left_where_this_is_sure() -> None:
+    obs, pose = setting("own")
+    p = camera_points(obs, pose)
+    obs = obs._replace(xy=p[:2] / p[2] + 1e-2 * obs.xy)
+    start = moved(pose, torch.full((6, BATCH), 0.05, dtype=F64))
+    cost = normal_equations(obs, start)[COST]
+    found = minimise(obs, start, max_iterations=50)
+    assert bool(found.converged.all())
+    least = found.normal[COST]
+    assert bool((least < 0.9 * cost).all())
+    left = minimise(obs, start, max_iterations=50, enough=torch.stack([0 * cost[0] - 1e9, *least[1:] + 1]))
+    assert bool(left.converged.all())
+    torch.testing.assert_close(left.pose[..., 0], start[..., 0], rtol=0, atol=0)
+    torch.testing.assert_close(left.normal[COST, 0], cost[0])
+    torch.testing.assert_close(left.normal[COST, 1:], least[1:])
 
 
 def test_step_of_few_and_of_many_poses_is_the_same() -> None:

@@ -19,6 +19,8 @@ from torchpose.pnp.verdict import Minima, choose, relevant
 
 # iterations in float32: the few poses that take more, off a saddle, would do so once more in float64
 _SINGLE = 8
+# poses up to which an iteration takes the time of its calls, in either dtype
+_FEW = 512
 
 
 class Late(NamedTuple):
@@ -57,31 +59,36 @@ def left_over(state: FirstPass, failed: Tensor) -> Late | None:
 def second_pass(problem: Problem, late: Late, max_iterations: int, compile: bool) -> Minima:
     """The minima of all that is left over."""
     batch, known = len(late.which), late.normal[COST]
-    other, other_cost, enough = late.other.clone(), late.other_cost.clone(), late.arrived[1].clone()
-
+    bound = relevant(known)
+    other, other_cost, enough = late.other.to(late.pose), late.other_cost.clone(), late.arrived[1].clone()
     index = (~enough).nonzero().squeeze(1)
-    single = problem.observed.to(torch.float32).select(index)
-    bound = relevant(known[index])
-    found = minimise(
-        single,
-        other[..., index],
-        max_iterations=min(max_iterations, _SINGLE),
-        rtol=1e-6,
-        enough=bound.to(single.xy),
-        report=False,
-        compile=compile,
-    )
-    cost = found.normal[COST].to(known)
-    other_cost[index], enough[index] = cost, found.converged & (cost > bound)
-    other[..., index] = torch.where(cost < torch.inf, found.pose, other[..., index])
+    if len(index) > _FEW:
+        single = problem.observed.to(torch.float32).select(index)
+        found = minimise(
+            single,
+            late.other[..., index],
+            max_iterations=min(max_iterations, _SINGLE),
+            rtol=1e-6,
+            enough=bound[index].to(single.xy),
+            report=False,
+            compile=compile,
+        )
+        cost = found.normal[COST].to(known)
+        other_cost[index], enough[index] = cost, found.converged & (cost > bound[index])
+        other[..., index] = torch.where(cost < torch.inf, found.pose.to(other), other[..., index])
 
     arrived = torch.cat([late.arrived[0], enough])
-    poses = upright(torch.stack([late.pose, other.to(late.pose)], 2)).flatten(2)
+    poses = upright(torch.stack([late.pose, other], 2)).flatten(2)
     normal = torch.cat([late.normal, torch.full_like(late.normal, torch.inf)], 1)
     normal[COST, batch:] = other_cost
     going = (~arrived).nonzero().squeeze(1)
-    part = problem.final.select(going % batch)
-    exact = minimise(part, poses[..., going], max_iterations=max_iterations, compile=compile)
+    exact = minimise(
+        problem.final.select(going % batch),
+        poses[..., going],
+        max_iterations=max_iterations,
+        enough=torch.cat([torch.full_like(bound, torch.inf), bound])[going],
+        compile=compile,
+    )
     count = torch.full((2 * batch,), EVALUATIONS, dtype=torch.int64, device=going.device)
     estimate = Estimate(
         poses.index_copy_(-1, going, exact.pose),

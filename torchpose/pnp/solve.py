@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchpose.camera import Camera
-from torchpose.pnp import chunks
+from torchpose.pnp._memory import keep_memory
 from torchpose.pnp.candidates import Candidates
 from torchpose.pnp.dlt import dlt
 from torchpose.pnp.epnp import epnp
@@ -58,7 +58,7 @@ def solve(
     compile: bool = False,
     raise_on_failure: bool = False,
 ) -> PnPResult:
-    """Poses of B sets of N points.
+    """Poses of B sets of N points. Line features have a solver of their own, `torchpose.pnp.lines`.
 
     Args:
         object_points: (N, 3) shared by all poses, or (B, N, 3).
@@ -133,33 +133,25 @@ def solve(
 def _solve(
     inputs: Inputs, method: Method, initial: tuple[Tensor, ...] | None, max_iterations: int, compile: bool
 ) -> PnPResult:
-    """Chunk by chunk; then those that the first pass has left over, together."""
+    """Chunk by chunk; whenever a chunk's worth of poses is left over by the first pass, they have their second one."""
+    keep_memory()
     inputs = inputs.with_body()
     batch = len(inputs.pixels)
     table = Table.empty(batch, inputs.pixels)
-
-    def first(rows: slice) -> Late | None:
-        start = None if initial is None else (initial[0][rows], initial[1][rows])
-        late = _solve_chunk(inputs.rows(rows), method, start, max_iterations, compile, table.columns(rows))
-        return late and late._replace(which=late.which + rows.start)
-
-    def second(late: Late) -> tuple[Tensor, Table]:
-        columns = Table.empty(len(late.which), inputs.pixels)
-        problem = prepare(inputs.rows(late.which))
-        write(
-            problem,
-            second_pass(problem, late, max_iterations, compile),
-            _bad(problem, late.pose[:, :, None], 0),
-            columns,
-        )
-        return late.which, columns
-
-    parts = chunks.each(first, [slice(k, min(k + _CHUNK, batch)) for k in range(0, batch, _CHUNK)])
-    left = [part for part in parts if part is not None]
-    if left:
-        every = zip(*(torch.cat(v, -1).split(_CHUNK, -1) for v in zip(*left, strict=True)), strict=True)
-        for index, columns in chunks.each(second, [Late(*fields) for fields in every]):
-            table.replace(index, columns)
+    pending: list[Late] = []
+    for start in range(0, batch, _CHUNK):
+        rows = slice(start, min(start + _CHUNK, batch))
+        given = None if initial is None else (initial[0][rows], initial[1][rows])
+        late = _solve_chunk(inputs.rows(rows), method, given, max_iterations, compile, table.columns(rows))
+        if late is not None:
+            pending.append(late._replace(which=late.which + start))
+        if pending and (rows.stop == batch or sum(len(part.which) for part in pending) >= _CHUNK):
+            late = Late(*(torch.cat(parts, -1) for parts in zip(*pending, strict=True)))
+            problem, columns = prepare(inputs.rows(late.which)), Table.empty(len(late.which), inputs.pixels)
+            minima = second_pass(problem, late, max_iterations, compile)
+            write(problem, minima, _bad(problem, late.pose[:, :, None], 0), columns)
+            table.replace(late.which, columns)
+            pending = []
     return table.result()
 
 
