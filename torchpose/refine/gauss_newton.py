@@ -3,7 +3,7 @@
 A marker has six levels: ring and paper, each with a constant and a gradient over the plane. Gradients left free cost a
 tenth of the precision of a frame whose light is even, and gradients left out would be a bias of many deviations where
 it is not. So they have a normal prior about 0 whose width is found in the frame itself (empirical Bayes; Morris 1983):
-the mean square of its gradients beyond what their noise explains, and the uncertainty of that mean on top.
+the mean square of its gradients beyond what their noise explains.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from torchpose.geometry.segments import segment_mean, segment_sum
 POSE, LEVELS = 7, 6  # unknowns of a frame (translation, rotation, blur) and of a marker
 QUANTISATION = 1 / 12  # variance of rounding, in grey levels^2, below which no noise estimate falls
 _GRADIENTS = (1, 2, 4, 5)  # among the levels
+_LEAST_WIDTH = 0.01  # variance of the prior over that of a gradient's noise: as good as none
 
 
 class Step(NamedTuple):
@@ -51,7 +52,7 @@ def gauss_newton_step(
     noise = variance[row, None] * scatter[:, _GRADIENTS]
     mean_noise = segment_mean(noise.mean(-1), row, rows)
     excess = segment_mean(gradients.square().mean(-1), row, rows) - mean_noise
-    width2 = excess.clamp_min(0) + mean_noise * (2 / (len(_GRADIENTS) * count.clamp_min(1))).sqrt()
+    width2 = excess.clamp_min(_LEAST_WIDTH * mean_noise)
     precision = torch.zeros_like(levels)
     precision[:, _GRADIENTS] = (variance / width2.clamp_min(1e-12))[row, None]
     held, _ = _solve_step(sums, precision, levels, row, rows, known, pull)
