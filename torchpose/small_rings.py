@@ -88,8 +88,8 @@ def fit_small_rings(
         last = step_number >= _ROBUST
         if not last:  # later it would grow with what it lets in
             spread = segment_mean(residual.square(), index, count, weight).sqrt()
-        fits = _agreeing(residual, clear, index * _SECTORS + sector, count) if step_number >= _HOLD else clear
-        weight = clear * fits * _weights(residual / spread[index], keep=last)
+        agrees = _agreeing(residual, clear, index * _SECTORS + sector, count) if step_number >= _HOLD else clear
+        weight = clear * agrees * _weights(residual / spread[index], keep=last)
         jacobian = torch.cat([derivative * linear[index, 3:], basis], -1)
         weighted = jacobian * weight[:, None]
         normal = segment_sum((weighted[:, :, None] * jacobian[:, None]).flatten(1), index, count)
