@@ -59,4 +59,4 @@ def test_methods_in_order_of_precision() -> None:
     )
     ratios = [found["lateral_ratio"] for found in rows]
     assert ratios == sorted(ratios)
-    assert ratios[2] > 1.4 * ratios[1]
+    assert ratios[2] > 1.5 * ratios[1]
