@@ -149,8 +149,8 @@ def _gauss_newton(window: _Window, theta: Tensor, seen: Tensor, known: Tensor, s
         residual = grey - (basis * linear[index]).sum(-1)
         if step_number < scheme.soft:  # later it would grow with what it lets in
             spread = segment_mean(residual.square(), index, count, weight).sqrt()
-        fits = _agreeing(residual, clear, index * _SECTORS + sector, count) if step_number >= scheme.hold else clear
-        weight = clear * fits * _weights(residual / spread[index], keep=step_number >= scheme.soft)
+        agrees = _agreeing(residual, clear, index * _SECTORS + sector, count) if step_number >= scheme.hold else clear
+        weight = clear * agrees * _weights(residual / spread[index], keep=step_number >= scheme.soft)
         jacobian = torch.cat([derivative * linear[index, 3:], basis], -1)
         weighted = jacobian * weight[:, None]
         normal = segment_sum((weighted[:, :, None] * jacobian[:, None]).flatten(1), index, count)

@@ -28,7 +28,7 @@ _MIN_CELLS = 0.35  # of a region on its ellipse, a pixel of perimeter; an edge i
 _PART_ROUNDS = 2  # of following the ellipse of a region that is only a part of it
 _FOLLOW = ((0.4, 1), (0.5, 2))  # least cover to be followed further, and rounds of it
 _ON_ELLIPSE = 1.5  # reduced px
-_TAPER = 2.0  # reduced px, where the weight of a cell in the second fit has fallen to 0
+_TAPER = 3.0  # reduced px, where the weight of a cell in the second fit has fallen to 0
 _FLANK, _FLANK_COS = 4.0, 0.8  # reduced px, and of the gradient with the normal: a blurred edge of a whole ellipse
 _ARC_RMS = 1.2  # reduced px, of the cells of an arc, which is a few cells wide
 _OCTAVES = 2
@@ -131,16 +131,19 @@ def fit_regions(grad: Gradient, regions: Regions, explain: bool = False) -> tupl
     # and with it the rim of the region, changes a little
     r = ellipse.distance(xy, regions.region, params).nan_to_num(nan=_TAPER)
     params = ellipse.fit(xy, regions.region, count, magnitude * (1 - (r / _TAPER).square()).clamp_min(0).square())
-    follows = ellipse.distance(xy, regions.region, params).abs() < _ON_ELLIPSE
-    length = segment_sum(follows.double(), regions.region, count)
     polarity = region_polarity(regions, params[:, :2], xy).sign()
+    off, normal = conics.signed_distance(params[regions.region], xy)
+    rise = (normal * regions.gradient).sum(-1) * polarity[regions.region]
+    follows = off.abs() < _ON_ELLIPSE
+    along = follows | ((off.abs() < _FLANK) & (rise > _FLANK_COS * magnitude))
+    length, edge = segment_sum(torch.stack([follows, along], -1).double(), regions.region, count).unbind(-1)
     verdict = plausible(grad, params)
-    off = length < _MIN_CELLS * conics.perimeter(params)
-    verdict = torch.where((verdict == Verdict.ACCEPTED) & off, int(Verdict.OFF_ELLIPSE), verdict)
+    elsewhere = length < _MIN_CELLS * conics.perimeter(params)
+    verdict = torch.where((verdict == Verdict.ACCEPTED) & elsewhere, int(Verdict.OFF_ELLIPSE), verdict)
     good = (verdict == Verdict.ACCEPTED).nonzero()[:, 0]
     found = score(grad, regions.frame[good], params[good], polarity[good])
     # a region that is not a whole ellipse runs along something else as well: only what lies along the ellipse counts
-    beyond = length < WHOLE * torch.bincount(regions.region, minlength=count)
+    beyond = edge < WHOLE * torch.bincount(regions.region, minlength=count)
     part = ((found.cover <= WHOLE) | beyond[good]).nonzero()[:, 0]
     some = found[part]
     refit = follow(grad, some.frame, some.ellipse, some.polarity, _PART_ROUNDS)
@@ -149,13 +152,7 @@ def fit_regions(grad: Gradient, regions: Regions, explain: bool = False) -> tupl
     found = found.replaced(part[sound], again)
     whole = torch.zeros(count, dtype=torch.bool, device=xy.device)
     whole[good[(found.verdict == Verdict.ACCEPTED) & (found.cover > WHOLE)]] = True
-    explained = whole[regions.region]
-    cell = explained.nonzero()[:, 0]
-    index = regions.region[cell]
-    off, normal = conics.signed_distance(params[index], xy[cell])
-    rise = (normal * regions.gradient[cell]).sum(-1) * polarity[index]
-    flank = (off.abs() < _FLANK) & (rise > _FLANK_COS * magnitude[cell])
-    explained[cell] = follows[cell] | flank
+    explained = along & whole[regions.region]
     if not explain:
         return accepted(found), explained
     bad = ((verdict != Verdict.ACCEPTED) & params.isfinite().all(-1)).nonzero()[:, 0]

@@ -36,6 +36,7 @@ _MISFIT = 0.02  # of the contrast: what a point-spread function that is not Gaus
 _TILE = 256  # pixels summed in float32 at a time; sums of tiles are float64, so padding changes no digit that counts
 _SECTORS = 48  # of a circle
 _SECTOR_KEPT = 0.9  # of a sector's pixels that must follow the model for it to count
+_SECTOR_CUT = 4.0  # standard deviations of the mean square of a sector's residuals
 _LEAST_CLEAR = 0.55  # of the sectors of a marker, below which none of them counts
 _MOST_SPREAD = 1.5  # of a marker's residuals, in those of the best marker of its frame
 
@@ -112,9 +113,10 @@ def _refine(
     for part in (*[coarse] * _STEPS[0], *[blocks] * _STEPS[1]):
         model = ring_model(part, r, t, blur)
         columns = _columns(part, model, levels)
-        usable, weight = _inliers(columns[:, :, -1].flatten(1), part, levels)
+        residual = columns[:, :, -1].flatten(1)
+        usable, weight = _inliers(residual, part, levels)
         if part is blocks:
-            weight = weight * _clear_sectors(usable, weight, part, model)
+            weight = weight * _clear_sectors(residual, usable, weight, part, model, levels)
         sums = _products(columns, weight)
         step, level_step, information, variance = gauss_newton_step(
             sums, weight.sum(-1), levels, blocks.row, rows, known, moved
@@ -210,10 +212,13 @@ def _inliers(residual: Tensor, b: PixelBlocks, levels: Tensor) -> tuple[Tensor, 
     return usable, usable * (residual.abs() < _CUT * spread + _MISFIT * contrast)
 
 
-def _clear_sectors(usable: Tensor, weight: Tensor, b: PixelBlocks, m: RingModel) -> Tensor:
+def _clear_sectors(
+    residual: Tensor, usable: Tensor, weight: Tensor, b: PixelBlocks, m: RingModel, levels: Tensor
+) -> Tensor:
     """0 for the pixels (K, P) of those sectors of either circle where many usable ones do not follow the model, else 1.
 
-    What covers an edge agrees with it by chance wherever the edge passes through the cover's own grey.
+    What covers an edge agrees with it by chance wherever the edge passes through the cover's own grey, and where both
+    are blurred no single pixel may betray it: a sector's mean square must be that of noise, too.
     """
     middle = 0.5 * (1 + b.radii[:, 1] / b.radii[:, 0])
     outer = torch.hypot(m.x, m.y) > middle[:, None].float()
@@ -223,7 +228,12 @@ def _clear_sectors(usable: Tensor, weight: Tensor, b: PixelBlocks, m: RingModel)
     count = 2 * _SECTORS * len(b.row)
     total = torch.zeros(count, dtype=weight.dtype, device=weight.device).index_add_(0, cell, usable.flatten())
     used = torch.zeros_like(total).index_add_(0, cell, weight.flatten())
-    clear = (used > _SECTOR_KEPT * total).view(-1, 2 * _SECTORS)
+    square = torch.zeros_like(total).index_add_(0, cell, (weight * residual.square()).flatten())
+    misfit = _MISFIT * (levels[:, 3] - levels[:, 0]).to(square.dtype)
+    spread = _spread(residual, b)[:, None]
+    total, used, square = (v.view(len(b.row), 2 * _SECTORS) for v in (total, used, square))
+    limit = spread.square() * (1 + _SECTOR_CUT * (2 / used.clamp_min(1)).sqrt()) + misfit[:, None].square()
+    clear = (used > _SECTOR_KEPT * total) & (square < used * limit)
     # where half of a ring is gone, the rest of the marker is not to be trusted either
     clear = clear & (clear.to(weight.dtype).mean(-1, keepdim=True) > _LEAST_CLEAR)
     return clear.flatten()[cell].view_as(weight).to(weight.dtype)
