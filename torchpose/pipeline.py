@@ -22,7 +22,7 @@ from torchpose.pose import (
     intrinsics_covariance,
     solve_poses,
 )
-from torchpose.refine import refine_centers, refine_edges, refine_photometric
+from torchpose.refine import decide, refine_centers, refine_edges, refine_photometric
 from torchpose.results import Detections, Poses, Reason, Status
 from torchpose.rings import Rings, measure_rings
 from torchpose.second_look import look_again
@@ -110,6 +110,8 @@ class PoseEstimator(nn.Module):
         if len(rings) > before:
             evidence, solvable, solutions = self._solved(rings, identified, table, target, camera)
         solutions = self._doubted(solutions, evidence[solvable], solvable // count, rings, table, target[solvable])
+        if self.method != "paper":
+            solutions = decide(solutions, evidence[solvable])
         refined = self.method in ("photometric", "edges")
         if refined:
             solutions = self._refined(
@@ -307,7 +309,7 @@ class PoseEstimator(nn.Module):
 
 def _on_centers(s: Solutions, e: Evidence) -> Solutions:
     """Solutions refined on the ellipses' own centres, where that holds."""
-    r, t, covariance, good = refine_centers(replace(e, mask=s.mask), s.R, s.t)
+    r, t, covariance, _, good = refine_centers(replace(e, mask=s.mask), s.R, s.t)
     better = good & (s.status != Status.REJECTED)
     return replace(
         s,

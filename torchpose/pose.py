@@ -156,8 +156,8 @@ def _solve(e: Evidence, rough: tuple[Tensor, Tensor], iterations: int) -> Soluti
     # both minima of the centres, weighed again with the rings' shapes
     both_r, both_t = torch.stack([result.R, result.R_alt], 1), torch.stack([result.t, result.t_alt], 1)
     center_chi2 = torch.stack([result.chi2, result.chi2_alt], 1)
-    shape_chi2 = _shape_chi2(e, both_r, both_t)
-    total = (center_chi2 + shape_chi2).nan_to_num(nan=torch.inf)  # NaN: no such minimum
+    of_shapes = shape_chi2(e, both_r, both_t)
+    total = (center_chi2 + of_shapes).nan_to_num(nan=torch.inf)  # NaN: no such minimum
     chi2, best = total.min(1)
     row = torch.arange(best.numel(), device=best.device)
     r, t, rms = both_r[row, best], both_t[row, best], torch.stack([result.rms, result.rms_alt], 1)
@@ -170,7 +170,7 @@ def _solve(e: Evidence, rough: tuple[Tensor, Tensor], iterations: int) -> Soluti
     reason = torch.full_like(seen, Reason.NONE)
     for condition, why in (
         (chi2_alt - chi2 < AMBIGUOUS_CHI2, Reason.TWO_SOLUTIONS),
-        (shape_chi2[row, best] > 4 * _SHAPE_LIMIT * seen, Reason.RING_SHAPE),
+        (of_shapes[row, best] > 4 * _SHAPE_LIMIT * seen, Reason.RING_SHAPE),
         (contradicts, Reason.RESIDUAL),
         (~chi2.isfinite(), Reason.NOT_CONVERGED),
         (result.code == pnp.PnPCode.BEHIND_CAMERA, Reason.BEHIND_CAMERA),
@@ -229,7 +229,7 @@ def _visible(covariance: Tensor, mask: Tensor) -> Tensor:
     return torch.where(mask[..., None, None], covariance, eye)
 
 
-def _shape_chi2(e: Evidence, r: Tensor, t: Tensor) -> Tensor:
+def shape_chi2(e: Evidence, r: Tensor, t: Tensor) -> Tensor:
     """Chi-squared (N, S) of the rings' shapes: elongation and its direction, which blur and threshold hardly touch."""
     x = (r[:, :, None] @ e.points[:, None, ..., None]).squeeze(-1) + t[:, :, None]  # (N, S, M, 3)
     predicted = conics.circle_ellipse(

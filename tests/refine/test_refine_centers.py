@@ -59,7 +59,7 @@ def test_derivatives() -> None:
 def test_exact_centers_give_the_exact_pose() -> None:
     r, t = random_poses(20, 60, (120, 300))
     off = rotations.exp(torch.full((3,), 2e-3, dtype=F64))
-    found_r, found_t, _, good = refine_centers(evidence(r, t, 1e-9), off @ r, t + 0.1)
+    found_r, found_t, _, _, good = refine_centers(evidence(r, t, 1e-9), off @ r, t + 0.1)
     assert good.all()
     assert errors(found_r, found_t, r, t).abs().max() < 1e-6
 
@@ -68,7 +68,7 @@ def test_better_than_compensated_centers_and_says_so() -> None:
     r, t = random_poses(400, 60, (130, 200))
     e = evidence(r, t, 0.02)
     s = solve_poses(e, (r, t))
-    found_r, found_t, covariance, good = refine_centers(e, s.R, s.t)
+    found_r, found_t, covariance, _, good = refine_centers(e, s.R, s.t)
     assert good.all()
     error = errors(found_r, found_t, r, t)
     before = errors(s.R, s.t, r, t).square().mean(0).sqrt()

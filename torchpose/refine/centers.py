@@ -7,6 +7,8 @@ nothing, and their eccentricity tells of the tilt besides.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -17,7 +19,21 @@ from torchpose.refine.gauss_newton import solve_scaled
 _STEPS = 4  # from within a few standard deviations: the last one changes no digit that counts
 
 
-def refine_centers(e: Evidence, rotation: Tensor, translation: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+class OnCenters(NamedTuple):
+    """Poses of N rows refined on centres.
+
+    R: (N, 3, 3). t: (N, 3). covariance: (N, 6, 6). chi2: (N,), of the centres. good: (N,) bool; where False no better
+    pose than the start was found, and R, t and chi2 are those of the start.
+    """
+
+    R: Tensor
+    t: Tensor
+    covariance: Tensor
+    chi2: Tensor
+    good: Tensor
+
+
+def refine_centers(e: Evidence, rotation: Tensor, translation: Tensor) -> OnCenters:
     """Refines N poses on the centres of the ellipses of both circles of every marker seen.
 
     The ellipses are those of ideal pixels, so that distortion is off already. Markers that contradict each other are
@@ -25,10 +41,6 @@ def refine_centers(e: Evidence, rotation: Tensor, translation: Tensor) -> tuple[
 
     Args:
         e: what was measured. rotation, translation: (N, 3, 3), (N, 3) to start from.
-
-    Returns:
-        R (N, 3, 3), t (N, 3), covariance (N, 6, 6), and good (N,) bool: False where no better pose was found, and the
-        others mean nothing.
     """
     seen = e.mask[:, :, None].expand(-1, -1, 2)
     eye = torch.eye(2, dtype=e.shape.dtype, device=e.shape.device)
@@ -52,7 +64,8 @@ def refine_centers(e: Evidence, rotation: Tensor, translation: Tensor) -> tuple[
             r, t = rotations.exp(change[:, 3:]) @ r, t + change[:, :3]
     inverse, info = torch.linalg.inv_ex(information)
     good = (info == 0) & (last <= first) & (inverse.diagonal(dim1=-2, dim2=-1) > 0).all(-1)
-    return r, t, inverse, good
+    r, t = torch.where(good[:, None, None], r, rotation), torch.where(good[:, None], t, translation)
+    return OnCenters(r, t, inverse, torch.where(good, last, first), good)
 
 
 def ellipse_centers(
