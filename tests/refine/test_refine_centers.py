@@ -11,8 +11,9 @@ import torchpose as tp
 from torchpose.centers import common_center
 from torchpose.geometry import rotations
 from torchpose.pose import Evidence, gather_evidence, solve_poses
-from torchpose.refine import refine_centers
+from torchpose.refine import decide, refine_centers
 from torchpose.refine.centers import ellipse_centers
+from torchpose.results import Status
 
 CAMERA = pinhole()
 QUAD = tp.Target.load("quad40")
@@ -86,3 +87,40 @@ def test_markers_not_seen_do_not_count() -> None:
     a, b = refine_centers(hidden, r, t), refine_centers(wrong, r, t)
     assert torch.equal(a[0], b[0])
     assert torch.equal(a[1], b[1])
+
+
+def far_and_noisy(count: int) -> tuple[torch.Tensor, torch.Tensor, Evidence]:
+    """Poses whose compensated centres leave two solutions open now and then; the shapes tell nothing."""
+    r, t = random_poses(count, 35, (700, 900), seed=7)
+    e = evidence(r, t, 0.6)
+    covariance = e.shape_covariance.clone()
+    covariance[..., 2:, 2:] += 100 * torch.eye(3, dtype=F64)
+    return r, t, dataclasses.replace(e, shape_covariance=covariance)
+
+
+def test_decides_between_two_solutions() -> None:
+    """The ellipses' own centres tell which is right."""
+    r, t, e = far_and_noisy(400)
+    s = solve_poses(e, (r, t))
+    open_ones = s.status == Status.AMBIGUOUS
+    found = decide(s, e)
+    decided = open_ones & (found.status == Status.OK)
+    assert open_ones.sum() > 20
+    assert decided.sum() > 0.5 * open_ones.sum()
+    error = errors(found.R, found.t, r, t)
+    nees = (error[:, None] @ torch.linalg.solve(found.covariance, error[..., None])).flatten()
+    assert (nees[decided] < 30).all()  # a wrong one would have hundreds
+    assert (found.chi2_alt - found.chi2)[decided].min() > 20
+    for name in ("R", "t", "status", "chi2"):
+        assert torch.equal(getattr(found, name)[~decided], getattr(s, name)[~decided])
+
+
+def test_what_no_pose_explains_stays_open() -> None:
+    """Centres that are a pixel off by something else than noise decide nothing."""
+    r, t, e = far_and_noisy(400)
+    s = solve_poses(e, (r, t))
+    shape = e.shape.clone()
+    shape[..., :2] += torch.randn(shape[..., :2].shape, generator=torch.Generator().manual_seed(1), dtype=F64)
+    found = decide(s, dataclasses.replace(e, shape=shape))
+    assert (s.status == Status.AMBIGUOUS).any()
+    assert torch.equal(found.status, s.status)
