@@ -1,6 +1,7 @@
 """Test modules import the shared witnesses (tests/exact.py) by name; property tests draw the same examples in CI."""
 
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -12,3 +13,6 @@ sys.path.insert(0, str(Path(__file__).parent))
 settings.register_profile("ci", derandomize=True)
 if os.environ.get("CI"):
     settings.load_profile("ci")
+
+# a shell starts jobs in the background with SIGINT ignored, and the programs under test would inherit that
+signal.signal(signal.SIGINT, signal.default_int_handler)
