@@ -29,12 +29,21 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     # worked on in few loops, or not in the cache
     fast = torch.compile(function, options={"cpp.dynamic_threads": True, "max_fusion_size": 4096})
 
+    known: set[tuple[Any, ...]] = set()
+
     def call(*args: Any) -> Any:
-        if _mark(args) <= _SPECIAL:
+        kind: list[Any] = [torch.is_inference_mode_enabled(), torch.get_default_dtype()]
+        size = _describe(args, kind)
+        if size <= _SPECIAL:
             return function(*args)
+        if (key := tuple(kind)) in known:  # few poses feel what the rest costs at every call
+            return fast(*args)
+        _mark(args)
         # one graph for every number of points, dtype and kind of weights in use
         with torch._dynamo.config.patch(recompile_limit=64, automatic_dynamic_shapes=False):
-            return fast(*args)
+            result = fast(*args)
+        known.add(key)
+        return result
 
     return call
 
@@ -45,11 +54,23 @@ def padded(index: torch.Tensor) -> torch.Tensor:
     return index if count == 0 or count > _SPECIAL else torch.cat([index, index[:1].expand(_SPECIAL + 1 - count)])
 
 
-def _mark(value: Any) -> int:
-    """Marks the batch, the last dimension of every tensor, as dynamic; returns its size."""
+def _describe(value: Any, kind: list[Any]) -> int:
+    """Appends all that a graph depends on but the batch, the last dimension of every tensor; returns its size."""
     if isinstance(value, torch.Tensor):
-        size = value.shape[-1] if value.ndim else 0
-        if size > _SPECIAL:
-            torch._dynamo.maybe_mark_dynamic(value, value.ndim - 1)
+        *shape, size = value.shape or (0,)
+        kind.append((*shape, min(size, _SPECIAL + 1), value.dtype, value.device))
         return size
-    return max(map(_mark, value), default=0) if isinstance(value, tuple) else 0
+    if isinstance(value, tuple):
+        return max((_describe(item, kind) for item in value), default=0)
+    kind.append(value)
+    return 0
+
+
+def _mark(value: Any) -> None:
+    """Marks the batch as dynamic."""
+    if isinstance(value, torch.Tensor):
+        if value.ndim and value.shape[-1] > _SPECIAL:
+            torch._dynamo.maybe_mark_dynamic(value, value.ndim - 1)
+    elif isinstance(value, tuple):
+        for item in value:
+            _mark(item)

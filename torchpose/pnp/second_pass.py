@@ -93,5 +93,5 @@ def second_pass(problem: Problem, late: Late, max_iterations: int, compile: bool
     count = torch.full((2 * batch,), EVALUATIONS, dtype=torch.int64, device=going.device)
     count[going] += exact.iterations
     arrived[going] = exact.converged
-    found = Found(*(v.unflatten(-1, (2, batch)) for v in (poses, cost, count, arrived)))
-    return choose(problem.final, found, compile)
+    every = Found(*(v.unflatten(-1, (2, batch)) for v in (poses, cost, count, arrived)))
+    return choose(problem.final, every, compile)

@@ -40,6 +40,8 @@ _LEAST = {"iterative": 4, "planar": 4, "dlt": 6, "p3p": 3, "epnp": 4, "posit": 4
 _LEAST_STARTED = 3
 # poses solved at once: enough for torch to share an operation among its threads, few enough for the cache
 _CHUNK = 16384
+# of which compiled code, with fewer and longer operations, needs half
+_CHUNK_COMPILED = 8192
 
 
 def solve(
@@ -139,8 +141,9 @@ def _solve(
     batch = len(inputs.pixels)
     table = Table.empty(batch, inputs.pixels)
     pending: list[Late] = []
-    for start in range(0, batch, _CHUNK):
-        rows = slice(start, min(start + _CHUNK, batch))
+    chunk = _CHUNK_COMPILED if compile else _CHUNK
+    for start in range(0, batch, chunk):
+        rows = slice(start, min(start + chunk, batch))
         given = None if initial is None else (initial[0][rows], initial[1][rows])
         late = _solve_chunk(inputs.rows(rows), method, given, max_iterations, compile, table.columns(rows))
         if late is not None:
@@ -170,8 +173,8 @@ def _solve_chunk(
         found = _CLOSED_FORMS[method](*batch_first(problem.observed, problem.weight))
         poses = torch.cat([found.R, found.t[..., None]], 3).permute(2, 3, 1, 0)
         cost = normal_equations(problem.final.each(), poses)[COST]
-        found = Found(poses, cost, torch.zeros_like(cost, dtype=torch.int64), cost.isfinite())
-        write(problem, choose(problem.final, found), _bad(problem, poses, least), table)
+        solutions = Found(poses, cost, torch.zeros_like(cost, dtype=torch.int64), cost.isfinite())
+        write(problem, choose(problem.final, solutions), _bad(problem, poses, least), table)
         return None
     single = problem.observed.to(torch.float32)
     if initial is not None:
@@ -188,9 +191,9 @@ def _solve_chunk(
         options, batch = poses.shape[2:]
         every = problem.final.select(torch.arange(batch, device=poses.device).repeat(options))
         flat = minimise(every, upright(poses.double()).flatten(2), max_iterations=max_iterations)
-        every_found = (flat.pose, flat.normal[COST], flat.iterations, flat.converged)
-        found = Found(*(v.unflatten(-1, (options, batch)) for v in every_found))
-        write(problem, choose(problem.final, found), bad, table)
+        ends = (flat.pose, flat.normal[COST], flat.iterations, flat.converged)
+        minima = choose(problem.final, Found(*(v.unflatten(-1, (options, batch)) for v in ends)))
+        write(problem, minima, bad, table)
         return None
     state = first_pass(single, problem.observed, problem.final, poses.float(), compile)
     write(problem, state.minima, bad, table, compile)

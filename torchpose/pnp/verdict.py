@@ -202,7 +202,7 @@ def _fill(
         rows.copy_(value)
     if not torch.compiler.is_compiling():
         for index, parts in ((failed.nonzero().squeeze(1), target[:6]), (alone.nonzero().squeeze(1), target[1:6:4])):
-            for rows in parts:
+            for rows in parts if len(index) else ():
                 rows.index_fill_(1, index, torch.nan)
 
 
