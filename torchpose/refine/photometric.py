@@ -24,6 +24,7 @@ from torchpose.refine.result import Refined
 from torchpose.refine.ring_model import PixelBlocks, RingModel, gather_pixels, ring_model
 
 _COARSE = 6  # the first steps take one pixel of so many; both are whole numbers of tiles
+_MOST_COARSE = 512  # of a marker: the last step, on all of them, mends what they leave
 _STEPS = (3, 1)  # of Gauss-Newton, on some of the pixels and on all
 _BAND = 4.0  # px on either side of an edge
 _BAND_PER_BLUR = 4.6  # band of a wide blur, in its standard deviations
@@ -103,7 +104,7 @@ def _refine(
     """`refine_photometric` by the pixels within ``band`` (N,) px of an edge, from a blur (N,) px."""
     rows = r.shape[0]
     blocks = gather_pixels(frames, camera, frame, mask, rings, centers, normals, radii, band, _TILE * _COARSE)
-    coarse = blocks.every(_COARSE)
+    coarse = blocks.every(_COARSE, _MOST_COARSE)
     levels = _first_levels(coarse, r, t, blur)
     usable = weight = blocks.valid
     information = torch.zeros(rows, 7, 7, dtype=torch.float64, device=r.device)
@@ -146,13 +147,12 @@ def _columns(b: PixelBlocks, m: RingModel, levels: Tensor) -> Tensor:
     contrast = paper - ring
     by_d = contrast * m.by_d
     residual = b.grey - (ring + contrast * m.fraction)
-    return _tiled((*(by_d * v for v in m.by_pose), contrast * m.by_q, *_basis(m), residual), b.valid)
+    return _tiled((*(by_d * v for v in m.by_pose), contrast * m.by_q, *_basis(m), residual))
 
 
-def _tiled(planes: tuple[Tensor, ...], valid: Tensor) -> Tensor:
-    """Planes (K, P) as (K, P / 256, planes, 256), zero where padded."""
-    tiles = torch.stack([p.unflatten(1, (-1, _TILE)) for p in planes], 2)
-    return tiles.masked_fill_(valid.unflatten(1, (-1, 1, _TILE)) == 0, 0.0)
+def _tiled(planes: tuple[Tensor, ...]) -> Tensor:
+    """Planes (K, P) as (K, P / 256, planes, 256)."""
+    return torch.stack([p.unflatten(1, (-1, _TILE)) for p in planes], 2)
 
 
 def _products(columns: Tensor, weight: Tensor) -> Tensor:
@@ -167,7 +167,7 @@ def _first_levels(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor) -> Tensor:
     A third of a ring may be covered: a least-squares fit of gradients would bend towards the cover and stay there.
     """
     model = ring_model(b, r, t, blur)
-    columns = _tiled((*_basis(model), b.grey), b.valid)
+    columns = _tiled((*_basis(model), b.grey))
     none = torch.zeros_like(model.fraction[:, 0])
     ring, paper = _median(b.grey, b.valid * (model.fraction < 0.05)), _median(b.grey, b.valid * (model.fraction > 0.95))
     # a level beyond the range of grey values shows no pixel
