@@ -176,13 +176,13 @@ def ring_model(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor) -> RingModel:
     outer, inner = (radius - scalar(size).float() for size in b.radii.unbind(-1))
 
     toward = toward / over.float()
-    depth = away.float() * toward
+    depth, over_away = away.float() * toward, 1 / away.float()
     one_c, two_c, q = one_c.float(), two_c.float(), scalar(blur[b.row]).float()
     axes = [[scalar(c).float() for c in v.unbind(-1)] for v in (one, two, normal, arm)]
     (ax, ay, az), (bx, by, bz), (nx, ny, nz), (cx, cy, cz) = axes
     ex, ey = x / radius, y / radius
     # a displacement w of the ray's foot, or of the plane against it, changes the radius by m . w
-    s = (radius + ex * one_c + ey * two_c) / depth * toward
+    s = (radius + ex * one_c + ey * two_c) * over_away
     mx, my, mz = ex * ax + ey * bx - s * nx, ex * ay + ey * by - s * ny, ex * az + ey * bz - s * nz
     w00, w01, w10, w11 = b.warp
     gu, gv = mx * w00 + my * w10, mx * w01 + my * w11  # gradient of the radius in the image, over the depth
@@ -194,7 +194,7 @@ def ring_model(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor) -> RingModel:
     # to second order in the distance: along the image's normal the radius bends where that normal is oblique in the
     # plane, and by perspective; both as second over first derivative, 1/px, halved
     nu, nv = gu * flat, gv * flat
-    side = (ex * two_c - ey * one_c) / depth * toward
+    side = (ex * two_c - ey * one_c) * over_away
     hx, hy = ex * bx - ey * ax - side * nx, ex * by - ey * ay - side * ny  # as m, but across the radius
     oblique = (hx * w00 + hy * w10) * nu + (hx * w01 + hy * w11) * nv
     recede = ((nx * w00 + ny * w10) * nu + (nx * w01 + ny * w11) * nv) * toward
