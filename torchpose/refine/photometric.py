@@ -24,7 +24,7 @@ from torchpose.refine.result import Refined
 from torchpose.refine.ring_model import PixelBlocks, RingModel, gather_pixels, ring_model
 
 _COARSE = 6  # the first steps take one pixel of so many; both are whole numbers of tiles
-_MOST_COARSE = 512  # of a marker: the last step, on all of them, mends what they leave
+_MOST_COARSE = 512  # of a marker whose edges are sharp: the last step, on all pixels, mends what they leave
 _STEPS = (3, 1)  # of Gauss-Newton, on some of the pixels and on all
 _BAND = 4.0  # px on either side of an edge
 _BAND_PER_BLUR = 4.6  # band of a wide blur, in its standard deviations
@@ -72,7 +72,8 @@ def refine_photometric(
     known = none if prior is None else prior
     narrow = torch.full_like(start, _BAND)
     model = (centers, normals, radii)
-    first = _refine(frames, camera, frame, mask, rings, *model, rotation, translation, start, narrow, known)
+    where = (frames, camera, frame, mask, rings)
+    first = _refine(*where, *model, rotation, translation, start, narrow, known, most_coarse=_MOST_COARSE)
     # a wide blur needs a wider band, or it takes the levels on both sides of the edge for its own
     w = (_BAND_PER_BLUR * first.blur > _BAND + 1).nonzero()[:, 0]
     if w.numel() == 0:
@@ -100,11 +101,12 @@ def _refine(
     blur: Tensor,
     band: Tensor,
     prior: Tensor,
+    most_coarse: int | None = None,
 ) -> Refined:
     """`refine_photometric` by the pixels within ``band`` (N,) px of an edge, from a blur (N,) px."""
     rows = r.shape[0]
     blocks = gather_pixels(frames, camera, frame, mask, rings, centers, normals, radii, band, _TILE * _COARSE)
-    coarse = blocks.every(_COARSE, _MOST_COARSE)
+    coarse = blocks.every(_COARSE, most_coarse)
     levels = _first_levels(coarse, r, t, blur)
     usable = weight = blocks.valid
     information = torch.zeros(rows, 7, 7, dtype=torch.float64, device=r.device)

@@ -47,9 +47,10 @@ class PixelBlocks:
     radii: Tensor
     limits: Tensor
 
-    def every(self, nth: int, most: int) -> PixelBlocks:
+    def every(self, nth: int, most: int | None = None) -> PixelBlocks:
         """The same with one pixel of ``nth``, or as many fewer as leave ``most`` of each marker."""
-        count = min(self.grey.shape[1] // nth, most)
+        count = self.grey.shape[1] // nth
+        count = count if most is None else min(count, most)
         i = torch.arange(count, device=self.row.device)
         index = i * self.size.clamp_min(nth * count)[:, None] // count
         inside = index < self.size[:, None]
