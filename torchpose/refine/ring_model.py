@@ -21,6 +21,9 @@ from torchpose.geometry.rotations import plane_axes
 from torchpose.refine.band import band_pixels
 
 _FULL_SCALES = (255.0, 1023.0, 4095.0, 16383.0, 65520.0, 65535.0)  # of 8 to 16 bits; 12 bits in the upper ones of 16
+_DEEP = 0.7  # of the radius of curvature: nearer to its centre a pixel sees edges on all sides
+_BENT = 0.4  # of a distance from an edge: the most that its second-order term may be
+_FAR = 3.5  # standard deviations of the blur from an edge, from where on neither matters
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +56,8 @@ class RingModel(NamedTuple):
     """Prediction and derivatives at one pose; planes (K, P) in float32.
 
     fraction: of paper, F. by_d, by_q: dF/dd through both circles, dF/dq. by_pose: 6 planes, derivative of d.
-    x, y: plane coordinates over the outer radius.
+    x, y: plane coordinates over the outer radius. sound: bool, False where the expansions below do not hold: deep in
+    a hole that is small for its blur, or where it is flat.
     """
 
     fraction: Tensor
@@ -62,6 +66,7 @@ class RingModel(NamedTuple):
     by_pose: tuple[Tensor, ...]
     x: Tensor
     y: Tensor
+    sound: Tensor
 
 
 def gather_pixels(
@@ -174,7 +179,9 @@ def ring_model(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor) -> RingModel:
     recede = ((nx * w00 + ny * w10) * nu + (nx * w01 + ny * w11) * nv) * toward
     second = 0.5 * oblique.square() * depth * flat / radius - recede
     d_outer, d_inner = outer * per_mm, inner * per_mm
+    deep = torch.maximum((second * d_inner).abs() * (_DEEP / _BENT), -bend * d_inner)
     d_outer, d_inner = d_outer + second * d_outer.square(), d_inner + second * d_inner.square()
+    sound = (deep < _DEEP) | (d_inner.abs() > _FAR * q)
     pull = 0.5 * q * bend
     z_outer, z_inner = d_outer / q + pull, d_inner / q + pull
     square = square_cumulant(nu, nv, q)
@@ -190,6 +197,7 @@ def ring_model(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor) -> RingModel:
         by_pose,
         x / size,
         y / size,
+        sound,
     )
 
 
