@@ -26,7 +26,7 @@ from torchpose.refine.sectors import away_from_unclear, clear_sectors, doubtful,
 
 _COARSE = 6  # the first steps take one pixel of so many; both are whole numbers of tiles
 _STEPS = (3, 1)  # of Gauss-Newton, on some of the pixels and on all
-_THOROUGH_STEPS = (3, 5)
+_THOROUGH_STEPS = (3, 4)
 _BAND = 4.0  # px on either side of an edge
 _BAND_PER_BLUR = 4.6  # band of a wide blur, in its standard deviations
 _WIDEST = 12.0  # px, of all bands
@@ -123,7 +123,7 @@ def _refine(
         tempered = thorough and number > steps[0] + 1
         if tempered and levels.shape[1] == LEVELS:
             levels = torch.nn.functional.pad(levels, (0, LEVELS))
-        model = ring_model(part, r, t, blur)
+        model = ring_model(part, r, t, blur, check=thorough)
         columns, slope = _columns(part, model, levels)
         residual = columns[:, :, -1].flatten(1)
         usable, weight = _inliers(residual, part, model, levels)
@@ -131,7 +131,7 @@ def _refine(
             sectors = sum_sectors(residual, slope, usable, weight, part, model)
             clear = clear_sectors(sectors, _spread(residual, part), _MISFIT * (levels[:, 3] - levels[:, 0]).float())
             if thorough:  # what levels without curvature could not explain stays out: curved ones bend into covers
-                clear = away_from_unclear(clear) & (earlier if tempered else True)
+                clear = away_from_unclear(sectors, clear) & (earlier if tempered else True)
                 earlier = clear
             factor = trust(sectors, clear, variance[blocks.row]) if tempered else clear.to(weight.dtype)
             weight = weight * sectors.of_pixels(factor)
@@ -219,6 +219,7 @@ def _pure_levels(b: PixelBlocks, fraction: Tensor) -> tuple[Tensor, Tensor]:
     A blurred ring has no pixel without paper, so the line through both medians is followed to the ends. A level beyond
     the range of grey values shows no pixel at all.
     """
+    fraction = fraction.clamp(0, 1)  # beyond: deep in a flat hole, where the expansions fail
     known = fraction.masked_fill(b.valid == 0, torch.nan)
     least = known.nan_to_num(nan=2.0).amin(-1, keepdim=True)
     most = known.nan_to_num(nan=-1.0).amax(-1, keepdim=True)
@@ -250,6 +251,8 @@ def _inliers(residual: Tensor, b: PixelBlocks, m: RingModel, levels: Tensor) -> 
     predicted = b.grey - residual
     margin = _CLEAR_OF_LIMITS * spread
     low, high = b.limits[:, :1], b.limits[:, 1:]
-    usable = b.valid * (m.sound & (predicted > low + margin) & (predicted < high - margin))
+    usable = b.valid * ((predicted > low + margin) & (predicted < high - margin))
+    if m.sound is not None:
+        usable = usable * m.sound
     contrast = (levels[:, 3] - levels[:, 0]).abs().to(residual.dtype)[:, None]
     return usable, usable * (residual.abs() < _CUT * spread + _MISFIT * contrast)

@@ -57,7 +57,7 @@ class RingModel(NamedTuple):
 
     fraction: of paper, F. by_d, by_q: dF/dd through both circles, dF/dq. by_pose: 6 planes, derivative of d.
     x, y: plane coordinates over the outer radius. sound: bool, False where the expansions below do not hold: deep in
-    a hole that is small for its blur, or where it is flat.
+    a hole that is small for its blur, or where it is flat; None if not asked for.
     """
 
     fraction: Tensor
@@ -66,7 +66,7 @@ class RingModel(NamedTuple):
     by_pose: tuple[Tensor, ...]
     x: Tensor
     y: Tensor
-    sound: Tensor
+    sound: Tensor | None
 
 
 def gather_pixels(
@@ -133,8 +133,8 @@ def _clipping(grey: Tensor, row: Tensor, rows: int) -> Tensor:
     return torch.stack([low, torch.where(full, brightest, torch.inf)], -1)
 
 
-def ring_model(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor) -> RingModel:
-    """Predicts every pixel. The radius in the plane is formed in float64, what is small beside it in float32."""
+def ring_model(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor, *, check: bool = False) -> RingModel:
+    """Predicts every pixel, and with ``check`` says where that is sound. The radius in the plane is formed in float64, what is small beside it in float32."""
     rk = r[b.row]
     normal = (rk @ b.normal[..., None]).squeeze(-1)
     arm = (rk @ b.center[..., None]).squeeze(-1)  # marker's centre about the target's origin, camera axes
@@ -179,9 +179,12 @@ def ring_model(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor) -> RingModel:
     recede = ((nx * w00 + ny * w10) * nu + (nx * w01 + ny * w11) * nv) * toward
     second = 0.5 * oblique.square() * depth * flat / radius - recede
     d_outer, d_inner = outer * per_mm, inner * per_mm
-    deep = torch.maximum((second * d_inner).abs() * (_DEEP / _BENT), -bend * d_inner)
+    straight = d_inner
     d_outer, d_inner = d_outer + second * d_outer.square(), d_inner + second * d_inner.square()
-    sound = (deep < _DEEP) | (d_inner.abs() > _FAR * q)
+    sound = None
+    if check:
+        near = (-bend * straight < _DEEP) & ((second * straight).abs() < _BENT)
+        sound = near | (d_inner.abs() > _FAR * q)
     pull = 0.5 * q * bend
     z_outer, z_inner = d_outer / q + pull, d_inner / q + pull
     square = square_cumulant(nu, nv, q)

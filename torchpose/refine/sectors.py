@@ -26,7 +26,7 @@ _CUT = 4.0  # standard deviations of the mean square of a sector's residuals
 _LEAST_CLEAR = 0.55  # of the sectors of a marker, below which none of them counts
 _CELL = 4  # sectors over which a misfit is taken for one
 _SIGNIFICANT = 4.0  # standard deviations beyond which a chi-squared or a displacement is no noise
-_UNCLEAR = 3  # sectors of a marker: more are no chance
+_UNCLEAR = 3  # sectors of an outer circle: more are no chance
 _RESTLESS = 120.0  # chi-squared of a step from one pixel of six to all: 35 in the mean, beyond this once in a thousand
 _TINY = 1e-12
 
@@ -69,11 +69,11 @@ def sum_sectors(
     slope = slope.masked_fill(weight == 0, 0.0)  # padded pixels have none
     pull = weight * slope
     planes = (usable, weight, weighted * residual, pull * residual, pull * slope)
-    sums = (
-        torch.zeros(2 * SECTORS * count, dtype=weight.dtype, device=weight.device).index_add_(0, flat, p.flatten())
-        for p in planes
+    sums = [torch.zeros(2 * SECTORS * count, dtype=weight.dtype, device=weight.device) for _ in planes]
+    total, used, square, pulls, hold = (
+        s.scatter_add_(0, flat, p.flatten()).view(count, 2 * SECTORS) for s, p in zip(sums, planes, strict=True)
     )
-    return Sectors(*(s.view(count, 2 * SECTORS) for s in sums), cell)
+    return Sectors(total, used, square, pulls, hold, cell)
 
 
 def clear_sectors(s: Sectors, spread: Tensor, misfit: Tensor) -> Tensor:
@@ -88,14 +88,15 @@ def clear_sectors(s: Sectors, spread: Tensor, misfit: Tensor) -> Tensor:
     limit = spread[:, None].square() * (1 + _CUT * (2 / s.used.clamp_min(1)).sqrt()) + misfit[:, None].square()
     clear = (s.used > _KEPT * s.total) & (s.square < s.used * limit)
     # where half of a ring is gone, the rest of the marker is not to be trusted either
-    return clear & (clear.to(s.used.dtype).mean(-1, keepdim=True) > _LEAST_CLEAR)
+    seen = (s.total > 0).sum(-1, keepdim=True)
+    return clear & (clear.sum(-1, keepdim=True) > _LEAST_CLEAR * seen)
 
 
-def away_from_unclear(clear: Tensor) -> Tensor:
+def away_from_unclear(s: Sectors, clear: Tensor) -> Tensor:
     """Clear sectors (K, 96) that touch no run of two unclear ones: what lies over these ends in a blurred edge."""
-    circles = ~clear.unflatten(1, (2, SECTORS))
-    run = circles & (circles.roll(1, -1) | circles.roll(-1, -1))
-    return ~(circles | run.roll(1, -1) | run.roll(-1, -1)).flatten(1)
+    unclear = (~clear & (s.total > 0)).unflatten(1, (2, SECTORS))
+    run = unclear & (unclear.roll(1, -1) | unclear.roll(-1, -1))
+    return clear & ~(run.roll(1, -1) | run.roll(-1, -1)).flatten(1)
 
 
 def trust(s: Sectors, clear: Tensor, variance: Tensor) -> Tensor:
@@ -129,7 +130,7 @@ def doubtful(s: Sectors, clear: Tensor, variance: Tensor, row: Tensor, step_chi2
         variance: (K,) of noise. row: (K,) int64. step_chi2: (N,) chi-squared by which the last step lowered the sum.
     """
     rows = step_chi2.numel()
-    unclear = (~clear & (s.total > 0)).sum(-1) > _UNCLEAR
+    unclear = (~clear & (s.total > 0))[:, SECTORS:].sum(-1) > _UNCLEAR
     chi2, hold = _cells(s.scaled(clear.to(s.pull.dtype)), variance[:, None].to(s.pull.dtype))
     total = segment_sum(chi2.double().sum(-1), row, rows) - step_chi2
     freedom = segment_sum((hold > 0).double().sum(-1), row, rows).clamp_min(1)
