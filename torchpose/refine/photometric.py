@@ -19,14 +19,15 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.geometry import rotations
 from torchpose.geometry.segments import segment_sum
-from torchpose.refine.gauss_newton import LEVELS, QUANTISATION, gauss_newton_step, solve_ridged
+from torchpose.refine.gauss_newton import LEVELS, POSE, QUANTISATION, gauss_newton_step, solve_ridged
 from torchpose.refine.result import Refined
 from torchpose.refine.ring_model import PixelBlocks, RingModel, gather_pixels, ring_model
-from torchpose.refine.sectors import away_from_unclear, clear_sectors, doubtful, sum_sectors, trust
+from torchpose.refine.sectors import away_from_unclear, clear_sectors, doubtful, misfit, sum_sectors, trust
 
 _COARSE = 6  # the first steps take one pixel of so many; both are whole numbers of tiles
 _STEPS = (3, 1)  # of Gauss-Newton, on some of the pixels and on all
 _THOROUGH_STEPS = (3, 4)
+_LEVEL_STEPS = 3  # of the grey levels alone
 _BAND = 4.0  # px on either side of an edge
 _BAND_PER_BLUR = 4.6  # band of a wide blur, in its standard deviations
 _WIDEST = 12.0  # px, of all bands
@@ -79,11 +80,60 @@ def refine_photometric(
             continue
         band = torch.where(wide, _BAND_PER_BLUR * first.blur, _BAND).clamp_max(_WIDEST)[w]
         rest = (centers[w], normals[w], radii[w], rotation[w], translation[w], first.blur[w], band, known[w])
-        again, doubtful = _refine(frames, camera, frame[w], mask[w], rings[w], *rest, thorough=thorough)
+        again, still = _refine(frames, camera, frame[w], mask[w], rings[w], *rest, thorough=thorough)
         good = again.good.nonzero()[:, 0]
         first = first.replaced(w[good], again[good])
-        doubt = doubt.index_copy(0, w[good], doubtful[good])
+        doubt = doubt.index_copy(0, w[good], still[good])
     return first
+
+
+def grey_chi2(
+    frames: Tensor,
+    camera: Camera,
+    frame: Tensor,
+    mask: Tensor,
+    rings: Tensor,
+    centers: Tensor,
+    normals: Tensor,
+    radii: Tensor,
+    one: Refined,
+    two: Refined,
+) -> Tensor:
+    """Chi-squared (N,) of the grey values under the refined poses ``two`` less that under ``one``.
+
+    Both are judged on the same pixels, those that either explains, each with grey levels of its own; no pixel counts
+    for more than an outlier would. Where not even the better pose explains them within noise the difference counts
+    for less, by as much as the displacements of its sectors exceed theirs.
+
+    Args: as in `refine_photometric`.
+    """
+    rows = mask.shape[0]
+    band = (_BAND_PER_BLUR * torch.maximum(one.blur, two.blur)).clamp(_BAND, _WIDEST)
+    b = gather_pixels(frames, camera, frame, mask, rings, centers, normals, radii, band, _TILE * _COARSE)
+    squares, weights, variances, misfits = [], [], [], []
+    for pose in (one, two):
+        model = ring_model(b, pose.R, pose.t, pose.blur, check=True)
+        levels = _first_levels(b, pose.R, pose.t, pose.blur)
+        for _ in range(_LEVEL_STEPS):
+            columns, slope = _columns(b, model, levels)
+            residual = columns[:, :, -1].flatten(1)
+            usable, weight = _inliers(residual, b, model, levels)
+            sectors = sum_sectors(residual, slope, usable, weight, b, model)
+            clear = clear_sectors(sectors, _spread(residual, b), _MISFIT * (levels[:, 3] - levels[:, 0]).float())
+            weight = weight * sectors.of_pixels(clear.to(weight.dtype))
+            sums = _products(columns, weight)
+            levels = levels + solve_ridged(sums[:, POSE:-1, POSE:-1], sums[:, POSE:-1, -1:]).squeeze(-1)
+        used = segment_sum(weight.sum(-1).double(), b.row, rows).clamp_min(1)
+        variance = (segment_sum(sums[:, -1, -1], b.row, rows) / used).clamp_min(QUANTISATION)
+        squares.append(residual.square())
+        weights.append(weight)
+        variances.append(variance)
+        misfits.append(misfit(sectors, clear, variance[b.row], b.row, rows))
+    variance = torch.minimum(*variances)
+    most = (_CUT**2 * variance[b.row, None]).to(squares[0].dtype)
+    of_one, of_two = (torch.minimum(s, most) for s in squares)
+    difference = (torch.maximum(*weights) * (of_two - of_one)).sum(-1).double()
+    return segment_sum(difference, b.row, rows) / variance / torch.minimum(*misfits).clamp_min(1)
 
 
 def _refine(

@@ -134,7 +134,10 @@ def _clipping(grey: Tensor, row: Tensor, rows: int) -> Tensor:
 
 
 def ring_model(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor, *, check: bool = False) -> RingModel:
-    """Predicts every pixel, and with ``check`` says where that is sound. The radius in the plane is formed in float64, what is small beside it in float32."""
+    """Predicts every pixel, and with ``check`` says where that is sound.
+
+    The radius in the plane is formed in float64, what is small beside it in float32.
+    """
     rk = r[b.row]
     normal = (rk @ b.normal[..., None]).squeeze(-1)
     arm = (rk @ b.center[..., None]).squeeze(-1)  # marker's centre about the target's origin, camera axes

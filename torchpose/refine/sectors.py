@@ -123,6 +123,13 @@ def _cells(s: Sectors, noise: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(hold > 0, pull.square() / (noise * hold).clamp_min(_TINY), 0.0), hold
 
 
+def misfit(s: Sectors, clear: Tensor, variance: Tensor, row: Tensor, rows: int) -> Tensor:
+    """Chi-squared of the displacements of a row's cells per cell (N,): 1 where the model holds."""
+    chi2, hold = _cells(s.scaled(clear.to(s.pull.dtype)), variance[:, None].to(s.pull.dtype))
+    count = segment_sum((hold > 0).double().sum(-1), row, rows).clamp_min(1)
+    return segment_sum(chi2.double().sum(-1), row, rows) / count
+
+
 def doubtful(s: Sectors, clear: Tensor, variance: Tensor, row: Tensor, step_chi2: Tensor) -> Tensor:
     """Rows (N,) bool whose grey values contradict the model, or that have not come to rest.
 
