@@ -98,8 +98,10 @@ def grey_chi2(
     radii: Tensor,
     one: Refined,
     two: Refined,
-) -> Tensor:
+) -> tuple[Tensor, Tensor]:
     """Chi-squared (N,) of the grey values under the refined poses ``two`` less that under ``one``.
+
+    Also whether each of the two (N, 2) explains most of the sectors of every marker.
 
     Both are judged on the same pixels, those that either explains, each with grey levels of its own; no pixel counts
     for more than an outlier would. Where not even the better pose explains them within noise the difference counts
@@ -110,7 +112,7 @@ def grey_chi2(
     rows = mask.shape[0]
     band = (_BAND_PER_BLUR * torch.maximum(one.blur, two.blur)).clamp(_BAND, _WIDEST)
     b = gather_pixels(frames, camera, frame, mask, rings, centers, normals, radii, band, _TILE * _COARSE)
-    squares, weights, variances, misfits = [], [], [], []
+    squares, weights, variances, misfits, explained = [], [], [], [], []
     for pose in (one, two):
         model = ring_model(b, pose.R, pose.t, pose.blur, check=True)
         levels = _first_levels(b, pose.R, pose.t, pose.blur)
@@ -129,11 +131,13 @@ def grey_chi2(
         weights.append(weight)
         variances.append(variance)
         misfits.append(misfit(sectors, clear, variance[b.row], b.row, rows))
+        explained.append(segment_sum((~clear.any(-1)).double(), b.row, rows) == 0)
     variance = torch.minimum(*variances)
     most = (_CUT**2 * variance[b.row, None]).to(squares[0].dtype)
     of_one, of_two = (torch.minimum(s, most) for s in squares)
     difference = (torch.maximum(*weights) * (of_two - of_one)).sum(-1).double()
-    return segment_sum(difference, b.row, rows) / variance / torch.minimum(*misfits).clamp_min(1)
+    chi2 = segment_sum(difference, b.row, rows) / variance / torch.minimum(*misfits).clamp_min(1)
+    return chi2, torch.stack(explained, -1)
 
 
 def _refine(

@@ -67,24 +67,34 @@ def decide_on_grey(
 ) -> Solutions:
     """Solutions whose ambiguous rows are `Status.OK` where the grey values tell which pose is right.
 
-    Both are refined. If they meet, there was one minimum; else the one that explains the grey values better wins.
+    Both are refined. If they meet, there was one minimum; else the one that explains the grey values better wins. Rows
+    that were rejected for the shapes of their rings, which blur, glare and covers bend, are `Status.OK` if beyond that
+    the grey values of most of the edges of every marker agree with the pose.
 
     Args:
         s: N rows. e: their evidence. frames: (B, H, W) grey. frame: (N,) int64. rings: (N, M, 2, 5) ellipses, raw px.
     """
-    row = (s.status == Status.AMBIGUOUS).nonzero()[:, 0]
+    shape = (s.status == Status.REJECTED) & (s.reason == Reason.RING_SHAPE)
+    row = ((s.status == Status.AMBIGUOUS) | shape).nonzero()[:, 0]
     if row.numel() == 0:
         return s
     mask = s.mask[row]
+    alone = s.R_alt[row].isnan().any(-1).any(-1)  # no second minimum
+    r_alt = torch.where(alone[:, None, None], s.R[row], s.R_alt[row])
+    t_alt = torch.where(alone[:, None], s.t[row], s.t_alt[row])
     start, model = (frames, camera, frame[row]), (mask, rings[row], e.points[row], e.normals[row], e.radii[row])
-    one, two = (refine_photometric(*start, r[row], t[row], *model) for r, t in ((s.R, s.t), (s.R_alt, s.t_alt)))
-    chi2 = grey_chi2(*start, *model, one, two).nan_to_num(0.0, 0.0, 0.0)
+    one, two = (refine_photometric(*start, r, t, *model) for r, t in ((s.R[row], s.t[row]), (r_alt, t_alt)))
+    chi2, explained = grey_chi2(*start, *model, one, two)
     swap = (chi2 < 0)[:, None]
     turn = rotations.log(two.R @ one.R.mT)
     apart = torch.cat([two.t - one.t, turn], -1)[..., None]
-    meet = (apart.mT @ torch.linalg.solve(one.covariance + two.covariance, apart))[:, 0, 0] < AMBIGUOUS_CHI2
-    sound = one.good & two.good & (torch.minimum(one.kept, two.kept) > _LEAST_KEPT)
+    covariance = torch.where(
+        (one.good & two.good)[:, None, None], one.covariance + two.covariance, torch.eye(6).to(apart)
+    )
+    meet = (apart.mT @ torch.linalg.solve(covariance, apart))[:, 0, 0] < AMBIGUOUS_CHI2
+    sound = one.good & two.good & (torch.where(swap[:, 0], two.kept, one.kept) > _LEAST_KEPT)
     sure = sound & (meet | (chi2.abs() > AMBIGUOUS_CHI2))
+    sure &= ~shape[row] | torch.where(swap[:, 0], explained[:, 1], explained[:, 0])
     values = {
         "R": torch.where(swap[..., None], s.R_alt[row], s.R[row]),
         "t": torch.where(swap, s.t_alt[row], s.t[row]),
