@@ -22,7 +22,7 @@ from torchpose.pose import (
     intrinsics_covariance,
     solve_poses,
 )
-from torchpose.refine import decide, refine_centers, refine_edges, refine_photometric
+from torchpose.refine import decide, decide_on_grey, refine_centers, refine_edges, refine_photometric
 from torchpose.results import Detections, Poses, Reason, Status
 from torchpose.rings import Rings, measure_rings
 from torchpose.second_look import look_again
@@ -112,10 +112,20 @@ class PoseEstimator(nn.Module):
         solutions = self._doubted(solutions, evidence[solvable], solvable // count, rings, table, target[solvable])
         if self.method != "paper":
             solutions = decide(solutions, evidence[solvable])
+        shapes = _raw_ellipses(rings, identified.ring[solvable])
+        if self.method == "photometric":
+            solutions = decide_on_grey(solutions, evidence[solvable], frames, camera, solvable // count, shapes)
         refined = self.method in ("photometric", "edges")
         if refined:
             solutions = self._refined(
-                frames, solutions, evidence[solvable], solvable // count, rings, identified.ring[solvable], camera
+                frames,
+                solutions,
+                evidence[solvable],
+                solvable // count,
+                rings,
+                identified.ring[solvable],
+                shapes,
+                camera,
             )
         elif self.method == "centers":
             solutions = _on_centers(solutions, evidence[solvable])
@@ -215,14 +225,14 @@ class PoseEstimator(nn.Module):
         frame: Tensor,
         rings: Rings,
         ring: Tensor,
+        shapes: Tensor,
         camera: Camera,
     ) -> Solutions:
         """Solutions whose poses are refined on the frames themselves, where the refinement holds."""
         solved = (s.status != Status.REJECTED).nonzero()[:, 0]
         index = ring[solved].clamp_min(0)
-        shapes = torch.stack([rings.outer_raw, rings.inner_raw], 1)[index]
         some = replace(e[solved], mask=s.mask[solved])
-        start = (frames, camera, frame[solved], s.R[solved], s.t[solved], some.mask, shapes)
+        start = (frames, camera, frame[solved], s.R[solved], s.t[solved], some.mask, shapes[solved])
         model = (some.points, some.normals, some.radii)
         if self.method == "edges":
             refined = refine_edges(*start, rings.polarity[index], *model)
@@ -317,6 +327,12 @@ def _on_centers(s: Solutions, e: Evidence) -> Solutions:
         t=torch.where(better[:, None], t, s.t),
         covariance=torch.where(better[:, None, None], covariance, s.covariance),
     )
+
+
+def _raw_ellipses(rings: Rings, ring: Tensor) -> Tensor:
+    """Ellipses (N, M, 2, 5) in raw pixels, outer and inner, of the rings (N, M); anything where it is -1."""
+    both = torch.stack([rings.outer_raw, rings.inner_raw], 1)
+    return both[ring.clamp_min(0)] if len(rings) else both.new_ones(*ring.shape, 2, 5)
 
 
 def _linear(frames: Tensor, white: float) -> Tensor:

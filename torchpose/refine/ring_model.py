@@ -22,6 +22,9 @@ from torchpose.geometry.segments import values_at
 from torchpose.refine.band import band_pixels
 
 _FULL_SCALES = (255.0, 1023.0, 4095.0, 16383.0, 65520.0, 65535.0)  # of 8 to 16 bits; 12 bits in the upper ones of 16
+_DEEP = 0.7  # of the radius of curvature: nearer to its centre a pixel sees edges on all sides
+_BENT = 0.4  # of a distance from an edge: the most that its second-order term may be
+_FAR = 3.5  # standard deviations of the blur from an edge, from where on neither matters
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +67,8 @@ class RingModel(NamedTuple):
     """Prediction and derivatives at one pose; planes (K, P) in float32.
 
     fraction: of paper, F. by_d, by_q: dF/dd through both circles, dF/dq. by_pose: 6 planes, derivative of d.
-    x, y: plane coordinates over the outer radius.
+    x, y: plane coordinates over the outer radius. sound: bool, False where the expansions below do not hold: deep in
+    a hole that is small for its blur, or where it is flat; None if not asked for.
     """
 
     fraction: Tensor
@@ -73,6 +77,7 @@ class RingModel(NamedTuple):
     by_pose: tuple[Tensor, ...]
     x: Tensor
     y: Tensor
+    sound: Tensor | None
 
 
 def gather_pixels(
@@ -149,8 +154,11 @@ def _clipping(grey: Tensor, row: Tensor, rows: int) -> Tensor:
     return torch.stack([low, torch.where(full, brightest, torch.inf)], -1)
 
 
-def ring_model(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor) -> RingModel:
-    """Predicts every pixel, in float32: rays count from a ray near the marker, so that no digits are lost."""
+def ring_model(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor, *, check: bool = False) -> RingModel:
+    """Predicts every pixel, in float32, and with ``check`` says where that is sound.
+
+    Rays count from a ray near the marker, so that no digits are lost.
+    """
     rk = r[b.row]
     normal = (rk @ b.normal[..., None]).squeeze(-1)
     arm = (rk @ b.center[..., None]).squeeze(-1)  # marker's centre about the target's origin, camera axes
@@ -201,7 +209,12 @@ def ring_model(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor) -> RingModel:
     recede = ((nx * w00 + ny * w10) * nu + (nx * w01 + ny * w11) * nv) * toward
     second = 0.5 * oblique.square() * depth * flat / radius - recede
     d_outer, d_inner = outer * per_mm, inner * per_mm
+    straight = d_inner
     d_outer, d_inner = d_outer + second * d_outer.square(), d_inner + second * d_inner.square()
+    sound = None
+    if check:
+        near = (-bend * straight < _DEEP) & ((second * straight).abs() < _BENT)
+        sound = near | (d_inner.abs() > _FAR * q)
     pull = 0.5 * q * bend
     z_outer, z_inner = d_outer / q + pull, d_inner / q + pull
     square = square_cumulant(nu, nv, q)
@@ -217,6 +230,7 @@ def ring_model(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor) -> RingModel:
         by_pose,
         x / size,
         y / size,
+        sound,
     )
 
 
