@@ -155,9 +155,9 @@ def _clipping(grey: Tensor, row: Tensor, rows: int) -> Tensor:
 
 
 def ring_model(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor, *, check: bool = False) -> RingModel:
-    """Predicts every pixel, in float32, and with ``check`` says where that is sound.
+    """Predicts every pixel, and with ``check`` says where that is sound.
 
-    Rays count from a ray near the marker, so that no digits are lost.
+    The radius in the plane is formed in float64, what is small beside it in float32.
     """
     rk = r[b.row]
     normal = (rk @ b.normal[..., None]).squeeze(-1)
@@ -169,22 +169,22 @@ def ring_model(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor, *, check: boo
         return value[:, None]
 
     # the ray of the pixel meets the plane at depth * ray; coordinates there, about the circle's centre, are quotients
-    # of linear functions of the ray, whose coefficients are formed in float64
+    # of linear functions of the ray, which counts from a ray near the marker, so that float32 holds it
     away = (normal * center).sum(-1, keepdim=True)
     near = torch.nn.functional.pad(b.origin, (0, 1), value=1.0)
     over = (normal * near).sum(-1, keepdim=True)
 
     def linear(vector: Tensor) -> Tensor:
-        at_x, at_y, _ = (scalar(c).float() for c in (vector / over).unbind(-1))
-        return ((vector * near).sum(-1, keepdim=True) / over).float() + at_x * b.ray_x + at_y * b.ray_y
+        at_x, at_y, _ = (scalar(c) for c in (vector / over).unbind(-1))
+        return (vector * near).sum(-1, keepdim=True) / over + at_x * b.ray_x + at_y * b.ray_y
 
     one_c, two_c = (one * center).sum(-1, keepdim=True), (two * center).sum(-1, keepdim=True)
     toward = 1 / linear(normal)
     x, y = linear(away * one - one_c * normal) * toward, linear(away * two - two_c * normal) * toward
     radius = (x * x + y * y).sqrt().clamp_min(1e-9)
-    outer, inner = (radius - scalar(size).float() for size in b.radii.unbind(-1))
+    outer, inner = ((radius - scalar(size)).float() for size in b.radii.unbind(-1))
 
-    toward = toward / over.float()
+    x, y, radius, toward = (v.float() for v in (x, y, radius, toward / over))
     depth, over_away = away.float() * toward, 1 / away.float()
     one_c, two_c, q = one_c.float(), two_c.float(), scalar(blur[b.row]).float()
     axes = [[scalar(c).float() for c in v.unbind(-1)] for v in (one, two, normal, arm)]
