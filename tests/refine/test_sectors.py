@@ -97,7 +97,7 @@ def test_blurred_rings_under_a_cover_start_at_their_own_grey() -> None:
     )
     frames = render(CAMERA, target, r, t, psf_sigma=2.5, covers=cover)
     result = refine_photometric(*arguments(add_noise(frames, 2.0), r, t))
-    assert result.good.all()
+    assert (result.good & (result.kept > 0.7)).all()
     assert nees(result, r, t).max() < 30
 
 
