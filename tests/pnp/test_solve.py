@@ -135,7 +135,8 @@ def test_random_planar_scenes_obey_their_covariance() -> None:
     assert 5.7 < row["decided_nees"] < 6.3
     assert row["decided_converged"] > 0.95
     assert row["wrong_per_10000"] <= 1
-    assert row["rest_converged"] > 0.1, "flagging everything is no way out"
+    converged = row["decided"] * row["decided_converged"] + (1 - row["decided"]) * row["rest_converged"]
+    assert converged > 0.66, "flagging everything is no way out"
 
 
 def test_a_frontal_view_is_not_ambiguous_and_a_far_tilted_one_is() -> None:

@@ -12,6 +12,9 @@ import torch
 
 from torchpose.errors import ConfigError
 
+# batches up to this size would have a graph each, and are not compiled
+_SPECIAL = 3
+
 
 @cache
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -27,7 +30,8 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     fast = torch.compile(function, options={"cpp.dynamic_threads": True, "max_fusion_size": 4096})
 
     def call(*args: Any) -> Any:
-        _mark(args)
+        if _mark(args) <= _SPECIAL:
+            return function(*args)
         # one graph for every number of points, dtype and kind of weights in use
         with torch._dynamo.config.patch(recompile_limit=64, automatic_dynamic_shapes=False):
             return fast(*args)
@@ -35,10 +39,17 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-def _mark(value: Any) -> None:
+def padded(index: torch.Tensor) -> torch.Tensor:
+    """An index of poses, the first one repeated where there are too few of them to be compiled."""
+    count = len(index)
+    return index if count == 0 or count > _SPECIAL else torch.cat([index, index[:1].expand(_SPECIAL + 1 - count)])
+
+
+def _mark(value: Any) -> int:
+    """Marks the batch, the last dimension of every tensor, as dynamic; returns its size."""
     if isinstance(value, torch.Tensor):
-        if value.ndim and value.shape[-1] > 3:
+        size = value.shape[-1] if value.ndim else 0
+        if size > _SPECIAL:
             torch._dynamo.maybe_mark_dynamic(value, value.ndim - 1)
-    elif isinstance(value, tuple):
-        for item in value:
-            _mark(item)
+        return size
+    return max(map(_mark, value), default=0) if isinstance(value, tuple) else 0

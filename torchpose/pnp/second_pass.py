@@ -11,11 +11,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchpose.pnp._compile import padded
 from torchpose.pnp.first_pass import EVALUATIONS, FirstPass, upright
-from torchpose.pnp.iterative import Estimate, minimise
+from torchpose.pnp.iterative import minimise
 from torchpose.pnp.normal_equations import COST
 from torchpose.pnp.problem import Problem
-from torchpose.pnp.verdict import Minima, choose, relevant
+from torchpose.pnp.verdict import Found, Minima, choose, relevant
 
 # iterations in float32: the few poses that take more, off a saddle, would do so once more in float64
 _SINGLE = 8
@@ -29,36 +30,36 @@ class Late(NamedTuple):
     Attributes:
         which: (L,) int64.
         pose: (3, 4, L) of the better minimum, or from where to go on. other: of the other one, the same, in float32.
-        normal: (28, L), normal equations at ``pose``, or the cost alone: of what is known, the least.
-        other_cost: (L,), infinite where there is no other minimum.
+        cost, other_cost: (L,), what is known of both; infinite where there is no other minimum.
         arrived: (2, L) bool, is enough known of this minimum?
     """
 
     which: Tensor
     pose: Tensor
     other: Tensor
-    normal: Tensor
+    cost: Tensor
     other_cost: Tensor
     arrived: Tensor
 
 
-def left_over(state: FirstPass, failed: Tensor) -> Late | None:
+def left_over(state: FirstPass, failed: Tensor, compile: bool) -> Late | None:
     """What is neither finished nor, by ``failed`` (B,), without an answer."""
     best, other, other_cost, _, decided = state.minima
     late = ~((best.converged & decided) | failed) & state.ahead
     which = late.nonzero().squeeze(1)
     if len(which) == 0:
         return None
-    pose, other, normal = (v.index_select(-1, which) for v in (state.fallback, other, best.normal))
-    done = best.converged[which]
-    pose = torch.where(done, best.pose.index_select(-1, which), pose)
-    normal[COST] = torch.where(done, normal[COST], state.least[which])
-    return Late(which, pose, other, normal, other_cost[which].to(normal), torch.stack([done, decided[which]]))
+    which = padded(which) if compile else which
+    done, pose = best.converged[which], state.fallback[..., which]
+    arrived = done.nonzero().squeeze(1)
+    pose[..., arrived] = best.pose[..., which[arrived]]
+    cost = torch.where(done, best.normal[COST, which], state.least[which])
+    return Late(which, pose, other[..., which], cost, other_cost[which].to(cost), torch.stack([done, decided[which]]))
 
 
 def second_pass(problem: Problem, late: Late, max_iterations: int, compile: bool) -> Minima:
     """The minima of all that is left over."""
-    batch, known = len(late.which), late.normal[COST]
+    batch, known = len(late.which), late.cost
     bound = relevant(known)
     other, other_cost, enough = late.other.to(late.pose), late.other_cost.clone(), late.arrived[1].clone()
     index = (~enough).nonzero().squeeze(1)
@@ -70,7 +71,6 @@ def second_pass(problem: Problem, late: Late, max_iterations: int, compile: bool
             max_iterations=min(max_iterations, _SINGLE),
             rtol=1e-6,
             enough=bound[index].to(single.xy),
-            report=False,
             compile=compile,
         )
         cost = found.normal[COST].to(known)
@@ -79,9 +79,9 @@ def second_pass(problem: Problem, late: Late, max_iterations: int, compile: bool
 
     arrived = torch.cat([late.arrived[0], enough])
     poses = upright(torch.stack([late.pose, other], 2)).flatten(2)
-    normal = torch.cat([late.normal, torch.full_like(late.normal, torch.inf)], 1)
-    normal[COST, batch:] = other_cost
+    cost = torch.cat([known, other_cost])
     going = (~arrived).nonzero().squeeze(1)
+    going = padded(going) if compile else going
     exact = minimise(
         problem.final.select(going % batch),
         poses[..., going],
@@ -89,11 +89,9 @@ def second_pass(problem: Problem, late: Late, max_iterations: int, compile: bool
         enough=torch.cat([torch.full_like(bound, torch.inf), bound])[going],
         compile=compile,
     )
+    poses[..., going], cost[going] = exact.pose, exact.normal[COST]
     count = torch.full((2 * batch,), EVALUATIONS, dtype=torch.int64, device=going.device)
-    estimate = Estimate(
-        poses.index_copy_(-1, going, exact.pose),
-        normal.index_copy_(-1, going, exact.normal),
-        count.index_add_(0, going, exact.iterations),
-        arrived.index_copy_(0, going, exact.converged),
-    )
-    return choose(Estimate(*(v.unflatten(-1, (2, batch)) for v in estimate)))
+    count[going] += exact.iterations
+    arrived[going] = exact.converged
+    found = Found(*(v.unflatten(-1, (2, batch)) for v in (poses, cost, count, arrived)))
+    return choose(problem.final, found, compile)

@@ -16,7 +16,7 @@ from torchpose.pnp.dlt import dlt
 from torchpose.pnp.epnp import epnp
 from torchpose.pnp.first_pass import EVALUATIONS, first_pass, upright
 from torchpose.pnp.implicit import attach_gradient
-from torchpose.pnp.iterative import Estimate, minimise
+from torchpose.pnp.iterative import minimise
 from torchpose.pnp.normal_equations import COST, normal_equations
 from torchpose.pnp.p3p import p3p
 from torchpose.pnp.planar import planar
@@ -25,7 +25,7 @@ from torchpose.pnp.problem import Inputs, Problem, prepare
 from torchpose.pnp.result import PnPCode, PnPError, PnPResult
 from torchpose.pnp.second_pass import Late, left_over, second_pass
 from torchpose.pnp.starts import batch_first, starts
-from torchpose.pnp.verdict import Table, choose, write
+from torchpose.pnp.verdict import Found, Table, choose, write
 
 Method = Literal["iterative", "planar", "dlt", "p3p", "epnp", "posit"]
 _CLOSED_FORMS: dict[str, Callable[[Tensor, Tensor, Tensor | None], Candidates]] = {
@@ -149,7 +149,7 @@ def _solve(
             late = Late(*(torch.cat(parts, -1) for parts in zip(*pending, strict=True)))
             problem, columns = prepare(inputs.rows(late.which)), Table.empty(len(late.which), inputs.pixels)
             minima = second_pass(problem, late, max_iterations, compile)
-            write(problem, minima, _bad(problem, late.pose[:, :, None], 0), columns)
+            write(problem, minima, _bad(problem, late.pose[:, :, None], 0), columns, compile)
             table.replace(late.which, columns)
             pending = []
     return table.result()
@@ -169,9 +169,9 @@ def _solve_chunk(
     if method != "iterative":
         found = _CLOSED_FORMS[method](*batch_first(problem.observed, problem.weight))
         poses = torch.cat([found.R, found.t[..., None]], 3).permute(2, 3, 1, 0)
-        normal = normal_equations(problem.final.each(), poses)
-        estimate = Estimate(poses, normal, torch.zeros_like(normal[0], dtype=torch.int64), normal[COST].isfinite())
-        write(problem, choose(estimate), _bad(problem, poses, least), table)
+        cost = normal_equations(problem.final.each(), poses)[COST]
+        found = Found(poses, cost, torch.zeros_like(cost, dtype=torch.int64), cost.isfinite())
+        write(problem, choose(problem.final, found), _bad(problem, poses, least), table)
         return None
     single = problem.observed.to(torch.float32)
     if initial is not None:
@@ -188,12 +188,14 @@ def _solve_chunk(
         options, batch = poses.shape[2:]
         every = problem.final.select(torch.arange(batch, device=poses.device).repeat(options))
         flat = minimise(every, upright(poses.double()).flatten(2), max_iterations=max_iterations)
-        write(problem, choose(Estimate(*(v.unflatten(-1, (options, batch)) for v in flat))), bad, table)
+        every_found = (flat.pose, flat.normal[COST], flat.iterations, flat.converged)
+        found = Found(*(v.unflatten(-1, (options, batch)) for v in every_found))
+        write(problem, choose(problem.final, found), bad, table)
         return None
     state = first_pass(single, problem.observed, problem.final, poses.float(), compile)
-    write(problem, state.minima, bad, table, compile and problem.calibration is None)
+    write(problem, state.minima, bad, table, compile)
     failed = torch.stack([flag.expand(len(inputs.pixels)) for flag, _ in bad]).any(0)
-    return left_over(state, failed)
+    return left_over(state, failed, compile)
 
 
 def _bad(problem: Problem, poses: Tensor, least: int) -> tuple[tuple[Tensor, PnPCode], ...]:

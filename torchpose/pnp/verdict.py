@@ -12,7 +12,15 @@ from torchpose.geometry.small_linalg import cross, eliminate, matmul3
 from torchpose.pnp import scalar
 from torchpose.pnp._compile import compiled
 from torchpose.pnp.iterative import Estimate
-from torchpose.pnp.normal_equations import COST, Observations, camera_points, distance, residuals, rows_of
+from torchpose.pnp.normal_equations import (
+    COST,
+    Observations,
+    camera_points,
+    distance,
+    normal_equations,
+    residuals,
+    rows_of,
+)
 from torchpose.pnp.problem import Problem
 from torchpose.pnp.result import PnPCode, PnPResult
 
@@ -22,6 +30,15 @@ DECISION = 20.0
 COINCIDENCE = 1.0
 # least 1 - (multiple correlation)^2 of a parameter below which the points do not fix the pose
 INDEPENDENCE = 1e-11
+
+
+class Found(NamedTuple):
+    """Minima found: [R | t] (3, 4, ...), cost, iterations and converged (...)."""
+
+    pose: Tensor
+    cost: Tensor
+    iterations: Tensor
+    converged: Tensor
 
 
 class Minima(NamedTuple):
@@ -85,15 +102,21 @@ def relevant(chi2: Tensor) -> Tensor:
     return 2 * chi2 + 2 * DECISION
 
 
-def choose(estimate: Estimate) -> Minima:
+def choose(obs: Observations, found: Found, compile: bool = False) -> Minima:
     """The best of S minima (..., S, B), and the next one that is not the same."""
-    options, batch = estimate.converged.shape
-    chi2, order = estimate.normal[COST].nan_to_num(nan=torch.inf, posinf=torch.inf).sort(0)
+    options, batch = found.converged.shape
+    chi2, order = found.cost.nan_to_num(nan=torch.inf, posinf=torch.inf).sort(0)
 
-    def pick(k: int) -> Estimate:
-        return Estimate(*(v.gather(-2, order[k].expand(*v.shape[:-2], 1, batch)).squeeze(-2) for v in estimate))
+    def pick(k: int) -> Found:
+        return Found(*(v.gather(-2, order[k].expand(*v.shape[:-2], 1, batch)).squeeze(-2) for v in found))
 
-    best = pick(0)
+    pose, cost, iterations, converged = pick(0)
+    fast = compile and obs.camera is None
+    equations = compiled(normal_equations) if fast else normal_equations
+    normal = equations(obs._replace(sums=None) if fast else obs, pose)
+    # a minimum is known by the cost that its last step promised; one behind the camera from the start by none
+    normal[COST] = cost
+    best = Estimate(pose, normal, iterations, converged)
     other, cost = best.pose, torch.full_like(chi2[0], torch.nan)
     different = torch.zeros_like(best.converged)
     reached = torch.ones_like(different)
@@ -128,20 +151,15 @@ def write(
     if isinstance(pixel, Observations):
         squares = tuple(_mean_square(pixel, problem.weight, pose.to(best.pose)) for pose in (best.pose, minima.other))
     mixed = None if problem.calibration is None else problem.calibration(best.pose)
-    columns = compiled(_columns) if compile else _columns
     scale = 1.0 if isinstance(pixel, Observations) else pixel
-    *parts, code = columns(minima, body.center, body.unit, mixed, squares, scale, problem.seen, bad)
-    for rows, part in zip(table.floats.split([len(part) for part in parts]), parts, strict=True):
-        rows.copy_(part)
-    table.integers[0], table.integers[1] = best.iterations, code
-    failed = (code > PnPCode.AMBIGUOUS).nonzero().squeeze(1)
-    table.floats.index_fill_(1, failed, torch.nan)
-    alone = (~minima.different).nonzero().squeeze(1)
-    for part in (table.floats[12:24], table.floats[62:]):
-        part.index_fill_(1, alone, torch.nan)
+    fill = compiled(_fill) if compile and mixed is None else _fill
+    # views that are overwritten as a whole: the compiled code then writes straight into the table
+    target = (*table.floats.split([12, 12, 36, 1, 1, 3]), *table.integers.split(1))
+    fill(target, minima, body.center, body.unit, mixed, squares, scale, problem.seen, bad)
 
 
-def _columns(
+def _fill(
+    target: tuple[Tensor, ...],
     minima: Minima,
     center: Tensor,
     unit: Tensor,
@@ -150,8 +168,7 @@ def _columns(
     sigma_px: float,
     seen: Tensor,
     bad: tuple[tuple[Tensor, PnPCode], ...],
-) -> tuple[Tensor, ...]:
-    """The floats of `Table` in four parts (12|12|36|5, B), and the codes (B,)."""
+) -> None:
     best, other, other_cost, different, reached = minima
     chi2 = best.normal[COST]
     matrix, independence = covariance(best, center, unit, mixed)
@@ -159,8 +176,6 @@ def _columns(
     if squares is None:  # of equal weights and squares: chi-squared says it all
         squares = chi2 / seen, chi2_alt / seen
     rms, rms_alt = (sigma_px * v.sqrt() for v in squares)
-    poses = [place(pose, center, unit).flatten(0, 1) for pose in (best.pose, other.to(chi2))]
-    rest = torch.stack([chi2, rms, chi2_alt, rms_alt, rms_alt / rms])
 
     finite = chi2 < torch.inf
     verdicts = (
@@ -174,7 +189,21 @@ def _columns(
     code = torch.zeros_like(best.iterations)
     for failed, verdict in verdicts:
         code = torch.where(failed, int(verdict), code)
-    return *poses, matrix, rest, code
+
+    pose, alt = (place(v, center, unit).flatten(0, 1) for v in (best.pose, other.to(chi2)))
+    rest = torch.stack([chi2_alt, rms_alt, rms_alt / rms])
+    failed = code > PnPCode.AMBIGUOUS
+    alone = failed | ~different
+    values = [pose, alt, matrix, chi2[None], rms[None], rest, best.iterations[None], code[None]]
+    unknown = [failed, alone, failed, failed, failed, alone]
+    if torch.compiler.is_compiling():  # no pass of its own
+        values[:6] = [torch.where(none, torch.nan, v) for none, v in zip(unknown, values[:6], strict=True)]
+    for rows, value in zip(target, values, strict=True):
+        rows.copy_(value)
+    if not torch.compiler.is_compiling():
+        for index, parts in ((failed.nonzero().squeeze(1), target[:6]), (alone.nonzero().squeeze(1), target[1:6:4])):
+            for rows in parts:
+                rows.index_fill_(1, index, torch.nan)
 
 
 def place(pose: Tensor, center: Tensor, unit: Tensor) -> Tensor:
