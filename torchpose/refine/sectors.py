@@ -28,6 +28,7 @@ _CELL = 4  # sectors over which a misfit is taken for one
 _SIGNIFICANT = 4.0  # standard deviations beyond which a chi-squared or a displacement is no noise
 _UNCLEAR = 3  # sectors of an outer circle: more are no chance
 _RESTLESS = 120.0  # chi-squared of a step from one pixel of six to all: 35 in the mean, beyond this once in a thousand
+_DISPLACED = 0.005  # px, displacement that a camera or print slightly off may cause: no reason for doubt
 _TINY = 1e-12
 
 
@@ -117,10 +118,11 @@ def trust(s: Sectors, clear: Tensor, variance: Tensor) -> Tensor:
     return good / (1 + spread.repeat_interleave(_CELL, 1))
 
 
-def _cells(s: Sectors, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Chi-squared of the displacement of every cell, and its hold: (K, 24)."""
+def _cells(s: Sectors, noise: Tensor, allowed: float = 0.0) -> tuple[Tensor, Tensor]:
+    """Chi-squared of the displacement of every cell, given ``allowed`` px besides noise, and its hold: (K, 24)."""
     pull, hold = (v.unflatten(1, (-1, _CELL)).sum(-1) for v in (s.pull, s.hold))
-    return torch.where(hold > 0, pull.square() / (noise * hold).clamp_min(_TINY), 0.0), hold
+    variance = noise * hold + (allowed * hold).square()
+    return torch.where(hold > 0, pull.square() / variance.clamp_min(_TINY), 0.0), hold
 
 
 def misfit(s: Sectors, clear: Tensor, variance: Tensor, row: Tensor, rows: int) -> Tensor:
@@ -138,7 +140,7 @@ def doubtful(s: Sectors, clear: Tensor, variance: Tensor, row: Tensor, step_chi2
     """
     rows = step_chi2.numel()
     unclear = (~clear & (s.total > 0))[:, SECTORS:].sum(-1) > _UNCLEAR
-    chi2, hold = _cells(s.scaled(clear.to(s.pull.dtype)), variance[:, None].to(s.pull.dtype))
+    chi2, hold = _cells(s.scaled(clear.to(s.pull.dtype)), variance[:, None].to(s.pull.dtype), _DISPLACED)
     total = segment_sum(chi2.double().sum(-1), row, rows) - step_chi2
     freedom = segment_sum((hold > 0).double().sum(-1), row, rows).clamp_min(1)
     pulled = total > freedom + _SIGNIFICANT * (2 * freedom).sqrt()
