@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchpose.geometry import rotations
 from torchpose.refine import Refined, refine_photometric
-from torchpose.refine.photometric import grey_chi2
+from torchpose.refine.grey_chi2 import grey_chi2
 from torchpose.refine.sectors import SECTORS, Sectors, away_from_unclear, doubtful, trust
 from torchpose.sim import add_noise, render, shapes
 from torchpose.target import Target

@@ -16,7 +16,8 @@ from torchpose.camera import Camera
 from torchpose.geometry import rotations
 from torchpose.pose import AMBIGUOUS_CHI2, Evidence, Solutions, center_rms, shape_chi2
 from torchpose.refine.centers import refine_centers
-from torchpose.refine.photometric import grey_chi2, refine_photometric
+from torchpose.refine.grey_chi2 import grey_chi2
+from torchpose.refine.photometric import refine_photometric
 from torchpose.results import Reason, Status
 
 _FLOOR = 0.03  # px, of a centre: what blur, covers and clutter do to it beyond its covariance
