@@ -40,7 +40,7 @@ def grey_chi2(
 ) -> tuple[Tensor, Tensor]:
     """Chi-squared (N,) of the grey values under the refined poses ``two`` less that under ``one``.
 
-    Also whether each of the two (N, 2) explains most of the sectors of every marker.
+    Also whether each of the two (N, 2) explains most of the sectors of every marker, by a ring that is there.
 
     Both are judged on the same pixels, those that either explains, each with grey levels of its own; no pixel counts
     for more than an outlier would. Where not even the better pose explains them within noise the difference counts
@@ -70,10 +70,23 @@ def grey_chi2(
         weights.append(weight)
         variances.append(variance)
         misfits.append(misfit(sectors, clear, variance[b.row], b.row, rows))
-        explained.append(segment_sum((~clear.any(-1)).double(), b.row, rows) == 0)
+        shows = clear.any(-1) & _has_contrast(levels, sums[:, POSE:-1, POSE:-1], variance[b.row])
+        explained.append(segment_sum((~shows).double(), b.row, rows) == 0)
     variance = torch.minimum(*variances)
     most = (CUT**2 * variance[b.row, None]).to(squares[0].dtype)
     of_one, of_two = (torch.minimum(s, most) for s in squares)
     difference = (torch.maximum(*weights) * (of_two - of_one)).sum(-1).double()
     chi2 = segment_sum(difference, b.row, rows) / variance / torch.minimum(*misfits).clamp_min(1)
     return chi2, torch.stack(explained, -1)
+
+
+def _has_contrast(levels: Tensor, information: Tensor, variance: Tensor) -> Tensor:
+    """Markers (K,) bool whose ring and paper differ beyond noise: levels that are equal explain a cover.
+
+    Args:
+        levels: (K, 6). information: (K, 6, 6) about them at unit noise. variance: (K,) of noise.
+    """
+    by_level = torch.zeros_like(levels)
+    by_level[:, 0], by_level[:, 3] = -1.0, 1.0
+    spread2 = variance * (by_level * solve_ridged(information, by_level[..., None]).squeeze(-1)).sum(-1)
+    return (by_level * levels).sum(-1).square() > CUT**2 * spread2
