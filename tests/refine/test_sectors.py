@@ -58,11 +58,15 @@ def test_trust_finds_the_variance_of_the_displacements() -> None:
 def test_doubt_needs_more_than_noise() -> None:
     clear, one = torch.ones(4, 2 * SECTORS, dtype=torch.bool), torch.ones(4)
     row, step = torch.zeros(4, dtype=torch.int64), torch.full((1,), 7.0, dtype=F64)
-    assert not doubtful(random_sectors(4), clear, one, row, step).any()
-    assert doubtful(random_sectors(4, tau=0.05), clear, one, row, step).all()
+    six = torch.full((1,), 6.0, dtype=F64)
+    assert not doubtful(random_sectors(4), clear, one, row, step, six).any()
+    assert doubtful(random_sectors(4, tau=0.05), clear, one, row, step, six).all()
+    # a step of 200 is noise where it comes from one pixel of twenty, not where it comes from one of six
+    assert doubtful(random_sectors(4), clear, one, row, step + 193, six).all()
+    assert not doubtful(random_sectors(4), clear, one, row, step + 193, six + 14).any()
     covered = clear.clone()
     covered[2, SECTORS : SECTORS + 5] = False
-    assert doubtful(random_sectors(4), covered, one, row, step).all()
+    assert doubtful(random_sectors(4), covered, one, row, step, six).all()
 
 
 def test_runs_of_unclear_sectors_take_their_neighbours() -> None:

@@ -113,6 +113,8 @@ def _refine(
     blocks = gather_pixels(frames, camera, frame, mask, rings, centers, normals, radii, band, TILE * _COARSE)
     coarse = blocks.every(_COARSE, most_coarse)
     levels = first_levels(coarse, r, t, blur)
+    seen, of_them = (segment_sum(b.valid.sum(-1).double(), b.row, rows) for b in (blocks, coarse))
+    more = (seen / of_them.clamp_min(1)).clamp_min(1)
     usable = weight = blocks.valid
     information = torch.zeros(rows, 7, 7, dtype=torch.float64, device=r.device)
     variance = torch.ones(rows, dtype=torch.float64, device=r.device)
@@ -143,7 +145,7 @@ def _refine(
         )
         if part is blocks:
             step_chi2 = (step * (information @ step[..., None]).squeeze(-1)).sum(-1) / variance
-            doubt = doubtful(sectors, clear, variance[blocks.row], blocks.row, step_chi2)
+            doubt = doubtful(sectors, clear, variance[blocks.row], blocks.row, step_chi2, more)
         moved = moved + step
         r = rotations.exp(step[:, 3:6]) @ r
         t = t + step[:, :3]

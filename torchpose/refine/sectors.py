@@ -27,7 +27,7 @@ _LEAST_CLEAR = 0.55  # of the sectors of a marker, below which none of them coun
 _CELL = 4  # sectors over which a misfit is taken for one
 _SIGNIFICANT = 4.0  # standard deviations beyond which a chi-squared or a displacement is no noise
 _UNCLEAR = 3  # sectors of an outer circle: more are no chance
-_RESTLESS = 120.0  # chi-squared of a step from one pixel of six to all: 35 in the mean, beyond this once in a thousand
+_RESTLESS = 24.3  # chi-squared of seven unknowns, exceeded once in a thousand
 _DISPLACED = 0.005  # px, displacement that a camera or print slightly off may cause: no reason for doubt
 _TINY = 1e-12
 
@@ -132,11 +132,13 @@ def misfit(s: Sectors, clear: Tensor, variance: Tensor, row: Tensor, rows: int) 
     return segment_sum(chi2.double().sum(-1), row, rows) / count
 
 
-def doubtful(s: Sectors, clear: Tensor, variance: Tensor, row: Tensor, step_chi2: Tensor) -> Tensor:
+def doubtful(s: Sectors, clear: Tensor, variance: Tensor, row: Tensor, step_chi2: Tensor, more: Tensor) -> Tensor:
     """Rows (N,) bool whose grey values contradict the model, or that have not come to rest.
 
     Args:
         variance: (K,) of noise. row: (K,) int64. step_chi2: (N,) chi-squared by which the last step lowered the sum.
+            more: (N,) how many times the pixels of the steps before it saw; from some pixels to ``more`` times as many
+            noise alone makes a step of more - 1 times its usual chi-squared.
     """
     rows = step_chi2.numel()
     unclear = (~clear & (s.total > 0))[:, SECTORS:].sum(-1) > _UNCLEAR
@@ -144,4 +146,4 @@ def doubtful(s: Sectors, clear: Tensor, variance: Tensor, row: Tensor, step_chi2
     total = segment_sum(chi2.double().sum(-1), row, rows) - step_chi2
     freedom = segment_sum((hold > 0).double().sum(-1), row, rows).clamp_min(1)
     pulled = total > freedom + _SIGNIFICANT * (2 * freedom).sqrt()
-    return pulled | (step_chi2 > _RESTLESS) | (segment_sum(unclear.double(), row, rows) > 0)
+    return pulled | (step_chi2 > _RESTLESS * (more - 1)) | (segment_sum(unclear.double(), row, rows) > 0)
