@@ -107,6 +107,14 @@ def test_hidden_markers() -> None:
     assert torch.equal(index[result.ring[keep]], index)
 
 
+def test_two_rings_alone_are_seen_from_the_front() -> None:
+    """From behind they would look the same."""
+    rings, _, _ = scene(QUAD, 60)
+    result = found(rings[torch.arange(len(rings)) % 4 < 2], [QUAD], 60)
+    assert ((result.ring >= 0).sum(-1) == 2).all()
+    assert (result.R[:, 2, 2] > 0).all()
+
+
 def test_polarity_separates_targets_of_one_code() -> None:
     rings, _, _ = scene(QUAD, 5)
     result = found(rings, [QUAD, Target.load("quad40_dark")], 5)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchpose.camera import Camera
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import conics
 
@@ -71,3 +72,12 @@ def exact(ellipses: Tensor, covariances: Tensor, radii: Tensor) -> tuple[Tensor,
     share = lever * scale / (lever * scale).sum(-1, keepdim=True)
     covariance = (share.square()[..., None, None] * covariances).sum(-3)
     return torch.where(slope.isfinite().all(-1).all(-1)[..., None], center, torch.nan), covariance
+
+
+def raw_centers(camera: Camera, ideal: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
+    """Centres (K, 2) and covariances (K, 2, 2) of ideal pixels as pixels of the distorted frame."""
+    k = camera.matrix
+    focal = k.diagonal()[:2]
+    xy = (ideal - k[:2, 2]) / focal
+    jacobian = camera.J_distort(xy) / focal
+    return camera.distort(xy), jacobian @ covariance @ jacobian.mT

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchpose import zernike
 from torchpose.geometry import conics
-from torchpose.geometry.segments import ragged_arange, segment_mean
+from torchpose.geometry.segments import positions, ragged_arange, segment_mean, values_at
 
 REACH = 4  # px searched to either side of the rough ellipse
 _SAMPLES_PER_PIXEL = 1.1  # of perimeter: a chain of edge pixels has at most one pixel a pixel of length
@@ -56,21 +56,30 @@ def edge_pixels(
     Returns:
         pixels (E, 2) int64 u, v without repetition and their ring (E,) int64, sorted by ring.
     """
+    key = _edge_keys(frames, frame, ellipses, outward, reach, margin)
+    return _of_key(key, *frames.shape[-2:])
+
+
+def _edge_keys(
+    frames: Tensor, frame: Tensor, ellipses: Tensor, outward: Tensor, reach: Tensor, margin: int = zernike.MASK // 2
+) -> Tensor:
+    """`edge_pixels` as keys (E,) int64, rising: (ring, v, u) as one number."""
     height, width = frames.shape[-2:]
     count = (conics.perimeter(ellipses) * _SAMPLES_PER_PIXEL).ceil().long()
     ring, position = ragged_arange(count)
-    xy = conics.points_on(ellipses[ring], position.double() * (2 * torch.pi) / count[ring])
-    normal = _normal(ellipses, ring, xy)
+    x, y, nx, ny = conics.boundary(ellipses, ring, position * (2 * torch.pi / count).index_select(0, ring))
     k = torch.arange(-REACH - 1, REACH + 2, device=frames.device, dtype=torch.float64)
-    line = (xy[:, None] + k[:, None] * normal[:, None]).round().long()
-    u, v = line[..., 0].clamp(0, width - 1), line[..., 1].clamp(0, height - 1)
-    grey = frames.reshape(-1)[(frame[ring, None] * height + v) * width + u].float()
-    rise = (grey[:, 2:] - grey[:, :-2]) * outward[ring, None]
-    rise = rise.masked_fill(k[1:-1].abs() > reach[ring, None], -torch.inf)
+    u = (x[:, None] + nx[:, None] * k).round_().clamp_(0, width - 1)
+    v = (y[:, None] + ny[:, None] * k).round_().clamp_(0, height - 1)
+    cell = v.add_(height * frame.index_select(0, ring)[:, None]).mul_(width).add_(u).long()
+    grey = values_at(frames, cell)
+    rise = (grey[:, 2:] - grey[:, :-2]) * outward.index_select(0, ring)[:, None].float()
+    rise = rise.masked_fill_(k[1:-1].abs() > reach.index_select(0, ring)[:, None], -torch.inf)
     value, best = rise.max(-1)
-    pixel = line[torch.arange(ring.numel(), device=ring.device), best + 1]
-    keep = (value > 0) & _clear_of_border(pixel, height, width, margin)
-    return _unique(pixel[keep], ring[keep], height, width)
+    along = k.index_select(0, best + 1)
+    u, v = (x + nx * along).round().long(), (y + ny * along).round().long()
+    keep = positions((value > 0) & _clear_of_border(u, v, height, width, margin))
+    return _unique(_key(u, v, ring, height, width).index_select(0, keep))
 
 
 def ring_edges(frames: Tensor, frame: Tensor, ellipses: Tensor, outward: Tensor, reach: Tensor) -> RingEdges:
@@ -80,48 +89,68 @@ def ring_edges(frames: Tensor, frame: Tensor, ellipses: Tensor, outward: Tensor,
     step far below the ring's mean are left out.
     """
     height, width = frames.shape[-2:]
-    pixel, ring = edge_pixels(frames, frame, ellipses, outward, reach)
-    found = zernike.locate(frames, frame[ring], pixel)
+    key = _edge_keys(frames, frame, ellipses, outward, reach)
+    pixel, ring = _of_key(key, height, width)
+    found = zernike.locate(frames, frame.index_select(0, ring), pixel)
 
     # the window of a neighbouring pixel saw the edge: look again, centred where it pointed
-    again = (~found.inside & (found.offset.abs() < 2)).nonzero()[:, 0]
-    moved = found.points[again].round().long()
-    clear = _clear_of_border(moved, height, width, zernike.MASK // 2)
-    moved, moved_ring = _unique(moved[clear], ring[again[clear]], height, width)
-    keep = found.inside
-    fresh = ~torch.isin(_key(moved, moved_ring, height, width), _key(pixel[keep], ring[keep], height, width))
-    moved, moved_ring = moved[fresh], moved_ring[fresh]
-    second = zernike.locate(frames, frame[moved_ring], moved)
+    again = positions(~found.inside & (found.offset.abs() < 2))
+    u, v = (p.index_select(0, again).round().long() for p in found.points.unbind(-1))
+    clear = positions(_clear_of_border(u, v, height, width, zernike.MASK // 2))
+    moved = _unique(_key(u, v, ring.index_select(0, again), height, width).index_select(0, clear))
+    keep = positions(found.inside)
+    kept = torch.nn.functional.pad(key.index_select(0, keep), (0, 1), value=-1)
+    fresh = positions(kept.index_select(0, torch.searchsorted(kept[:-1], moved)) != moved)
+    moved_pixel, moved_ring = _of_key(moved.index_select(0, fresh), height, width)
+    second = zernike.locate(frames, frame.index_select(0, moved_ring), moved_pixel)
+    also = positions(second.inside)
 
-    def both(name: str) -> Tensor:
-        return torch.cat([getattr(found, name)[keep], getattr(second, name)[second.inside]])
+    def both(first: Tensor, other: Tensor) -> Tensor:
+        return torch.cat([first.index_select(0, keep), other.index_select(0, also)])
 
-    ring = torch.cat([ring[keep], moved_ring[second.inside]])
-    points, normal, offset, step = both("points"), both("normal"), both("offset"), both("step")
-    aligned = (normal * _normal(ellipses, ring, points)).sum(-1) * outward[ring] > _NORMAL_COS
+    ring = both(ring, moved_ring)
+    points, normal = (
+        [both(a, b) for a, b in zip(getattr(found, n).unbind(-1), getattr(second, n).unbind(-1), strict=True)]
+        for n in ("points", "normal")
+    )
+    offset, step = both(found.offset, second.offset), both(found.step, second.step)
+    nx, ny = _normal(ellipses, ring, *points)
+    aligned = (normal[0] * nx + normal[1] * ny) * outward.index_select(0, ring) > _NORMAL_COS
     mean_step = segment_mean(step, ring, ellipses.shape[0], aligned.double())
-    good = (aligned & (step > _LEAST_STEP * mean_step[ring])).nonzero()[:, 0]
+    good = positions(aligned & (step > _LEAST_STEP * mean_step.index_select(0, ring)))
     order = good[torch.argsort(ring[good], stable=True)]
-    return RingEdges(ring[order], points[order], normal[order], offset[order], step[order])
+    (x, y), (nx, ny) = ([c.index_select(0, order) for c in pair] for pair in (points, normal))
+    return RingEdges(ring[order], torch.stack([x, y]).mT, torch.stack([nx, ny]).mT, offset[order], step[order])
 
 
-def _normal(ellipses: Tensor, ring: Tensor, points: Tensor) -> Tensor:
-    """Outward unit normals (E, 2) of the ellipses' level curves through the points."""
+def _normal(ellipses: Tensor, ring: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Outward unit normals nx, ny (E,) of the ellipses' level curves through points x, y (E,)."""
     inverse = torch.linalg.inv(conics.shape_matrix(ellipses))
-    normal = ((inverse @ inverse)[ring] @ (points - ellipses[ring, :2])[..., None]).squeeze(-1)
-    return normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
+    square = (inverse @ inverse).flatten(1)
+    each = (*square[:, [0, 1, 3]].unbind(-1), *ellipses[:, :2].unbind(-1))
+    s11, s12, s22, cx, cy = (v.contiguous().index_select(0, ring) for v in each)
+    dx, dy = x - cx, y - cy
+    nx, ny = s11 * dx + s12 * dy, s12 * dx + s22 * dy
+    scale = (nx * nx + ny * ny).rsqrt()
+    return nx * scale, ny * scale
 
 
-def _clear_of_border(pixel: Tensor, height: int, width: int, margin: int) -> Tensor:
-    u, v = pixel.unbind(-1)
+def _clear_of_border(u: Tensor, v: Tensor, height: int, width: int, margin: int) -> Tensor:
     return (u >= margin) & (u < width - margin) & (v >= margin) & (v < height - margin)
 
 
-def _key(pixel: Tensor, ring: Tensor, height: int, width: int) -> Tensor:
-    return (ring * height + pixel[:, 1]) * width + pixel[:, 0]
+def _key(u: Tensor, v: Tensor, ring: Tensor, height: int, width: int) -> Tensor:
+    return (ring * height + v) * width + u
 
 
-def _unique(pixel: Tensor, ring: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
-    key = torch.unique(_key(pixel, ring, height, width))
-    rest = key % (height * width)
-    return torch.stack([rest % width, rest // width], -1), key // (height * width)
+def _of_key(key: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Pixels (E, 2) u, v and rings (E,) of keys."""
+    row = torch.div(key, width, rounding_mode="floor")
+    ring = torch.div(row, height, rounding_mode="floor")
+    return torch.stack([key - row * width, row - ring * height]).mT, ring
+
+
+def _unique(key: Tensor) -> Tensor:
+    """The keys without repetition, rising."""
+    key = key.sort().values
+    return key[positions(torch.nn.functional.pad(key[1:] != key[:-1], (1, 0), value=True))] if key.numel() else key

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchpose.geometry import conics
-from torchpose.geometry.segments import segment_mean, segment_sum
+from torchpose.geometry.segments import Tiles
 
 _SOLVABLE_POINTS = 6  # five parameters and one point to spare
 _CHUNK = 1 << 15  # points summed at a time: blocks that stay in the processor's cache
@@ -139,17 +139,22 @@ def _moments(points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Ten
 
 
 def _flat_moments(points: Tensor, index: Tensor, count: int, weights: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """As `_moments`, for ellipses whose numbers of points differ so much that padding would cost more than sums."""
+    """As `_moments`, for ellipses whose numbers of points differ too much for one block: summed by tiles of points."""
     w = torch.ones_like(index, dtype=torch.float64) if weights is None else weights.double()
-    xy = torch.where(w[:, None] > 0, points.double(), 0.0)
-    total = segment_sum(w, index, count)
-    center = segment_sum(xy * w[:, None], index, count) / total[:, None]
-    x, y = (xy - center[index]).unbind(-1)
-    xx, xy_, yy = x * x, x * y, y * y
-    terms = (xx, xy_, yy, xx * x, xx * y, yy * x, yy * y, xx * xx, xx * xy_, xx * yy, xy_ * yy, yy * yy)
-    sums = segment_sum(torch.stack(terms, -1) * w[:, None], index, count)
-    enough = segment_sum((w > 0).to(index), index, count) >= _SOLVABLE_POINTS
-    return center, sums / total[:, None], enough
+    tiles = Tiles.of(index, count)
+    xy, w = tiles.planes(*points.double().unbind(-1), w).split([2, 1], 1)
+    return _tile_moments(tiles, xy, w)
+
+
+def _tile_moments(tiles: Tiles, xy: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The same of points (K, 2, T) and weights (K, 1, T) laid out in tiles."""
+    counts = w > 0
+    xy = torch.where(counts, xy, 0.0)
+    total, used = tiles.sums(w.sum(-1)), tiles.sums(counts.sum(-1))
+    center = tiles.sums((xy * w).sum(-1)) / total
+    sums = _fused_sums if xy.requires_grad else _gram_sums
+    moments = tiles.sums(sums(xy, center[tiles.group][..., None], w)) / total
+    return center, moments, used.squeeze(-1) >= _SOLVABLE_POINTS
 
 
 def _gram_sums(xy: Tensor, center: Tensor, weights: Tensor | None) -> Tensor:
@@ -284,26 +289,39 @@ def _cross(u: Vector, v: Vector) -> tuple[Vector, Tensor]:
 
 def distance(points: Tensor, index: Tensor, ellipses: Tensor) -> Tensor:
     """Signed first-order distances (E,) in px of points to their ellipses, positive outside (Sampson)."""
-    value, gradient = _radial(points, index, ellipses)
-    return value / torch.linalg.vector_norm(gradient, dim=-1)
+    value, gx, gy = _radial(points, index, ellipses)
+    return value / torch.sqrt(gx * gx + gy * gy)
 
 
 def curvature(points: Tensor, index: Tensor, ellipses: Tensor) -> Tensor:
     """Curvature (E,) in 1/px of the ellipses where the rays from their centres through the points meet them."""
-    _, gradient = _radial(points, index, ellipses)
+    _, gx, gy = _radial(points, index, ellipses)
+    steep = gx * gx + gy * gy
     # p^3 / (a b)^2 with p = 1 / |grad rho| the distance of the tangent from the centre
-    return 1 / (torch.linalg.vector_norm(gradient, dim=-1) ** 3 * (ellipses[:, 2] * ellipses[:, 3]).square()[index])
+    return 1 / (steep * steep.sqrt() * (ellipses[:, 2] * ellipses[:, 3]).square().index_select(0, index))
 
 
-def _radial(points: Tensor, index: Tensor, ellipses: Tensor) -> tuple[Tensor, Tensor]:
-    """rho - 1 (E,) and its gradient (E, 2), rho = |S^-1 (x - c)| the elliptic radius."""
+def _radial(points: Tensor, index: Tensor, ellipses: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """rho - 1 (E,) and its gradient, two of (E,); rho = |S^-1 (x - c)| the elliptic radius."""
+    of = (v.contiguous().index_select(0, index) for v in _inverse_shape(ellipses).unbind(-1))
+    return _radius(*points.double().unbind(-1), *of)
+
+
+def _inverse_shape(ellipses: Tensor) -> Tensor:
+    """(M, 5): what `_radius` needs of ellipses (M, 5)."""
     shape = conics.shape_matrix(ellipses)
-    det = shape[:, 0, 0] * shape[:, 1, 1] - shape[:, 0, 1].square()
-    i11, i12, i22 = (shape[:, 1, 1] / det)[index], (-shape[:, 0, 1] / det)[index], (shape[:, 0, 0] / det)[index]
-    dx, dy = (points.double() - ellipses[index, :2]).unbind(-1)
+    s11, s12, s22 = shape[:, 0, 0], shape[:, 0, 1], shape[:, 1, 1]
+    det = s11 * s22 - s12.square()
+    return torch.stack([ellipses[:, 0], ellipses[:, 1], s22 / det, -s12 / det, s11 / det], -1)
+
+
+def _radius(
+    x: Tensor, y: Tensor, cx: Tensor, cy: Tensor, i11: Tensor, i12: Tensor, i22: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    dx, dy = x - cx, y - cy
     u, v = i11 * dx + i12 * dy, i12 * dx + i22 * dy
-    rho = torch.hypot(u, v)
-    return rho - 1, torch.stack([i11 * u + i12 * v, i12 * u + i22 * v], -1) / rho[:, None]
+    rho = torch.sqrt(u * u + v * v)
+    return rho - 1, (i11 * u + i12 * v) / rho, (i12 * u + i22 * v) / rho
 
 
 def fit_robust(
@@ -327,21 +345,35 @@ def fit_robust(
     Returns:
         (M, 5) ellipses and (E,) bool, the points kept.
     """
+    tiles = Tiles.of(index, count)
+    planes = tiles.planes(*points.double().unbind(-1), torch.ones_like(points[:, 0], dtype=torch.float64))
+    xy, there = planes.split([2, 1], 1)
+
+    def distances(ellipses: Tensor) -> Tensor:
+        of = _inverse_shape(ellipses)[tiles.group, :, None].unbind(1)
+        value, gx, gy = _radius(*xy.unbind(1), *of)
+        return value / torch.sqrt(gx * gx + gy * gy)
+
+    def refit(weights: Tensor) -> Tensor:
+        return _from_moments(*_tile_moments(tiles, xy, weights[:, None]), method="halir-flusser")
+
+    def trust(r: Tensor, scale: float) -> Tensor:
+        return there[:, 0] * (1 + (r / scale).square()).reciprocal().square().nan_to_num(nan=0.0)
+
     ellipses = start.double()
     for scale in scales:
-        r = distance(points, index, ellipses)
-        w = (1 + (r / scale).square()).reciprocal().square().nan_to_num(nan=0.0)
-        refit = fit(points, index, count, w)
-        ellipses = torch.where(refit.isfinite().all(-1, keepdim=True), refit, ellipses)
-    keep = torch.ones_like(index, dtype=torch.bool)
+        again = refit(trust(distances(ellipses), scale))
+        ellipses = torch.where(again.isfinite().all(-1, keepdim=True), again, ellipses)
+    keep = there[:, 0]
     for _ in range(3):
-        r = distance(points, index, ellipses)
+        r = distances(ellipses)
         # the weighted RMS under Geman-McClure weights is a scale that outliers hardly move
-        w = (1 + (r / scales[-1]).square()).reciprocal().square().nan_to_num(nan=0.0)
-        sigma = segment_mean(r.square().nan_to_num(nan=0.0), index, count, w).sqrt()
-        keep = r.abs() <= (cut * sigma + 0.02)[index]
-        ellipses = fit(points, index, count, keep.double())
-    return ellipses, keep
+        w = trust(r, scales[-1])
+        sums = tiles.sums(torch.stack([(w * r.square().nan_to_num(nan=0.0)).sum(-1), w.sum(-1)], -1))
+        sigma = (sums[:, 0] / sums[:, 1]).sqrt()
+        keep = there[:, 0] * (r.abs() <= (cut * sigma + 0.02)[tiles.group, None])
+        ellipses = refit(keep)
+    return ellipses, tiles.flat(keep) > 0
 
 
 def with_covariance(
@@ -360,26 +392,27 @@ def with_covariance(
     """
     count = ellipses.shape[0]
     w = torch.ones_like(points[:, 0], dtype=torch.float64) if weights is None else weights.double()
-    value, gradient = _radial(points, index, ellipses)
-    norm = torch.linalg.vector_norm(gradient, dim=-1)
+    value, gx, gy = _radial(points, index, ellipses)
+    norm = torch.sqrt(gx * gx + gy * gy)
     r = (value / norm).nan_to_num(nan=0.0)
-    normal = (gradient / norm[:, None]).nan_to_num(nan=0.0)
-    theta = ellipses[index, 4]
-    cos, sin = theta.cos().nan_to_num(nan=1.0), theta.sin().nan_to_num(nan=0.0)
-    n1, n2 = normal[:, 0] * cos + normal[:, 1] * sin, normal[:, 1] * cos - normal[:, 0] * sin
+    nx, ny = (gx / norm).nan_to_num(nan=0.0), (gy / norm).nan_to_num(nan=0.0)
+    theta = ellipses[:, 4]
+    each = theta.cos().nan_to_num(nan=1.0), theta.sin().nan_to_num(nan=0.0), ellipses[:, 2], ellipses[:, 3]
+    cos, sin, a, b = (v.index_select(0, index) for v in each)
+    n1, n2 = nx * cos + ny * sin, ny * cos - nx * sin
     # unit circle coordinates (s1, s2) of the point: the boundary moves by n . (dc + E s)
-    a, b = ellipses[index, 2], ellipses[index, 3]
     s1, s2 = a * n1, b * n2
-    s = torch.hypot(s1, s2)
+    s = torch.sqrt(s1 * s1 + s2 * s2)
     s1, s2 = (s1 / s).nan_to_num(nan=0.0), (s2 / s).nan_to_num(nan=0.0)
-    jac = torch.stack([normal[:, 0], normal[:, 1], n1 * s1, n1 * s2 + n2 * s1, n2 * s2], -1)
     # times b, so that it is 1 where the ellipse is steepest
-    algebraic = (w * (b * norm).square()).nan_to_num(nan=0.0)[:, None]
-    outer_product = algebraic * (jac[:, :, None] * jac[:, None, :]).flatten(1)
-    rows = torch.cat([outer_product, algebraic * outer_product, (w * r.square())[:, None], w[:, None]], -1)
-    sums = segment_sum(rows, index, count)
-    normal_matrix, scatter = sums[:, :50].unflatten(-1, (2, 5, 5)).unbind(1)
-    chi2, n = sums[:, 50:].unbind(-1)
+    algebraic = (w * (b * norm).square()).nan_to_num(nan=0.0)
+    tiles = Tiles.of(index, count)
+    planes = tiles.planes(nx, ny, n1 * s1, n1 * s2 + n2 * s1, n2 * s2, algebraic, w * r.square(), w)
+    jac, algebraic = planes[:, :5], planes[:, 5:6]
+    weighted = jac * algebraic
+    normal_matrix = tiles.sums(weighted @ jac.mT)
+    scatter = tiles.sums((weighted * algebraic) @ jac.mT)
+    chi2, n = tiles.sums(planes[:, 6:].sum(-1)).unbind(-1)
     sigma = (chi2 / (n - 5).clamp_min(1)).sqrt()
     solvable = (n >= _SOLVABLE_POINTS) & ellipses.isfinite().all(-1)
     eye = torch.eye(5, dtype=torch.float64, device=points.device)

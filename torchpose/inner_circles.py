@@ -10,6 +10,7 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.detect import Candidates
 from torchpose.geometry import conics
+from torchpose.geometry.segments import values_at
 
 ANGLES = 64
 _RADII = 72
@@ -57,15 +58,16 @@ def find_inner(frames: Tensor, candidates: Candidates, camera: Camera | None = N
     outer = candidates.ellipse[own]
     shape = conics.shape_matrix(outer)
     shift = (1 - rho.square()).clamp_min(0) * apart[..., None]  # (P, 2, R)
-    uv = (shape @ circle)[:, :, None, :] * rho[:, None] + (outer[:, :2, None] + shift)[..., None]
-    u, v = uv.round().long().unbind(1)
-    cell = (candidates.frame[own, None, None] * height + v.clamp(0, height - 1)) * width + u.clamp(0, width - 1)
-    grey = frames.reshape(-1)[cell].float()
+    u, v = ((shape @ circle)[:, :, None, :] * rho[:, None] + (outer[:, :2, None] + shift)[..., None]).round_().unbind(1)
+    u, v = u.clamp_(0, width - 1), v.clamp_(0, height - 1)
+    cell = v.add_(height * candidates.frame[own, None, None]).mul_(width).add_(u).long()
+    grey = values_at(frames, cell)
     at, polarity = rho[1:-1], candidates.polarity[own]
     # what covers the outer circle on one side hides the inner one there too: only directions that show the outer count
-    edge = ((grey[:, 2:] - grey[:, :-2]) * polarity[:, None, None].float())[:, at > _RATIO_RANGE[1]].amax(1)
+    far = int((at <= _RATIO_RANGE[1]).sum())
+    edge = ((grey[:, far + 2 :] - grey[:, far:-2]) * polarity[:, None, None].float()).amax(1)
     seen = edge > _LEAST_EDGE * edge.nanmedian(-1, keepdim=True).values
-    profile = torch.where(seen[:, None], grey, torch.nan).nanmean(-1).double()
+    profile = _mean_profile(grey, seen, frames.is_floating_point())
     rise = (profile[:, 2:] - profile[:, :-2]) * polarity[:, None]
     outermost = rise.masked_fill(at < _RATIO_RANGE[1], -torch.inf).amax(-1)
     fall = (-rise).masked_fill((at < _RATIO_RANGE[0]) | (at > _RATIO_RANGE[1]), -torch.inf)
@@ -81,6 +83,13 @@ def find_inner(frames: Tensor, candidates: Candidates, camera: Camera | None = N
     inner = torch.cat([center, candidates.ellipse[:, 2:4] * ratio[:, None], candidates.ellipse[:, 4:]], -1)
     found = (outermost[first] > 0) & (steepest > _LEAST_PEAK * outermost[first])
     return InnerCircles(ratio, found, inner, seen[first])
+
+
+def _mean_profile(grey: Tensor, seen: Tensor, gaps: bool) -> Tensor:
+    """Means (P, R) float64 of grey (P, R, A) over directions (P, A) that are seen; with ``gaps`` some may be NaN."""
+    if gaps:
+        return torch.where(seen[:, None], grey, torch.nan).nanmean(-1).double()
+    return (grey @ seen[..., None].float()).squeeze(-1).double() / seen.sum(-1, keepdim=True)
 
 
 def _planes(candidates: Candidates, camera: Camera | None) -> tuple[Tensor, Tensor]:

@@ -30,6 +30,7 @@ _PLACE_TOLERANCE = (2.0, 0.3, 0.05)
 _SIZE_TOLERANCE = 1.25
 _OVERLAP, _CONCENTRIC = 0.3, 0.4  # of the semi-major axis: two rings so far across each other are not both there
 _SEEDS = 24  # assignments of one target in one frame whose pairs are tried
+_EQUAL = 1e-6  # difference of scores that rounding may make
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +167,8 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int) -> I
     # 5. the best pose of each row, and the nearest ring of each of its markers
     best_score = torch.full((rows,), -torch.inf, dtype=torch.float64, device=device)
     best_score.scatter_reduce_(0, row[a], score, "amax")
-    candidates = (score == best_score[row[a]]).nonzero()[:, 0]
+    # two rings alone fit a plane seen from behind as well: of equals the first, its normal away from the camera
+    candidates = (score >= best_score[row[a]] - _EQUAL).nonzero()[:, 0]
     best = torch.full((rows,), count, dtype=torch.int64, device=device)
     best.scatter_reduce_(0, row[a[candidates]], candidates, "amin")
     chosen = (best[row[member]] == hypothesis) & (cost == per_marker[hypothesis, marker[member]])

@@ -14,7 +14,9 @@ from torchpose.centers import common_center, compensate
 from torchpose.detect import find_candidates
 from torchpose.errors import ConfigError, FrameError
 from torchpose.markers import Identified, MarkerTable, crossed_out, identify
+from torchpose.outcome import outcome
 from torchpose.pose import (
+    MIN_MARKERS,
     Evidence,
     Solutions,
     center_rms,
@@ -22,14 +24,13 @@ from torchpose.pose import (
     intrinsics_covariance,
     solve_poses,
 )
-from torchpose.refine import decide, refine_centers, refine_edges, refine_photometric
-from torchpose.results import Detections, Poses, Reason, Status
+from torchpose.refine import decide, decide_on_grey, refine_centers, refine_edges, refine_photometric
+from torchpose.results import Poses, Reason, Status
 from torchpose.rings import Rings, measure_rings
 from torchpose.second_look import look_again
 from torchpose.target import Target
 
 _FRAME_TYPES = (torch.uint8, torch.uint16, torch.float16, torch.bfloat16, torch.float32, torch.float64)
-MIN_MARKERS = 3
 Method = Literal["photometric", "edges", "centers", "paper"]
 _LEAST_KEPT = 0.5  # of the pixels around the edges that must follow the model for a refinement to count
 
@@ -112,17 +113,27 @@ class PoseEstimator(nn.Module):
         solutions = self._doubted(solutions, evidence[solvable], solvable // count, rings, table, target[solvable])
         if self.method != "paper":
             solutions = decide(solutions, evidence[solvable])
+        shapes = _raw_ellipses(rings, identified.ring[solvable])
+        if self.method == "photometric":
+            solutions = decide_on_grey(solutions, evidence[solvable], frames, camera, solvable // count, shapes)
         refined = self.method in ("photometric", "edges")
         if refined:
             solutions = self._refined(
-                frames, solutions, evidence[solvable], solvable // count, rings, identified.ring[solvable], camera
+                frames,
+                solutions,
+                evidence[solvable],
+                solvable // count,
+                rings,
+                identified.ring[solvable],
+                shapes,
+                camera,
             )
         elif self.method == "centers":
             solutions = _on_centers(solutions, evidence[solvable])
         if camera.covariance is not None:
             wider = intrinsics_covariance(evidence[solvable], solutions, camera, refined=refined)
             solutions = replace(solutions, covariance=solutions.covariance + wider)
-        return self._poses(target, solvable, solutions, evidence, identified, rings, table, camera)
+        return outcome(target, solvable, solutions, evidence, identified, rings, table, camera)
 
     def _checked(self, frames: Tensor) -> Tensor:
         if frames.ndim == 4 and frames.shape[1] == 1:
@@ -215,14 +226,14 @@ class PoseEstimator(nn.Module):
         frame: Tensor,
         rings: Rings,
         ring: Tensor,
+        shapes: Tensor,
         camera: Camera,
     ) -> Solutions:
         """Solutions whose poses are refined on the frames themselves, where the refinement holds."""
         solved = (s.status != Status.REJECTED).nonzero()[:, 0]
         index = ring[solved].clamp_min(0)
-        shapes = torch.stack([rings.outer_raw, rings.inner_raw], 1)[index]
         some = replace(e[solved], mask=s.mask[solved])
-        start = (frames, camera, frame[solved], s.R[solved], s.t[solved], some.mask, shapes)
+        start = (frames, camera, frame[solved], s.R[solved], s.t[solved], some.mask, shapes[solved])
         model = (some.points, some.normals, some.radii)
         if self.method == "edges":
             refined = refine_edges(*start, rings.polarity[index], *model)
@@ -239,73 +250,6 @@ class PoseEstimator(nn.Module):
             rms=s.rms.index_copy(0, index, rms[good]),
         )
 
-    def _poses(
-        self,
-        target: Tensor,
-        solvable: Tensor,
-        s: Solutions,
-        e: Evidence,
-        identified: Identified,
-        rings: Rings,
-        table: MarkerTable,
-        camera: Camera,
-    ) -> Poses:
-        """Rows of every frame and target from the solutions of the ``solvable`` ones."""
-        rows, device = target.numel(), target.device
-        frame = torch.arange(rows, device=device) // len(self.targets)
-        mask = e.mask.clone()
-        mask[solvable] = s.mask
-        status = torch.full((rows,), int(Status.REJECTED), device=device)
-        reason = torch.full((rows,), int(Reason.RESIDUAL), device=device)
-        status[solvable], reason[solvable] = s.status, s.reason
-
-        # a ring belongs to one target: where two claim it, to the one that explains more rings
-        support = torch.where(status == Status.REJECTED, 0, mask.sum(-1))
-        row, marker = (mask & (support > 0)[:, None]).nonzero().unbind(-1)
-        ring = identified.ring[row, marker]
-        best = torch.zeros(len(rings), dtype=support.dtype, device=device)
-        best.scatter_reduce_(0, ring, support[row], "amax")
-        outdone = torch.zeros_like(support).index_add_(0, row, (support[row] < best[ring]).to(support.dtype)) > 0
-        claimed = torch.zeros(len(rings), dtype=torch.bool, device=device)
-        claimed[ring[~outdone[row]]] = True
-        found = (support > 0) & ~outdone
-
-        # without a pose: the rings that nobody else explains tell why
-        proposed = identified.proposed(~claimed)
-        mask &= found[:, None] | ~torch.cat([claimed, claimed.new_ones(1)])[identified.ring]
-        few = ~found & (proposed < MIN_MARKERS)
-        few_status = torch.where(proposed == 0, int(Status.NO_TARGET), int(Status.TOO_FEW_MARKERS))
-        status = torch.where(few, few_status, status)
-        reason = torch.where(few, int(Reason.NONE), reason)
-
-        def spread(values: Tensor) -> Tensor:
-            out = torch.full((rows, *values.shape[1:]), torch.nan, dtype=values.dtype, device=device)
-            out[solvable] = values
-            return torch.where(found.view(-1, *[1] * (values.ndim - 1)), out, torch.nan)
-
-        row, marker = mask.nonzero().unbind(-1)
-        ring = identified.ring[row, marker]
-        center, center_cov = raw_centers(camera, e.center[row, marker], e.covariance[row, marker])
-        detections = Detections(
-            frame[row],
-            target[row],
-            table.ids[target[row], marker],
-            center,
-            center_cov,
-            rings.outer_raw[ring],
-            rings.inner_raw[ring],
-        )
-        names = ("R", "t", "covariance", "rms", "chi2", "R_alt", "t_alt", "rms_alt", "chi2_alt")
-        return Poses(
-            frame=frame,
-            target=target,
-            status=status,
-            reason=reason,
-            markers=torch.where(few, proposed, mask.sum(-1)),
-            detections=detections,
-            **{n: spread(getattr(s, n)) for n in names},
-        )
-
 
 def _on_centers(s: Solutions, e: Evidence) -> Solutions:
     """Solutions refined on the ellipses' own centres, where that holds."""
@@ -319,18 +263,15 @@ def _on_centers(s: Solutions, e: Evidence) -> Solutions:
     )
 
 
+def _raw_ellipses(rings: Rings, ring: Tensor) -> Tensor:
+    """Ellipses (N, M, 2, 5) in raw pixels, outer and inner, of the rings (N, M); anything where it is -1."""
+    both = torch.stack([rings.outer_raw, rings.inner_raw], 1)
+    return both[ring.clamp_min(0)] if len(rings) else both.new_ones(*ring.shape, 2, 5)
+
+
 def _linear(frames: Tensor, white: float) -> Tensor:
     """sRGB-encoded frames as linear grey, float32 with white at 255 (IEC 61966-2-1)."""
     if not frames.is_floating_point():
         white = float(torch.iinfo(frames.dtype).max)
     x = (frames.float() / white).nan_to_num(nan=0.0)
     return 255.0 * torch.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055).clamp_min(0).pow(2.4))
-
-
-def raw_centers(camera: Camera, ideal: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
-    """Centres (K, 2) and covariances (K, 2, 2) of ideal pixels as pixels of the distorted frame."""
-    k = camera.matrix
-    focal = k.diagonal()[:2]
-    xy = (ideal - k[:2, 2]) / focal
-    jacobian = camera.J_distort(xy) / focal
-    return camera.distort(xy), jacobian @ covariance @ jacobian.mT

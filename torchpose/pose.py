@@ -21,6 +21,7 @@ from torchpose.results import Reason, Status
 from torchpose.rings import Rings
 
 AMBIGUOUS_CHI2 = 20.0  # contract: two poses are ambiguous where their chi-squared differs by less
+MIN_MARKERS = 3  # seen, that a pose needs
 _MOST_INFLATION = 1e10  # of a parameter's variance by the others' freedom, beyond which it counts as open
 _SHAPE_FLOOR = (0.03, 0.5)  # px, and times the curvature a / b^2: what blur and mask do to an ellipse's shape
 _SHAPE_LIMIT = 16.0  # mean chi-squared a shape component above which the rings contradict the pose

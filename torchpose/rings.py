@@ -155,9 +155,13 @@ def _measure(
 
 def _direction(edges: RingEdges, ellipses: Tensor) -> Tensor:
     """Number (E,) of each edge point's direction, see `inner_circles.find_inner`."""
-    inverse = torch.linalg.inv(conics.shape_matrix(ellipses))[edges.ring]
-    x, y = (inverse @ (edges.points - ellipses[edges.ring, :2])[..., None]).squeeze(-1).unbind(-1)
-    return (torch.atan2(y, x) * (ANGLES / (2 * torch.pi))).round().long() % ANGLES
+    inverse = torch.linalg.inv(conics.shape_matrix(ellipses)).flatten(1)
+    each = (*inverse[:, [0, 1, 3]].unbind(-1), *ellipses[:, :2].unbind(-1))
+    i11, i12, i22, cx, cy = (v.contiguous().index_select(0, edges.ring) for v in each)
+    u, v = edges.points.unbind(-1)
+    dx, dy = u - cx, v - cy
+    turn = torch.atan2(i12 * dx + i22 * dy, i11 * dx + i12 * dy)
+    return (turn * (ANGLES / (2 * torch.pi))).round().long() % ANGLES
 
 
 def _measure_small(

@@ -17,7 +17,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor, nn
 
-from torchpose.geometry.segments import segment_sum
+from torchpose.geometry.segments import segment_sum, values_at
 
 ORDERS = ((0, 0), (1, 1), (2, 0), (2, 2), (3, 1), (3, 3), (4, 0), (4, 2), (4, 4))
 EDGE_ORDERS = ((1, 1), (2, 0))  # all that the edge position needs
@@ -121,11 +121,11 @@ def moments_at(
     d = torch.arange(-half, half + 1, device=frames.device)
     window = (d[:, None] * width + d[None, :]).flatten()
     base = (frame * height + pixels[:, 1]) * width + pixels[:, 0]
-    values = frames.reshape(-1)[base[:, None] + window].float()
+    values = values_at(frames, base[:, None] + window)
     # every kernel but A_00 sums to nearly zero: taking the middle grey off first keeps float32 exact to rounding
-    middle = values[:, size * size // 2, None]
+    middle = values[:, size * size // 2, None].clone()
     weight = kernels(size, orders).flatten(1).to(values)
-    return (values - middle) @ weight.T + middle * weight.sum(1)
+    return values.sub_(middle) @ weight.T + middle * weight.sum(1)
 
 
 def locate(frames: Tensor, frame: Tensor, pixels: Tensor, size: int = MASK) -> Edges:
@@ -134,15 +134,15 @@ def locate(frames: Tensor, frame: Tensor, pixels: Tensor, size: int = MASK) -> E
     Args:
         frames: (B, H, W) grey. frame: (E,) int64. pixels: (E, 2) int64 u, v, at least N // 2 from the border.
     """
-    c, s, a20 = moments_at(frames, frame, pixels, size).double().unbind(-1)
-    a11 = torch.hypot(c, s)
-    normal = torch.stack([c, s], -1) / a11[:, None]
-    length = a20 / a11
+    c, s, a20 = moments_at(frames, frame, pixels, size).T.double().unbind()
+    a11 = (c * c + s * s).sqrt()
+    nx, ny, length = c / a11, s / a11, a20 / a11
     offset = length * (size / 2)
-    shift = offset[:, None] * normal
+    dx, dy = offset * nx, offset * ny
     step = 1.5 * a11 / (1 - length.square()).clamp_min(1e-3).pow(1.5)
-    inside = (shift.abs() <= 0.5).all(-1)
-    return Edges(pixels.double() + shift, normal, offset, step, inside)
+    inside = (dx.abs() <= 0.5) & (dy.abs() <= 0.5)
+    u, v = pixels.unbind(-1)
+    return Edges(torch.stack([u + dx, v + dy]).mT, torch.stack([nx, ny]).mT, offset, step, inside)
 
 
 def blur_slope(offset: Tensor, distance: Tensor, group: Tensor, count: int) -> Tensor:

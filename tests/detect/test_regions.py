@@ -147,3 +147,15 @@ def test_broken_pixels_only_lose_their_own_cells():
     assert broken.threshold.isfinite().all()
     assert torch.equal(regions_of(broken, 10).cell, whole.cell)
     assert gradient(torch.full((1, 5, 5), torch.nan)).threshold.isfinite().all()
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
+def test_directions_at_the_limit_never_join(dtype):
+    """(3, 1) beside (3, -1) have the cosine 0.8: rounding would join them at one contrast and not at another."""
+    y, x = torch.meshgrid(torch.arange(12), torch.arange(12), indexing="ij")
+    cells = (torch.arange(11)[:, None] * 12 + torch.arange(11)).flatten()
+    for scale in range(1, 6):
+        frame = (scale * (3 * x - (y - 6).abs()) + 40).to(dtype)[None]
+        regions = level_line_regions(Gradient(frame, torch.ones(1)), cells, 10)
+        assert regions.frame.numel() == 2
+        assert regions.cell.numel() == 11 * 11

@@ -185,3 +185,15 @@ def test_circle_poses_batch_and_sign():
     pair = torch.cdist(centers, flipped).amin(-1)
     assert pair.max() < 1e-8
     assert torch.cdist(centers[3], single).amin(-1).max() < 1e-8
+
+
+def test_boundary_is_points_on_and_the_normals_of_the_distance():
+    ellipses = torch.tensor([[3.0, -2.0, 5.0, 2.0, 0.4], [1.0, 1.0, 2.0, 2.0, 0.0]], dtype=torch.float64)
+    index = torch.tensor([0, 1, 0, 0, 1])
+    angle = torch.tensor([0.1, 2.0, 3.3, 5.9, 4.4], dtype=torch.float64)
+    x, y, nx, ny = conics.boundary(ellipses, index, angle)
+    expected = conics.points_on(ellipses[index], angle)
+    torch.testing.assert_close(torch.stack([x, y], -1), expected)
+    distance, normal = conics.signed_distance(ellipses[index], expected)
+    torch.testing.assert_close(distance, torch.zeros_like(distance), rtol=0, atol=1e-12)
+    torch.testing.assert_close(torch.stack([nx, ny], -1), normal)

@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchpose.geometry.segments import ragged_arange, rank_in_group, segment_mean, segment_sum
+from torchpose.geometry.segments import (
+    Tiles,
+    positions,
+    ragged_arange,
+    rank_in_group,
+    segment_mean,
+    segment_sum,
+    values_at,
+)
 
 no_deadline = settings(deadline=None)
 groups = st.lists(st.integers(0, 5), max_size=40)
@@ -30,6 +39,36 @@ def test_sum_is_differentiable():
     values = torch.randn(7, 3, dtype=torch.float64, requires_grad=True)
     index = torch.tensor([2, 0, 2, 1, 0, 0, 2])
     assert torch.autograd.gradcheck(lambda v: segment_sum(v, index, 4), values)
+
+
+@no_deadline
+@given(groups, st.integers(1, 7))
+def test_tiles_sum_the_same_and_give_the_values_back(members, size):
+    index = torch.tensor(members, dtype=torch.int64)
+    values = torch.arange(2.0 * len(members), dtype=torch.float64).reshape(-1, 2).sin()
+    tiles = Tiles.of(index, 6, size)
+    planes = tiles.planes(*values.unbind(-1))
+    assert planes.shape == (len(tiles.group), 2, size)
+    torch.testing.assert_close(tiles.sums(planes.sum(-1)), segment_sum(values, index, 6))
+    products = segment_sum(values[:, :, None] * values[:, None], index, 6)
+    torch.testing.assert_close(tiles.sums(planes @ planes.mT), products)
+    assert torch.equal(torch.stack([tiles.flat(plane) for plane in planes.unbind(1)], -1), values)
+
+
+@no_deadline
+@given(st.lists(st.booleans(), max_size=40))
+def test_positions(mask):
+    assert positions(torch.tensor(mask, dtype=torch.bool)).tolist() == [i for i, true in enumerate(mask) if true]
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.uint16, torch.float16, torch.float32, torch.float64])
+def test_values_of_every_dtype(dtype):
+    most = 60_000 if dtype in (torch.uint16, torch.float32, torch.float64) else 250
+    frames = torch.linspace(0, most, 60).to(dtype).view(2, 5, 6)
+    cell = torch.tensor([[0, 59, 7], [30, 30, 1]])
+    found = values_at(frames, cell)
+    assert found.dtype == torch.float32
+    assert torch.equal(found, frames.float().flatten()[cell])
 
 
 @no_deadline

@@ -62,6 +62,24 @@ def test_reaches_the_bound() -> None:
     assert (result.blur - math.hypot(0.8, 0.289)).abs().max() < 0.03
 
 
+def test_large_rings_reach_the_bound() -> None:
+    """Of more than ten thousand pixels the coarse steps take 512, and the last one mends what they leave."""
+    r, t = random_poses(6, 40, (60, 64), seed=11)
+    t[:, :2] *= 0.2
+    frames = add_noise(render(CAMERA, QUAD, r, t, psf_sigma=0.8, plate=PLATE), 16.0)
+    result = refined(frames, r, t)
+    bound = pose_crlb(CAMERA, QUAD, r, t, psf_sigma=0.8, noise_sigma=16.0)
+    assert result.good.all()
+    assert nees(errors(result, r, t), bound).mean() < 6 * 1.7
+
+
+def test_rings_beyond_the_frame_give_no_pose() -> None:
+    r, t = random_poses(2, 30, (150, 170))
+    none = torch.zeros(2, CAMERA.height, CAMERA.width, dtype=torch.uint8)
+    t[:, 0] += 1000
+    assert not refined(none, r, t).good.any()
+
+
 def test_noise_free_frames_leave_a_tenth_of_a_micron() -> None:
     r, t = random_poses(10, 30, (150, 170), seed=2)
     result = refined(add_noise(render(CAMERA, QUAD, r, t, psf_sigma=0.7, plate=PLATE), 0.0), r, t)

@@ -195,8 +195,13 @@ class Camera:
 
     def J_distort(self, xy: Tensor) -> Tensor:
         """Jacobian (..., 2, 2) of `distort`: d(u, v)/d(x, y), px per unit of normalised coordinates."""
-        _, _, j_xx, j_xy, j_yy = self._warp(*xy.unbind(-1))
-        return torch.stack([j_xx, j_xy, j_xy, j_yy], -1).unflatten(-1, (2, 2)) * self._intrinsics(xy)[0][:, None]
+        return torch.stack(self.slopes(*xy.unbind(-1)), -1).unflatten(-1, (2, 2))
+
+    def slopes(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The entries du/dx, du/dy, dv/dx, dv/dy (...) of `J_distort` at x, y (...), unstacked, for many points."""
+        (fx, fy), _ = self._intrinsics(x)
+        _, _, j_xx, j_xy, j_yy = self._warp(x, y)
+        return j_xx * fx, j_xy * fx, j_xy * fy, j_yy * fy
 
     def undistort_points(self, uv: Tensor) -> Tensor:
         """Undistorted normalised coordinates (..., 2) of pixels (..., 2): the inverse of `distort`, to rounding.

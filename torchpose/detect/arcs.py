@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchpose.detect.regions import Gradient, Regions
 from torchpose.geometry import conics
-from torchpose.geometry.segments import ragged_arange, rank_in_group, segment_mean, segment_sum
+from torchpose.geometry.segments import positions, ragged_arange, rank_in_group, segment_mean, segment_sum
 
 _TANGENT_PX = 2.0  # px of position error that weigh as much as a radian of direction error
 _LEAST_TURN = 0.25  # rad from end to end of an arc; less may be straight
@@ -52,20 +52,23 @@ def describe_arcs(regions: Regions, xy: Tensor) -> Arcs:
         xy: (P, 2) float64, centres of the cells of the regions.
     """
     count, index = regions.frame.numel(), regions.region
-    unit = (regions.gradient / torch.linalg.vector_norm(regions.gradient, dim=-1, keepdim=True)).double()
-    middle, normal = segment_mean(torch.cat([xy, unit], -1), index, count).split(2, -1)
+    (x, y), (gx, gy) = xy.unbind(-1), regions.gradient.unbind(-1)
+    scale = (gx * gx + gy * gy).rsqrt()
+    gx, gy = (gx * scale).double(), (gy * scale).double()
+    size = torch.bincount(index, minlength=count)
+    mean = torch.stack([segment_sum(v, index, count) for v in (x, y, gx, gy)], -1) / size[:, None]
+    middle, normal = mean.split(2, -1)
     normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
-    n = normal[index]
-    tangent = torch.stack([-n[:, 1], n[:, 0]], -1)
-    along = ((xy - middle[index]) * tangent).sum(-1)
-    angle = torch.atan2((unit * tangent).sum(-1), (unit * n).sum(-1))
-    sums = segment_sum(torch.stack([along * angle, along.square()], -1), index, count)
-    curvature = sums[:, 0] / sums[:, 1].clamp_min(1e-9)
+    each = (*middle.unbind(-1), *normal.unbind(-1))
+    mx, my, nx, ny = (v.contiguous().index_select(0, index) for v in each)
+    along = (y - my) * nx - (x - mx) * ny  # the tangent is (-ny, nx)
+    angle = torch.atan2(gy * nx - gx * ny, gx * nx + gy * ny)
+    curvature = segment_sum(along * angle, index, count) / segment_sum(along * along, index, count).clamp_min(1e-9)
     ends = torch.zeros(2, count, dtype=angle.dtype, device=angle.device)
     ends[0].scatter_reduce_(0, index, along, "amax")
     ends[1].scatter_reduce_(0, index, -along, "amax")
     turn = ends.sum(0) * curvature.abs()
-    return Arcs(regions.frame, middle, normal, curvature, turn, torch.bincount(index, minlength=count))
+    return Arcs(regions.frame, middle, normal, curvature, turn, size)
 
 
 def chain_pairs(arcs: Arcs) -> tuple[Tensor, Tensor]:
@@ -162,21 +165,22 @@ def follow(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor, ro
         (M, 5); NaN where nothing was left to fit.
     """
     largest = max(grad.shape[1:])
-    for _ in range(rounds):
+    for _ in range(rounds if ellipses.shape[0] else 0):
         # a hairline fits an ellipse of any size: without a limit, its samples would fill the memory
         ellipses = torch.where(ellipses[:, 2:3] <= largest, ellipses, torch.nan)
         which, xy, normal, _ = perimeter_samples(ellipses)
         band = torch.arange(-_BAND, _BAND + 1, dtype=torch.float64, device=xy.device)
-        at = (xy[:, None] + band[:, None] * normal[:, None]).flatten(0, 1)
-        which = which.repeat_interleave(band.numel())
-        cell, inside = cells_at(grad, frame[which], at)
-        g = grad.at(cell)
-        rise = (g * normal.repeat_interleave(band.numel(), 0)).sum(-1) * polarity[which]
-        strength = torch.linalg.vector_norm(g, dim=-1)
-        good = inside & (rise > _BAND_COS * strength) & (strength > 0.5 * grad.threshold[frame[which]])
-        keep = good.nonzero()[:, 0]
-        middle = (at[keep] - 0.5).round() + 0.5
-        ellipses = fit_joint(middle, g[keep], which[keep], ellipses.shape[0], rise[keep])
+        cell, inside, (x, y) = cells_along(grad, frame.index_select(0, which), xy, normal, band)
+        gx, gy = (g.view_as(x) for g in grad.components(cell.flatten()))
+        nx, ny = (n[:, None].float() for n in normal.unbind(-1))
+        rise = (gx * nx + gy * ny) * polarity.index_select(0, which)[:, None].float()
+        power, least = gx * gx + gy * gy, (0.5 * grad.threshold[frame]).square()
+        good = inside & (rise > 0) & (rise * rise > _BAND_COS**2 * power) & (power > least[which, None])
+        keep = positions(good.flatten())
+        kept = [v.flatten().index_select(0, keep) for v in (x, y, gx, gy, rise)]
+        middle, gradient = torch.stack(kept[:2], -1), torch.stack(kept[2:4], -1)
+        of = which.index_select(0, keep // band.numel())
+        ellipses = fit_joint(middle, gradient, of, ellipses.shape[0], kept[4])
     return ellipses
 
 
@@ -194,20 +198,31 @@ def perimeter_samples(
     n = multiple * (conics.perimeter(ellipses).nan_to_num(nan=0.0) / multiple).ceil().long()
     n = n if most is None else n.clamp_max(most)
     which, position = ragged_arange(n)
-    turn = (position.double() + 0.5) / n[which]
-    angle = 2 * torch.pi * turn
-    of = ellipses[which]
-    a, b, theta = of[:, 2], of[:, 3], of[:, 4]
-    cos, sin = theta.cos(), theta.sin()
-    p, q = b * angle.cos(), a * angle.sin()
-    length = torch.hypot(p, q)
-    normal = torch.stack([cos * p - sin * q, sin * p + cos * q], -1) / length[:, None]
-    return which, conics.points_on(of, angle), normal, turn
+    turn = (position.double() + 0.5) / n.index_select(0, which)
+    x, y, nx, ny = conics.boundary(ellipses, which, 2 * torch.pi * turn)
+    return which, torch.stack([x, y]).mT, torch.stack([nx, ny]).mT, turn
 
 
 def cells_at(grad: Gradient, frame: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
-    """Flat cells (S,) nearest to positions (S, 2), and whether they lie on the frame (S,) bool."""
+    """Flat cells (S,) nearest to positions (S, 2), and which positions lie on the frame (S,) bool; the others any."""
     _, height, width = grad.shape
-    x, y = (xy - 0.5).round().long().unbind(-1)
-    inside = (x >= 0) & (x < width - 1) & (y >= 0) & (y < height - 1)
-    return (frame * height + y.clamp(0, height - 1)) * width + x.clamp(0, width - 1), inside
+    x, y = ((v - 0.5).round() for v in xy.unbind(-1))
+    on_x, on_y = x.clamp(0, width - 2), y.clamp(0, height - 2)
+    return ((frame * height + on_y) * width + on_x).long(), (x == on_x) & (y == on_y)
+
+
+def cells_along(
+    grad: Gradient, frame: Tensor, xy: Tensor, normal: Tensor, band: Tensor
+) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
+    """Cells (S, K) nearest to the positions ``band`` (K,) along normals (S, 2) from positions (S, 2).
+
+    Returns:
+        cells (S, K) and which positions lie on the frame, as `cells_at`, and x, y (S, K), the centres of the cells.
+    """
+    _, height, width = grad.shape
+    x, y = (
+        (at[:, None] + n[:, None] * band - 0.5).round() for at, n in zip(xy.unbind(-1), normal.unbind(-1), strict=True)
+    )
+    on_x, on_y = x.clamp(0, width - 2), y.clamp(0, height - 2)
+    cell = ((frame[:, None] * height + on_y) * width + on_x).long()
+    return cell, (x == on_x) & (y == on_y), (x + 0.5, y + 0.5)

@@ -17,7 +17,7 @@ from torchpose.detect.reduce import area_reduce, reduction_factor
 from torchpose.detect.regions import Gradient, Regions, gradient, level_line_regions, region_polarity, strong_cells
 from torchpose.detect.validation import SAME, WHOLE, Candidates, Verdict, accepted, merge_duplicates, score
 from torchpose.geometry import conics
-from torchpose.geometry.segments import ragged_arange, segment_mean, segment_sum
+from torchpose.geometry.segments import positions, ragged_arange, segment_mean
 
 MIN_PIXELS = 10
 _SECTORS = 8  # arcs turn by up to 45 degrees
@@ -114,9 +114,10 @@ def find_ellipses(grad: Gradient, known: Candidates | None = None, explain: bool
     valid = (found.verdict == Verdict.ACCEPTED).nonzero()[:, 0]
     some = found[valid]
     freed = free_of_stumps(grad, some.frame, some.ellipse, some.polarity)
-    moved = ((freed != some.ellipse).any(-1) & (plausible(grad, freed) == Verdict.ACCEPTED)).nonzero()[:, 0]
-    again = score(grad, some.frame[moved], freed[moved], some.polarity[moved])
-    found = found.replaced(valid[moved], again)
+    moved = positions((freed != some.ellipse).any(-1) & (plausible(grad, freed) == Verdict.ACCEPTED))
+    if moved.numel():
+        again = score(grad, some.frame[moved], freed[moved], some.polarity[moved])
+        found = found.replaced(valid[moved], again)
     found = explain_once(grad, merge_duplicates(found if explain else accepted(found), explain=explain), known)
     return found if explain else accepted(found)
 
@@ -125,18 +126,16 @@ def fit_regions(grad: Gradient, regions: Regions, explain: bool = False) -> tupl
     """Ellipses that single regions follow, and which of the cells (P,) bool of the regions they explain."""
     xy = cell_centers(grad, regions.cell)
     count = regions.frame.numel()
-    magnitude = torch.linalg.vector_norm(regions.gradient, dim=-1).double()
+    gx, gy = regions.gradient.unbind(-1)
+    magnitude = (gx * gx + gy * gy).sqrt().double()
     params = ellipse.fit(xy, regions.region, count, magnitude)
     # once more with what is near the ellipse; weights that fall to 0 smoothly leave it where it is when the threshold,
     # and with it the rim of the region, changes a little
     r = ellipse.distance(xy, regions.region, params).nan_to_num(nan=_TAPER)
     params = ellipse.fit(xy, regions.region, count, magnitude * (1 - (r / _TAPER).square()).clamp_min(0).square())
     polarity = region_polarity(regions, params[:, :2], xy).sign()
-    off, normal = conics.signed_distance(params[regions.region], xy)
-    rise = (normal * regions.gradient).sum(-1) * polarity[regions.region]
-    follows = off.abs() < _ON_ELLIPSE
-    along = follows | ((off.abs() < _FLANK) & (rise > _FLANK_COS * magnitude))
-    length, edge = segment_sum(torch.stack([follows, along], -1).double(), regions.region, count).unbind(-1)
+    follows, along = _on_ellipses(regions, xy, params, polarity, magnitude)
+    length, edge = (torch.bincount(regions.region[positions(on)], minlength=count) for on in (follows, along))
     verdict = plausible(grad, params)
     elsewhere = length < _MIN_CELLS * conics.perimeter(params)
     verdict = torch.where((verdict == Verdict.ACCEPTED) & elsewhere, int(Verdict.OFF_ELLIPSE), verdict)
@@ -144,15 +143,16 @@ def fit_regions(grad: Gradient, regions: Regions, explain: bool = False) -> tupl
     found = score(grad, regions.frame[good], params[good], polarity[good])
     # a region that is not a whole ellipse runs along something else as well: only what lies along the ellipse counts
     beyond = edge < WHOLE * torch.bincount(regions.region, minlength=count)
-    part = ((found.cover <= WHOLE) | beyond[good]).nonzero()[:, 0]
-    some = found[part]
-    refit = follow(grad, some.frame, some.ellipse, some.polarity, _PART_ROUNDS)
-    sound = (plausible(grad, refit) == Verdict.ACCEPTED).nonzero()[:, 0]
-    again = score(grad, some.frame[sound], refit[sound], some.polarity[sound])
-    found = found.replaced(part[sound], again)
+    part = positions((found.cover <= WHOLE) | beyond[good])
+    if part.numel():
+        some = found[part]
+        refit = follow(grad, some.frame, some.ellipse, some.polarity, _PART_ROUNDS)
+        sound = positions(plausible(grad, refit) == Verdict.ACCEPTED)
+        again = score(grad, some.frame[sound], refit[sound], some.polarity[sound])
+        found = found.replaced(part[sound], again)
     whole = torch.zeros(count, dtype=torch.bool, device=xy.device)
     whole[good[(found.verdict == Verdict.ACCEPTED) & (found.cover > WHOLE)]] = True
-    explained = along & whole[regions.region]
+    explained = along & whole.index_select(0, regions.region)
     if not explain:
         return accepted(found), explained
     bad = ((verdict != Verdict.ACCEPTED) & params.isfinite().all(-1)).nonzero()[:, 0]
@@ -161,12 +161,28 @@ def fit_regions(grad: Gradient, regions: Regions, explain: bool = False) -> tupl
     return Candidates.cat([found, rejected]), explained
 
 
+def _on_ellipses(
+    regions: Regions, xy: Tensor, params: Tensor, polarity: Tensor, magnitude: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Which cells (P,) lie on the ellipse of their region, and which belong to its edge, a blurred one included."""
+    conic = conics.conic_from_ellipse(params)
+    each = [v.contiguous().index_select(0, regions.region) for v in (*conic.unbind(-1), polarity)]
+    off, (nx, ny) = conics.conic_distance(tuple(each[:6]), xy.unbind(-1))
+    gx, gy = regions.gradient.unbind(-1)
+    rise = (nx * gx + ny * gy) * each[6]
+    off = off.abs()
+    follows = off < _ON_ELLIPSE
+    return follows, follows | ((off < _FLANK) & (rise > _FLANK_COS * magnitude))
+
+
 def fit_arcs(grad: Gradient, arcs: Regions) -> Candidates:
     """Ellipses of pairs of arcs, followed along their whole perimeter."""
     xy = cell_centers(grad, arcs.cell)
     about = describe_arcs(arcs, xy)
     pair = torch.stack(chain_pairs(about), -1)
     count = pair.shape[0]
+    if count == 0:
+        return score(grad, about.frame[:0], xy.new_zeros(0, 5), xy.new_zeros(0))
     # the cells of both members, flat
     order = torch.argsort(arcs.region, stable=True)
     start = about.size.cumsum(0) - about.size
@@ -174,9 +190,10 @@ def fit_arcs(grad: Gradient, arcs: Regions) -> Candidates:
     which, offset = ragged_arange(about.size[member])
     cell = order[start[member[which]] + offset]
     index = which // 2
-    weight = torch.linalg.vector_norm(arcs.gradient[cell], dim=-1)
-    params = fit_joint(xy[cell], arcs.gradient[cell], index, count, weight)
-    r = ellipse.distance(xy[cell], index, params)
+    xy, gradient = xy[cell], arcs.gradient[cell]
+    weight = torch.linalg.vector_norm(gradient, dim=-1)
+    params = fit_joint(xy, gradient, index, count, weight)
+    r = ellipse.distance(xy, index, params)
     rms = segment_mean(r.square(), index, count, weight.double()).sqrt()
     good = ((plausible(grad, params) == Verdict.ACCEPTED) & (rms < _ARC_RMS)).nonzero()[:, 0]
     frame, polarity = about.frame[pair[good, 0]], about.curvature[pair[good, 0]].sign()
@@ -200,5 +217,6 @@ def plausible(grad: Gradient, ellipses: Tensor) -> Tensor:
 def cell_centers(grad: Gradient, cell: Tensor) -> Tensor:
     """Positions (P, 2) float64 of flat cells in reduced px."""
     _, height, width = grad.shape
-    inside = cell % (height * width)
-    return torch.stack([inside % width, inside // width], -1).double() + 0.5
+    row = torch.div(cell, width, rounding_mode="floor")
+    x, y = cell - row * width, row % height
+    return torch.stack([x.double() + 0.5, y.double() + 0.5]).mT

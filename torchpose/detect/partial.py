@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchpose.detect.arcs import cells_at, direction_rows, fit_scatter, perimeter_samples
+from torchpose.detect.arcs import cells_along, direction_rows, fit_scatter, perimeter_samples
 from torchpose.detect.regions import Gradient
 from torchpose.geometry.segments import segment_sum
 
@@ -80,24 +80,25 @@ def find_ridge(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor
     count = ellipses.shape[0]
     of, xy, normal, turn = perimeter_samples(ellipses, _MOST_SAMPLES, _SECTORS)
     band = torch.arange(-_REACH, _REACH + 1, dtype=torch.float64, device=xy.device)
-    at = xy[:, None] + band[:, None] * normal[:, None]
-    cell, inside = cells_at(grad, frame[of].repeat_interleave(band.numel()), at.flatten(0, 1))
-    g = grad.at(cell).view(*at.shape)
-    rise = (g * normal[:, None].float()).sum(-1) * polarity[of, None].float()
-    strength = torch.linalg.vector_norm(g, dim=-1)
-    good = inside.view(rise.shape) & (rise > _COS * strength) & (strength > 0.5 * grad.threshold[frame[of], None])
+    cell, inside, (x, y) = cells_along(grad, frame.index_select(0, of), xy, normal, band)
+    gx, gy = (g.view_as(x) for g in grad.components(cell.flatten()))
+    nx, ny = normal.unbind(-1)
+    rise = (gx * nx[:, None].float() + gy * ny[:, None].float()) * polarity.index_select(0, of)[:, None].float()
+    power, least = gx * gx + gy * gy, (0.5 * grad.threshold[frame]).square()
+    good = inside & (rise > 0) & (rise * rise > _COS**2 * power) & (power > least[of, None])
     rise = torch.where(good, rise, 0.0)
     peak = rise.argmax(-1, keepdim=True)
     beside = torch.cat([(peak - 1).clamp_min(0), peak, (peak + 1).clamp_max(2 * _REACH)], -1)
     weight = rise.gather(-1, beside).double()
     # a cell is sampled where its centre is, not where it was asked for
-    away = (((at - 0.5).round() + 0.5 - xy[:, None]) * normal[:, None]).sum(-1).gather(-1, beside)
+    px, py = xy.unbind(-1)
+    away = (x.gather(-1, beside) - px[:, None]) * nx[:, None] + (y.gather(-1, beside) - py[:, None]) * ny[:, None]
     total = weight.sum(-1)
     offset = (weight * away).sum(-1) / total.clamp_min(1e-12)
     found = total > 0
     support = segment_sum(torch.where(found, (1 - offset.square()).clamp_min(0), 0.0), of, count)
     support = support / torch.bincount(of, minlength=count).clamp_min(1)
-    gradient = g.gather(1, peak[..., None].expand(-1, -1, 2))[:, 0]
+    gradient = torch.cat([gx.gather(-1, peak), gy.gather(-1, peak)], -1)
     sector = (turn * _SECTORS).long().clamp_max(_SECTORS - 1)
     return Ridge(of, sector, xy + offset[:, None] * normal, gradient, offset, found, support)
 

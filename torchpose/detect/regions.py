@@ -15,14 +15,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpose.geometry.segments import segment_sum
+from torchpose.geometry.segments import positions, segment_sum
 
-_JOIN_COS = 0.8  # neighbours join within 37 degrees: a circle of 3 px turns 19 to 27 degrees from pixel to pixel
+# neighbours join within 37 degrees: a circle of 3 px turns 19 to 27 degrees from pixel to pixel. Not 0.8, which whole
+# grey levels reach exactly, as (3, 4) beside (0, 5): rounding would decide.
+_JOIN_COS = 0.8001
 _NOISE_SIGMAS = 3.7  # of the gradient: one pure-noise pixel in a thousand stays
 _RANGE_FRACTION = 0.01  # of the frame's own range of grey, for frames without noise
 _LEAST_LEVEL = 1.5  # grey levels, above the flicker of quantisation
 _NOISE_SAMPLES = 10_000
-_PART_PIXELS = 6_000_000  # of the frames whose gradients are formed at a time
+_PART_PIXELS = 300_000  # of the frames whose gradients are formed at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,18 +44,28 @@ class Gradient:
         """(B, h, w)."""
         return self.frames.shape
 
+    def components(self, cells: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradients gx, gy (P,) float32 at flat cell indices (P,); zero at NaN pixels.
+
+        Cells are not of the last row or column of a frame, which have no gradient.
+        """
+        flat, width = self.frames.view(-1), self.shape[2]
+        # index_select of single numbers: advanced indexing, or rows of two, cost several times as much
+        a, b, c, d = (flat.index_select(0, cells + step).float() for step in (0, 1, width, width + 1))
+        diag, anti = d.sub_(a), b.sub_(c)
+        gx, gy = (diag + anti).mul_(0.5), (diag - anti).mul_(0.5)
+        if self.frames.is_floating_point():
+            bad = ~(gx + gy).isfinite()
+            gx, gy = gx.masked_fill_(bad, 0.0), gy.masked_fill_(bad, 0.0)
+        return gx, gy
+
     def at(self, cells: Tensor) -> Tensor:
-        """Gradients (..., 2) gx, gy at flat cell indices (...); zero in the last row and column and at NaN pixels."""
+        """The same as (..., 2) for any cells (...); zero in the last row and column as well."""
         _, height, width = self.shape
-        flat = self.frames.view(-1)
-        x, y = cells % width, (cells // width) % height
-        inside = (x < width - 1) & (y < height - 1)
-        first = torch.where(inside, cells, 0)
-        right, below = torch.where(inside, cells + 1, 0), torch.where(inside, cells + width, 0)
-        diag = flat[torch.where(inside, cells + width + 1, 0)].float() - flat[first].float()
-        anti = flat[right].float() - flat[below].float()
-        g = torch.stack([0.5 * (diag + anti), 0.5 * (diag - anti)], -1)
-        return torch.where(g.isfinite().all(-1, keepdim=True), g, 0.0)
+        flat = cells.flatten()
+        inside = (flat % width < width - 1) & ((flat // width) % height < height - 1)
+        gx, gy = self.components(torch.where(inside, flat, 0))
+        return torch.where(inside[:, None], torch.stack([gx, gy], -1), 0.0).view(*cells.shape, 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,41 +108,44 @@ def gradient(frames: Tensor) -> Gradient:
 
 
 def strong_cells(grad: Gradient) -> Tensor:
-    """Flat indices (P,) int64, rising, of the cells whose gradient is above their frame's threshold.
-
-    The dense pass is taken over a few frames at a time: what fits the cache is not fetched twice, and the memory of one
-    part serves the next.
-    """
-    batch, height, width = grad.shape
+    """Flat indices (P,) int64, rising, of the cells whose gradient is above their frame's threshold."""
+    _, height, width = grad.shape
     if grad.frames.numel() == 0 or min(height, width) < 2:
         return torch.zeros(0, dtype=torch.int64, device=grad.frames.device)
-    some = max(1, _PART_PIXELS // (height * width))
-    found = []
-    for start in range(0, batch, some):
-        part = slice(start, start + some)
-        found.append(_steep(grad.frames[part], grad.threshold[part]) + start * height * width)
-    cell = torch.cat(found)
-    strength = torch.linalg.vector_norm(grad.at(cell), dim=-1)
-    return cell[strength > grad.threshold[cell // (height * width)]]
+    cell = _steep(grad.frames, grad.threshold)
+    gx, gy = grad.components(cell)
+    limit = grad.threshold.square().index_select(0, cell // (height * width))
+    return cell.index_select(0, positions(gx.square() + gy.square() > limit))
 
 
 def _steep(frames: Tensor, threshold: Tensor) -> Tensor:
     """Flat cells with a diagonal difference above the threshold, among which are all whose gradient is.
 
     |gradient|^2 is half the sum of the squares of both diagonal differences. On the CPU these go through OpenCV, the
-    batch as one tall picture: what the last row of a frame shares with the next is no cell of its gradient.
+    batch as one tall picture, a few rows at a time that stay in the cache. What the last row of a frame shares with the
+    next is no cell of its gradient.
     """
     batch, height, width = frames.shape
     if frames.device.type == "cpu":
         tall = frames.view(batch * height, width).numpy()
-        limit = threshold.numpy()
+        limit = threshold.numpy().repeat(height)
+        limit[height - 1 :: height] = np.inf
         if tall.dtype == np.uint8:  # whole levels: above the threshold is above its whole part, and bytes are quick
             limit = limit.clip(0, 255).astype(np.uint8)
-        differ = np.zeros_like(tall)
-        cv2.absdiff(tall[1:, 1:], tall[:-1, :-1], differ[:-1, :-1])
-        cv2.max(differ[:-1, :-1], cv2.absdiff(tall[:-1, 1:], tall[1:, :-1]), differ[:-1, :-1])
-        above = differ.reshape(batch, height, width) > limit[:, None, None]
-        return torch.from_numpy(np.flatnonzero(above))
+        rows = min(max(1, _PART_PIXELS // width), len(tall) - 1)
+        differ, other = np.empty((2, rows, width - 1), tall.dtype)
+        above = np.zeros((rows, width), bool)
+        found = []
+        for start in range(0, len(tall) - 1, rows):
+            upper, lower = tall[start : start + rows], tall[start + 1 : start + 1 + rows]
+            upper = upper[: len(lower)]
+            one, two = differ[: len(lower)], other[: len(lower)]
+            cv2.absdiff(lower[:, 1:], upper[:, :-1], one)
+            cv2.absdiff(upper[:, 1:], lower[:, :-1], two)
+            cv2.max(one, two, one)
+            np.greater(one, limit[start : start + len(lower), None], out=above[: len(lower), :-1])
+            found.append(np.flatnonzero(above[: len(lower)]) + start * width)
+        return torch.from_numpy(np.concatenate(found))
     frames = frames.float()
     steep = torch.zeros_like(frames)
     diagonals = (frames[:, 1:, 1:] - frames[:, :-1, :-1]).abs(), (frames[:, :-1, 1:] - frames[:, 1:, :-1]).abs()
@@ -148,23 +163,27 @@ def level_line_regions(grad: Gradient, cell: Tensor, min_pixels: int, sectors: i
             of known turn, and corners part from what they join. phase: fraction of a sector that the first starts at.
     """
     _, height, width = grad.shape
-    g = grad.at(cell)
-    unit = g / torch.linalg.vector_norm(g, dim=-1, keepdim=True)
+    gx, gy = grad.components(cell)
     a, b = _neighbours(cell, width)
     if sectors:
-        sector = ((torch.atan2(g[:, 1], g[:, 0]) / (2 * math.pi) + 1) * sectors + phase).long() % sectors
-        agree = sector[a] == sector[b]
+        sector = ((torch.atan2(gy, gx) / (2 * math.pi) + 1) * sectors + phase).long() % sectors
+        agree = sector.index_select(0, a) == sector.index_select(0, b)
     else:
-        agree = (unit[a] * unit[b]).sum(-1) > _JOIN_COS
-    label = connected_components(a[agree], b[agree], cell.numel())
+        scale = (gx.square() + gy.square()).rsqrt_()
+        x, y = gx * scale, gy * scale
+        cos = x.index_select(0, a) * x.index_select(0, b) + y.index_select(0, a) * y.index_select(0, b)
+        agree = cos > _JOIN_COS
+    joined = positions(agree)
+    label = connected_components(a.index_select(0, joined), b.index_select(0, joined), cell.numel())
 
     size = torch.bincount(label, minlength=cell.numel())
     large = size >= min_pixels
     number = large.cumsum(0) - 1
-    keep = large[label]
-    region = number[label[keep]]
-    frame = large.nonzero()[:, 0]
-    return Regions(cell[keep], region, g[keep], cell[frame] // (height * width))
+    keep = positions(large.index_select(0, label))
+    region = number.index_select(0, label.index_select(0, keep))
+    first = positions(large)
+    gradient = torch.stack([gx.index_select(0, keep), gy.index_select(0, keep)])
+    return Regions(cell.index_select(0, keep), region, gradient.mT, cell[first] // (height * width))
 
 
 def _neighbours(cell: Tensor, width: int) -> tuple[Tensor, Tensor]:
@@ -174,38 +193,44 @@ def _neighbours(cell: Tensor, width: int) -> tuple[Tensor, Tensor]:
     needed. The last row and column hold no cell, so that an index that wraps around meets none.
     """
     padded = torch.nn.functional.pad(cell, (0, 3), value=torch.iinfo(cell.dtype).max)
-    below = torch.searchsorted(cell, cell + (width - 1))
-    at = torch.arange(cell.numel(), device=cell.device)
-    pairs = [(at, at + 1, 1, 1), *((at, below + k, width - 1, width + 1) for k in range(3))]
-    found = []
-    for first, second, least, most in pairs:
-        step = padded[second] - cell
-        index = ((step >= least) & (step <= most)).nonzero()[:, 0]
-        found.append(torch.stack([first[index], second[index]]))
-    a, b = torch.cat(found, 1)
-    return a, b
+    right = positions(cell[1:] - cell[:-1] == 1)
+    first, second = [right], [right + 1]
+    wanted = cell + (width - 1)
+    below = _search(cell, wanted)
+    for k in range(3):
+        step = padded.index_select(0, below + k) - wanted
+        index = positions((step >= 0) & (step <= 2))
+        first.append(index)
+        second.append(below.index_select(0, index) + k)
+    return torch.cat(first), torch.cat(second)
+
+
+def _search(rising: Tensor, values: Tensor) -> Tensor:
+    """torch.searchsorted of values that rise themselves, which NumPy turns to account."""
+    if rising.device.type == "cpu":
+        return torch.from_numpy(np.searchsorted(rising.numpy(), values.numpy()))
+    return torch.searchsorted(rising, values)
 
 
 def connected_components(a: Tensor, b: Tensor, count: int) -> Tensor:
     """Smallest member (count,) int64 of each node's component in the graph with edges (a_i, b_i)."""
     parent = torch.arange(count, device=a.device)
     while a.numel():
-        first, second = parent[a], parent[b]
+        first, second = parent.index_select(0, a), parent.index_select(0, b)
         low = torch.minimum(first, second)
         parent = parent.scatter_reduce(0, first, low, "amin").scatter_reduce_(0, second, low, "amin")
-        while not torch.equal(shorter := parent[parent], parent):
+        while not torch.equal(shorter := parent.index_select(0, parent), parent):
             parent = shorter
-        apart = (parent[a] != parent[b]).nonzero()[:, 0]  # what is joined stays so
-        a, b = a[apart], b[apart]
+        # what is joined stays so
+        apart = positions(parent.index_select(0, first) != parent.index_select(0, second))
+        a, b = first.index_select(0, apart), second.index_select(0, apart)
     return parent
 
 
 def region_polarity(regions: Regions, center: Tensor, cells_xy: Tensor) -> Tensor:
     """Mean cosine (count,) of the gradient with the way out of ``center`` (count, 2): +1 dark inside, -1 light."""
-    count = center.shape[0]
-    out = cells_xy - center[regions.region]
-    cos = (out * regions.gradient).sum(-1) / (
-        torch.linalg.vector_norm(out, dim=-1) * torch.linalg.vector_norm(regions.gradient, dim=-1)
-    )
-    size = segment_sum(torch.ones_like(cos), regions.region, count)
-    return segment_sum(cos.nan_to_num(nan=0.0), regions.region, count) / size
+    index, count = regions.region, center.shape[0]
+    (x, y), (gx, gy) = cells_xy.unbind(-1), regions.gradient.unbind(-1)
+    x, y = x - center[:, 0].index_select(0, index), y - center[:, 1].index_select(0, index)
+    cos = (x * gx + y * gy) / ((x * x + y * y) * (gx * gx + gy * gy)).sqrt()
+    return segment_sum(cos.nan_to_num(nan=0.0), index, count) / torch.bincount(index, minlength=count)

@@ -96,11 +96,13 @@ class Samples:
 def sample_edges(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> Samples:
     """Samples of ellipses (M, 5), cells, of frames (M,) int64 and polarities (M,) +1 or -1."""
     which, xy, normal, _ = perimeter_samples(ellipses)
-    cell, on_frame = cells_at(grad, frame[which], xy)
-    g = grad.at(cell).double()
-    cos = (g * normal).sum(-1) * polarity[which] / torch.linalg.vector_norm(g, dim=-1).clamp_min(1e-6)
+    cell, on_frame = cells_at(grad, frame.index_select(0, which), xy)
+    gx, gy = (g.double() for g in grad.components(cell))
+    nx, ny = normal.unbind(-1)
+    length = (gx * gx + gy * gy).sqrt().clamp_min(1e-6)
+    cos = (gx * nx + gy * ny) * polarity.index_select(0, which) / length
     error = torch.where(on_frame, cos.clamp(-1, 1).acos() / torch.pi, 0.5)  # 0.5: neither for nor against
-    return Samples(which, xy, g, error)
+    return Samples(which, xy, torch.stack([gx, gy]).mT, error)
 
 
 def score(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> Candidates:
@@ -120,9 +122,8 @@ def false_alarms(grad: Gradient, error: Tensor, of: Tensor, count: int) -> tuple
     ellipses, (h w)^(5/2): five parameters, each with as many values as the frame has pixels on a side.
     """
     _, height, width = grad.shape
-    size, k, on_arc = segment_sum(
-        torch.stack([torch.ones_like(error), error, (error < _COVER_ERROR).double()], -1), of, count
-    ).unbind(-1)
+    size = torch.bincount(of, minlength=count).double()
+    k, on_arc = segment_sum(error, of, count), segment_sum((error < _COVER_ERROR).double(), of, count)
     log_tests = 2.5 * math.log10(max(1, height * width))
     log10_nfa = log_tests + size * k.clamp_min(1e-12).log10() - torch.lgamma(size + 1) / math.log(10)
     return log10_nfa, on_arc / size.clamp_min(1)

@@ -75,17 +75,39 @@ def points_on(ellipse: Tensor, angle: Tensor) -> Tensor:
     return torch.stack([cx + cos * x - sin * y, cy + sin * x + cos * y], -1)
 
 
+def boundary(ellipses: Tensor, index: Tensor, angle: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Points x, y (S,) of ellipses (M, 5) and the outward unit normals nx, ny (S,) there, for samples of them.
+
+    Args:
+        index: (S,) int64, whose sample. angle: (S,), eccentric anomaly, counted from the major axis.
+    """
+    theta = ellipses[:, 4]
+    each = (*ellipses[:, :4].unbind(-1), theta.cos(), theta.sin())
+    cx, cy, a, b, cos, sin = (v.contiguous().index_select(0, index) for v in each)
+    c, s = angle.cos(), angle.sin()
+    x, y, p, q = a * c, b * s, b * c, a * s
+    scale = (p * p + q * q).rsqrt()
+    p, q = p * scale, q * scale
+    return cx + cos * x - sin * y, cy + sin * x + cos * y, cos * p - sin * q, sin * p + cos * q
+
+
 def signed_distance(ellipse: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     """First-order (Sampson's) distances (...) of points (..., 2) outside ellipses (..., 5), and unit normals (..., 2).
 
     The normals point outwards, across the conic of the same centre and proportions through each point.
     """
-    a, b, c, d, e, f = conic_from_ellipse(ellipse).unbind(-1)
-    x, y = points.unbind(-1)
+    value, normal = conic_distance(conic_from_ellipse(ellipse).unbind(-1), points.unbind(-1))
+    return value, torch.stack(normal, -1)
+
+
+def conic_distance(conic: tuple[Tensor, ...], point: tuple[Tensor, ...]) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+    """The same from the six coefficients (...) of conics, negative inside, and the two coordinates (...) of points."""
+    a, b, c, d, e, f = conic
+    x, y = point
     px, py = 2 * a * x + b * y + d, b * x + 2 * c * y + e
-    steep = torch.hypot(px, py)
+    steep = torch.sqrt(px * px + py * py)
     value = 0.5 * ((px + d) * x + (py + e) * y) + f
-    return value / steep, torch.stack([px, py], -1) / steep[..., None]
+    return value / steep, (px / steep, py / steep)
 
 
 def perimeter(ellipse: Tensor) -> Tensor:

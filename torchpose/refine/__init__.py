@@ -4,6 +4,6 @@ from torchpose.refine.centers import refine_centers
 from torchpose.refine.edges import refine_edges
 from torchpose.refine.photometric import refine_photometric
 from torchpose.refine.result import Refined
-from torchpose.refine.two_solutions import decide
+from torchpose.refine.two_solutions import decide, decide_on_grey
 
-__all__ = ["Refined", "decide", "refine_centers", "refine_edges", "refine_photometric"]
+__all__ = ["Refined", "decide", "decide_on_grey", "refine_centers", "refine_edges", "refine_photometric"]

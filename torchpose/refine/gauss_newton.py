@@ -15,14 +15,15 @@ from torch import Tensor
 
 from torchpose.geometry.segments import segment_mean, segment_sum
 
-POSE, LEVELS = 7, 6  # unknowns of a frame (translation, rotation, blur) and of a marker
+POSE, LEVELS = 7, 6  # unknowns of a frame (translation, rotation, blur) and of a marker, at least
 QUANTISATION = 1 / 12  # variance of rounding, in grey levels^2, below which no noise estimate falls
 _GRADIENTS = (1, 2, 4, 5)  # among the levels
+_CURVATURES = (6, 7, 8, 9, 10, 11)  # where there are any
 _LEAST_WIDTH = 0.01  # variance of the prior over that of a gradient's noise: as good as none
 
 
 class Step(NamedTuple):
-    """pose: (N, 7). levels: (K, 6). information: (N, 7, 7) at unit noise, levels eliminated. variance: (N,)."""
+    """pose: (N, 7). levels: (K, L). information: (N, 7, 7) at unit noise, levels eliminated. variance: (N,)."""
 
     pose: Tensor
     levels: Tensor
@@ -36,25 +37,26 @@ def gauss_newton_step(
     """Step towards the least squares of the residuals and of the priors.
 
     Args:
-        sums: (K, 14, 14), of every marker, weight times products of the derivatives by pose (7) and levels (6) and the
-            residual. used: (K,) sum of weights. levels: (K, 6) so far.
+        sums: (K, 8 + L, 8 + L), of every marker, weight times products of the derivatives by pose (7) and levels (L)
+            and the residual. used: (K,) sum of weights. levels: (K, L) so far, L = 6, or 12 with the light's curvature.
         row: (K,) int64, frame of every marker, of ``rows`` N. known: (N, 7, 7) prior information about the pose;
             moved: (N, 7), how far the pose is from the prior's.
     """
     count = torch.bincount(row, minlength=rows)
     chi2 = segment_sum(sums[:, -1, -1], row, rows)
-    freedom = segment_sum(used, row, rows) - POSE - LEVELS * count
+    freedom = segment_sum(used, row, rows) - POSE - levels.shape[1] * count
     variance = (chi2 / freedom.clamp_min(1)).clamp_min(QUANTISATION)
     known = known * variance[:, None, None]
     pull = (known @ moved[..., None]).squeeze(-1)
     free, scatter = _solve_step(sums, torch.zeros_like(levels), levels, row, rows, known, pull)
-    gradients = (levels + free.levels)[:, _GRADIENTS]
-    noise = variance[row, None] * scatter[:, _GRADIENTS]
-    mean_noise = segment_mean(noise.mean(-1), row, rows)
-    excess = segment_mean(gradients.square().mean(-1), row, rows) - mean_noise
-    width2 = excess.clamp_min(_LEAST_WIDTH * mean_noise)
     precision = torch.zeros_like(levels)
-    precision[:, _GRADIENTS] = (variance / width2.clamp_min(1e-12))[row, None]
+    for group in (_GRADIENTS, _CURVATURES) if levels.shape[1] > LEVELS else (_GRADIENTS,):
+        gradients = (levels + free.levels)[:, group]
+        noise = variance[row, None] * scatter[:, group]
+        mean_noise = segment_mean(noise.mean(-1), row, rows)
+        excess = segment_mean(gradients.square().mean(-1), row, rows) - mean_noise
+        width2 = excess.clamp_min(_LEAST_WIDTH * mean_noise)
+        precision[:, group] = (variance / width2.clamp_min(1e-12))[row, None]
     held, _ = _solve_step(sums, precision, levels, row, rows, known, pull)
     return held._replace(variance=variance)
 
@@ -62,7 +64,7 @@ def gauss_newton_step(
 def _solve_step(
     sums: Tensor, precision: Tensor, levels: Tensor, row: Tensor, rows: int, known: Tensor, pull: Tensor
 ) -> tuple[Step, Tensor]:
-    """Step under a prior of ``precision`` (K, 6) about levels of 0, and variances (K, 6) of the levels at unit noise.
+    """Step under a prior of ``precision`` (K, L) about levels of 0, and variances (K, L) of the levels at unit noise.
 
     The variance of the residuals is left at 1.
     """
@@ -71,9 +73,9 @@ def _solve_step(
     ridge = 1e-9 * bb.diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True) + 1e-12
     bb = bb + torch.diag_embed(ridge + precision)
     gb = gb - precision * levels
-    eye = torch.eye(LEVELS, dtype=bb.dtype, device=bb.device).expand_as(bb)
+    eye = torch.eye(bb.shape[-1], dtype=bb.dtype, device=bb.device).expand_as(bb)
     by_pose, alone, inverse = torch.linalg.solve(bb, torch.cat([nb.mT, gb[..., None], eye], -1)).split(
-        [POSE, 1, LEVELS], -1
+        [POSE, 1, bb.shape[-1]], -1
     )
     information = segment_sum(nn - nb @ by_pose, row, rows) + known
     right = segment_sum(gn - (nb @ alone).squeeze(-1), row, rows) - pull

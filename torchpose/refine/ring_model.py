@@ -18,42 +18,57 @@ from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.geometry.rotations import plane_axes
+from torchpose.geometry.segments import values_at
 from torchpose.refine.band import band_pixels
 
 _FULL_SCALES = (255.0, 1023.0, 4095.0, 16383.0, 65520.0, 65535.0)  # of 8 to 16 bits; 12 bits in the upper ones of 16
+_DEEP = 0.7  # of the radius of curvature: nearer to its centre a pixel sees edges on all sides
+_BENT = 0.4  # of a distance from an edge: the most that its second-order term may be
+_FAR = 3.5  # standard deviations of the blur from an edge, from where on neither matters
 
 
 @dataclass(frozen=True, eq=False)
 class PixelBlocks:
     """Pixels of K markers, padded to P; one plane of numbers (K, P) for every component.
 
-    row: (K,) int64. ray_x, ray_y: on the plane z = 1. warp: 4 planes, d(ray)/d(pixel) row by row. grey, valid.
-    center, normal: (K, 3), target frame. radii: (K, 2). limits: (K, 2), the grey levels at which the frame's noise is
-    clipped, -inf and inf where it is not.
+    row: (K,) int64. origin: (K, 2), a ray near each marker, on the plane z = 1. ray_x, ray_y: the pixels', from there.
+    warp: 4 planes, d(ray)/d(pixel) row by row. grey, valid. size: (K,) int64, pixels of each marker; what follows in
+    its row repeats the last one and is not valid. center, normal: (K, 3), target frame. radii: (K, 2). limits: (K, 2),
+    the grey levels at which the frame's noise is clipped, -inf and inf where it is not.
     """
 
     row: Tensor
+    origin: Tensor
     ray_x: Tensor
     ray_y: Tensor
     warp: tuple[Tensor, ...]
     grey: Tensor
     valid: Tensor
+    size: Tensor
     center: Tensor
     normal: Tensor
     radii: Tensor
     limits: Tensor
 
-    def every(self, nth: int) -> PixelBlocks:
-        """The same with one pixel of ``nth``."""
-        planes = {n: getattr(self, n)[:, ::nth].contiguous() for n in ("ray_x", "ray_y", "grey", "valid")}
-        return replace(self, **planes, warp=tuple(w[:, ::nth].contiguous() for w in self.warp))
+    def every(self, nth: int, most: int | None = None) -> PixelBlocks:
+        """The same with one pixel of ``nth``, or as many fewer as leave ``most`` of each marker."""
+        count = self.grey.shape[1] // nth
+        count = count if most is None else min(count, most)
+        i = torch.arange(count, device=self.row.device)
+        index = i * self.size.clamp_min(nth * count)[:, None] // count
+        inside = index < self.size[:, None]
+        index = index.minimum((self.size[:, None] - 1).clamp_min(0))
+        planes = {n: getattr(self, n).gather(1, index) for n in ("ray_x", "ray_y", "grey", "valid")}
+        planes["valid"] *= inside
+        return replace(self, **planes, warp=tuple(w.gather(1, index) for w in self.warp))
 
 
 class RingModel(NamedTuple):
     """Prediction and derivatives at one pose; planes (K, P) in float32.
 
     fraction: of paper, F. by_d, by_q: dF/dd through both circles, dF/dq. by_pose: 6 planes, derivative of d.
-    x, y: plane coordinates over the outer radius.
+    x, y: plane coordinates over the outer radius. sound: bool, False where the expansions below do not hold: deep in
+    a hole that is small for its blur, or where it is flat; None if not asked for.
     """
 
     fraction: Tensor
@@ -62,6 +77,7 @@ class RingModel(NamedTuple):
     by_pose: tuple[Tensor, ...]
     x: Tensor
     y: Tensor
+    sound: Tensor | None
 
 
 def gather_pixels(
@@ -84,33 +100,43 @@ def gather_pixels(
     row, marker = mask.nonzero().unbind(-1)
     both = rings[row, marker]  # (K, 2, 5)
     block, u, v = band_pixels(both[:, 0], both[:, 1], band[row], height, width)
-    uv = torch.stack([u, v], -1).double()
+    if block.numel() == 0:  # of rings beyond the frame: one pixel that does not count
+        block, u, v = (torch.zeros(min(1, row.numel()), dtype=torch.int64, device=frames.device) for _ in range(3))
     count = row.numel()
     size = torch.bincount(block, minlength=count)
     most = (int(size.max()) // grain + 1) * grain if count else grain
-    start = torch.arange(count, device=block.device) * most - (size.cumsum(0) - size)
-    place = torch.arange(block.numel(), device=block.device) + start[block]
+    first = size.cumsum(0) - size
+    place = torch.arange(most, device=block.device)
+    inside = place < size[:, None]
+    index = (first[:, None] + torch.minimum(place, (size[:, None] - 1).clamp_min(0))).clamp_max(block.numel() - 1)
 
-    def padded(values: Tensor, dtype: torch.dtype = torch.float64) -> Tensor:
-        out = torch.zeros(count * most, dtype=dtype, device=frames.device)
-        return out.index_copy_(0, place, values.to(dtype)).view(count, most)
+    def padded(values: Tensor) -> Tensor:
+        return values.float().index_select(0, index.flatten()).view_as(index)
 
-    xy = camera.undistort_points(uv)
-    grey = frames.reshape(-1)[(frame[row[block]] * height + v) * width + u].float()
-    limits = _clipping(grey, row[block], frame.numel())[row]
+    of = row.index_select(0, block)
+    grey = values_at(frames, (frame.index_select(0, of) * height + v) * width + u)
+    limits = _clipping(grey, of, frame.numel())[row]
+    low, high = (limit.contiguous().index_select(0, block) for limit in limits.unbind(-1))
+    xy = camera.undistort_points(torch.stack([u, v]).double().mT)
+    x, y = xy.unbind(-1)
     # what is clipped is no measurement
-    sound = xy.isfinite().all(-1) & grey.isfinite() & (grey > limits[block, 0]) & (grey < limits[block, 1])
-    xy = torch.where(sound[:, None], xy, 0.0)
-    j00, j01, j10, j11 = camera.J_distort(xy).flatten(-2).unbind(-1)
+    sound = (x + y).isfinite() & grey.isfinite() & (grey > low) & (grey < high)
+    # rays count from that of the marker's middle pixel; what is not sound gets one of the marker, too, and stays finite
+    origin = xy.index_select(0, (first + size // 2).clamp_max(block.numel() - 1)).nan_to_num(nan=0.0)
+    x0, y0 = (o.contiguous().index_select(0, block) for o in origin.unbind(-1))
+    aside = (both[:, 0, 2] / camera.matrix[0, 0].to(x)).index_select(0, block)
+    x, y = (torch.where(sound, ray - start, aside) for ray, start in ((x, x0), (y, y0)))
+    j00, j01, j10, j11 = camera.slopes((x0 + x).float(), (y0 + y).float())
     det = j00 * j11 - j01 * j10
-    warp = tuple(padded(w / det, torch.float32) for w in (j11, -j01, -j10, j00))
     return PixelBlocks(
         row,
-        padded(xy[:, 0]),
-        padded(xy[:, 1]),
-        warp,
-        padded(torch.where(sound, grey, 0.0), torch.float32),
-        padded(sound, torch.float32),
+        origin,
+        padded(x),
+        padded(y),
+        tuple(padded(w / det) for w in (j11, -j01, -j10, j00)),
+        padded(torch.where(sound, grey, 0.0)),
+        padded(sound) * inside,
+        size,
         centers[row, marker],
         normals[row, marker],
         radii[row, marker],
@@ -128,8 +154,11 @@ def _clipping(grey: Tensor, row: Tensor, rows: int) -> Tensor:
     return torch.stack([low, torch.where(full, brightest, torch.inf)], -1)
 
 
-def ring_model(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor) -> RingModel:
-    """Predicts every pixel. The radius in the plane is formed in float64, what is small beside it in float32."""
+def ring_model(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor, *, check: bool = False) -> RingModel:
+    """Predicts every pixel, and with ``check`` says where that is sound.
+
+    The radius in the plane is formed in float64, what is small beside it in float32.
+    """
     rk = r[b.row]
     normal = (rk @ b.normal[..., None]).squeeze(-1)
     arm = (rk @ b.center[..., None]).squeeze(-1)  # marker's centre about the target's origin, camera axes
@@ -139,24 +168,30 @@ def ring_model(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor) -> RingModel:
     def scalar(value: Tensor) -> Tensor:
         return value[:, None]
 
-    def along(axis: Tensor) -> Tensor:
-        return scalar(axis[:, 0]) * b.ray_x + scalar(axis[:, 1]) * b.ray_y + scalar(axis[:, 2])
+    # the ray of the pixel meets the plane at depth * ray; coordinates there, about the circle's centre, are quotients
+    # of linear functions of the ray, which counts from a ray near the marker, so that float32 holds it
+    away = (normal * center).sum(-1, keepdim=True)
+    near = torch.nn.functional.pad(b.origin, (0, 1), value=1.0)
+    over = (normal * near).sum(-1, keepdim=True)
 
-    # the ray of the pixel meets the plane at depth * ray; coordinates about the circle's centre
-    toward = 1 / along(normal)
-    depth = scalar((normal * center).sum(-1)) * toward
-    one_c, two_c = scalar((one * center).sum(-1)), scalar((two * center).sum(-1))
-    x, y = depth * along(one) - one_c, depth * along(two) - two_c
-    radius = torch.hypot(x, y).clamp_min(1e-9)
+    def linear(vector: Tensor) -> Tensor:
+        at_x, at_y, _ = (scalar(c) for c in (vector / over).unbind(-1))
+        return (vector * near).sum(-1, keepdim=True) / over + at_x * b.ray_x + at_y * b.ray_y
+
+    one_c, two_c = (one * center).sum(-1, keepdim=True), (two * center).sum(-1, keepdim=True)
+    toward = 1 / linear(normal)
+    x, y = linear(away * one - one_c * normal) * toward, linear(away * two - two_c * normal) * toward
+    radius = (x * x + y * y).sqrt().clamp_min(1e-9)
     outer, inner = ((radius - scalar(size)).float() for size in b.radii.unbind(-1))
 
-    x, y, radius, depth, toward = (v.float() for v in (x, y, radius, depth, toward))
+    x, y, radius, toward = (v.float() for v in (x, y, radius, toward / over))
+    depth, over_away = away.float() * toward, 1 / away.float()
     one_c, two_c, q = one_c.float(), two_c.float(), scalar(blur[b.row]).float()
     axes = [[scalar(c).float() for c in v.unbind(-1)] for v in (one, two, normal, arm)]
     (ax, ay, az), (bx, by, bz), (nx, ny, nz), (cx, cy, cz) = axes
     ex, ey = x / radius, y / radius
     # a displacement w of the ray's foot, or of the plane against it, changes the radius by m . w
-    s = (radius + ex * one_c + ey * two_c) / depth * toward
+    s = (radius + ex * one_c + ey * two_c) * over_away
     mx, my, mz = ex * ax + ey * bx - s * nx, ex * ay + ey * by - s * ny, ex * az + ey * bz - s * nz
     w00, w01, w10, w11 = b.warp
     gu, gv = mx * w00 + my * w10, mx * w01 + my * w11  # gradient of the radius in the image, over the depth
@@ -168,13 +203,18 @@ def ring_model(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor) -> RingModel:
     # to second order in the distance: along the image's normal the radius bends where that normal is oblique in the
     # plane, and by perspective; both as second over first derivative, 1/px, halved
     nu, nv = gu * flat, gv * flat
-    side = (ex * two_c - ey * one_c) / depth * toward
+    side = (ex * two_c - ey * one_c) * over_away
     hx, hy = ex * bx - ey * ax - side * nx, ex * by - ey * ay - side * ny  # as m, but across the radius
     oblique = (hx * w00 + hy * w10) * nu + (hx * w01 + hy * w11) * nv
     recede = ((nx * w00 + ny * w10) * nu + (nx * w01 + ny * w11) * nv) * toward
     second = 0.5 * oblique.square() * depth * flat / radius - recede
     d_outer, d_inner = outer * per_mm, inner * per_mm
+    straight = d_inner
     d_outer, d_inner = d_outer + second * d_outer.square(), d_inner + second * d_inner.square()
+    sound = None
+    if check:
+        near = (-bend * straight < _DEEP) & ((second * straight).abs() < _BENT)
+        sound = near | (d_inner.abs() > _FAR * q)
     pull = 0.5 * q * bend
     z_outer, z_inner = d_outer / q + pull, d_inner / q + pull
     square = square_cumulant(nu, nv, q)
@@ -190,6 +230,7 @@ def ring_model(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor) -> RingModel:
         by_pose,
         x / size,
         y / size,
+        sound,
     )
 
 

@@ -1,0 +1,122 @@
+"""What the grey values around a ring say of a pose: the check by sectors, and the second fit of doubtful rows."""
+
+from __future__ import annotations
+
+import torch
+from exact import F64, exact_ellipses, pinhole, random_poses
+from torch import Tensor
+
+from torchpose.geometry import rotations
+from torchpose.refine import Refined, refine_photometric
+from torchpose.refine.grey_chi2 import grey_chi2
+from torchpose.refine.sectors import SECTORS, Sectors, away_from_unclear, doubtful, trust
+from torchpose.sim import add_noise, render, shapes
+from torchpose.target import Target
+
+CAMERA = pinhole()
+QUAD = Target.load("quad40")
+
+
+def arguments(frames: Tensor, r: Tensor, t: Tensor, off: float = 1e-2) -> tuple[object, ...]:
+    """Of `refine_photometric`, from a start that is off by ``off`` mm."""
+    g, count = torch.Generator().manual_seed(5), len(r)
+    start = t + off * torch.randn(count, 3, dtype=F64, generator=g)
+    model = (x.expand(count, *x.shape) for x in (QUAD.centers, QUAD.normals, QUAD.radii))
+    mask = torch.ones(count, len(QUAD), dtype=torch.bool)
+    return (frames, CAMERA, torch.arange(count), r, start, mask, exact_ellipses(QUAD, CAMERA, r, t), *model)
+
+
+def nees(result: Refined, r: Tensor, t: Tensor) -> Tensor:
+    e = torch.cat([result.t - t, rotations.log(result.R @ r.mT)], -1)
+    return (e[:, None] @ torch.linalg.inv(result.covariance) @ e[..., None]).flatten()
+
+
+def random_sectors(markers: int, tau: float = 0.0) -> Sectors:
+    """Sums as noise of 1 leaves them, where edges are displaced at random, by ``tau`` px in cells of four sectors."""
+    g = torch.Generator().manual_seed(3)
+    hold = 50 + 100 * torch.rand(markers, 2 * SECTORS, generator=g)
+    shift = tau * torch.randn(markers, SECTORS // 2, generator=g).repeat_interleave(4, 1)
+    pull = hold * shift + hold.sqrt() * torch.randn(hold.shape, generator=g)
+    count = torch.full_like(hold, 60)
+    return Sectors(count, count, count, pull, hold, torch.zeros(markers, 1, dtype=torch.int64))
+
+
+def test_trust_finds_the_variance_of_the_displacements() -> None:
+    """Edges that scatter by 0.05 px: weights are 1 / (v + tau^2) on average, and near 1 where there is noise alone."""
+    clear = torch.ones(40, 2 * SECTORS, dtype=torch.bool)
+    one = torch.ones(40)
+    assert trust(random_sectors(40), clear, one).mean() > 0.9
+    s = random_sectors(40, tau=0.05)
+    weight = trust(s, clear, one)
+    hold = s.hold.unflatten(1, (-1, 4)).sum(-1).repeat_interleave(4, 1)
+    expected = 1 / (1 + 0.05**2 * hold)
+    used = weight > 0
+    assert used.float().mean() > 0.9
+    assert abs(float((weight / expected)[used].mean()) - 1) < 0.2
+
+
+def test_doubt_needs_more_than_noise() -> None:
+    clear, one = torch.ones(4, 2 * SECTORS, dtype=torch.bool), torch.ones(4)
+    row, step = torch.zeros(4, dtype=torch.int64), torch.full((1,), 7.0, dtype=F64)
+    six = torch.full((1,), 6.0, dtype=F64)
+    assert not doubtful(random_sectors(4), clear, one, row, step, six).any()
+    assert doubtful(random_sectors(4, tau=0.05), clear, one, row, step, six).all()
+    # a step of 200 is noise where it comes from one pixel of twenty, not where it comes from one of six
+    assert doubtful(random_sectors(4), clear, one, row, step + 193, six).all()
+    assert not doubtful(random_sectors(4), clear, one, row, step + 193, six + 14).any()
+    covered = clear.clone()
+    covered[2, SECTORS : SECTORS + 5] = False
+    assert doubtful(random_sectors(4), covered, one, row, step, six).all()
+
+
+def test_runs_of_unclear_sectors_take_their_neighbours() -> None:
+    clear = torch.ones(1, 2 * SECTORS, dtype=torch.bool)
+    clear[0, [0, SECTORS - 1, SECTORS + 20]] = (
+        False  # a run across the seam of the inner circle, one alone on the outer
+    )
+    lost = (~away_from_unclear(random_sectors(1), clear))[0].nonzero()[:, 0].tolist()
+    assert lost == [0, 1, SECTORS - 2, SECTORS - 1, SECTORS + 20]
+
+
+def test_curved_light_and_a_glare_leave_no_false_certainty() -> None:
+    """Large rings in light that falls by 1 / distance^2, and a bright spot whose tail lies over one of them."""
+    r, t = random_poses(4, 40, (80, 90), seed=3)
+    frames = render(CAMERA, QUAD, r, t, psf_sigma=1.2)
+    v, u = torch.meshgrid(torch.arange(CAMERA.height), torch.arange(CAMERA.width), indexing="ij")
+    light = 1 / (1 + ((u - 0.2 * CAMERA.width) ** 2 + v**2) / CAMERA.width**2)
+    ring = exact_ellipses(QUAD, CAMERA, r, t)[:, 0, 0]
+    away = (u - ring[:, 0, None, None] - ring[:, 2, None, None]).square() + (v - ring[:, 1, None, None]).square()
+    glare = 150 * torch.exp(-away / (0.5 * ring[:, 2, None, None]).square())
+    result = refine_photometric(*arguments(add_noise((frames * light + glare).float(), 1.0), r, t))
+    assert result.good.all()
+    assert nees(result, r, t).max() < 25
+
+
+def test_blurred_rings_under_a_cover_start_at_their_own_grey() -> None:
+    """No pixel shows the ring's own grey, and a third of two rings is covered by paper: levels must not bend to it."""
+    target = Target.load("quad40_dark")
+    r, t = random_poses(4, 30, (300, 320), seed=4)
+    cover = shapes.cat(
+        [shapes.rectangle((x + 4.5, y), 4.0, 12.0, 0.0, 35.0) for x, y, _ in target.centers[2:].tolist()]
+    )
+    frames = render(CAMERA, target, r, t, psf_sigma=2.5, covers=cover)
+    result = refine_photometric(*arguments(add_noise(frames, 2.0), r, t))
+    assert (result.good & (result.kept > 0.7)).all()
+    assert nees(result, r, t).max() < 30
+
+
+def test_grey_values_tell_a_tilt_from_its_mirror_image() -> None:
+    """Chi-squared of the mirrored tilt less that of the true one, far beyond noise, and the opposite when swapped."""
+    r, t = random_poses(4, 40, (300, 320), seed=6)
+    frames = add_noise(render(CAMERA, QUAD, r, t, psf_sigma=0.8), 2.0)
+    given = arguments(frames, r, t)
+    right = refine_photometric(*given)
+    line = torch.nn.functional.normalize(t, dim=-1)
+    flip = torch.eye(3, dtype=F64) - 2 * line[:, :, None] * line[:, None]
+    normal = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=F64))
+    mirrored = Refined(flip @ r @ normal, t, right.covariance, right.blur, right.noise, right.kept, right.good)
+    judged = (*given[:3], *given[5:])
+    chi2, explained = grey_chi2(*judged, right, mirrored)
+    assert (chi2 > 20).all()
+    assert explained[:, 0].all()
+    torch.testing.assert_close(grey_chi2(*judged, mirrored, right)[0], -chi2)
