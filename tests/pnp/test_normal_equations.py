@@ -12,7 +12,7 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.geometry import rotations
 from torchpose.geometry.small_linalg import matmul3
-from torchpose.pnp.iterative import minimise
+from torchpose.pnp.iterative import _proposal, minimise
 from torchpose.pnp.normal_equations import (
     COST,
     STARTS,
@@ -132,6 +132,24 @@ def test_minima_out_of_the_question_are_left_where_this_is_sure() -> None:
     torch.testing.assert_close(left.pose[..., 0], start[..., 0], rtol=0, atol=0)
     torch.testing.assert_close(left.normal[COST, 0], cost[0])
     torch.testing.assert_close(left.normal[COST, 1:], least[1:])
+
+
+def test_a_minimum_is_not_ruled_out_by_a_step_cut_short() -> None:
+    """Rejected steps raise the damping until they promise little: such a pose went round in a circle."""
+    obs, pose = setting("own")
+    p = camera_points(obs, pose)
+    obs = obs._replace(xy=p[:2] / p[2] + 1e-2 * obs.xy)
+    normal = normal_equations(obs, moved(pose, torch.full((6, BATCH), 0.05, dtype=F64)), newton=True)
+    damping = torch.full((BATCH,), 1e4, dtype=F64)
+    step, decrease, _ = damped_step(normal, damping)
+    enough = normal[COST] - 100 * decrease
+    trial, promised, done = _proposal(
+        pose, normal[COST], damping, step, decrease, 1e-12, 0 * damping, enough - decrease
+    )
+    assert not bool(done.any())
+    assert bool((promised > 0).all()) and not torch.equal(trial, pose)
+    _, promised, done = _proposal(pose, normal[COST], 1e-4 * damping, step, decrease, 1e-12, 0 * damping, enough)
+    assert bool(done.all()) and not bool(promised.any())
 
 
 def test_step_of_few_and_of_many_poses_is_the_same() -> None:

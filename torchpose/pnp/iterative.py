@@ -106,10 +106,10 @@ def _proposal(
     enough: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Next trial, its promised decrease, and are we done? No step for poses that are sure to stay above ``enough``."""
-    trial = moved(pose, step)
-    left = cost - RESERVE * decrease > enough
+    trial, sure = moved(pose, step), damping <= 1  # a step that is cut short promises little, wherever it is
+    left = sure & (cost - RESERVE * decrease > enough)
     trial, decrease = torch.where(left, pose, trial), torch.where(left, 0, decrease)
-    return trial, decrease, (decrease <= rtol * cost + floor) & (damping <= 1) & (cost < torch.inf)
+    return trial, decrease, sure & (decrease <= rtol * cost + floor) & (cost < torch.inf)
 
 
 def settled(pose: Tensor, normal: Tensor, trial: Tensor, decrease: Tensor, done: Tensor) -> tuple[Tensor, Tensor]:
