@@ -147,9 +147,11 @@ def test_a_minimum_is_not_ruled_out_by_a_step_cut_short() -> None:
         pose, normal[COST], damping, step, decrease, 1e-12, 0 * damping, enough - decrease
     )
     assert not bool(done.any())
-    assert bool((promised > 0).all()) and not torch.equal(trial, pose)
+    assert bool((promised > 0).all())
+    assert not torch.equal(trial, pose)
     _, promised, done = _proposal(pose, normal[COST], 1e-4 * damping, step, decrease, 1e-12, 0 * damping, enough)
-    assert bool(done.all()) and not bool(promised.any())
+    assert bool(done.all())
+    assert not bool(promised.any())
 
 
 def test_step_of_few_and_of_many_poses_is_the_same() -> None:
