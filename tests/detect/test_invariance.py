@@ -125,6 +125,10 @@ def test_invariance_by_brute_force(bar: bool) -> None:
                 uv = mine.ellipse[:, :2] + torch.tensor([8.0 - right, 8.0 - down])
                 if change != "shift":
                     uv = changed(middle, mine.ellipse[:, :2], change)[1]
+                elif bar:  # of the covered ring the coarser octave sees other blocks: docs/detection.md, limits
+                    at = torch.tensor([70.0 - right, 145.0 - down])
+                    clear, there = (torch.linalg.vector_norm(v - at, dim=-1) > 40 for v in (uv, other.ellipse[:, :2]))
+                    mine, uv, other = mine[clear], uv[clear], other[there]
                 if not is_same(other, uv, mine.ellipse[:, 2:4]):
                     failed.append((first + k, change))
     assert not failed
