@@ -9,6 +9,7 @@ from torch import Tensor
 from torchpose.geometry import rotations
 from torchpose.refine import Refined, refine_photometric
 from torchpose.refine.grey_chi2 import grey_chi2
+from torchpose.refine.ring_model import Sight
 from torchpose.refine.sectors import SECTORS, Sectors, away_from_unclear, doubtful, trust
 from torchpose.sim import add_noise, render, shapes
 from torchpose.target import Target
@@ -116,7 +117,7 @@ def test_grey_values_tell_a_tilt_from_its_mirror_image() -> None:
     normal = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=F64))
     mirrored = Refined(flip @ r @ normal, t, right.covariance, right.blur, right.noise, right.kept, right.good)
     judged = (*given[:3], *given[5:])
-    chi2, explained = grey_chi2(*judged, right, mirrored)
+    chi2, explained = grey_chi2(Sight(*judged), right, mirrored)
     assert (chi2 > 20).all()
     assert explained[:, 0].all()
-    torch.testing.assert_close(grey_chi2(*judged, mirrored, right)[0], -chi2)
+    torch.testing.assert_close(grey_chi2(Sight(*judged), mirrored, right)[0], -chi2)

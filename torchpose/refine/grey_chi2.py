@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchpose.camera import Camera
 from torchpose.geometry.segments import segment_sum
 from torchpose.refine.band import band_width
 from torchpose.refine.gauss_newton import POSE, QUANTISATION, solve_ridged
@@ -20,24 +19,13 @@ from torchpose.refine.grey_levels import (
     sum_products,
 )
 from torchpose.refine.result import Refined
-from torchpose.refine.ring_model import gather_pixels, ring_model
+from torchpose.refine.ring_model import Sight, gather_pixels, ring_model
 from torchpose.refine.sectors import clear_sectors, misfit, sum_sectors
 
 _LEVEL_STEPS = 3  # of the grey levels alone
 
 
-def grey_chi2(
-    frames: Tensor,
-    camera: Camera,
-    frame: Tensor,
-    mask: Tensor,
-    rings: Tensor,
-    centers: Tensor,
-    normals: Tensor,
-    radii: Tensor,
-    one: Refined,
-    two: Refined,
-) -> tuple[Tensor, Tensor]:
+def grey_chi2(sight: Sight, one: Refined, two: Refined) -> tuple[Tensor, Tensor]:
     """Chi-squared (N,) of the grey values under the refined poses ``two`` less that under ``one``.
 
     Also whether each of the two (N, 2) explains most of the sectors of every marker, by a ring that is there.
@@ -45,12 +33,10 @@ def grey_chi2(
     Both are judged on the same pixels, those that either explains, each with grey levels of its own; no pixel counts
     for more than an outlier would. Where not even the better pose explains them within noise the difference counts
     for less, by as much as the displacements of its sectors exceed theirs.
-
-    Args: as in `refine_photometric`.
     """
-    rows = mask.shape[0]
+    rows = len(sight.frame)
     band = band_width(torch.maximum(one.blur, two.blur))
-    b = gather_pixels(frames, camera, frame, mask, rings, centers, normals, radii, band, TILE)
+    b = gather_pixels(sight, band, TILE)
     squares, weights, variances, misfits, explained = [], [], [], [], []
     for pose in (one, two):
         model = ring_model(b, pose.R, pose.t, pose.blur, check=True)

@@ -29,7 +29,7 @@ from torchpose.refine.grey_levels import (
     sum_products,
 )
 from torchpose.refine.result import Refined
-from torchpose.refine.ring_model import gather_pixels, ring_model
+from torchpose.refine.ring_model import Sight, gather_pixels, ring_model
 from torchpose.refine.sectors import away_from_unclear, clear_sectors, doubtful, sum_sectors, trust
 
 _COARSE = 6  # the first steps take one pixel of so many; both are whole numbers of tiles
@@ -69,9 +69,8 @@ def refine_photometric(
     none = torch.zeros(rows, 6, 6, dtype=torch.float64, device=rotation.device)
     known = none if prior is None else prior
     narrow = torch.full_like(start, BAND)
-    model = (centers, normals, radii)
-    where = (frames, camera, frame, mask, rings)
-    first, doubt = _refine(*where, *model, rotation, translation, start, narrow, known, most_coarse=_MOST_COARSE)
+    sight = Sight(frames, camera, frame, mask, rings, centers, normals, radii)
+    first, doubt = _refine(sight, rotation, translation, start, narrow, known, most_coarse=_MOST_COARSE)
     # a wide blur needs a wider band, or it takes the levels on both sides of the edge for its own
     wide = band_width(first.blur) > BAND + 1
     for thorough in (False, True):
@@ -79,8 +78,8 @@ def refine_photometric(
         if w.numel() == 0:
             continue
         band = torch.where(wide, band_width(first.blur), BAND)[w]
-        rest = (centers[w], normals[w], radii[w], rotation[w], translation[w], first.blur[w], band, known[w])
-        again, still = _refine(frames, camera, frame[w], mask[w], rings[w], *rest, thorough=thorough)
+        begin = (rotation[w], translation[w], first.blur[w], band, known[w])
+        again, still = _refine(sight.rows(w), *begin, thorough=thorough)
         good = again.good.nonzero()[:, 0]
         first = first.replaced(w[good], again[good])
         doubt = doubt.index_copy(0, w[good], still[good])
@@ -88,14 +87,7 @@ def refine_photometric(
 
 
 def _refine(
-    frames: Tensor,
-    camera: Camera,
-    frame: Tensor,
-    mask: Tensor,
-    rings: Tensor,
-    centers: Tensor,
-    normals: Tensor,
-    radii: Tensor,
+    sight: Sight,
     r: Tensor,
     t: Tensor,
     blur: Tensor,
@@ -110,7 +102,7 @@ def _refine(
     pose count for less, and there are more steps. ``most_coarse``: pixels of a marker in the coarse steps.
     """
     rows = r.shape[0]
-    blocks = gather_pixels(frames, camera, frame, mask, rings, centers, normals, radii, band, TILE * _COARSE)
+    blocks = gather_pixels(sight, band, TILE * _COARSE)
     coarse = blocks.every(_COARSE, most_coarse)
     levels = first_levels(coarse, r, t, blur)
     seen, of_them = (segment_sum(b.valid.sum(-1).double(), b.row, rows) for b in (blocks, coarse))

@@ -27,6 +27,23 @@ _BENT = 0.4  # of a distance from an edge: the most that its second-order term m
 _FAR = 3.5  # standard deviations of the blur from an edge, from where on neither matters
 
 
+class Sight(NamedTuple):
+    """N rows of markers seen in frames, and where; arguments as in `refine_photometric`."""
+
+    frames: Tensor
+    camera: Camera
+    frame: Tensor
+    mask: Tensor
+    rings: Tensor
+    centers: Tensor
+    normals: Tensor
+    radii: Tensor
+
+    def rows(self, index: Tensor) -> Sight:
+        """Some of the rows, in the same frames."""
+        return Sight(self.frames, self.camera, *(v[index] for v in self[2:]))
+
+
 @dataclass(frozen=True, eq=False)
 class PixelBlocks:
     """Pixels of K markers, padded to P; one plane of numbers (K, P) for every component.
@@ -80,22 +97,12 @@ class RingModel(NamedTuple):
     sound: Tensor | None
 
 
-def gather_pixels(
-    frames: Tensor,
-    camera: Camera,
-    frame: Tensor,
-    mask: Tensor,
-    rings: Tensor,
-    centers: Tensor,
-    normals: Tensor,
-    radii: Tensor,
-    band: Tensor,
-    grain: int,
-) -> PixelBlocks:
-    """The pixels within ``band`` (N,) px of either circle of every marker seen; arguments as in `refine_photometric`.
+def gather_pixels(sight: Sight, band: Tensor, grain: int) -> PixelBlocks:
+    """The pixels within ``band`` (N,) px of either circle of every marker seen.
 
     ``grain``: the padded length P is a multiple of it.
     """
+    frames, camera, frame, mask, rings, centers, normals, radii = sight
     height, width = frames.shape[-2:]
     row, marker = mask.nonzero().unbind(-1)
     both = rings[row, marker]  # (K, 2, 5)

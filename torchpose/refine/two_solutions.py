@@ -18,6 +18,7 @@ from torchpose.pose import AMBIGUOUS_CHI2, Evidence, Solutions, center_rms, shap
 from torchpose.refine.centers import refine_centers
 from torchpose.refine.grey_chi2 import grey_chi2
 from torchpose.refine.photometric import refine_photometric
+from torchpose.refine.ring_model import Sight
 from torchpose.results import Reason, Status
 
 _FLOOR = 0.03  # px, of a centre: what blur, covers and clutter do to it beyond its covariance
@@ -85,7 +86,7 @@ def decide_on_grey(
     t_alt = torch.where(alone[:, None], s.t[row], s.t_alt[row])
     start, model = (frames, camera, frame[row]), (mask, rings[row], e.points[row], e.normals[row], e.radii[row])
     one, two = (refine_photometric(*start, r, t, *model) for r, t in ((s.R[row], s.t[row]), (r_alt, t_alt)))
-    chi2, explained = grey_chi2(*start, *model, one, two)
+    chi2, explained = grey_chi2(Sight(*start, *model), one, two)
     swap = (chi2 < 0)[:, None]
     turn = rotations.log(two.R @ one.R.mT)
     apart = torch.cat([two.t - one.t, turn], -1)[..., None]
