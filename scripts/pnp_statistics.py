@@ -177,7 +177,7 @@ def fall(scenes: Scenes) -> Tensor:
     weights = scenes.sigma[:, None].pow(-2).expand(-1, count)
     inputs = Inputs(scenes.object_points, scenes.image_points, scenes.matrix, 1.0, None, weights, None, math.inf)
     problem = prepare(inputs)
-    poses = upright(starts(problem, problem.observed.to(torch.float32), compile=False).double())
+    poses = upright(starts(problem).double())
     normal = normal_equations(problem.observed.each(), poses)
     _, promised, _ = damped_step(normal)
     every = problem.observed.select(torch.arange(poses.shape[3]).repeat(2))

@@ -389,12 +389,3 @@ def test_compile_without_a_compiler_says_so(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.delenv("CXX", raising=False)
     with pytest.raises(ConfigError, match="compile: needs a C\\+\\+ compiler"):
         pnp.solve(SQUARE, pixels(views(SQUARE, 5)[2]), MATRIX, compile=True)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::DeprecationWarning:torch.*")
-def test_compiled_is_the_same() -> None:
-    image = pixels(views(SQUARE, 500, tilt_deg=(0, 75))[2], 0.1)
-    plain, fast = (pnp.solve(SQUARE, image, MATRIX, sigma_px=0.1, compile=c) for c in (False, True))
-    assert plain.code.tolist() == fast.code.tolist()
-    torch.testing.assert_close(fast.t[plain.converged], plain.t[plain.converged], rtol=1e-6, atol=1e-5)

@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from torchpose.geometry.small_linalg import orthonormalise
-from torchpose.pnp._compile import compiled
 from torchpose.pnp.iterative import RESERVE, Estimate, not_above, rounding, settled
 from torchpose.pnp.normal_equations import (
     COST,
@@ -32,33 +31,37 @@ EVALUATIONS = 3
 _RTOL = 1e-12
 
 
-class FirstPass(NamedTuple):
-    """Minima found; (B,) bool, is there a start? and where the better one may go on, (3, 4, B) of cost (B,) at most."""
+class Rest(NamedTuple):
+    """What `second_pass` has to know.
 
-    minima: Minima
-    ahead: Tensor
+    Attributes:
+        open: (B,) bool, is there a start that has not led to all that is wanted?
+        done: (B,) bool, has the better one arrived?
+        pose, fallback: (3, 4, B), where it has arrived, or where else it may go on. cost: (B,), what is known of it.
+        other: (3, 4, B), the other start. other_cost: (B,), infinite where there is none.
+        decided: (B,) bool, is enough known of the other one?
+    """
+
+    open: Tensor
+    done: Tensor
+    pose: Tensor
     fallback: Tensor
-    least: Tensor
+    cost: Tensor
+    other: Tensor
+    other_cost: Tensor
+    decided: Tensor
 
 
-def first_pass(
-    single: Observations, double: Observations, final: Observations, start: Tensor, compile: bool
-) -> FirstPass:
+def first_pass(single: Observations, double: Observations, final: Observations, start: Tensor) -> tuple[Minima, Rest]:
     """From starts (3, 4, S, B), S one or two; the observations without distortion in both dtypes, and as they are."""
-    # the distortion model is left to eager mode: its Python would be traced anew for every camera
-    fast = compile and final.camera is None
-    if fast:
-        single, double, final = (v._replace(sums=None) for v in (single, double, final))
-    begin = compiled(_begin) if fast else _begin
-    improve = compiled(_improve) if fast else _improve
-    finish = compiled(_finish) if fast else _finish
-    better, pose, least, other, other_cost, bound = begin(single.each(), start)
-    pose, newton = improve(single, double, pose)
-    found, normal, done, going, known, different, decided, count = finish(
+    better, pose, least, other, other_cost, bound = _begin(single.each(), start)
+    pose, newton = _improve(single, double, pose)
+    found, normal, done, going, known, different, decided, count = _finish(
         final, better, pose, newton, least, other_cost, bound
     )
-    minima = Minima(Estimate(found, normal, count, done), other, other_cost, different, decided)
-    return FirstPass(minima, least < torch.inf, going, known)
+    cost = torch.where(done, normal[COST], known)
+    rest = Rest((least < torch.inf) & ~(done & decided), done, found, going, cost, other, other_cost, decided)
+    return Minima(Estimate(found, normal, count, done), other, other_cost, different, decided), rest
 
 
 def _begin(obs: Observations, start: Tensor) -> tuple[Tensor, ...]:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchpose.pnp._compile import compiled, padded
+from torchpose.kernels import repeated, tracing
 from torchpose.pnp.normal_equations import (
     COST,
     Observations,
@@ -36,7 +36,11 @@ class Estimate(NamedTuple):
 
 
 class _State(NamedTuple):
-    """Poses under way: the best so far with Newton's matrix and damping, and the trial that comes next."""
+    """Poses under way: the best so far with Newton's matrix and damping, and the trial that comes next.
+
+    ``over`` (B,) bool: done, or without a prospect of it; these stay as they are, so that a pose does not depend on the
+    others of its batch.
+    """
 
     pose: Tensor
     normal: Tensor
@@ -44,6 +48,8 @@ class _State(NamedTuple):
     trial: Tensor
     decrease: Tensor
     done: Tensor
+    over: Tensor
+    iterations: Tensor
 
 
 def rounding(obs: Observations) -> Tensor:
@@ -60,32 +66,41 @@ def not_above(cost: Tensor, old: Tensor, floor: Tensor) -> Tensor:
     return cost <= old + 2 * (old * floor).sqrt() + floor
 
 
-def _advance(obs: Observations, state: _State, rtol: float, floor: Tensor, enough: Tensor) -> tuple[_State, Tensor]:
-    """Evaluates the trial poses, accepts those that lower the cost, and proposes the next damped step.
-
-    Poses that were done stay as they are, so that a pose does not depend on the others of its batch. (B,) bool: is
-    Newton's matrix positive definite, or is none needed? Where not, `_off_saddle` has the next step.
-    """
-    pose = state.trial
-    normal = normal_equations(obs, pose, newton=True)
+def _advance(state: _State, obs: Observations, rtol: float, floor: Tensor, enough: Tensor) -> tuple[_State, Tensor]:
+    """Evaluates the trial poses, accepts those that lower the cost, and proposes the next step. (B,): who goes on?"""
+    pose, normal = state.trial, normal_equations(obs, state.trial, newton=True)
     lower = not_above(normal[COST], state.normal[COST], floor)
-    accept = lower & ~state.done
-    if torch.compiler.is_compiling() or not bool(accept.all()):
+    accept = lower & ~state.over
+    if tracing() or not bool(accept.all()):
         pose, normal = torch.where(accept, pose, state.pose), torch.where(accept, normal, state.normal)
     # never so small that many rejections in a row would be needed to matter again
     damping = torch.where(lower, (0.1 * state.damping).clamp_min(1e-6), (10 * state.damping).clamp_min(1e-2))
+    cost = normal[COST]
     step, decrease, definite = damped_step(normal, damping)
-    trial, decrease, done = _proposal(pose, normal[COST], damping, step, decrease, rtol, floor, enough)
-    was = state.done
-    if torch.compiler.is_compiling() or bool(was.any()):
-        trial, decrease = torch.where(was, state.trial, trial), torch.where(was, state.decrease, decrease)
-    return _State(pose, normal, damping, trial, decrease, done | was), definite | was
+    trial, decrease, done = _proposal(pose, cost, damping, step, decrease, rtol, floor, enough)
+    if tracing():
+        bent = _off_saddle(obs, pose, cost, damping, rtol, floor, enough)
+        trial, decrease, done = (
+            torch.where(definite, a, b) for a, b in zip((trial, decrease, done), bent, strict=True)
+        )
+    elif not bool(definite.all()):
+        rows = (~(definite | state.over)).nonzero().squeeze(1)
+        some = obs.select(rows), pose[..., rows], cost[rows], damping[rows]
+        bent = _off_saddle(*some, rtol, floor[rows], enough[rows])
+        for whole, part in zip((trial, decrease, done), bent, strict=True):
+            whole.index_copy_(-1, rows, part)
+    if tracing() or bool(state.over.any()):
+        trial, decrease = (torch.where(state.over, *v) for v in ((state.trial, trial), (state.decrease, decrease)))
+        damping, done = torch.where(state.over, state.damping, damping), torch.where(state.over, state.done, done)
+    # neither a pose without numbers nor one whose steps have shrunk to nothing will come to an end
+    over = done | ~((damping < 1e8) & (cost < torch.inf))
+    return _State(pose, normal, damping, trial, decrease, done, over, state.iterations + ~state.over), ~over
 
 
 def _off_saddle(
     obs: Observations, pose: Tensor, cost: Tensor, damping: Tensor, rtol: float, floor: Tensor, enough: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """`_proposal` of Gauss-Newton, for poses at which the cost is no bowl.
+    """`_proposal` of Gauss-Newton, for poses at which Newton's matrix is not positive definite.
 
     Near a saddle its step is as small as the gradient and grows by half each time. So the step is stretched until it
     promises a tenth of the cost, unless such a one was rejected.
@@ -133,48 +148,37 @@ def minimise(
     A pose has converged when the step promises to lower its cost by no more than ``rtol`` of it, or than rounding
     could; that step is still taken. Converged poses leave the batch when a quarter of it is done.
     """
-    # the distortion model is left to eager mode: its Python would be traced anew for every camera
-    compile = compile and obs.camera is None
-    advance, off_saddle = _advance, _off_saddle
-    if compile:
-        advance, off_saddle, obs = compiled(_advance), compiled(_off_saddle), obs._replace(sums=None)
     floor = rounding(obs).expand(pose.shape[2:])
     if enough is None:
         enough = torch.full_like(pose[0, 0], torch.inf)
     unknown = pose.new_full((28, pose.shape[-1]), torch.inf)
     lam = torch.full_like(unknown[0], 1e-3)
-    # copies: torch.compile would make one more graph for tensors that are the same
-    state = _State(pose, unknown, lam, pose.clone(), lam.clone(), lam < 0)
+    none = lam < 0
+    state = _State(pose, unknown, lam, pose, lam, none, none, torch.zeros_like(none, dtype=torch.int64))
+    if compile:
+        return _ended(repeated(_advance)(max_iterations, state, obs, rtol, floor, enough))
     result: Estimate | None = None
     index: Tensor | None = None  # of the poses still under way; None: all
 
     for iteration in range(1, max_iterations + 1):
-        state, definite = advance(obs, state, rtol, floor, enough)
-        state = _State(*state)
-        if not bool(definite.all()):
-            rows = (~definite).nonzero().squeeze(1)
-            rows = padded(rows) if compile else rows
-            pose, cost, damping = state.pose[..., rows], state.normal[COST, rows], state.damping[rows]
-            proposal = off_saddle(obs.select(rows), pose, cost, damping, rtol, floor[rows], enough[rows])
-            for whole, part in zip((state.trial, state.decrease, state.done), proposal, strict=True):
-                whole.index_copy_(-1, rows, part)
-        # neither a pose without numbers nor one whose steps have shrunk to nothing will come to an end
-        over = state.done | ~((state.damping < 1e8) & (state.normal[COST] < torch.inf))
-        remaining = (~over).nonzero().squeeze(1)
+        state, going = _advance(state, obs, rtol, floor, enough)
+        remaining = going.nonzero().squeeze(1)
         last = iteration == max_iterations or len(remaining) == 0
-        if last or (len(over) > 64 and 4 * len(remaining) <= 3 * len(over)):
-            pose, normal = settled(state.pose, state.normal, state.trial, state.decrease, state.done)
+        if last or (len(going) > 64 and 4 * len(remaining) <= 3 * len(going)):
+            ended = _ended(state)
             if result is None or index is None:
-                count = torch.full_like(over, iteration, dtype=torch.int64)
-                result = Estimate(pose, normal, count, state.done)
+                result = ended
             else:
-                result.pose.index_copy_(-1, index, pose)
-                result.normal.index_copy_(-1, index, normal)
-                result.iterations.index_fill_(0, index, iteration)
-                result.converged.index_copy_(0, index, state.done)
+                for whole, part in zip(result, ended, strict=True):
+                    whole.index_copy_(-1, index, part)
             if last:
                 return result
             index = remaining if index is None else index[remaining]
             obs, floor, enough = obs.select(remaining), floor[remaining], enough[remaining]
             state = _State(*(v.index_select(-1, remaining) for v in state))
     raise AssertionError("unreachable: the last iteration returns")
+
+
+def _ended(state: _State) -> Estimate:
+    pose, normal = settled(state.pose, state.normal, state.trial, state.decrease, state.done)
+    return Estimate(pose, normal, state.iterations, state.done)

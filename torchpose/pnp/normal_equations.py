@@ -9,6 +9,7 @@ points, the sums over the points are one matrix product.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from typing import NamedTuple
@@ -18,7 +19,7 @@ from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.geometry.small_linalg import cayley, cross, matmul3, solve_rows
-from torchpose.pnp import scalar
+from torchpose.kernels import tracing
 
 # upper triangle of the 6 x 7 matrix [J^T J | J^T r] row by row, and the cost, packed in 28 numbers
 STARTS = (0, 7, 13, 18, 22, 25, 27)
@@ -31,8 +32,9 @@ _BR = (3, 6, 8)
 _FEW = 64
 
 
-class Sums(NamedTuple):
-    """What sums over points that all poses share are, as matrices.
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """What sums over points that all poses share are, as matrices. Compiled code has no use for them.
 
     Attributes:
         points: (N, 4) homogeneous: @ pose gives the points in the camera frame.
@@ -42,6 +44,9 @@ class Sums(NamedTuple):
     points: Tensor
     gauss: Tensor
     newton: Tensor
+
+    def to(self, dtype: torch.dtype) -> Sums:
+        return Sums(self.points.to(dtype), self.gauss.to(dtype), self.newton.to(dtype))
 
 
 class Observations(NamedTuple):
@@ -79,7 +84,7 @@ class Observations(NamedTuple):
 
     def to(self, dtype: torch.dtype) -> Observations:
         points, xy, whitening = (v.to(dtype) for v in (self.points, self.xy, self.whitening))
-        sums = None if self.sums is None else Sums(*(v.to(dtype) for v in self.sums))
+        sums = None if self.sums is None else self.sums.to(dtype)
         return self._replace(points=points, xy=xy, whitening=whitening, sums=sums)
 
 
@@ -101,7 +106,7 @@ def sums_of(points: Tensor) -> Sums:
 
 def camera_points(obs: Observations, pose: Tensor) -> Tensor:
     """(3, N, ...) of poses (3, 4, ...)."""
-    if obs.sums is not None:
+    if obs.sums is not None and not tracing():
         return (obs.sums.points @ pose.flatten(2)).unflatten(2, pose.shape[2:])
     x, y, z = obs.points
     p = torch.addcmul(pose[:, None, 3], pose[:, None, 0], x)
@@ -164,8 +169,6 @@ def normal_equations(obs: Observations, pose: Tensor, newton: bool = False, fine
     the point is -(du dz' + du' dz) / z; the distortion of a camera is taken as linear.
     ``fine`` as in `differentiate`: a step has then the accuracy of its dtype, but for an error in proportion to itself.
     """
-    if torch.compiler.is_compiling():
-        return scalar.normal_equations(obs, pose, newton, fine)
     z, rows, cost = differentiate(obs, pose, fine)
     u, v = rows.unbind(1)
     products = torch.empty((_PRODUCTS, *cost.shape), dtype=cost.dtype, device=cost.device)
@@ -182,7 +185,7 @@ def normal_equations(obs: Observations, pose: Tensor, newton: bool = False, fine
             for k in range(m, 3):
                 products[_BB[m][k]].addcmul_(gradient[m], depth[k], value=-1).addcmul_(depth[m], gradient[k], value=-1)
     products[9] = cost
-    if obs.sums is not None:
+    if obs.sums is not None and not tracing():
         sums = obs.sums.newton if newton else obs.sums.gauss
         normal = (sums @ products.flatten(0, 1).flatten(1)).unflatten(1, cost.shape[1:])
     else:
@@ -228,12 +231,8 @@ def damped_step(normal: Tensor, damping: Tensor | None = None) -> tuple[Tensor, 
 
     Where the matrix is not positive definite, the first two mean nothing.
     """
-    if torch.compiler.is_compiling():
-        x, diagonal = scalar.solve([list(row) for row in rows_of(normal)], damping)
-        terms = [x[i] * normal[start + 6 - i] for i, start in enumerate(STARTS[:6])]
-        return -torch.stack(x), sum(terms[1:], terms[0]), torch.stack([v > 0 for v in diagonal]).all(0)
     batch = normal.shape[1:]
-    if normal.device.type == "cpu" and batch.numel() <= _FEW:
+    if not tracing() and normal.device.type == "cpu" and batch.numel() <= _FEW:
         numbers = normal.index_select(0, _full(normal.device)).flatten(1)
         gradient = numbers[36:]
         if damping is not None:
@@ -261,8 +260,6 @@ def _full(device: torch.device) -> Tensor:
 
 def moved(pose: Tensor, step: Tensor) -> Tensor:
     """Poses [R C(w) | R d + t] (3, 4, ...) of steps (d, w) (6, ...), with Cayley's rotation C(w)."""
-    if torch.compiler.is_compiling():
-        return scalar.moved(pose, step)
     result = matmul3(pose[:, :3], torch.cat([cayley(step[3:]), step[:3, None]], 1))
     result[:, 3] += pose[:, 3]
     return result

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -10,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchpose.camera import Camera
-from torchpose.pnp.normal_equations import Observations, Sums, differentiate, product2, sums_of
+from torchpose.pnp.normal_equations import Observations, Sums, product2, sums_of
 from torchpose.pnp.planar import COLLINEARITY, FLATNESS, plane_frame
 
 
@@ -98,8 +97,7 @@ class Inputs:
         return None if self.mask is None else self.mask.reshape(-1, count).T.expand(count, batch)
 
 
-@dataclass(frozen=True)
-class Problem:
+class Problem(NamedTuple):
     """One chunk, batch last.
 
     Attributes:
@@ -110,7 +108,8 @@ class Problem:
         weight: (N, B), 1 for a point that was seen, 0 for one that was not; None: all were.
         seen: (B,), points seen.
         finite: (B,) bool.
-        calibration: of a pose (3, 4, B), J^T W J_K L (6, 4, B), where L L^T is the covariance of fx, fy, cx, cy.
+        calibration: du, dv (4, N, B), by how many standard deviations four independent errors of fx, fy, cx, cy, of one
+            standard deviation each, move an image point; None where the intrinsics are exact.
     """
 
     body: Body
@@ -120,7 +119,7 @@ class Problem:
     weight: Tensor | None
     seen: Tensor
     finite: Tensor
-    calibration: Callable[[Tensor], Tensor] | None
+    calibration: tuple[Tensor, Tensor] | None
 
 
 def prepare(inputs: Inputs) -> Problem:
@@ -165,7 +164,7 @@ def prepare(inputs: Inputs) -> Problem:
         pixel = final._replace(whitening=torch.ones_like(whitening) if final is not observed else slope)
     calibration = None
     if isinstance(camera, Camera) and camera.covariance is not None:
-        calibration = _calibration(final, whitening, image, camera)
+        calibration = _calibration(whitening, image, camera)
     seen = torch.full((batch,), count, device=pixels.device) if keep is None else keep.sum(0)
     return Problem(body, observed, final, pixel, weight, seen, finite, calibration)
 
@@ -204,7 +203,7 @@ def _all_finite(value: Tensor, keep: Tensor | None) -> Tensor:
     return (finite if keep is None else finite | ~keep).all(0)
 
 
-def _calibration(final: Observations, whitening: Tensor, image: Tensor, camera: Camera) -> Callable[[Tensor], Tensor]:
+def _calibration(whitening: Tensor, image: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     assert camera.covariance is not None
     values, vectors = torch.linalg.eigh(camera.covariance.to(image))
     root = vectors * values.clamp_min(0).sqrt()  # (4, 4)
@@ -216,11 +215,4 @@ def _calibration(final: Observations, whitening: Tensor, image: Tensor, camera: 
         du, dv = du * whitening[0], dv * whitening[0]
     else:
         du, dv = whitening[0, 0] * du + whitening[0, 1] * dv, whitening[1, 0] * du + whitening[1, 1] * dv
-
-    def mixed(pose: Tensor) -> Tensor:
-        b = differentiate(final, pose).rows[:3]  # (3, 2, N, B)
-        by_intrinsics = b[:, 0, None] * du + b[:, 1, None] * dv  # (3, 4, N, B)
-        turned = torch.linalg.cross(final.points[:, None].expand_as(by_intrinsics), by_intrinsics, dim=0)
-        return torch.cat([by_intrinsics.sum(2), turned.sum(2)])
-
-    return mixed
+    return du, dv

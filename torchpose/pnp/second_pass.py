@@ -11,8 +11,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchpose.pnp._compile import padded
-from torchpose.pnp.first_pass import EVALUATIONS, FirstPass, upright
+from torchpose.kernels import padded
+from torchpose.pnp.first_pass import EVALUATIONS, Rest, upright
 from torchpose.pnp.iterative import minimise
 from torchpose.pnp.normal_equations import COST
 from torchpose.pnp.problem import Problem
@@ -42,19 +42,19 @@ class Late(NamedTuple):
     arrived: Tensor
 
 
-def left_over(state: FirstPass, failed: Tensor, compile: bool) -> Late | None:
-    """What is neither finished nor, by ``failed`` (B,), without an answer."""
-    best, other, other_cost, _, decided = state.minima
-    late = ~((best.converged & decided) | failed) & state.ahead
-    which = late.nonzero().squeeze(1)
+def left_over(rest: Rest, compile: bool) -> Late | None:
+    """What is not finished."""
+    which = rest.open.nonzero().squeeze(1)
     if len(which) == 0:
         return None
     which = padded(which) if compile else which
-    done, pose = best.converged[which], state.fallback[..., which]
+    done, pose = rest.done[which], rest.fallback[..., which]
     arrived = done.nonzero().squeeze(1)
-    pose[..., arrived] = best.pose[..., which[arrived]]
-    cost = torch.where(done, best.normal[COST, which], state.least[which])
-    return Late(which, pose, other[..., which], cost, other_cost[which].to(cost), torch.stack([done, decided[which]]))
+    pose[..., arrived] = rest.pose[..., which[arrived]]
+    cost, other_cost = rest.cost[which], rest.other_cost[which]
+    return Late(
+        which, pose, rest.other[..., which], cost, other_cost.to(cost), torch.stack([done, rest.decided[which]])
+    )
 
 
 def second_pass(problem: Problem, late: Late, max_iterations: int, compile: bool) -> Minima:

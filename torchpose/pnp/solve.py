@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from typing import Literal
 
 import torch
 from torch import Tensor
 
 from torchpose.camera import Camera
+from torchpose.kernels import LEAST, compiled, padded
 from torchpose.pnp._memory import keep_memory
 from torchpose.pnp.candidates import Candidates
 from torchpose.pnp.dlt import dlt
 from torchpose.pnp.epnp import epnp
-from torchpose.pnp.first_pass import EVALUATIONS, first_pass, upright
+from torchpose.pnp.first_pass import EVALUATIONS, Rest, first_pass, upright
 from torchpose.pnp.implicit import attach_gradient
 from torchpose.pnp.iterative import minimise
 from torchpose.pnp.normal_equations import COST, normal_equations
@@ -24,7 +26,7 @@ from torchpose.pnp.posit import posit
 from torchpose.pnp.problem import Inputs, Problem, prepare
 from torchpose.pnp.result import PnPCode, PnPError, PnPResult
 from torchpose.pnp.second_pass import Late, left_over, second_pass
-from torchpose.pnp.starts import batch_first, starts
+from torchpose.pnp.starts import batch_first, of_planes, planes, starts
 from torchpose.pnp.verdict import Found, Table, choose, write
 
 Method = Literal["iterative", "planar", "dlt", "p3p", "epnp", "posit"]
@@ -40,8 +42,8 @@ _LEAST = {"iterative": 4, "planar": 4, "dlt": 6, "p3p": 3, "epnp": 4, "posit": 4
 _LEAST_STARTED = 3
 # poses solved at once: enough for torch to share an operation among its threads, few enough for the cache
 _CHUNK = 16384
-# of which compiled code, with fewer and longer operations, needs half
-_CHUNK_COMPILED = 8192
+# points up to which the code of a pose is compiled, number by number; of these it takes a minute or two
+_COMPILED_POINTS = 128
 
 
 def solve(
@@ -77,7 +79,8 @@ def solve(
             only their own minima are then found.
         huber: residual, in standard deviations, above which the cost of a point grows linearly.
         max_iterations: of Levenberg-Marquardt, float32 and float64 together about.
-        compile: run the inner functions through torch.compile (first call with a new number of points: many seconds).
+        compile: have a C++ compiler make one loop of it (`torchpose.kernels`; the first call with another number of
+            points takes seconds). Without effect on other devices than the CPU, and for more than 128 points.
         raise_on_failure: raise instead of returning codes other than CONVERGED and AMBIGUOUS.
 
     Returns:
@@ -118,6 +121,7 @@ def solve(
 
     inputs = Inputs(points, pixels, camera, sigma_px, covariances, weights, mask, huber)
     given = None if initial is None else tuple(v.to(pixels) for v in initial)
+    compile = compile and pixels.device.type == "cpu" and count <= _COMPILED_POINTS
     with torch.no_grad():
         result = _solve(inputs, method, given, max_iterations, compile)
     tensors = [points, pixels, *([camera] if isinstance(camera, Tensor) else [camera.matrix, camera.distortion])]
@@ -137,25 +141,30 @@ def _solve(
 ) -> PnPResult:
     """Chunk by chunk; whenever a chunk's worth of poses is left over by the first pass, they have their second one."""
     keep_memory()
-    inputs = inputs.with_body()
+    inputs, asked = inputs.with_body(), len(inputs.pixels)
+    if compile and asked < LEAST:
+        index = padded(torch.arange(asked))
+        inputs, initial = inputs.rows(index), None if initial is None else tuple(v[index] for v in initial)
     batch = len(inputs.pixels)
-    table = Table.empty(batch, inputs.pixels)
+    table = Table.empty(batch, inputs.pixels, compile)
     pending: list[Late] = []
-    chunk = _CHUNK_COMPILED if compile else _CHUNK
-    for start in range(0, batch, chunk):
-        rows = slice(start, min(start + chunk, batch))
+    # a chunk of its own for the last few would be too small to be compiled
+    firsts = range(0, max(batch - LEAST, min(batch, 1)), _CHUNK)
+    for start, stop in pairwise((*firsts, batch)):
+        rows = slice(start, stop)
         given = None if initial is None else (initial[0][rows], initial[1][rows])
         late = _solve_chunk(inputs.rows(rows), method, given, max_iterations, compile, table.columns(rows))
         if late is not None:
             pending.append(late._replace(which=late.which + start))
-        if pending and (rows.stop == batch or sum(len(part.which) for part in pending) >= _CHUNK):
+        if pending and (stop == batch or sum(len(part.which) for part in pending) >= _CHUNK):
             late = Late(*(torch.cat(parts, -1) for parts in zip(*pending, strict=True)))
-            problem, columns = prepare(inputs.rows(late.which)), Table.empty(len(late.which), inputs.pixels)
+            problem, columns = prepare(inputs.rows(late.which)), Table.empty(len(late.which), inputs.pixels, compile)
             minima = second_pass(problem, late, max_iterations, compile)
-            write(problem, minima, _bad(problem, late.pose[:, :, None], 0), columns, compile)
+            finish = compiled(write) if compile else write
+            finish(problem, minima, _bad(problem, late.pose[:, :, None], 0), columns)
             table.replace(late.which, columns)
             pending = []
-    return table.result()
+    return table.columns(slice(asked)).result()
 
 
 def _solve_chunk(
@@ -171,34 +180,44 @@ def _solve_chunk(
     body, least = problem.body, _LEAST[method]
     if method != "iterative":
         found = _CLOSED_FORMS[method](*batch_first(problem.observed, problem.weight))
-        poses = torch.cat([found.R, found.t[..., None]], 3).permute(2, 3, 1, 0)
-        cost = normal_equations(problem.final.each(), poses)[COST]
-        solutions = Found(poses, cost, torch.zeros_like(cost, dtype=torch.int64), cost.isfinite())
-        write(problem, choose(problem.final, solutions), _bad(problem, poses, least), table)
+        closed = torch.cat([found.R, found.t[..., None]], 3).permute(2, 3, 1, 0)
+        cost = normal_equations(problem.final.each(), closed)[COST]
+        solutions = Found(closed, cost, torch.zeros_like(cost, dtype=torch.int64), cost.isfinite())
+        write(problem, choose(problem.final, solutions), _bad(problem, closed, least), table)
         return None
-    single = problem.observed.to(torch.float32)
+    poses: Tensor | None = None
     if initial is not None:
         least = _LEAST_STARTED
         r, t = (v if v.ndim == n else v[:, None] for v, n in zip(initial, (4, 3), strict=True))
         r, t = r.permute(2, 3, 1, 0), t.permute(2, 1, 0)
         t = (t + (r * body.center[:, None]).sum(1)) / body.unit
         poses = torch.cat([r, t[:, None]], 1)
-    else:
-        poses = starts(problem, single, compile)
-    bad = _bad(problem, poses, least)
+    elif not planes(problem):
+        poses = starts(problem)
     # of several starts that are given, the minimum of each is wanted
-    if max_iterations <= EVALUATIONS or (initial is not None and poses.shape[2] > 1):
+    if max_iterations <= EVALUATIONS or (initial is not None and initial[0].ndim == 4):
+        poses = starts(problem) if poses is None else poses
         options, batch = poses.shape[2:]
         every = problem.final.select(torch.arange(batch, device=poses.device).repeat(options))
         flat = minimise(every, upright(poses.double()).flatten(2), max_iterations=max_iterations)
         ends = (flat.pose, flat.normal[COST], flat.iterations, flat.converged)
         minima = choose(problem.final, Found(*(v.unflatten(-1, (options, batch)) for v in ends)))
-        write(problem, minima, bad, table)
+        write(problem, minima, _bad(problem, poses, least), table)
         return None
-    state = first_pass(single, problem.observed, problem.final, poses.float(), compile)
-    write(problem, state.minima, bad, table, compile)
-    failed = torch.stack([flag.expand(len(inputs.pixels)) for flag, _ in bad]).any(0)
-    return left_over(state, failed, compile)
+    attempt = compiled(_attempt) if compile else _attempt
+    return left_over(attempt(problem, poses, least, table), compile)
+
+
+def _attempt(problem: Problem, poses: Tensor | None, least: int, table: Table) -> Rest:
+    """The first pass from poses (3, 4, S, B), or from those of planes; writes its results."""
+    poses = of_planes(problem) if poses is None else poses.float()
+    bad = _bad(problem, poses, least)
+    minima, rest = first_pass(problem.observed.to(torch.float32), problem.observed, problem.final, poses)
+    write(problem, minima, bad, table)
+    unfinished = rest.open
+    for flag, _ in bad:  # an answer that will not change
+        unfinished = unfinished & ~flag
+    return rest._replace(open=unfinished)
 
 
 def _bad(problem: Problem, poses: Tensor, least: int) -> tuple[tuple[Tensor, PnPCode], ...]:

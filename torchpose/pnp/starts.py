@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchpose.pnp._compile import compiled
 from torchpose.pnp.candidates import Candidates
 from torchpose.pnp.epnp import epnp
 from torchpose.pnp.normal_equations import Observations
@@ -17,23 +16,32 @@ from torchpose.pnp.problem import Problem
 _SUSPICIOUS = 1e-3
 
 
-def starts(problem: Problem, single: Observations, compile: bool) -> Tensor:
+def starts(problem: Problem) -> Tensor:
     """Poses [R | t] (3, 4, 2, B) in float32, about the centroid, in units of the extent.
 
     NaN where there is none; infinite where the points lie behind the camera.
     """
-    body, weight = problem.body, problem.weight
-    ours = compiled(ippe) if compile else ippe
-    center = torch.zeros_like(body.center).to(single.xy)
-    mask = None if weight is None else weight.to(single.xy)
-    r, t = ours(single.points, single.xy, mask, body.frame.to(single.xy), center)
-    pose = torch.cat([r, t[:, None]], 1)
-    planar = body.flat & ~body.line
-    if bool(planar.all()):
+    pose = of_planes(problem)
+    if planes(problem):
         return pose
-    pose = torch.where(planar, pose, torch.nan)
+    body = problem.body
+    pose = torch.where(body.flat & ~body.line, pose, torch.nan)
     rows = (~(body.flat | body.line)).expand(pose.shape[-1]).nonzero().squeeze(1)
     return pose if len(rows) == 0 else pose.index_copy(3, rows, _in_space(problem, rows).to(pose))
+
+
+def planes(problem: Problem) -> bool:
+    """Do the points of every pose lie in a plane, and not on a line?"""
+    return bool((problem.body.flat & ~problem.body.line).all())
+
+
+def of_planes(problem: Problem) -> Tensor:
+    """`starts` of points that all lie in planes."""
+    body, weight, single = problem.body, problem.weight, problem.observed.to(torch.float32)
+    center = torch.zeros_like(body.center).to(single.xy)
+    mask = None if weight is None else weight.to(single.xy)
+    r, t = ippe(single.points, single.xy, mask, body.frame.to(single.xy), center)
+    return torch.cat([r, t[:, None]], 1)
 
 
 def batch_first(observed: Observations, weight: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:

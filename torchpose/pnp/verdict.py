@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from torchpose.geometry.small_linalg import cross, eliminate, matmul3
-from torchpose.pnp import scalar
-from torchpose.pnp._compile import compiled
+from torchpose.kernels import compiled, tracing
 from torchpose.pnp.iterative import Estimate
 from torchpose.pnp.normal_equations import (
     COST,
     Observations,
     camera_points,
+    differentiate,
     distance,
     normal_equations,
     residuals,
@@ -63,12 +63,13 @@ class Table(NamedTuple):
     integers: Tensor
 
     @staticmethod
-    def empty(batch: int, like: Tensor) -> Table:
-        if like.device.type == "cpu":  # NumPy asks the system for huge pages: a tenth of the time of a compiled solve
-            floats = torch.from_numpy(np.empty((65, batch)))
-        else:
-            floats = like.new_empty(65, batch)
-        return Table(floats, torch.empty(2, batch, dtype=torch.int64, device=like.device))
+    def empty(batch: int, like: Tensor, compile: bool) -> Table:
+        """Rows in memory for eager mode; for compiled code, which has all of a pose at once, poses."""
+        shape = (batch, 65) if compile else (65, batch)
+        # NumPy asks the system for huge pages: a tenth of the time of a compiled solve
+        floats = torch.from_numpy(np.empty(shape)) if like.device.type == "cpu" else like.new_empty(shape)
+        integers = torch.empty((batch, 2) if compile else (2, batch), dtype=torch.int64, device=like.device)
+        return Table(floats.T, integers.T) if compile else Table(floats, integers)
 
     def columns(self, rows: slice) -> Table:
         return Table(self.floats[:, rows], self.integers[:, rows])
@@ -111,9 +112,8 @@ def choose(obs: Observations, found: Found, compile: bool = False) -> Minima:
         return Found(*(v.gather(-2, order[k].expand(*v.shape[:-2], 1, batch)).squeeze(-2) for v in found))
 
     pose, cost, iterations, converged = pick(0)
-    fast = compile and obs.camera is None
-    equations = compiled(normal_equations) if fast else normal_equations
-    normal = equations(obs._replace(sums=None) if fast else obs, pose)
+    equations = compiled(normal_equations) if compile else normal_equations
+    normal = equations(obs, pose)
     # a minimum is known by the cost that its last step promised; one behind the camera from the start by none
     normal[COST] = cost
     best = Estimate(pose, normal, iterations, converged)
@@ -142,40 +142,18 @@ def _coincide(a: Estimate, b: Tensor) -> Tensor:
     return distance(a.normal, step) < COINCIDENCE
 
 
-def write(
-    problem: Problem, minima: Minima, bad: tuple[tuple[Tensor, PnPCode], ...], table: Table, compile: bool = False
-) -> None:
+def write(problem: Problem, minima: Minima, bad: tuple[tuple[Tensor, PnPCode], ...], table: Table) -> None:
     """Writes the columns of ``table``; ``bad`` are the codes of poses without a sensible problem, the last one wins."""
-    best, body, pixel = minima.best, problem.body, problem.pixel
-    squares = None
-    if isinstance(pixel, Observations):
-        squares = tuple(_mean_square(pixel, problem.weight, pose.to(best.pose)) for pose in (best.pose, minima.other))
-    mixed = None if problem.calibration is None else problem.calibration(best.pose)
-    scale = 1.0 if isinstance(pixel, Observations) else pixel
-    fill = compiled(_fill) if compile and mixed is None else _fill
-    # views that are overwritten as a whole: the compiled code then writes straight into the table
-    target = (*table.floats.split([12, 12, 36, 1, 1, 3]), *table.integers.split(1))
-    fill(target, minima, body.center, body.unit, mixed, squares, scale, problem.seen, bad)
-
-
-def _fill(
-    target: tuple[Tensor, ...],
-    minima: Minima,
-    center: Tensor,
-    unit: Tensor,
-    mixed: Tensor | None,
-    squares: tuple[Tensor, ...] | None,
-    sigma_px: float,
-    seen: Tensor,
-    bad: tuple[tuple[Tensor, PnPCode], ...],
-) -> None:
     best, other, other_cost, different, reached = minima
+    center, unit, pixel = problem.body.center, problem.body.unit, problem.pixel
     chi2 = best.normal[COST]
+    mixed = None if problem.calibration is None else _mixed(problem.final, problem.calibration, best.pose)
     matrix, independence = covariance(best, center, unit, mixed)
     chi2_alt = other_cost.to(chi2)
-    if squares is None:  # of equal weights and squares: chi-squared says it all
-        squares = chi2 / seen, chi2_alt / seen
-    rms, rms_alt = (sigma_px * v.sqrt() for v in squares)
+    if isinstance(pixel, Observations):
+        rms, rms_alt = (_mean_square(pixel, problem.weight, v.to(chi2)).sqrt() for v in (best.pose, other))
+    else:  # of equal weights and squares: chi-squared says it all
+        rms, rms_alt = (pixel * (v / problem.seen).sqrt() for v in (chi2, chi2_alt))
 
     finite = chi2 < torch.inf
     verdicts = (
@@ -191,19 +169,19 @@ def _fill(
         code = torch.where(failed, int(verdict), code)
 
     pose, alt = (place(v, center, unit).flatten(0, 1) for v in (best.pose, other.to(chi2)))
-    rest = torch.stack([chi2_alt, rms_alt, rms_alt / rms])
     failed = code > PnPCode.AMBIGUOUS
     alone = failed | ~different
-    values = [pose, alt, matrix, chi2[None], rms[None], rest, best.iterations[None], code[None]]
-    unknown = [failed, alone, failed, failed, failed, alone]
-    if torch.compiler.is_compiling():  # no pass of its own
-        values[:6] = [torch.where(none, torch.nan, v) for none, v in zip(unknown, values[:6], strict=True)]
-    for rows, value in zip(target, values, strict=True):
-        rows.copy_(value)
-    if not torch.compiler.is_compiling():
-        for index, parts in ((failed.nonzero().squeeze(1), target[:6]), (alone.nonzero().squeeze(1), target[1:6:4])):
-            for rows in parts if len(index) else ():
-                rows.index_fill_(1, index, torch.nan)
+    unknown = (failed, alone, failed, failed, failed, alone)
+    values = (pose, alt, matrix, chi2[None], rms[None], torch.stack([chi2_alt, rms_alt, rms_alt / rms]))
+    parts = table.floats.split([12, 12, 36, 1, 1, 3])
+    for part, value, none in zip(parts, values, unknown, strict=True):
+        part.copy_(torch.where(none, torch.nan, value) if tracing() else value)
+    for part, value in zip(table.integers.split(1), (best.iterations, code), strict=True):
+        part.copy_(value)
+    if not tracing():  # few lines rather than one more pass
+        for index, columns in ((failed.nonzero().squeeze(1), parts), (alone.nonzero().squeeze(1), parts[1:6:4])):
+            for part in columns if len(index) else ():
+                part.index_fill_(1, index, torch.nan)
 
 
 def place(pose: Tensor, center: Tensor, unit: Tensor) -> Tensor:
@@ -218,7 +196,7 @@ def covariance(best: Estimate, center: Tensor, unit: Tensor, mixed: Tensor | Non
 
     The latter is the least pivot over its diagonal entry, that is the least 1 - (multiple correlation)^2: 0 where a
     parameter is not fixed. With J^T J = L D L^T and T the derivative of (t, R) by a step, the covariance is the square
-    of D^-1/2 L^-1 T^T. ``mixed`` (6, 4, B) adds what uncertain intrinsics do, see `Problem.calibration`.
+    of D^-1/2 L^-1 T^T. ``mixed`` (6, 4, B) adds what uncertain intrinsics do, see `_mixed`.
     """
     columns = best.pose[:, :3].transpose(0, 1)
     arm = cross(columns, center[:, None])
@@ -228,16 +206,6 @@ def covariance(best: Estimate, center: Tensor, unit: Tensor, mixed: Tensor | Non
     rows = rows_of(best.normal)
     more = () if mixed is None else (mixed,)
     rhs = [torch.cat([row[:-1], transfer[k], *(m[k] for m in more)]) for k, row in enumerate(rows)]
-    if torch.compiler.is_compiling():
-        lists, diagonal = scalar.eliminate([list(row) for row in rhs], None)
-        entries = {}
-        for i in range(6):
-            for k in range(i, 6):
-                # what is left of the rotation's part lies in the last three rows
-                terms = [lists[n][6 - n + i] * lists[n][6 - n + k] / diagonal[n] for n in range(3 if k >= 3 else 0, 6)]
-                entries[i, k] = entries[k, i] = sum(terms[1:], terms[0])
-        least = torch.stack([p / row[0] for p, row in zip(diagonal, rows, strict=True)]).amin(0)
-        return torch.stack([entries[i, k] for i in range(6) for k in range(6)]), least
     block, pivots = eliminate(rhs)
     y = torch.stack([row[6 - k :] for k, row in enumerate(block)]) * pivots.rsqrt()[:, None]  # (6, 6 + 4, B)
     out = torch.empty((6, 6, y.shape[-1]), dtype=y.dtype, device=y.device)
@@ -249,6 +217,15 @@ def covariance(best: Estimate, center: Tensor, unit: Tensor, mixed: Tensor | Non
         shift = (y[:, :6, None] * y[:, None, 6:]).sum(0)  # (6, 4, B), of the pose by the intrinsics
         out += (shift[:, None] * shift).sum(2)
     return out.flatten(0, 1), (pivots / torch.stack([row[0] for row in rows])).amin(0)
+
+
+def _mixed(obs: Observations, calibration: tuple[Tensor, Tensor], pose: Tensor) -> Tensor:
+    """J^T W J_K L (6, 4, B) at a pose (3, 4, B), where L L^T is the covariance of the intrinsics."""
+    du, dv = calibration
+    b = differentiate(obs, pose).rows[:3]  # (3, 2, N, B)
+    by_intrinsics = b[:, 0, None] * du + b[:, 1, None] * dv  # (3, 4, N, B)
+    turned = cross(obs.points[:, None], by_intrinsics)
+    return torch.cat([by_intrinsics.sum(2), turned.sum(2)])
 
 
 def _mean_square(pixel: Observations, weight: Tensor | None, pose: Tensor) -> Tensor:

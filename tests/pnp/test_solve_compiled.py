@@ -1,0 +1,124 @@
+"""`solve` with ``compile``: the poses, covariances and codes are those of eager mode."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from scenes import CUBOID, F64, FOCAL, GRID, MATRIX, SQUARE, pixels, views
+from torch import Tensor
+
+from torchpose import pnp
+from torchpose.camera import Camera
+from torchpose.pnp import PnPCode, PnPResult
+
+LENS = Camera(1280, 960, [[1111.0, 0, 640], [0, 1115, 480], [0, 0, 1]], [-0.2, 0.05, 1e-3, -5e-4, 0.01])
+FISHEYE = Camera(1280, 960, [[700.0, 0, 640], [0, 702, 480], [0, 0, 1]], [0.02, -0.01, 0.003, 0.0], "kannala_brandt")
+UNSURE = Camera(1280, 960, MATRIX, [], covariance=torch.diag(torch.tensor([1.0, 1.0, 0.5, 0.5])))
+
+
+def same(fast: PnPResult, plain: PnPResult) -> None:
+    """Poses to a millionth of their standard deviations, the rest to rounding."""
+    assert fast.code.tolist() == plain.code.tolist()
+    good = (plain.code <= PnPCode.AMBIGUOUS).nonzero().squeeze(1)
+    assert len(good), "nothing to compare"
+    scale = plain.covariance[good].diagonal(dim1=1, dim2=2).sqrt()
+    assert float(((fast.t[good] - plain.t[good]).abs() / scale[:, :3]).max()) < 1e-6
+    torch.testing.assert_close(fast.R[good], plain.R[good], rtol=0, atol=1e-6 * float(scale[:, 3:].max()))
+    spread = scale[:, :, None] * scale[:, None]
+    assert float(((fast.covariance[good] - plain.covariance[good]).abs() / spread).max()) < 1e-6
+    for name in ("chi2", "rms"):
+        torch.testing.assert_close(getattr(fast, name)[good], getattr(plain, name)[good], rtol=1e-9, atol=1e-12)
+    for name in ("R", "t", "covariance", "chi2", "rms", "rms_alt", "t_alt"):
+        ours, theirs = getattr(fast, name), getattr(plain, name)
+        assert ours.shape == theirs.shape
+        torch.testing.assert_close(ours.isnan(), theirs.isnan())
+
+
+def both(points: Tensor, image: Tensor, camera: Camera | Tensor, **options: Any) -> tuple[PnPResult, PnPResult]:
+    options = {"sigma_px": 0.1, **options}
+    return pnp.solve(points, image, camera, compile=True, **options), pnp.solve(points, image, camera, **options)
+
+
+@pytest.mark.parametrize("points", [SQUARE, GRID, CUBOID], ids=["4", "9", "solid"])
+def test_poses_are_the_same(points: Tensor) -> None:
+    """Near planes with two minima, tilted ones that decide at once, and points in space."""
+    same(*both(points, pixels(views(points, 1500, tilt_deg=(0, 75), far=60)[2], 0.1), MATRIX))
+
+
+@pytest.mark.parametrize("camera", [LENS, FISHEYE, UNSURE], ids=["brown-conrady", "kannala-brandt", "unsure"])
+def test_cameras(camera: Camera) -> None:
+    same(*both(SQUARE, camera.distort(views(SQUARE, 60)[2]) + 0.1 * pixels(torch.zeros(60, 4, 2)).sin(), camera))
+
+
+def test_cameras_share_what_was_compiled() -> None:
+    xy = views(SQUARE, 40)[2]
+    for k in (0.0, 0.03):
+        camera = Camera(
+            1280, 960, [[1111.0 + 100 * k, 0, 640], [0, 1115, 480], [0, 0, 1]], [-0.2 + k, 0.05, 1e-3, 0, 0]
+        )
+        result = pnp.solve(SQUARE, camera.distort(xy), camera, compile=True)
+        assert float(result.rms.max()) < 1e-7, "the camera of the call, not the one that was compiled for"
+
+
+@pytest.mark.parametrize("kind", ["own", "mask", "weights", "covariances", "huber", "initial", "initials", "matrices"])
+def test_options(kind: str) -> None:
+    g = torch.Generator().manual_seed(5)
+    r, t, xy = views(GRID, 80)
+    points, image, camera, options = GRID, pixels(xy, 0.1), MATRIX, {}
+    if kind == "own":
+        points = GRID.expand(80, -1, -1) * torch.linspace(1, 1.5, 80, dtype=F64)[:, None, None]
+        camera_points = points @ r.mT + t[:, None]
+        image = pixels(camera_points[..., :2] / camera_points[..., 2:], 0.1)
+    elif kind == "mask":
+        options["mask"] = torch.rand(80, 9, generator=g) < 0.7
+    elif kind == "weights":
+        options["weights"] = 0.5 + torch.rand(80, 9, generator=g, dtype=F64)
+    elif kind == "covariances":
+        root = 0.1 * torch.eye(2, dtype=F64) + 0.02 * torch.randn(9, 2, 2, generator=g, dtype=F64)
+        options["covariances"] = root @ root.mT
+    elif kind == "huber":
+        image[:, 0] += 3 * torch.rand(80, 2, generator=g, dtype=F64)
+        options["huber"] = 1.5
+    elif kind == "initial":
+        options["initial"] = (r, t)
+    elif kind == "initials":
+        options["initial"] = (torch.stack([r, r.roll(1, 1)], 1), torch.stack([t, t], 1))
+    else:
+        camera = (
+            MATRIX.expand(80, 3, 3) + torch.diag(torch.tensor([1.0, 1, 0], dtype=F64)) * torch.arange(80)[:, None, None]
+        )
+        image = (xy * (FOCAL + torch.arange(80, dtype=F64))[:, None, None]) + MATRIX[:2, 2]
+    same(*both(points, image, camera, **options))
+
+
+@pytest.mark.parametrize("batch", [0, 1, 3, 7, 8, 9, 63, 16385])
+def test_batches_of_any_size(batch: int) -> None:
+    fast, plain = both(SQUARE, pixels(views(SQUARE, max(batch, 1))[2], 0.1)[:batch], MATRIX)
+    assert len(fast) == batch
+    if batch:
+        same(fast, plain)
+
+
+def test_poses_without_an_answer_have_their_codes() -> None:
+    image = pixels(views(SQUARE, 30)[2], 0.1)
+    image[3, 1, 0] = torch.nan
+    image[7, 2] = torch.inf
+    image[11] = image[11, :1]  # all at one place
+    mask = torch.ones(30, 4, dtype=torch.bool)
+    mask[5, 0] = False
+    fast, plain = both(SQUARE, image, MATRIX, mask=mask)
+    same(fast, plain)
+    assert fast.code[3] == fast.code[7] == PnPCode.NOT_FINITE
+    assert fast.code[5] == PnPCode.TOO_FEW
+    line = torch.tensor([[x, 2 * x, 0] for x in (0.0, 1, 2, 3)], dtype=F64)
+    fast, plain = both(line, pixels(views(line, 12)[2]), MATRIX)
+    assert fast.code.tolist() == plain.code.tolist() == 12 * [PnPCode.DEGENERATE]
+
+
+def test_more_points_than_are_compiled_are_solved_all_the_same() -> None:
+    points = torch.rand(140, 3, generator=torch.Generator().manual_seed(2), dtype=F64) * torch.tensor([40.0, 40, 0])
+    image = pixels(views(points, 10)[2], 0.1)
+    fast, plain = both(points, image, MATRIX)
+    torch.testing.assert_close(fast.t, plain.t, rtol=0, atol=0)

@@ -1,0 +1,108 @@
+"""C++ to machine code: the compiler, and what it has made before."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchpose.errors import ConfigError
+
+_FLAGS = (
+    "-std=c++17",
+    "-O2",
+    "-march=native" if platform.machine() in ("x86_64", "AMD64") else "-mcpu=native",
+    "-ffp-contract=fast",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-fPIC",
+    "-shared",
+    # the threads of torch, which brings the same library; Apple's compiler has none
+    *(("-fopenmp",) if sys.platform == "linux" else ()),
+)
+# problems below which a second thread does not pay
+_SHARE = 512
+
+
+class Kernel:
+    """A function of tensors that lie in memory as `Rows`, with the results among them."""
+
+    def __init__(self, library: Path) -> None:
+        code = ctypes.CDLL(str(library))
+        code.lanes.restype = ctypes.c_int64
+        self.lanes: int = code.lanes()
+        self._run = code.kernel
+        self._run.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_int)
+        self._run.restype = None
+
+    def __call__(self, tensors: Sequence[Tensor], batch: int, limit: int = 1) -> None:
+        data = [t.data_ptr() for t in tensors]
+        strides = [s for t in tensors for s in t.stride()]
+        threads = torch.get_num_threads() if batch >= _SHARE else 1
+        pointers, steps = (ctypes.c_void_p * len(data))(*data), (ctypes.c_int64 * len(strides))(*strides)
+        self._run(pointers, steps, batch, limit, threads)
+
+
+def build(source: str) -> Kernel:
+    """Compiles the source of a `Program`, unless this compiler has done so on such a processor before.
+
+    Raises:
+        ConfigError: there is no C++ compiler, or it fails.
+    """
+    compiler = find_compiler()
+    source = files("torchpose.kernels").joinpath("lanes.h").read_text() + source
+    key = hashlib.sha256("\0".join((source, *_FLAGS, _target(compiler))).encode()).hexdigest()[:32]
+    folder = _folder()
+    library = folder / f"{key}.so"
+    if not library.exists():
+        with tempfile.TemporaryDirectory(dir=folder) as scratch:
+            text, made = Path(scratch, "kernel.cpp"), Path(scratch, "kernel.so")
+            text.write_text(source)
+            run = subprocess.run([compiler, *_FLAGS, text, "-o", made], capture_output=True, text=True)
+            if run.returncode:
+                said = [line for line in run.stderr.splitlines() if "error" in line] or [f"exit code {run.returncode}"]
+                raise ConfigError(f"compile: {compiler} failed: {said[0]}; use compile=False")
+            os.replace(made, library)  # another process may be at the same
+    return Kernel(library)
+
+
+def find_compiler() -> str:
+    """
+    Raises:
+        ConfigError: there is no C++ compiler.
+    """
+    for name in (os.environ.get("CXX", ""), "g++", "clang++"):
+        if name and (path := shutil.which(name)):
+            return path
+    raise ConfigError("compile: needs a C++ compiler and found none; install g++ or clang++, or use compile=False")
+
+
+@cache
+def _target(compiler: str) -> str:
+    """What distinguishes the code of this compiler, for this processor, from that of others."""
+    command = [compiler, *_FLAGS, "-dM", "-E", "-x", "c++", os.devnull]
+    return subprocess.run(command, capture_output=True, text=True).stdout
+
+
+@cache
+def _folder() -> Path:
+    """Where kernels are kept: the user's cache, or, where this cannot be written, a folder for this process."""
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "torchpose", "kernels")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return folder
+    except OSError:
+        return Path(tempfile.mkdtemp(prefix="torchpose-kernels-"))
