@@ -89,7 +89,11 @@ def _call(
         made[key] = _make(function, args, tensors, rounds is not None)
     kernel, results, structure = made[key]
     out = [torch.empty((*rows.shape, batch), dtype=rows.dtype) for rows in results]
-    kernel([*tensors, *out], batch, rounds or 1)
+    if torch.autograd._profiler_enabled():
+        with torch.profiler.record_function(f"compiled {function.__module__}.{function.__name__}"):
+            kernel([*tensors, *out], batch, rounds or 1)
+    else:
+        kernel([*tensors, *out], batch, rounds or 1)
     if rounds is not None:
         return _put_together(args[0], out)
     return None if structure is None else tree_unflatten(out, structure)

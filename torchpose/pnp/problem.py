@@ -17,7 +17,7 @@ class Body(NamedTuple):
     """Points (3, N, B) about their centroid in units of their extent; B is 1 where all poses share them.
 
     Attributes:
-        points: (3, N, B). sums: `Sums` of them where shared, else None.
+        points: (3, N, B). sums: `Sums` of them where shared, else None, as for compiled code.
         frame: (3, 3, B), axes of their plane as rows, the last one normal to it.
         center: (3, B), centroid. unit: (B,), extent.
         flat, line: (B,) bool, do the points lie in a plane, on a line (or in a spot)?
@@ -66,11 +66,12 @@ class Inputs:
             mask=part(self.mask, 1),
         )
 
-    def with_body(self) -> Inputs:
-        """With the points' frame computed once, where all poses share them and see them all."""
+    def with_body(self, sums: bool) -> Inputs:
+        """With the points' frame, and ``sums`` if wanted, computed once, where all poses share and see all points."""
         if self.points.ndim == 3 or self.mask is not None or not bool(self.points.isfinite().all()):
             return self
-        return replace(self, body=_body(self.points.T[..., None].contiguous(), None))
+        body = _body(self.points.T[..., None].contiguous(), None)
+        return replace(self, body=body._replace(sums=sums_of(body.points)) if sums else body)
 
     def whitening(self) -> Tensor:
         """Square root of the information of the image points, 1/px: (1, N|1, B|1) diagonal or (2, 2, N, B|1) lower."""
@@ -177,7 +178,7 @@ def _body(points: Tensor, weight: Tensor | None) -> Body:
         local = torch.where(weight > 0, local, 0.0)
     flat = extent[0] <= FLATNESS * extent[2]
     line = (extent[1] <= COLLINEARITY * extent[2]) | (extent[2] <= 1e-12 * center.abs().amax(0))
-    return Body(local, sums_of(local) if local.shape[2] == 1 else None, frame, center, unit, flat, line)
+    return Body(local, None, frame, center, unit, flat, line)
 
 
 def _rays(camera: Camera | Tensor, pixels: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:

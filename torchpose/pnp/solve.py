@@ -141,7 +141,7 @@ def _solve(
 ) -> PnPResult:
     """Chunk by chunk; whenever a chunk's worth of poses is left over by the first pass, they have their second one."""
     keep_memory()
-    inputs, asked = inputs.with_body(), len(inputs.pixels)
+    inputs, asked = inputs.with_body(sums=not compile), len(inputs.pixels)
     if compile and asked < LEAST:
         index = padded(torch.arange(asked))
         inputs, initial = inputs.rows(index), None if initial is None else tuple(v[index] for v in initial)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -148,7 +149,10 @@ def write(problem: Problem, minima: Minima, bad: tuple[tuple[Tensor, PnPCode], .
     center, unit, pixel = problem.body.center, problem.body.unit, problem.pixel
     chi2 = best.normal[COST]
     mixed = None if problem.calibration is None else _mixed(problem.final, problem.calibration, best.pose)
-    matrix, independence = covariance(best, center, unit, mixed)
+    parts = table.floats.split([12, 12, 36, 1, 1, 3])
+    for part, minimum in zip(parts, (best.pose, other.to(chi2)), strict=False):
+        place(minimum, center, unit, part.unflatten(0, (3, 4)))
+    independence = covariance(best, center, unit, mixed, parts[2].unflatten(0, (6, 6)))
     chi2_alt = other_cost.to(chi2)
     if isinstance(pixel, Observations):
         rms, rms_alt = (_mean_square(pixel, problem.weight, v.to(chi2)).sqrt() for v in (best.pose, other))
@@ -168,55 +172,72 @@ def write(problem: Problem, minima: Minima, bad: tuple[tuple[Tensor, PnPCode], .
     for failed, verdict in verdicts:
         code = torch.where(failed, int(verdict), code)
 
-    pose, alt = (place(v, center, unit).flatten(0, 1) for v in (best.pose, other.to(chi2)))
-    failed = code > PnPCode.AMBIGUOUS
-    alone = failed | ~different
-    unknown = (failed, alone, failed, failed, failed, alone)
-    values = (pose, alt, matrix, chi2[None], rms[None], torch.stack([chi2_alt, rms_alt, rms_alt / rms]))
-    parts = table.floats.split([12, 12, 36, 1, 1, 3])
-    for part, value, none in zip(parts, values, unknown, strict=True):
-        part.copy_(torch.where(none, torch.nan, value) if tracing() else value)
+    for part, value in zip(
+        parts[3:], (chi2[None], rms[None], torch.stack([chi2_alt, rms_alt, rms_alt / rms])), strict=True
+    ):
+        part.copy_(value)
     for part, value in zip(table.integers.split(1), (best.iterations, code), strict=True):
         part.copy_(value)
-    if not tracing():  # few lines rather than one more pass
-        for index, columns in ((failed.nonzero().squeeze(1), parts), (alone.nonzero().squeeze(1), parts[1:6:4])):
-            for part in columns if len(index) else ():
+    failed = code > PnPCode.AMBIGUOUS
+    alone = failed | ~different
+    for unknown, columns in ((failed, parts), (alone, parts[1:6:4])):
+        index = None if tracing() else unknown.nonzero().squeeze(1)
+        for part in columns:
+            if index is None:
+                part.copy_(torch.where(unknown, torch.nan, part))
+            elif len(index):  # few lines rather than one more pass
                 part.index_fill_(1, index, torch.nan)
 
 
-def place(pose: Tensor, center: Tensor, unit: Tensor) -> Tensor:
+def place(pose: Tensor, center: Tensor, unit: Tensor, out: Tensor) -> None:
     """Poses (3, 4, B) from the centroid in units of the extent to the origin of the object: t = unit t' - R c."""
     r = pose[:, :3]
-    t = unit * pose[:, 3] - (r[:, 0] * center[0] + r[:, 1] * center[1] + r[:, 2] * center[2])
-    return torch.cat([r, t[:, None]], 1)
+    out[:, :3] = r
+    torch.mul(pose[:, 3], unit, out=out[:, 3])
+    for k in range(3):
+        out[:, 3].addcmul_(r[:, k], center[k], value=-1)
 
 
-def covariance(best: Estimate, center: Tensor, unit: Tensor, mixed: Tensor | None) -> tuple[Tensor, Tensor]:
-    """The covariance (36, B), translation first, rotation from the left, and the independence (B,).
+def covariance(best: Estimate, center: Tensor, unit: Tensor, mixed: Tensor | None, out: Tensor) -> Tensor:
+    """Writes the covariance to ``out`` (6, 6, B), translation first, rotation from the left; the independence (B,).
 
     The latter is the least pivot over its diagonal entry, that is the least 1 - (multiple correlation)^2: 0 where a
     parameter is not fixed. With J^T J = L D L^T and T the derivative of (t, R) by a step, the covariance is the square
     of D^-1/2 L^-1 T^T. ``mixed`` (6, 4, B) adds what uncertain intrinsics do, see `_mixed`.
     """
     columns = best.pose[:, :3].transpose(0, 1)
-    arm = cross(columns, center[:, None])
-    zero = torch.zeros_like(columns[0])
-    transfer = [torch.cat([row, zero]) for row in columns * unit]
-    transfer += [torch.cat(pair) for pair in zip(arm, columns, strict=True)]
     rows = rows_of(best.normal)
-    more = () if mixed is None else (mixed,)
-    rhs = [torch.cat([row[:-1], transfer[k], *(m[k] for m in more)]) for k, row in enumerate(rows)]
-    block, pivots = eliminate(rhs)
-    y = torch.stack([row[6 - k :] for k, row in enumerate(block)]) * pivots.rsqrt()[:, None]  # (6, 6 + 4, B)
-    out = torch.empty((6, 6, y.shape[-1]), dtype=y.dtype, device=y.device)
-    for i in range(6):
-        first = 3 if i >= 3 else 0
-        torch.sum(y[first:, i, None] * y[first:, i:6], 0, out=out[i, i:])
-        out[i + 1 :, i] = out[i, i + 1 :]
+    to_t = [*(columns * unit), *cross(columns, center[:, None])]
     if mixed is not None:
-        shift = (y[:, :6, None] * y[:, None, 6:]).sum(0)  # (6, 4, B), of the pose by the intrinsics
+        to_t = [torch.cat(pair) for pair in zip(to_t, mixed, strict=True)]
+    block, pivots = eliminate([torch.cat([row[:-1], part]) for row, part in zip(rows, to_t, strict=True)])
+    scale = pivots.rsqrt()
+    t = [row[6 - k :] * scale[k] for k, row in enumerate(block)]  # (3, B) each, or (3 + 4, B)
+    to_r = list(columns)  # in the last three rows alone: nothing but a turn moves the rotation
+    for k in range(3):
+        for i in range(k + 1, 3):
+            to_r[i] = torch.addcmul(to_r[i], block[3 + k][i - k] / pivots[3 + k], to_r[k], value=-1)
+    r = [row * scale[3 + k] for k, row in enumerate(to_r)]
+    for i in range(3):
+        _sum_of_products([v[i] for v in t], [v[i:3] for v in t], out[i, i:3])
+        _sum_of_products([v[i] for v in t[3:]], r, out[i, 3:])
+        _sum_of_products([v[i] for v in r], [v[i:] for v in r], out[3 + i, 3 + i :])
+    for i in range(5):
+        out[i + 1 :, i] = out[i, i + 1 :]
+    if mixed is not None:  # (6, 4, B), of the pose by the intrinsics
+        shift = torch.empty_like(mixed)
+        for i in range(3):
+            _sum_of_products([v[i] for v in t], [v[3:] for v in t], shift[i])
+            _sum_of_products([v[i] for v in r], [v[3:] for v in t[3:]], shift[3 + i])
         out += (shift[:, None] * shift).sum(2)
-    return out.flatten(0, 1), (pivots / torch.stack([row[0] for row in rows])).amin(0)
+    return (pivots / torch.stack([row[0] for row in rows])).amin(0)
+
+
+def _sum_of_products(a: Sequence[Tensor], b: Sequence[Tensor], out: Tensor) -> None:
+    """Without a tensor for each product."""
+    torch.mul(a[0], b[0], out=out)
+    for x, y in zip(a[1:], b[1:], strict=True):
+        out.addcmul_(x, y)
 
 
 def _mixed(obs: Observations, calibration: tuple[Tensor, Tensor], pose: Tensor) -> Tensor:
