@@ -94,7 +94,7 @@ class Statistics:
     two_minima: Tensor
 
 
-def evaluate(scenes: Scenes) -> Statistics:
+def evaluate(scenes: Scenes, compile: bool) -> Statistics:
     """Solves the scenes, each with its own noise given as weights."""
     count = scenes.image_points.shape[1]
     result = pnp.solve(
@@ -102,6 +102,7 @@ def evaluate(scenes: Scenes) -> Statistics:
         scenes.image_points,
         scenes.matrix,
         weights=scenes.sigma[:, None].pow(-2).expand(-1, count),
+        compile=compile,
     )
     # both errors by the covariance of the pose given: it decides which minimum is the true one
     information = torch.linalg.inv(torch.where(result.covariance.isnan(), torch.eye(6).double(), result.covariance))
@@ -190,20 +191,22 @@ def fall(scenes: Scenes) -> Tensor:
     return ratio[second]
 
 
-def run(scenes: int, seed: int = 0) -> list[Statistics]:
+def run(scenes: int, seed: int, compile: bool = False) -> list[Statistics]:
     """About ``scenes`` scenes, equally many for each number of points and focal length."""
     generator = torch.Generator().manual_seed(seed)
     each = math.ceil(scenes / (len(POINTS) * len(FOCAL_PX)))
-    return [evaluate(random_scenes(each, count, focal, generator)) for count in POINTS for focal in FOCAL_PX]
+    scenes_of = (random_scenes(each, count, focal, generator) for count in POINTS for focal in FOCAL_PX)
+    return [evaluate(part, compile) for part in scenes_of]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--compile", action="store_true", help="the poses of compiled code")
     parser.add_argument("--out", type=Path, help="CSV or Markdown file")
     args = parser.parse_args()
-    runs = run(args.scenes, args.seed)
+    runs = run(args.scenes, args.seed, args.compile)
     rows = table(runs)
     writer = csv.DictWriter(sys.stdout, rows[0].keys(), delimiter="\t")
     writer.writeheader()
@@ -216,8 +219,9 @@ def main() -> None:
     if args.out is not None and args.out.suffix == ".md":
         cells = [[f"{v:.4g}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows]
         lines = [list(rows[0]), ["---"] * len(rows[0]), *cells]
+        about = __doc__[__doc__.index("Every scene") :].strip()
         text = "# Batched PnP: do poses obey their covariance?\n\nBy `scripts/pnp_statistics.py`, "
-        text += f"{args.scenes} scenes, seed {args.seed}.\n\n{__doc__[__doc__.index('Every scene') :].strip()}\n\n"
+        text += f"{args.scenes} scenes, seed {args.seed}{', compiled' if args.compile else ''}.\n\n{about}\n\n"
         args.out.write_text(text + "\n".join("| " + " | ".join(line) + " |" for line in lines) + f"\n\n{falls}\n")
     elif args.out is not None:
         with args.out.open("w", newline="") as file:
