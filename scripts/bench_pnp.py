@@ -9,7 +9,7 @@ that are left. Loops are timed on at most `LOOP` poses, other torch libraries on
 Kornia take part where they can be imported. `result_mb` are the tensors returned, which no chunking can avoid,
 `working_mb` is what a call needs besides: the process's high-water mark over its size before. What bounds the eager
 code follows at the end: the bytes that its operations read and write, and the rate at which one operation alone does
-so; then the operations and graphs that take most of the time. `--profile` prints only that.
+so; then the operations and compiled functions that take most of the time. `--profile` prints only that.
 """
 
 from __future__ import annotations
@@ -38,8 +38,6 @@ from torchpose.geometry import rotations
 
 LOOP = 1000
 PEERS = 4096
-# least batch that is timed compiled: below, kernels are specialised to every size anew
-COMPILED = 64
 # batches from which the first call counts as a round
 LARGE = 65536
 SIGMA_PX = 0.1
@@ -150,7 +148,7 @@ def contestants(compile: bool) -> dict[str, tuple[Callable[[Tensor, Tensor], obj
 def measure(points: Tensor, batch: int, rounds: int, seconds: float, compile: bool) -> list[dict[str, object]]:
     """Rows of the table for one batch size."""
     pixels = scene(points, batch)
-    table = contestants(compile and batch >= COMPILED)
+    table = contestants(compile)
     times: dict[str, list[float]] = {}
     spent = dict.fromkeys(table, 0.0)
     failed: dict[str, str] = {}
@@ -282,7 +280,7 @@ def profile(points: Tensor, compile: bool, most: int = 12) -> list[dict[str, obj
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        pnp.solve(points, pixels, MATRIX, sigma_px=SIGMA_PX, compile=compile)  # compiles, for this number of threads
+        pnp.solve(points, pixels, MATRIX, sigma_px=SIGMA_PX, compile=compile)  # compiles
         with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as record:
             pnp.solve(points, pixels, MATRIX, sigma_px=SIGMA_PX, compile=compile)
     finally:
@@ -291,7 +289,7 @@ def profile(points: Tensor, compile: bool, most: int = 12) -> list[dict[str, obj
     total = sum(e.self_cpu_time_total for e in events)
     rows: list[dict[str, object]] = []
     for e in sorted(events, key=lambda e: e.self_cpu_time_total, reverse=True)[:most]:
-        row: dict[str, object] = {"points": len(points), "compiled": compile, "operation": e.key[:60], "calls": e.count}
+        row: dict[str, object] = {"points": len(points), "compile": compile, "operation": e.key[:60], "calls": e.count}
         rows.append(row | {"us_per_pose": e.self_cpu_time_total / LARGE, "share": e.self_cpu_time_total / total})
     return rows
 
@@ -343,7 +341,7 @@ def main() -> None:
     limit_columns = ["points", "threads", "calls", "kb_per_pose", "us_per_call", "gb_per_s", "bound_us_per_pose"]
     limit_columns.append("us_per_pose")
     print(markdown(limits, limit_columns))
-    columns = ["points", "compiled", "operation", "calls", "us_per_pose", "share"]
+    columns = ["points", "compile", "operation", "calls", "us_per_pose", "share"]
     print(markdown(operations, columns))
     if args.out is not None:
         args.out.parent.mkdir(parents=True, exist_ok=True)
@@ -352,7 +350,7 @@ def main() -> None:
             f"## What bounds it\n\nThe eager solve of {LARGE} poses: operations, the bytes that they read and write,"
             " and what these take at the rate of `addcmul_` on eight vectors of a chunk in float64, repeated.\n\n"
             f"{markdown(limits, limit_columns)}\n"
-            f"CPU time of {LARGE} poses on one thread, by operation or compiled graph, profiler included.\n\n"
+            f"CPU time of {LARGE} poses on one thread, by operation or compiled function, profiler included.\n\n"
         )
         args.out.write_text(text + markdown(operations, columns))
 

@@ -1,8 +1,8 @@
 """Batched linear algebra of 2 x 2 to 6 x 6 matrices as structures of arrays: the batch is the last dimension.
 
 `torch.linalg` treats a batch of small matrices one LAPACK call at a time. Here every scalar of the textbook algorithm
-is a contiguous vector over the batch, so an elimination is a few dozen elementwise calls whatever the batch size; under
-`torch.compile` they fuse. All functions are differentiable and keep dtype and device.
+is a contiguous vector over the batch, so an elimination is a few dozen elementwise calls whatever the batch size; a
+compiler fuses them (`torchpose.kernels`). All functions are differentiable and keep dtype and device.
 """
 
 from __future__ import annotations
