@@ -244,6 +244,12 @@ def test_what_it_cannot_do_it_says() -> None:
         compiled(lambda a: a.cumsum(0))(a)
     with pytest.raises(ValueError, match="cannot read the tensors that it writes"):
         compiled(lambda a: a[:1].mul_(2))(a)
+    with pytest.raises(NotImplementedError, match="int32"):
+        compiled(lambda a: a + 1)(a.int())
+    with pytest.raises(ValueError, match=r"a tensor \(3, 9\) on cpu; expected \(..., 16\) or \(..., 1\) on the CPU"):
+        compiled(lambda a, b: a + b[:, :1])(a, a[:, :9])
+    with pytest.raises(ValueError, match=r"a tensor \(3, 16\) on meta"):
+        compiled(lambda a: a + 1)(a.to("meta"))
     with pytest.raises(ValueError, match=f"5 problems; a compiled function needs {LEAST}"):
         compiled(lambda a: 2 * a)(numbers(3, 5))
     assert not tracing()

@@ -13,7 +13,7 @@ from scenes import CUBOID, F64, FOCAL, GRID, MATRIX, SQUARE, errors, pixels, pro
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from torchpose import ConfigError, pnp
+from torchpose import ConfigError, kernels, pnp
 from torchpose.camera import Camera
 from torchpose.geometry import rotations
 from torchpose.pnp import PnPCode, PnPResult
@@ -387,5 +387,6 @@ def test_wrong_arguments_are_named() -> None:
 def test_compile_without_a_compiler_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
     monkeypatch.delenv("CXX", raising=False)
+    kernels.compiled.cache_clear()
     with pytest.raises(ConfigError, match="compile: needs a C\\+\\+ compiler"):
         pnp.solve(SQUARE, pixels(views(SQUARE, 5)[2]), MATRIX, compile=True)

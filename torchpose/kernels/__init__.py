@@ -2,10 +2,11 @@
 
 Eager mode makes a pass over the memory for every operation, and so, between its few fusions, does the code that
 torch.compile makes. But where every problem is worked on by itself, no number of it need ever leave the registers:
-`compiled` traces a function for one problem, down to single numbers (`trace`, `program`), and has a compiler make one
-loop over the problems of it, a lane of a vector for each (`build`, lanes.h). docs/decisions/0007 has the figures.
+`compiled` (`functions`) traces a function for one problem, down to single numbers (`trace`, `program`), and has a
+compiler make one loop over the problems of it, a lane of a vector for each (`build`, lanes.h). docs/decisions/0007 has
+the figures.
 """
 
-from torchpose.kernels.compiled import LEAST, compiled, padded, repeated, tracing
+from torchpose.kernels.functions import LEAST, compiled, padded, repeated, tracing
 
 __all__ = ["LEAST", "compiled", "padded", "repeated", "tracing"]

@@ -65,6 +65,8 @@ class Program:
 
     def input(self, rows: Rows) -> Array:
         """The next tensor of the call, to be read."""
+        if rows.dtype not in TYPES:
+            raise NotImplementedError(f"{rows.dtype} in a compiled function")
         tensor = len(self._tensors)
         self._tensors.append(rows)
         step = f"strides[{self._strides(tensor) + len(rows.shape)}]"

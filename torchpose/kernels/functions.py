@@ -1,7 +1,8 @@
-"""`compiled`: a function of tensors with the batch last, run as one loop in C++."""
+"""`compiled` and `repeated`: functions of tensors with the batch last, run as one loop in C++."""
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from functools import cache
@@ -17,12 +18,12 @@ from torchpose.kernels.trace import trace
 
 # problems that a call needs: the lanes of the widest vectors there are
 LEAST = 8
-_tracing = False
+_thread = threading.local()
 
 
 def tracing() -> bool:
     """Is the function under way being compiled? It has one problem then, and no numbers to decide by."""
-    return _tracing
+    return getattr(_thread, "tracing", False)
 
 
 def padded(index: Tensor) -> Tensor:
@@ -44,12 +45,13 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     Arguments are tensors (..., B) or (..., 1), the latter shared by all problems; tuples of arguments; dataclasses, the
     tensors of which are shared by all problems, whatever their shape; and anything else, compiled in. Every problem
     must be worked on by itself, by operations that `trace` knows, and without a look at numbers. Results are tensors
-    (..., B), in nested tuples. Tensors that are only written to, as a whole, are so by the compiled code; a function
-    that returns None does nothing else.
+    (..., B), in nested tuples, and have no gradients. Tensors that are only written to, as a whole, are so by the
+    compiled code; a function that returns None does nothing else.
 
     Raises:
         ConfigError: there is no C++ compiler.
-        ValueError: fewer than `LEAST` problems.
+        ValueError: fewer than `LEAST` problems, different numbers of them, or tensors that are not on the CPU.
+        NotImplementedError: an operation or a dtype that `trace` does not know.
     """
     find_compiler()
     made: dict[tuple[Any, ...], _Made] = {}
@@ -85,6 +87,9 @@ def _call(
     batch = max(t.shape[-1] for t in tensors)
     if batch < LEAST:
         raise ValueError(f"{batch} problems; a compiled function needs {LEAST}")
+    for t in tensors:  # what is not there would be read all the same
+        if t.shape[-1] not in (1, batch) or t.device.type != "cpu":
+            raise ValueError(f"a tensor {tuple(t.shape)} on {t.device}; expected (..., {batch}) or (..., 1) on the CPU")
     if (key := tuple(kind)) not in made:
         made[key] = _make(function, args, tensors, rounds is not None)
     kernel, results, structure = made[key]
@@ -103,15 +108,14 @@ def _make(function: Callable[..., Any], args: tuple[Any, ...], tensors: list[Ten
     def flat(*values: Tensor) -> Any:
         return function(*_put_together(args, list(values)))
 
-    global _tracing
-    _tracing = True
+    _thread.tracing = True
     try:
         inputs = [
             Rows(tuple(t.shape[:-1]), t.dtype, t.shape[-1] == 1, t.shape[-1] > 1 and t.stride(-1) != 1) for t in tensors
         ]
         program, results, structure = trace(flat, inputs, len(tree_leaves(args[0])) if loop else 0)
     finally:
-        _tracing = False
+        _thread.tracing = False
     return _Made(build(program.source()), results, structure)
 
 
@@ -122,7 +126,7 @@ def _take_apart(value: Any, tensors: list[Tensor], kind: list[Any]) -> None:
         tensors.append(value)
         kind.append((*shape, batch == 1, batch > 1 and value.stride(-1) != 1, value.dtype))
     elif isinstance(value, tuple):
-        kind.append(len(value))
+        kind.append((type(value), len(value)))
         for item in value:
             _take_apart(item, tensors, kind)
     elif is_dataclass(value):
@@ -131,7 +135,7 @@ def _take_apart(value: Any, tensors: list[Tensor], kind: list[Any]) -> None:
             item = getattr(value, field.name)
             _take_apart(item[..., None] if isinstance(item, Tensor) else item, tensors, kind)
     else:
-        kind.append(value)
+        kind.append((type(value), value))
 
 
 def _put_together(value: Any, tensors: list[Tensor]) -> Any:
