@@ -286,6 +286,25 @@ def test_what_was_compiled_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     assert sum("-dM" not in call for call in calls) <= 1
 
 
+def test_what_was_cut_short_is_compiled_again_and_a_full_disk_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    def plain(a: Tensor) -> Tensor:
+        return a - 19
+
+    compiled(plain)(numbers(16))
+    before = set(build._folder().glob("*.so"))
+    for library in before:
+        library.unlink()
+        library.write_bytes(b"\x7fELF")
+    torch.testing.assert_close(compiled(lambda a: a - 19)(numbers(16)), numbers(16) - 19)
+
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(ConfigError, match=r"compile: .*\.so: No space left on device; make room or use compile=False"):
+        compiled(lambda a: a - 23)(numbers(16))
+
+
 def test_a_cache_that_cannot_be_written_is_done_without(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     code = """

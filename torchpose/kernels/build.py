@@ -59,23 +59,33 @@ def build(source: str) -> Kernel:
     """Compiles the source of a `Program`, unless this compiler has done so on such a processor before.
 
     Raises:
-        ConfigError: there is no C++ compiler, or it fails.
+        ConfigError: there is no C++ compiler, or it fails, or there is no room for what it makes.
     """
     compiler = find_compiler()
     source = files("torchpose.kernels").joinpath("lanes.h").read_text() + source
     key = hashlib.sha256("\0".join((source, *_FLAGS, _target(compiler))).encode()).hexdigest()[:32]
-    folder = _folder()
-    library = folder / f"{key}.so"
-    if not library.exists():
-        with tempfile.TemporaryDirectory(dir=folder) as scratch:
-            text, made = Path(scratch, "kernel.cpp"), Path(scratch, "kernel.so")
-            text.write_text(source)
-            run = subprocess.run([compiler, *_FLAGS, text, "-o", made], capture_output=True, text=True)
-            if run.returncode:
-                said = [line for line in run.stderr.splitlines() if "error" in line] or [f"exit code {run.returncode}"]
-                raise ConfigError(f"compile: {compiler} failed: {said[0]}; use compile=False")
-            os.replace(made, library)  # another process may be at the same
-    return Kernel(library)
+    library = _folder() / f"{key}.so"
+    try:
+        if library.exists():
+            try:
+                return Kernel(library)
+            except OSError:  # cut short, by a full disk say
+                pass
+        _compile(compiler, source, library)
+        return Kernel(library)
+    except OSError as error:
+        raise ConfigError(f"compile: {library}: {error.strerror or error}; make room or use compile=False") from None
+
+
+def _compile(compiler: str, source: str, library: Path) -> None:
+    with tempfile.TemporaryDirectory(dir=library.parent) as scratch:
+        text, made = Path(scratch, "kernel.cpp"), Path(scratch, "kernel.so")
+        text.write_text(source)
+        run = subprocess.run([compiler, *_FLAGS, text, "-o", made], capture_output=True, text=True)
+        if run.returncode:
+            said = [line for line in run.stderr.splitlines() if "error" in line] or [f"exit code {run.returncode}"]
+            raise ConfigError(f"compile: {compiler} failed: {said[0]}; use compile=False")
+        os.replace(made, library)  # another process may be at the same
 
 
 def find_compiler() -> str:
@@ -99,10 +109,10 @@ def _target(compiler: str) -> str:
 @cache
 def _folder() -> Path:
     """Where kernels are kept: the user's cache, or, where this cannot be written, a folder for this process."""
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "torchpose", "kernels")
     try:
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "torchpose", "kernels")
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             return folder
-    except OSError:
+    except (OSError, RuntimeError):  # nobody's home
         return Path(tempfile.mkdtemp(prefix="torchpose-kernels-"))

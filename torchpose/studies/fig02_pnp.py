@@ -18,7 +18,9 @@ import torch
 from torch import Tensor
 
 from torchpose import pnp
+from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
+from torchpose.kernels import find_compiler
 from torchpose.report.figures import subplots
 from torchpose.studies.study import Comparison, Picture, Progress, StudyResult, Table, ignore_progress
 
@@ -32,6 +34,7 @@ MATRIX = torch.tensor([[1111.0, 0, 912], [0, 1111.0, 608], [0, 0, 1]], dtype=tor
 POINTS = torch.tensor([[x, y, 0.0] for y in (-20, 0, 20) for x in (-20, 0, 20)], dtype=torch.float64)
 CORNERS = POINTS[[0, 2, 8, 6]]
 SAMPLES = 25
+COMPILED = "torchpose iterative, compiled"
 BY_POINTS, BY_LINES = "4 corners as points", "4 sides as lines"
 Poses = tuple[Tensor, Tensor]  # R (B, 3, 3) and t (B, 3)
 
@@ -51,9 +54,9 @@ def project(points: Tensor, r: Tensor, t: Tensor) -> Tensor:
     return MATRIX[0, 0] * camera_points[..., :2] / camera_points[..., 2:] + MATRIX[:2, 2]
 
 
-def ours(method: pnp.Method) -> Callable[[Tensor], Poses]:
+def ours(method: pnp.Method, compile: bool = False) -> Callable[[Tensor], Poses]:
     def run(pixels: Tensor) -> Poses:
-        result = pnp.solve(POINTS, pixels, MATRIX, method=method)
+        result = pnp.solve(POINTS, pixels, MATRIX, method=method, compile=compile)
         return result.R, result.t
 
     return run
@@ -158,6 +161,7 @@ def run(
         pictures=[Picture("fig02", "Errors against noise, times, and lines against points", plot(rows, seconds))],
         comparisons=[
             Comparison("1000 poses by the iterative method", "s", "< 0.3", fastest),
+            *(Comparison("the same, compiled", "s", "< 0.3", seconds[name]) for name in seconds if name == COMPILED),
         ],
         statements=[
             f"torchpose's iterative method takes {1e3 * fastest:.1f} ms for 1000 poses, OpenCV's, called 1000 times, "
@@ -169,6 +173,13 @@ def run(
     )
 
 
+def _has_compiler() -> bool:
+    try:
+        return bool(find_compiler())
+    except ConfigError:
+        return False
+
+
 def _methods() -> dict[str, Callable[[Tensor], Poses]]:
     cv2.setNumThreads(1)
     methods: dict[str, Callable[[Tensor], Poses]] = {
@@ -177,6 +188,7 @@ def _methods() -> dict[str, Callable[[Tensor], Poses]]:
         "torchpose epnp": ours("epnp"),
         "torchpose p3p": ours("p3p"),
         "torchpose posit": ours("posit"),
+        **({COMPILED: ours("iterative", compile=True)} if _has_compiler() else {}),
         "cv2 ITERATIVE": opencv(cv2.SOLVEPNP_ITERATIVE),
         "cv2 EPNP": opencv(cv2.SOLVEPNP_EPNP),
         "cv2 IPPE": opencv(cv2.SOLVEPNP_IPPE),
