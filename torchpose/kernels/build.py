@@ -8,7 +8,6 @@ import os
 import platform
 import shutil
 import subprocess
-import sys
 import tempfile
 from collections.abc import Sequence
 from functools import cache
@@ -29,9 +28,9 @@ _FLAGS = (
     "-fno-trapping-math",
     "-fPIC",
     "-shared",
-    # the threads of torch, which brings the same library; Apple's compiler has none
-    *(("-fopenmp",) if sys.platform == "linux" else ()),
 )
+# the threads of torch, which brings the same library for GCC; other compilers may have none
+_THREADS = "-fopenmp"
 # problems below which a second thread does not pay
 _SHARE = 512
 
@@ -81,8 +80,11 @@ def _compile(compiler: str, source: str, library: Path) -> None:
     with tempfile.TemporaryDirectory(dir=library.parent) as scratch:
         text, made = Path(scratch, "kernel.cpp"), Path(scratch, "kernel.so")
         text.write_text(source)
-        run = subprocess.run([compiler, *_FLAGS, text, "-o", made], capture_output=True, text=True)
-        if run.returncode:
+        for flags in ((*_FLAGS, _THREADS), _FLAGS):
+            run = subprocess.run([compiler, *flags, text, "-o", made], capture_output=True, text=True)
+            if run.returncode == 0:
+                break
+        else:
             said = [line for line in run.stderr.splitlines() if "error" in line] or [f"exit code {run.returncode}"]
             raise ConfigError(f"compile: {compiler} failed: {said[0]}; use compile=False")
         os.replace(made, library)  # another process may be at the same
