@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -20,6 +21,9 @@ from torch import Tensor
 from torchpose import ConfigError
 from torchpose.kernels import LEAST, build, compiled, padded, repeated, tracing
 
+pytestmark = pytest.mark.skipif(
+    not any(shutil.which(name) for name in ("g++", "clang++")), reason="needs a C++ compiler (apt-get install g++)"
+)
 F32, F64 = torch.float32, torch.float64
 AWKWARD = (0.0, 1.0, -1.0, 2.5, math.inf, -math.inf, math.nan)
 
