@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -257,6 +258,14 @@ def test_what_it_cannot_do_it_says() -> None:
     with pytest.raises(ValueError, match=f"5 problems; a compiled function needs {LEAST}"):
         compiled(lambda a: 2 * a)(numbers(3, 5))
     assert not tracing()
+
+
+def test_threads_may_compile_and_run_at_the_same_time() -> None:
+    function = compiled(lambda a: (a * 3.5).sum(0))
+    with ThreadPoolExecutor(4) as pool:
+        results = list(pool.map(lambda n: (n, function(numbers(n, 600))), (2, 3, 4, 5, 2, 3, 4, 5)))
+    for n, result in results:
+        torch.testing.assert_close(result, (numbers(n, 600) * 3.5).sum(0))
 
 
 def test_lists_of_problems_are_filled_up() -> None:

@@ -19,6 +19,7 @@ from torchpose.kernels.trace import trace
 # problems that a call needs: the lanes of the widest vectors there are
 LEAST = 8
 _thread = threading.local()
+_one_at_a_time = threading.Lock()  # torch's tracer keeps its state for the whole process
 
 
 def tracing() -> bool:
@@ -91,7 +92,9 @@ def _call(
         if t.shape[-1] not in (1, batch) or t.device.type != "cpu":
             raise ValueError(f"a tensor {tuple(t.shape)} on {t.device}; expected (..., {batch}) or (..., 1) on the CPU")
     if (key := tuple(kind)) not in made:
-        made[key] = _make(function, args, tensors, rounds is not None)
+        with _one_at_a_time:
+            if key not in made:
+                made[key] = _make(function, args, tensors, rounds is not None)
     kernel, results, structure = made[key]
     out = [torch.empty((*rows.shape, batch), dtype=rows.dtype) for rows in results]
     if torch.autograd._profiler_enabled():
