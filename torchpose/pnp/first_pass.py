@@ -37,15 +37,17 @@ class Rest(NamedTuple):
     Attributes:
         open: (B,) bool, is there a start that has not led to all that is wanted?
         done: (B,) bool, has the better one arrived?
-        pose, fallback: (3, 4, B), where it has arrived, or where else it may go on. cost: (B,), what is known of it.
+        onward: (B,) bool, is it at ``pose`` (3, 4, B), or has to go on there? Else it is at ``start`` (3, 4, B), float32.
+        cost: (B,), what is known of it.
         other: (3, 4, B), the other start. other_cost: (B,), infinite where there is none.
         decided: (B,) bool, is enough known of the other one?
     """
 
     open: Tensor
     done: Tensor
+    onward: Tensor
     pose: Tensor
-    fallback: Tensor
+    start: Tensor
     cost: Tensor
     other: Tensor
     other_cost: Tensor
@@ -56,11 +58,11 @@ def first_pass(single: Observations, double: Observations, final: Observations, 
     """From starts (3, 4, S, B), S one or two; the observations without distortion in both dtypes, and as they are."""
     better, pose, least, other, other_cost, bound = _begin(single.each(), start)
     pose, newton = _improve(single, double, pose)
-    found, normal, done, going, known, different, decided, count = _finish(
-        final, better, pose, newton, least, other_cost, bound
+    found, normal, done, onward, trial, known, different, decided, count = _finish(
+        final, pose, newton, least, other_cost, bound
     )
-    cost = torch.where(done, normal[COST], known)
-    rest = Rest((least < torch.inf) & ~(done & decided), done, found, going, cost, other, other_cost, decided)
+    cost, unfinished = torch.where(done, normal[COST], known), (least < torch.inf) & ~(done & decided)
+    rest = Rest(unfinished, done, onward, trial, better, cost, other, other_cost, decided)
     return Minima(Estimate(found, normal, count, done), other, other_cost, different, decided), rest
 
 
@@ -88,12 +90,12 @@ def _improve(single: Observations, double: Observations, pose: Tensor) -> tuple[
 
 
 def _finish(
-    obs: Observations, start: Tensor, pose: Tensor, newton: Tensor, least: Tensor, other_cost: Tensor, bound: Tensor
+    obs: Observations, pose: Tensor, newton: Tensor, least: Tensor, other_cost: Tensor, bound: Tensor
 ) -> tuple[Tensor, ...]:
     """The last evaluation; its step takes the matrix of the one before, which has hardly changed.
 
-    Pose, normal equations, has it arrived? Where else to go on and the least cost known; is there another minimum, and
-    is enough known of it? Iterations.
+    Pose, normal equations, has it arrived? Is the next pose any good, which is it, and the least cost known; is there
+    another minimum, and is enough known of it? Iterations.
     """
     normal = normal_equations(obs, pose)
     rows = [v for a, b in pairwise(STARTS) for v in (newton[a : b - 1], normal[b - 1 : b].to(newton))]
@@ -109,7 +111,7 @@ def _finish(
     different = other_cost < torch.inf
     decided = ~different | (bound > relevant(known))
     count = torch.full_like(done, EVALUATIONS, dtype=torch.int64)
-    return found, normal, done, torch.where(sane & definite, trial, start.to(pose)), known, different, decided, count
+    return found, normal, done, sane & definite, trial, known, different, decided, count
 
 
 def upright(pose: Tensor) -> Tensor:

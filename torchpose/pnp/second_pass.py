@@ -48,13 +48,11 @@ def left_over(rest: Rest, compile: bool) -> Late | None:
     if len(which) == 0:
         return None
     which = padded(which) if compile else which
-    done, pose = rest.done[which], rest.fallback[..., which]
-    arrived = done.nonzero().squeeze(1)
-    pose[..., arrived] = rest.pose[..., which[arrived]]
+    pose, start = rest.pose[..., which], rest.start[..., which]
+    pose = torch.where(rest.onward[which], pose, start.to(pose))
     cost, other_cost = rest.cost[which], rest.other_cost[which]
-    return Late(
-        which, pose, rest.other[..., which], cost, other_cost.to(cost), torch.stack([done, rest.decided[which]])
-    )
+    arrived = torch.stack([rest.done[which], rest.decided[which]])
+    return Late(which, pose, rest.other[..., which], cost, other_cost.to(cost), arrived)
 
 
 def second_pass(problem: Problem, late: Late, max_iterations: int, compile: bool) -> Minima:

@@ -213,16 +213,16 @@ def _attempt(problem: Problem, poses: Tensor | None, least: int, table: Table) -
     poses = of_planes(problem) if poses is None else poses.float()
     bad = _bad(problem, poses, least)
     minima, rest = first_pass(problem.observed.to(torch.float32), problem.observed, problem.final, poses)
-    write(problem, minima, bad, table)
     unfinished = rest.open
     for flag, _ in bad:  # an answer that will not change
         unfinished = unfinished & ~flag
+    write(problem, minima, bad, table, again=unfinished)
     return rest._replace(open=unfinished)
 
 
 def _bad(problem: Problem, poses: Tensor, least: int) -> tuple[tuple[Tensor, PnPCode], ...]:
     """Poses that have no answer and why; of several reasons the last one counts."""
-    numbers = ((0 * poses).sum((0, 1)) == 0).any(0)
+    numbers = (0 * poses.sum((0, 1)) == 0).any(0)
     return (
         (~numbers, PnPCode.DEGENERATE),
         (poses[0, 0].isinf().any(0), PnPCode.BEHIND_CAMERA),

@@ -143,8 +143,17 @@ def _coincide(a: Estimate, b: Tensor) -> Tensor:
     return distance(a.normal, step) < COINCIDENCE
 
 
-def write(problem: Problem, minima: Minima, bad: tuple[tuple[Tensor, PnPCode], ...], table: Table) -> None:
-    """Writes the columns of ``table``; ``bad`` are the codes of poses without a sensible problem, the last one wins."""
+def write(
+    problem: Problem,
+    minima: Minima,
+    bad: tuple[tuple[Tensor, PnPCode], ...],
+    table: Table,
+    again: Tensor | None = None,
+) -> None:
+    """Writes the columns of ``table``; ``bad`` are the codes of poses without a sensible problem, the last one wins.
+
+    Poses that will be written ``again`` (B,) need not be made NaN.
+    """
     best, other, other_cost, different, reached = minima
     center, unit, pixel = problem.body.center, problem.body.unit, problem.pixel
     chi2 = best.normal[COST]
@@ -181,7 +190,7 @@ def write(problem: Problem, minima: Minima, bad: tuple[tuple[Tensor, PnPCode], .
     failed = code > PnPCode.AMBIGUOUS
     alone = failed | ~different
     for unknown, columns in ((failed, parts), (alone, parts[1:6:4])):
-        index = None if tracing() else unknown.nonzero().squeeze(1)
+        index = None if tracing() else (unknown if again is None else unknown & ~again).nonzero().squeeze(1)
         for part in columns:
             if index is None:
                 part.copy_(torch.where(unknown, torch.nan, part))
