@@ -37,7 +37,7 @@ class Rest(NamedTuple):
     Attributes:
         open: (B,) bool, is there a start that has not led to all that is wanted?
         done: (B,) bool, has the better one arrived?
-        onward: (B,) bool, is it at ``pose`` (3, 4, B), or has to go on there? Else it is at ``start`` (3, 4, B), float32.
+        onward: (B,) bool, is it at ``pose`` (3, 4, B), or has to go on there? Else at ``start`` (3, 4, B), float32.
         cost: (B,), what is known of it.
         other: (3, 4, B), the other start. other_cost: (B,), infinite where there is none.
         decided: (B,) bool, is enough known of the other one?
