@@ -101,12 +101,11 @@ def _finish(
     rows = [v for a, b in pairwise(STARTS) for v in (newton[a : b - 1], normal[b - 1 : b].to(newton))]
     step, decrease, definite = damped_step(torch.cat([*rows, newton[COST:]]))
     cost, before, floor = torch.where(least < torch.inf, normal[COST], torch.inf), newton[COST], rounding(obs)
-    normal = torch.cat([normal[:COST], cost[None]])
     # the cost has never risen by more than rounding can make it: it is still the minimum of this start
     sane = not_above(cost, before, 1e-3 * before + 1) & not_above(before, least, 1e-3 * least + 1)
     done = (decrease <= _RTOL * cost + floor) & definite & sane
     trial = moved(pose, step.to(pose))
-    found, normal = settled(pose, normal, trial, decrease, done)
+    found, normal[COST] = settled(pose, cost, trial, decrease, done)
     known = torch.where(sane, cost, least)
     different = other_cost < torch.inf
     decided = ~different | (bound > relevant(known))

@@ -127,10 +127,9 @@ def _proposal(
     return trial, decrease, sure & (decrease <= rtol * cost + floor) & (cost < torch.inf)
 
 
-def settled(pose: Tensor, normal: Tensor, trial: Tensor, decrease: Tensor, done: Tensor) -> tuple[Tensor, Tensor]:
-    """Poses and normal equations, with the last step of those that are done, of which the cost is predicted."""
-    cost = (normal[COST] - torch.where(done, decrease, 0)).clamp_min(0)
-    return torch.where(done, trial, pose), torch.cat([normal[:COST], cost[None]])
+def settled(pose: Tensor, cost: Tensor, trial: Tensor, decrease: Tensor, done: Tensor) -> tuple[Tensor, Tensor]:
+    """Poses and costs, with the last step of those that are done, of which the cost is predicted."""
+    return torch.where(done, trial, pose), (cost - torch.where(done, decrease, 0)).clamp_min(0)
 
 
 def minimise(
@@ -180,5 +179,5 @@ def minimise(
 
 
 def _ended(state: _State) -> Estimate:
-    pose, normal = settled(state.pose, state.normal, state.trial, state.decrease, state.done)
-    return Estimate(pose, normal, state.iterations, state.done)
+    pose, cost = settled(state.pose, state.normal[COST], state.trial, state.decrease, state.done)
+    return Estimate(pose, torch.cat([state.normal[:COST], cost[None]]), state.iterations, state.done)
