@@ -18,7 +18,6 @@ import argparse
 import ctypes
 import math
 import platform
-import shutil
 import statistics
 import time
 from collections.abc import Callable
@@ -35,6 +34,7 @@ from torch.utils._pytree import tree_leaves
 
 from torchpose import pnp
 from torchpose.geometry import rotations
+from torchpose.kernels import has_compiler
 
 LOOP = 1000
 PEERS = 4096
@@ -315,7 +315,7 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     cv2.setNumThreads(1)
-    compile = args.compile and any(shutil.which(name) for name in ("g++", "clang++"))
+    compile = args.compile and has_compiler()
     machine = (
         f"{platform.processor() or platform.machine()}, {args.threads} threads, torch {torch.__version__}, "
         f"OpenCV {cv2.__version__}, at most {args.rounds} rounds, sigma {SIGMA_PX} px"

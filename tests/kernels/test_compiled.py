@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -20,11 +19,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from torchpose import ConfigError
-from torchpose.kernels import LEAST, build, compiled, padded, repeated, tracing
+from torchpose.kernels import LEAST, build, compiled, has_compiler, padded, repeated, tracing
 
-pytestmark = pytest.mark.skipif(
-    not any(shutil.which(name) for name in ("g++", "clang++")), reason="needs a C++ compiler (apt-get install g++)"
-)
+pytestmark = pytest.mark.skipif(not has_compiler(), reason="needs a C++ compiler (apt-get install g++)")
 F32, F64 = torch.float32, torch.float64
 AWKWARD = (0.0, 1.0, -1.0, 2.5, math.inf, -math.inf, math.nan)
 
@@ -206,14 +203,17 @@ def test_arguments_and_results_are_arranged_as_they_are_in_python() -> None:
 
 @pytest.mark.parametrize("by_problem", [False, True])
 def test_results_are_written_where_the_caller_wants_them(by_problem: bool) -> None:
-    def function(target: Tensor, count: Tensor, a: Tensor) -> None:
+    def function(target: Tensor, count: Tensor, truth: Tensor, a: Tensor) -> None:
+        truth.copy_(a > 0)
         for part, value in zip(target.split([1, 2]), (a[:1], 2 * a), strict=True):
             part.copy_(value)
         count.copy_(torch.where(a[0] > 0, 1, 0))
 
     table = torch.full((30, 5), -1.0, dtype=F64).T if by_problem else torch.full((5, 30), -1.0, dtype=F64)
     count, a = torch.full((30,), -1), numbers(2, 20)
-    assert compiled(function)(table[1:4, 5:25], count[5:25], a) is None
+    truth = torch.zeros(30, 2, dtype=torch.bool).T if by_problem else torch.zeros(2, 30, dtype=torch.bool)
+    assert compiled(function)(table[1:4, 5:25], count[5:25], truth[:, 5:25], a) is None
+    assert truth.view(torch.uint8)[:, 5:25].tolist() == (a > 0).int().tolist()
     expected = torch.full((5, 30), -1.0, dtype=F64)
     expected[1:4, 5:25] = torch.cat([a[:1], 2 * a])
     torch.testing.assert_close(table, expected, rtol=0, atol=0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from typing import Any
 
 import pytest
@@ -12,11 +11,10 @@ from torch import Tensor
 
 from torchpose import pnp
 from torchpose.camera import Camera
+from torchpose.kernels import has_compiler
 from torchpose.pnp import PnPCode, PnPResult
 
-pytestmark = pytest.mark.skipif(
-    not any(shutil.which(name) for name in ("g++", "clang++")), reason="needs a C++ compiler (apt-get install g++)"
-)
+pytestmark = pytest.mark.skipif(not has_compiler(), reason="needs a C++ compiler (apt-get install g++)")
 LENS = Camera(1280, 960, [[1111.0, 0, 640], [0, 1115, 480], [0, 0, 1]], [-0.2, 0.05, 1e-3, -5e-4, 0.01])
 FISHEYE = Camera(1280, 960, [[700.0, 0, 640], [0, 702, 480], [0, 0, 1]], [0.02, -0.01, 0.003, 0.0], "kannala_brandt")
 UNSURE = Camera(1280, 960, MATRIX, [], covariance=torch.diag(torch.tensor([1.0, 1.0, 0.5, 0.5])))

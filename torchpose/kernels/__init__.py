@@ -7,7 +7,7 @@ compiler make one loop over the problems of it, a lane of a vector for each (`bu
 the figures.
 """
 
-from torchpose.kernels.build import find_compiler
+from torchpose.kernels.build import has_compiler
 from torchpose.kernels.functions import LEAST, compiled, padded, repeated, tracing
 
-__all__ = ["LEAST", "compiled", "find_compiler", "padded", "repeated", "tracing"]
+__all__ = ["LEAST", "compiled", "has_compiler", "padded", "repeated", "tracing"]

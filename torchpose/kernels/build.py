@@ -40,8 +40,6 @@ class Kernel:
 
     def __init__(self, library: Path) -> None:
         code = ctypes.CDLL(str(library))
-        code.lanes.restype = ctypes.c_int64
-        self.lanes: int = code.lanes()
         self._run = code.kernel
         self._run.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_int)
         self._run.restype = None
@@ -90,15 +88,24 @@ def _compile(compiler: str, source: str, library: Path) -> None:
         os.replace(made, library)  # another process may be at the same
 
 
+def has_compiler() -> bool:
+    """Is there a C++ compiler?"""
+    return _compiler() is not None
+
+
 def find_compiler() -> str:
     """
     Raises:
         ConfigError: there is no C++ compiler.
     """
-    for name in (os.environ.get("CXX", ""), "g++", "clang++"):
-        if name and (path := shutil.which(name)):
-            return path
-    raise ConfigError("compile: needs a C++ compiler and found none; install g++ or clang++, or use compile=False")
+    if (path := _compiler()) is None:
+        raise ConfigError("compile: needs a C++ compiler and found none; install g++ or clang++, or use compile=False")
+    return path
+
+
+def _compiler() -> str | None:
+    names = (os.environ.get("CXX", ""), "g++", "clang++")
+    return next((path for name in names if name and (path := shutil.which(name))), None)
 
 
 @cache

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import fields, is_dataclass
 from functools import cache
 from typing import Any, NamedTuple
@@ -94,28 +95,24 @@ def _call(
     if (key := tuple(kind)) not in made:
         with _one_at_a_time:
             if key not in made:
-                made[key] = _make(function, args, tensors, rounds is not None)
+                rows = [part for part in kind if isinstance(part, Rows)]
+                made[key] = _make(function, args, rows, rounds is not None)
     kernel, results, structure = made[key]
     out = [torch.empty((*rows.shape, batch), dtype=rows.dtype) for rows in results]
-    if torch.autograd._profiler_enabled():
-        with torch.profiler.record_function(f"compiled {function.__module__}.{function.__name__}"):
-            kernel([*tensors, *out], batch, rounds or 1)
-    else:
+    name = f"compiled {function.__module__}.{function.__name__}"
+    with torch.profiler.record_function(name) if torch.autograd._profiler_enabled() else nullcontext():
         kernel([*tensors, *out], batch, rounds or 1)
     if rounds is not None:
         return _put_together(args[0], out)
     return None if structure is None else tree_unflatten(out, structure)
 
 
-def _make(function: Callable[..., Any], args: tuple[Any, ...], tensors: list[Tensor], loop: bool) -> _Made:
+def _make(function: Callable[..., Any], args: tuple[Any, ...], inputs: list[Rows], loop: bool) -> _Made:
     def flat(*values: Tensor) -> Any:
         return function(*_put_together(args, list(values)))
 
     _thread.tracing = True
     try:
-        inputs = [
-            Rows(tuple(t.shape[:-1]), t.dtype, t.shape[-1] == 1, t.shape[-1] > 1 and t.stride(-1) != 1) for t in tensors
-        ]
         program, results, structure = trace(flat, inputs, len(tree_leaves(args[0])) if loop else 0)
     finally:
         _thread.tracing = False
@@ -127,7 +124,7 @@ def _take_apart(value: Any, tensors: list[Tensor], kind: list[Any]) -> None:
     if isinstance(value, Tensor):
         *shape, batch = value.shape
         tensors.append(value)
-        kind.append((*shape, batch == 1, batch > 1 and value.stride(-1) != 1, value.dtype))
+        kind.append(Rows(tuple(shape), value.dtype, batch == 1, batch > 1 and value.stride(-1) != 1))
     elif isinstance(value, tuple):
         kind.append((type(value), len(value)))
         for item in value:

@@ -50,6 +50,7 @@ template <class S, class T> INLINE void store(S* p, T x) { memcpy(p, &x, sizeof 
 template <class S, class T> INLINE void scatter(S* p, int64_t stride, T x) {
     for (int l = 0; l < LANES; ++l) p[l * stride] = x[l];
 }
+INLINE void scatter(uint8_t* p, int64_t stride, M x) { scatter<uint8_t, M>(p, stride, x & 1); }
 INLINE void store(uint8_t* p, M x) { store(p, __builtin_convertvector(x & 1, B)); }
 
 template <class T, class S> INLINE T to(S x) { return __builtin_convertvector(x, T); }

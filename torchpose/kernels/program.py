@@ -146,16 +146,12 @@ class Program:
 
         def add(number: int) -> None:
             for k in self._needed(number, done):
-                looped = self._going is not None and k in self._loads
-                place = (
-                    work
-                    if k in self._carried
-                    else shared
-                    if self._operations[k].invariant
-                    else fixed
-                    if looped
-                    else work
-                )
+                place = work
+                if k not in self._carried:
+                    if self._operations[k].invariant:
+                        place = shared
+                    elif k in self._loads and self._going is not None:
+                        place = fixed
                 place.append(self._line(k))
 
         def store(tensor: int, index: tuple[int, ...], name: str) -> None:
@@ -238,7 +234,6 @@ const int64_t b = block * LANES < batch - LANES ? block * LANES : batch - LANES;
 }}
 }}
 
-extern "C" int64_t lanes() {{ return LANES; }}
 extern "C" void kernel(void* const* data, const int64_t* strides, int64_t batch, int64_t limit,
                        int threads) {{
     const int64_t blocks = (batch + LANES - 1) / LANES;

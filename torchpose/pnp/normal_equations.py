@@ -9,7 +9,6 @@ points, the sums over the points are one matrix product.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from typing import NamedTuple
@@ -32,9 +31,8 @@ _BR = (3, 6, 8)
 _FEW = 64
 
 
-@dataclass(frozen=True, eq=False)
-class Sums:
-    """What sums over points that all poses share are, as matrices. Compiled code has no use for them.
+class Sums(NamedTuple):
+    """What sums over points that all poses share are, as matrices; none for compiled code.
 
     Attributes:
         points: (N, 4) homogeneous: @ pose gives the points in the camera frame.
@@ -44,9 +42,6 @@ class Sums:
     points: Tensor
     gauss: Tensor
     newton: Tensor
-
-    def to(self, dtype: torch.dtype) -> Sums:
-        return Sums(self.points.to(dtype), self.gauss.to(dtype), self.newton.to(dtype))
 
 
 class Observations(NamedTuple):
@@ -84,7 +79,7 @@ class Observations(NamedTuple):
 
     def to(self, dtype: torch.dtype) -> Observations:
         points, xy, whitening = (v.to(dtype) for v in (self.points, self.xy, self.whitening))
-        sums = None if self.sums is None else self.sums.to(dtype)
+        sums = None if self.sums is None else Sums(*(v.to(dtype) for v in self.sums))
         return self._replace(points=points, xy=xy, whitening=whitening, sums=sums)
 
 
@@ -106,7 +101,7 @@ def sums_of(points: Tensor) -> Sums:
 
 def camera_points(obs: Observations, pose: Tensor) -> Tensor:
     """(3, N, ...) of poses (3, 4, ...)."""
-    if obs.sums is not None and not tracing():
+    if obs.sums is not None:
         return (obs.sums.points @ pose.flatten(2)).unflatten(2, pose.shape[2:])
     x, y, z = obs.points
     p = torch.addcmul(pose[:, None, 3], pose[:, None, 0], x)
@@ -185,7 +180,7 @@ def normal_equations(obs: Observations, pose: Tensor, newton: bool = False, fine
             for k in range(m, 3):
                 products[_BB[m][k]].addcmul_(gradient[m], depth[k], value=-1).addcmul_(depth[m], gradient[k], value=-1)
     products[9] = cost
-    if obs.sums is not None and not tracing():
+    if obs.sums is not None:
         sums = obs.sums.newton if newton else obs.sums.gauss
         normal = (sums @ products.flatten(0, 1).flatten(1)).unflatten(1, cost.shape[1:])
     else:

@@ -158,10 +158,10 @@ def write(
     center, unit, pixel = problem.body.center, problem.body.unit, problem.pixel
     chi2 = best.normal[COST]
     mixed = None if problem.calibration is None else _mixed(problem.final, problem.calibration, best.pose)
-    parts = table.floats.split([12, 12, 36, 1, 1, 3])
-    for part, minimum in zip(parts, (best.pose, other.to(chi2)), strict=False):
-        place(minimum, center, unit, part.unflatten(0, (3, 4)))
-    independence = covariance(best, center, unit, mixed, parts[2].unflatten(0, (6, 6)))
+    pose, alt, matrix, figures = table.floats.split([12, 12, 36, 5])
+    place(best.pose, center, unit, pose.unflatten(0, (3, 4)))
+    place(other.to(chi2), center, unit, alt.unflatten(0, (3, 4)))
+    independence = covariance(best, center, unit, mixed, matrix.unflatten(0, (6, 6)))
     chi2_alt = other_cost.to(chi2)
     if isinstance(pixel, Observations):
         rms, rms_alt = (_mean_square(pixel, problem.weight, v.to(chi2)).sqrt() for v in (best.pose, other))
@@ -181,20 +181,16 @@ def write(
     for failed, verdict in verdicts:
         code = torch.where(failed, int(verdict), code)
 
-    for part, value in zip(
-        parts[3:], (chi2[None], rms[None], torch.stack([chi2_alt, rms_alt, rms_alt / rms])), strict=True
-    ):
-        part.copy_(value)
-    for part, value in zip(table.integers.split(1), (best.iterations, code), strict=True):
-        part.copy_(value)
+    figures.copy_(torch.stack([chi2, rms, chi2_alt, rms_alt, rms_alt / rms]))
+    table.integers.copy_(torch.stack([best.iterations, code]))
     failed = code > PnPCode.AMBIGUOUS
-    alone = failed | ~different
-    for unknown, columns in ((failed, parts), (alone, parts[1:6:4])):
-        index = None if tracing() else (unknown if again is None else unknown & ~again).nonzero().squeeze(1)
-        for part in columns:
-            if index is None:
+    for unknown, rows in ((failed, (table.floats,)), (failed | ~different, (alt, figures[2:]))):
+        if tracing():
+            for part in rows:
                 part.copy_(torch.where(unknown, torch.nan, part))
-            elif len(index):  # few lines rather than one more pass
+        else:  # few lines rather than one more pass
+            index = (unknown if again is None else unknown & ~again).nonzero().squeeze(1)
+            for part in rows if len(index) else ():
                 part.index_fill_(1, index, torch.nan)
 
 

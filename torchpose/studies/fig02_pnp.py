@@ -18,9 +18,8 @@ import torch
 from torch import Tensor
 
 from torchpose import pnp
-from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
-from torchpose.kernels import find_compiler
+from torchpose.kernels import has_compiler
 from torchpose.report.figures import subplots
 from torchpose.studies.study import Comparison, Picture, Progress, StudyResult, Table, ignore_progress
 
@@ -173,13 +172,6 @@ def run(
     )
 
 
-def _has_compiler() -> bool:
-    try:
-        return bool(find_compiler())
-    except ConfigError:
-        return False
-
-
 def _methods() -> dict[str, Callable[[Tensor], Poses]]:
     cv2.setNumThreads(1)
     methods: dict[str, Callable[[Tensor], Poses]] = {
@@ -188,7 +180,7 @@ def _methods() -> dict[str, Callable[[Tensor], Poses]]:
         "torchpose epnp": ours("epnp"),
         "torchpose p3p": ours("p3p"),
         "torchpose posit": ours("posit"),
-        **({COMPILED: ours("iterative", compile=True)} if _has_compiler() else {}),
+        **({COMPILED: ours("iterative", compile=True)} if has_compiler() else {}),
         "cv2 ITERATIVE": opencv(cv2.SOLVEPNP_ITERATIVE),
         "cv2 EPNP": opencv(cv2.SOLVEPNP_EPNP),
         "cv2 IPPE": opencv(cv2.SOLVEPNP_IPPE),
