@@ -19,9 +19,9 @@ from pathlib import Path
 import cv2
 import torch
 
+from torchpose.datasets.dataset import analytic
+from torchpose.datasets.plan import Plan, load_plan
 from torchpose.errors import ConfigError
-from torchpose.sim.dataset import analytic
-from torchpose.sim.plan import Plan, load_plan
 from torchpose.sim.sensor import add_noise
 
 BATCH = 3  # as the data set writer for 2 megapixels
@@ -49,7 +49,7 @@ def peak() -> float:
 
 
 def blender_times(plan: Plan, frames: int) -> list[float]:
-    from torchpose.sim.blender import blender
+    from torchpose.datasets.blender import blender
 
     renderer = blender(plan, threads=1)
     times = []

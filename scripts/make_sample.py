@@ -16,7 +16,8 @@ from torchpose.analysis import pose_crlb
 from torchpose.camera import Camera
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
-from torchpose.sim import Truth, add_noise, render, write_truth
+from torchpose.io.truth import Truth, write_truth
+from torchpose.sim import add_noise, render
 from torchpose.target import Target
 
 SEED = 20

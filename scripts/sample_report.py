@@ -24,7 +24,7 @@ from torch import Tensor
 from torchpose.analysis import pose_errors, rms
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
-from torchpose.sim import Truth, read_truth
+from torchpose.io.truth import Truth, read_truth
 
 REQUIRED = torch.tensor([2e-3, 6e-3, math.radians(0.01)], dtype=torch.float64)  # RMS over frames: mm, mm, rad
 BOUND_FACTOR = 2.0  # a frame whose Cramer-Rao bound times this is larger is held to that instead

@@ -15,7 +15,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 import torchpose as tp
 from torchpose.geometry import rotations
-from torchpose.sim import add_noise, read_truth, render
+from torchpose.io.truth import read_truth
+from torchpose.sim import add_noise, render
 
 SAMPLE = Path(__file__).parent.parent / "data" / "sample"
 QUAD = tp.Target.load("quad40")

@@ -87,6 +87,6 @@ def test_layout_names_every_part():
     layout = README[README.index("## Layout") : README.index("Imports point one way")]
     parts = [path for path in (ROOT / "torchpose").iterdir() if not path.name.startswith("_")]
     stages = {f"{path.name}/" for path in parts if (path / "__init__.py").exists()}
-    helpers = {"errors.py", "yaml_files.py"}
+    helpers = {"errors.py", "config.py"}
     modules = {path.name for path in parts if path.suffix == ".py"} - helpers
     assert set(re.findall(r"`([\w.]+/?)`", layout)) >= stages | modules

@@ -10,10 +10,10 @@ import torch
 from pydantic import BaseModel, ConfigDict, FiniteFloat, model_validator
 from torch import Tensor
 
+from torchpose.config import format_list, read_yaml, validate, write_text
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.target import Vector
-from torchpose.yaml_files import format_list, read_yaml, validate, write_text
 
 _ORTHONORMAL = 1e-6  # largest entry of R^T R - I that a file may have
 

@@ -10,24 +10,24 @@ import torch
 from torch import Tensor, nn
 
 from torchpose.camera import Camera
-from torchpose.centers import common_center, compensate
 from torchpose.detect import find_candidates
 from torchpose.errors import ConfigError, FrameError
-from torchpose.markers import Identified, MarkerTable, crossed_out, identify
-from torchpose.outcome import outcome
+from torchpose.identify import Identified, MarkerTable, crossed_out, identify, look_again
 from torchpose.pose import (
     MIN_MARKERS,
     Evidence,
     Solutions,
     center_rms,
+    common_center,
+    compensate,
     gather_evidence,
     intrinsics_covariance,
+    outcome,
     solve_poses,
 )
 from torchpose.refine import decide, decide_on_grey, refine_centers, refine_edges, refine_photometric
 from torchpose.results import Poses, Reason, Status
 from torchpose.rings import Rings, measure_rings
-from torchpose.second_look import look_again
 from torchpose.target import Target
 
 _FRAME_TYPES = (torch.uint8, torch.uint16, torch.float16, torch.bfloat16, torch.float32, torch.float64)

@@ -13,9 +13,9 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
 from torch import Tensor
 
+from torchpose.config import format_list, format_number, read_yaml, validate, write_text
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
-from torchpose.yaml_files import format_list, format_number, read_yaml, validate, write_text
 
 MIN_RATIO_GAP = 0.05  # smallest difference between the inner/outer ratios of two markers that can be told apart
 RATIO_RANGE = (0.15, 0.9)  # inner/outer: a smaller hole or a thinner ring is not readable

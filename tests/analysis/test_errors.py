@@ -12,8 +12,8 @@ from scipy.stats import chi2, kstest
 
 from torchpose.analysis import pose_errors, rms
 from torchpose.geometry import rotations
+from torchpose.io.truth import Truth
 from torchpose.results import Poses
-from torchpose.sim import Truth
 
 POSES = 4000
 

@@ -10,7 +10,6 @@ import torch
 from exact import exact_ellipses, pinhole
 from torch import Tensor
 
-from torchpose import centers as stage
 from torchpose.analysis import (
     Uncertainty,
     edge_noise,
@@ -24,6 +23,7 @@ from torchpose.analysis.sensitivity import radius_shift
 from torchpose.camera import Camera
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import rotations
+from torchpose.pose import centers as stage
 from torchpose.target import Target
 
 # torch's forward mode loads a module that warns of torch's own use of torch.jit.script

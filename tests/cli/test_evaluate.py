@@ -13,7 +13,7 @@ import torch
 from torchpose.analysis.evaluation import SCALE, estimates_of, evaluate
 from torchpose.cli.main import main
 from torchpose.geometry import rotations
-from torchpose.sim import Truth, write_truth
+from torchpose.io.truth import Truth, write_truth
 
 F64 = torch.float64
 POSE = ("tx", "ty", "tz", "rx", "ry", "rz")

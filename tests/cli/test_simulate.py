@@ -13,10 +13,11 @@ import yaml
 
 from torchpose.camera import Camera
 from torchpose.cli.main import main
+from torchpose.datasets.dataset import analytic, plan_truth, simulated_frames
+from torchpose.datasets.plan import load_plan
 from torchpose.geometry import rotations
-from torchpose.sim import add_noise, read_truth, render
-from torchpose.sim.dataset import analytic, plan_truth, simulated_frames
-from torchpose.sim.plan import load_plan
+from torchpose.io.truth import read_truth
+from torchpose.sim import add_noise, render
 from torchpose.target import Target
 
 ROOT = Path(__file__).parents[2]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from torchpose.camera import Camera
 from torchpose.design.layout import ARRANGEMENTS, Limits, assign_codes
-from torchpose.markers import ratio_tolerance
+from torchpose.identify.markers import ratio_tolerance
 
 F64 = torch.float64
 LIMITS = Limits(outer=12.0, inner=4.0, width=7.0, scale=6.0)

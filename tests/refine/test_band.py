@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchpose import ellipse
-from torchpose.refine.band import band_pixels
+from torchpose.refine.photometric.band import band_pixels
 
 F64 = torch.float64
 HEIGHT, WIDTH, BAND = 110, 120, 3.5

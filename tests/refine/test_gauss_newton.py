@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchpose.refine.gauss_newton import LEVELS, POSE, Step, gauss_newton_step
+from torchpose.refine.photometric.gauss_newton import LEVELS, POSE, Step, gauss_newton_step
 
 F64 = torch.float64
 MARKERS, PIXELS, TRIALS = 4, 300, 400

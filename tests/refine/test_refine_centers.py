@@ -8,9 +8,8 @@ import torch
 from exact import F64, exact_ellipses, pinhole, random_poses, rings_of
 
 import torchpose as tp
-from torchpose.centers import common_center
 from torchpose.geometry import rotations
-from torchpose.pose import Evidence, gather_evidence, solve_poses
+from torchpose.pose import Evidence, common_center, gather_evidence, solve_poses
 from torchpose.refine import decide, refine_centers
 from torchpose.refine.centers import ellipse_centers
 from torchpose.results import Status

@@ -14,7 +14,7 @@ import torchpose as tp
 from torchpose import ellipse
 from torchpose.geometry import conics, rotations
 from torchpose.refine import Refined, refine_edges
-from torchpose.refine.edges import circle_distance
+from torchpose.refine.edges.fit import circle_distance
 from torchpose.sim import add_noise, render
 
 QUAD = tp.Target.load("quad40")

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from torchpose.geometry import rotations
 from torchpose.refine import Refined, refine_photometric
-from torchpose.refine.grey_chi2 import grey_chi2
-from torchpose.refine.ring_model import Sight
-from torchpose.refine.sectors import SECTORS, Sectors, away_from_unclear, doubtful, trust
+from torchpose.refine.photometric.grey_chi2 import grey_chi2
+from torchpose.refine.photometric.ring_model import Sight
+from torchpose.refine.photometric.sectors import SECTORS, Sectors, away_from_unclear, doubtful, trust
 from torchpose.sim import add_noise, render, shapes
 from torchpose.target import Target
 

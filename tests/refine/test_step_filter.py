@@ -10,7 +10,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
-from torchpose.refine.step_filter import StepOffsets, step_offsets, window_correlation
+from torchpose.refine.edges.step_filter import StepOffsets, step_offsets, window_correlation
 
 F64 = torch.float64
 PSF, FINE, SIZE = 0.8, 15, 33

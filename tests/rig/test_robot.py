@@ -20,10 +20,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from torchpose.config import validate
 from torchpose.errors import ConfigError
 from torchpose.rig.robot import Robot, RobotFault, RobotReason, RobotSettings, Settle, Workspace
 from torchpose.rig.twin.controller import START_POSE, Fault, TwinController
-from torchpose.yaml_files import validate
 
 WORKSPACE = Workspace(min=[200.0, -200.0, 100.0], max=[600.0, 200.0, 800.0])
 FAR = (430.0, 0.0, 300.0, math.pi, 0.0, 0.0)  # 30 mm from the start: 0.85 s at the speed of these tests

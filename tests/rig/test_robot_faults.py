@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 import yaml
 
+from torchpose.config import validate
 from torchpose.rig.robot import RobotReason, RobotSettings
 from torchpose.rig.robot_faults import of_dashboard, of_safety_bits
-from torchpose.yaml_files import validate
 
 PAGE = (Path(__file__).parents[2] / "docs" / "robot.md").read_text()
 # safety_status_bits: normal mode, reduced mode, protective stopped, recovery mode, safeguard stopped, system emergency

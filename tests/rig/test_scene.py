@@ -82,9 +82,9 @@ def test_the_flange_is_where_the_tool_offset_says():
 
 @pytest.mark.parametrize("size", ["", "_2mp"])
 def test_the_shipped_files_belong_together(size):
+    from torchpose.datasets.plan import markers_in_view
     from torchpose.rig.plan import load_plan
     from torchpose.rig.settings import load_rig
-    from torchpose.sim.plan import markers_in_view
 
     folder = ROOT / "configs/rig"
     rig = load_rig(folder / f"ur5_{'20mp' if not size else '2mp'}.yaml")

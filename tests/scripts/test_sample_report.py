@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchpose.sim import read_truth
+from torchpose.io.truth import read_truth
 
 ROOT = Path(__file__).parents[2]
 TRUTH = ROOT / "data" / "sample" / "truth.csv"

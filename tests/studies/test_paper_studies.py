@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchpose.sim.plan import load_plan
+from torchpose.datasets.plan import load_plan
 from torchpose.studies import (
     fig06_regions,
     fig07_subpixel,

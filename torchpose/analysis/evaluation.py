@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchpose.analysis.errors import PoseErrors, pose_errors, rms
 from torchpose.geometry import rotations
-from torchpose.sim.truth import Truth
+from torchpose.io.truth import Truth
 
 AXES = ("x", "y", "z", "pitch", "yaw", "roll")
 UNITS = ("um", "um", "um", "mdeg", "mdeg", "mdeg")

@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpose import ellipse, zernike
+from torchpose import ellipse
 from torchpose.camera import Camera
 from torchpose.geometry.segments import segment_sum
-from torchpose.rings import ideal_pixels
+from torchpose.rings import ideal_pixels, zernike
 
 _REACH = 2.0  # px on either side of the rough outline
 _LEAST_STEP = 40.0  # grey levels

@@ -9,10 +9,10 @@ from torch import Tensor
 
 from torchpose.calibration.views import Views
 from torchpose.camera import Camera
-from torchpose.centers import common_center, raw_centers
 from torchpose.detect import find_candidates
-from torchpose.markers import MarkerTable, identify
+from torchpose.identify import MarkerTable, identify
 from torchpose.pipeline import PoseEstimator
+from torchpose.pose import common_center, raw_centers
 from torchpose.refine import refine_photometric
 from torchpose.results import Status
 from torchpose.rings import measure_rings

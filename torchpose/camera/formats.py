@@ -17,8 +17,8 @@ from typing import Any
 import torch
 
 from torchpose.camera.model import Camera, Model
+from torchpose.config import format_list, format_number, parse_mapping, read_text, suggest, write_text
 from torchpose.errors import ConfigError
-from torchpose.yaml_files import format_list, format_number, parse_mapping, read_text, suggest, write_text
 
 FIELDS: dict[str, tuple[str, ...]] = {
     "image_width": ("image_width", "width"),

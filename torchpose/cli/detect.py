@@ -138,8 +138,8 @@ def _rows(sources: Sequence[Source], images: np.ndarray, explain: bool) -> list[
     import torch
 
     from torchpose.detect import Verdict, find_shapes
-    from torchpose.inner_circles import find_inner
     from torchpose.io.shape_rows import shape_rows
+    from torchpose.rings.inner_circles import find_inner
 
     frames = torch.from_numpy(images)
     shapes = find_shapes(frames, explain=explain)

@@ -12,7 +12,7 @@ from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:
     from torchpose.analysis.evaluation import Evaluation
-    from torchpose.sim.truth import Truth
+    from torchpose.io.truth import Truth
 
 EPILOG = """
 Examples:
@@ -42,7 +42,7 @@ def evaluate(
     """Compare poses with the truth: bias and spread of each axis beside its bound, success by status, NEES."""
     from torchpose.analysis.evaluation import estimates_of
     from torchpose.analysis.evaluation import evaluate as evaluate_poses
-    from torchpose.sim.truth import read_truth
+    from torchpose.io.truth import read_truth
 
     path = truth / "truth.csv" if truth.is_dir() else truth
     known = read_truth(path)

@@ -51,8 +51,8 @@ def simulate(
     import torch
 
     from torchpose.cli.terminal import FrameProgress
-    from torchpose.sim.dataset import write_dataset
-    from torchpose.sim.plan import load_plan
+    from torchpose.datasets.dataset import write_dataset
+    from torchpose.datasets.plan import load_plan
 
     cv2.setNumThreads(1)
     torch.set_num_threads(max(1, (threads or cores()) // 2))

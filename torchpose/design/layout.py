@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.detect.reduce import reduction_factor
-from torchpose.markers import ratio_tolerance
+from torchpose.identify.markers import ratio_tolerance
 from torchpose.target import MIN_RATIO_GAP
 
 # columns, rows (columns along the longer side) and whether the places within the rim are used
@@ -59,7 +59,7 @@ class Limits:
     def ratios(self, count: int, radius: float) -> Tensor | None:
         """Inner/outer ratios (count,), rising, as far apart as the ring allows; None where it cannot hold so many.
 
-        Neighbours differ by at least twice the tolerance of `torchpose.markers`, so that a reading within the
+        Neighbours differ by at least twice the tolerance of `torchpose.identify.markers`, so that a reading within the
         tolerance of one code is outside that of every other.
         """
         semi_minor = radius * self.scale

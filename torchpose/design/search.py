@@ -14,7 +14,7 @@ from torchpose.design.precision import FRAME_MARGIN_PX, Need, Precision, predict
 from torchpose.design.predict import Imaging, deviations, edge_covariance, in_view, outlines
 from torchpose.design.volume import WorkingVolume
 from torchpose.errors import ConfigError
-from torchpose.markers import ratio_tolerance
+from torchpose.identify.markers import ratio_tolerance
 from torchpose.target import Target
 
 _RADII = 10  # outer radii tried for every number of rings

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchpose.geometry import rotations
 from torchpose.pose import Evidence
-from torchpose.refine.gauss_newton import solve_scaled
+from torchpose.refine.photometric.gauss_newton import solve_scaled
 
 _STEPS = 4  # from within a few standard deviations: the last one changes no digit that counts
 

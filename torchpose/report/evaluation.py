@@ -15,7 +15,7 @@ from torchpose.report.figures import COLOURS, GREY, subplots
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from torchpose.sim.truth import Truth
+    from torchpose.io.truth import Truth
 
 
 def plot_errors(evaluation: Evaluation, title: str) -> Figure:

@@ -19,11 +19,11 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator, model_validator
 from torch import Tensor
 
+from torchpose.config import read_yaml, validate
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.rig.robot_settings import Pose, Workspace
 from torchpose.target import RigidTransformFile, Vector
-from torchpose.yaml_files import read_yaml, validate
 
 _FROZEN = ConfigDict(extra="forbid", frozen=True)
 _AXES = {"x": 0, "y": 1, "z": 2, "pitch": 0, "yaw": 1, "roll": 2}

@@ -7,9 +7,9 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
 
+from torchpose.config import read_yaml, validate
 from torchpose.rig.camera import CameraSettings
 from torchpose.rig.robot_settings import RobotSettings
-from torchpose.yaml_files import read_yaml, validate
 
 
 class Rig(BaseModel):

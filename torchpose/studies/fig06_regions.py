@@ -18,13 +18,13 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.detect import find_shapes
 from torchpose.geometry import conics, rotations
-from torchpose.inner_circles import find_inner
 from torchpose.io.shape_rows import shape_rows
 from torchpose.pipeline import PoseEstimator
 from torchpose.report.detection_overlay import draw_shapes
 from torchpose.report.figures import subplots
 from torchpose.results import Status
 from torchpose.rings import measure_rings
+from torchpose.rings.inner_circles import find_inner
 from torchpose.sim import add_noise, render, shapes
 from torchpose.sim.sensor import Lighting
 from torchpose.studies import table02_detection

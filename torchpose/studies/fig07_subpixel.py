@@ -13,13 +13,13 @@ import cv2
 import torch
 from torch import Tensor
 
-from torchpose import ellipse, zernike
+from torchpose import ellipse
 from torchpose.camera import Camera
 from torchpose.detect import find_candidates
-from torchpose.edges import RingEdges, ring_edges
 from torchpose.geometry import conics, rotations
 from torchpose.report.figures import COLOURS, subplots
-from torchpose.rings import measure_rings
+from torchpose.rings import measure_rings, zernike
+from torchpose.rings.edges import RingEdges, ring_edges
 from torchpose.sim import add_noise, render, shapes
 from torchpose.studies.study import Picture, Progress, StudyResult, Table, Value, ignore_progress
 

@@ -20,14 +20,14 @@ from torch import Tensor
 
 from torchpose.analysis.evaluation import BOUND, Estimates, Evaluation, evaluate
 from torchpose.camera import Camera
+from torchpose.datasets.dataset import analytic, bounds, plan_truth, simulated_frames
+from torchpose.datasets.plan import Plan, load_plan
+from torchpose.io.truth import Truth
 from torchpose.pipeline import PoseEstimator
 from torchpose.report.evaluation import plot_consistency, plot_errors
 from torchpose.report.figures import subplots
 from torchpose.report.overlay import Overlay
 from torchpose.results import Poses, Status
-from torchpose.sim import Truth
-from torchpose.sim.dataset import analytic, bounds, plan_truth, simulated_frames
-from torchpose.sim.plan import Plan, load_plan
 from torchpose.studies.study import Comparison, Picture, Progress, StudyResult, Table, Value, ignore_progress
 
 if TYPE_CHECKING:
@@ -145,7 +145,7 @@ def _estimates(parts: list[Poses]) -> Estimates:
 
 
 def _by_blender(plan: Plan) -> Evaluation:
-    from torchpose.sim.blender import blender
+    from torchpose.datasets.blender import blender
 
     renderer, estimator = blender(plan), PoseEstimator(plan.camera, plan.target)
     truth: Truth = plan_truth(plan)

@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 
 import torchpose as tp
-from torchpose.centers import common_center, compensate
 from torchpose.detect import find_candidates
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import conics, rotations
+from torchpose.pose import common_center, compensate
 from torchpose.report.figures import COLOURS, GREY, subplots
 from torchpose.rings import measure_rings
 from torchpose.sim import add_noise, render

@@ -20,13 +20,13 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 from torch import Tensor
 
 from torchpose.camera import Camera
+from torchpose.config import beside, read_yaml, validate
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.rig.settings import Rig
 from torchpose.rig.twin.controller import TwinController, TwinErrors
 from torchpose.sim import add_noise, render
 from torchpose.target import RigidTransformFile, Target
-from torchpose.yaml_files import beside, read_yaml, validate
 
 _FROZEN = ConfigDict(extra="forbid", frozen=True)
 _Positive = Annotated[FiniteFloat, Field(gt=0)]

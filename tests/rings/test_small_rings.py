@@ -1,0 +1,85 @@
+"""Whole-ring fits of rendered rings too small for separate edges."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from exact import exact_ellipses, pinhole, random_poses
+
+from torchpose.identify.markers import ratio_tolerance
+from torchpose.rings.small_rings import fit_small_rings
+from torchpose.sim import add_noise, render
+from torchpose.target import Target
+
+
+@pytest.mark.parametrize("tilt", [0.1, 40.0])
+@pytest.mark.parametrize("noise", [1.0, 4.0])
+def test_within_their_own_covariance(tilt, noise):
+    camera, target = pinhole(1111.11, 400, 300), Target.load("quad40")
+    r, t = random_poses(12, tilt, (600, 800), seed=4)
+    t[:, :2] = 0
+    frames = add_noise(render(camera, target, r, t, psf_sigma=0.8), noise, seed=1)
+    truth = exact_ellipses(target, camera, r, t).flatten(0, 1)
+    frame = torch.arange(12).repeat_interleave(4)
+    rough = truth[:, 0].clone()
+    rough[:, :2] += 0.4
+    rough[:, 2:4] += 0.3
+    ratio = truth[:, 1, 3] / truth[:, 0, 3] + 0.05
+    seen, one = torch.ones(48, 64, dtype=torch.bool), torch.ones(48, dtype=torch.float64)
+    found = fit_small_rings(frames, frame, rough, ratio, seen, one, torch.tensor(1111.11))
+    assert found.good.all()
+    for fit, exact in ((found.outer, truth[:, 0]), (found.inner, truth[:, 1])):
+        error = fit.params[:, :2] - exact[:, :2]
+        nees = (error[:, None] @ torch.linalg.solve(fit.center_covariance, error[..., None])).flatten()
+        assert error.norm(dim=-1).max() < 0.04 + 0.03 * noise
+        if tilt < 1:  # perspective parts the centres of tilted circles, see the module
+            assert nees.mean() < 3.0  # 1 expected: each circle is given twice the variance of the common fit
+    code = (found.inner.params[:, 2:4].prod(-1) / found.outer.params[:, 2:4].prod(-1)).sqrt()
+    assert (code - truth[:, 1, 3] / truth[:, 0, 3]).abs().max() < 0.01 + 0.01 * noise
+
+
+@pytest.mark.parametrize("blur", [1.7, 2.5])
+def test_codes_of_much_blurred_rings(blur):
+    """Rings of 7 to 10 px under a blur of half their inner circle or more: the codes stay within their tolerance."""
+    camera, target = pinhole(1111.11, 400, 300), Target.load("quad40")
+    r, t = random_poses(10, 30.0, (560, 700), seed=2)
+    t[:, :2] = 0
+    frames = add_noise(render(camera, target, r, t, psf_sigma=blur), 1.0, seed=1)
+    truth = exact_ellipses(target, camera, r, t).flatten(0, 1)
+    rough = truth[:, 0].clone()
+    rough[:, 2:4] += 0.5
+    seen, one = torch.ones(40, 64, dtype=torch.bool), torch.ones(40, dtype=torch.float64)
+    frame, start = torch.arange(10).repeat_interleave(4), torch.full((40,), 0.45, dtype=torch.float64)
+    found = fit_small_rings(frames, frame, rough, start, seen, one, torch.tensor(1111.11))
+    code = (found.inner.params[:, 2:4].prod(-1) / found.outer.params[:, 2:4].prod(-1)).sqrt()
+    off = (code - truth[:, 1, 3] / truth[:, 0, 3]).abs() / ratio_tolerance(truth[:, 0, 3])
+    assert found.good.double().mean() >= 0.9  # where the blur leaves the code open, the fit says so
+    assert off[found.good].quantile(0.95) < 1
+
+
+def test_codes_without_noise():
+    """A blur of 0.37 of the outer radius; to first order in the distance the codes would be wrong by 0.1 to 0.2."""
+    camera, target = pinhole(1111.11, 200, 200), Target.load("quad40")
+    r = torch.eye(3, dtype=torch.float64)[None]
+    frame = render(camera, target, r, torch.tensor([[0.0, 0, 790]], dtype=torch.float64), psf_sigma=2.6)
+    truth = exact_ellipses(target, camera, r, torch.tensor([[0.0, 0, 790]], dtype=torch.float64))[0]
+    rough = truth[:, 0] + torch.tensor([0.2, -0.1, 0.4, 0.4, 0], dtype=torch.float64)
+    seen, one = torch.ones(4, 64, dtype=torch.bool), torch.ones(4, dtype=torch.float64)
+    nought, start = torch.zeros(4, dtype=torch.int64), torch.full((4,), 0.4, dtype=torch.float64)
+    found = fit_small_rings(frame, nought, rough, start, seen, one, torch.tensor(1111.11))
+    code = (found.inner.params[:, 2:4].prod(-1) / found.outer.params[:, 2:4].prod(-1)).sqrt()
+    assert found.good.all()
+    assert (code - truth[:, 1, 3] / truth[:, 0, 3])[:3].abs().max() < 0.005
+    assert abs(code[3] - 0.6) < 0.05
+
+
+def test_refuses_what_is_no_ring():
+    frames = 128 + 20 * torch.randn(1, 80, 80, generator=torch.Generator().manual_seed(1))
+    frames[0, 30:50, 30:50] = 20.0  # a square without a hole
+    v, u = torch.meshgrid(torch.arange(80), torch.arange(80), indexing="ij")
+    frames[0] -= 100 * torch.sigmoid(3 * (7 - torch.hypot(u - 60.0, v - 60.0)))  # a disc without a hole
+    rough = [[20.0, 20, 7, 7, 0], [40, 40, 9, 9, 0], [1, 40, 7, 7, 0], [60, 60, 7, 7, 0]]
+    half, one = torch.full((4,), 0.5, dtype=torch.float64), torch.ones(4, dtype=torch.float64)
+    frame, seen = torch.zeros(4, dtype=torch.int64), torch.ones(4, 64, dtype=torch.bool)
+    found = fit_small_rings(frames, frame, torch.tensor(rough).double(), half, seen, one, torch.tensor(1111.11))
+    assert not found.good.any()

@@ -1,0 +1,62 @@
+"""The house: what may import what, and how large a function may grow."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1] / "torchpose"
+# each room may import those before it, and rooms of its own line none of each other
+FLOW = [
+    ["errors", "geometry"],
+    ["config", "ellipse", "kernels"],
+    ["camera", "target"],
+    ["handeye", "results", "pnp"],
+    ["detect"],
+    ["rings"],
+    ["identify"],
+    ["pose"],
+    ["refine"],
+    ["pipeline"],
+    ["io", "sim"],
+    ["analysis"],
+    ["datasets"],
+    ["design", "calibration", "rig"],
+    ["report"],
+    ["studies"],
+    ["cli"],
+    ["__main__"],
+]
+LEVEL = {room: level for level, rooms in enumerate(FLOW) for room in rooms}
+MODULES = sorted(ROOT.rglob("*.py"))
+LOOSE = 8  # files beside __init__.py
+
+
+def imported(tree):
+    """Rooms of the package that a module imports, with their lines."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "torchpose":
+            parts = node.module.split(".")[1:2] or [alias.name for alias in node.names]
+            yield from ((part, node.lineno) for part in parts)
+        elif isinstance(node, ast.Import):
+            names = [alias.name.split(".") for alias in node.names]
+            yield from ((name[1], node.lineno) for name in names if name[0] == "torchpose" and len(name) > 1)
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_imports_follow_the_flow(path):
+    room = path.relative_to(ROOT).parts[0].removesuffix(".py")
+    if room == "__init__":
+        return  # hands on the public names of all rooms
+    for other, line in imported(ast.parse(path.read_text())):
+        if other != room and other not in ("__version__",):
+            assert LEVEL[other] < LEVEL[room], f"line {line}: {room} imports {other}"
+
+
+def test_every_room_has_its_place():
+    found = {path.stem for path in ROOT.glob("*.py")} | {path.parent.name for path in ROOT.glob("*/__init__.py")}
+    assert found - {"__init__"} == set(LEVEL)
+
+
+def test_few_loose_files():
+    assert len([path for path in ROOT.glob("*.py") if path.name != "__init__.py"]) <= LOOSE

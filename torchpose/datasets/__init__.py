@@ -1,0 +1,1 @@
+"""Simulated data sets: plans, and frames written with their truth and bound."""

@@ -1,0 +1,99 @@
+"""The truth of simulated frames: one CSV row per frame and target."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from torchpose.config import format_number, read_text, write_text
+from torchpose.errors import ConfigError
+from torchpose.geometry import rotations
+
+NAMES = ("frame", "target")
+POSE = ("tx", "ty", "tz", "rx", "ry", "rz")
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Known poses of N frame-target pairs.
+
+    Attributes:
+        frame: N paths relative to the folder of frames. target: N names of targets.
+        t: (N, 3) float64, mm, target to camera.
+        rotation_vector: (N, 3) float64, rad, target to camera.
+        extra: further columns by name, (N,) float64 each. Their names carry the unit where it is not mm, rad, px or
+            grey levels; ``sx sy sz srx sry srz`` are the Cramer-Rao standard deviations of `torchpose.analysis`.
+    """
+
+    frame: list[str]
+    target: list[str]
+    t: Tensor
+    rotation_vector: Tensor
+    extra: dict[str, Tensor] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @property
+    def R(self) -> Tensor:
+        """(N, 3, 3) float64, target to camera."""
+        return rotations.exp(self.rotation_vector)
+
+
+def write_truth(path: str | os.PathLike[str], truth: Truth) -> None:
+    """Writes a truth file in one piece; every number reads back exactly.
+
+    Raises:
+        ConfigError: the folder does not exist or cannot be written.
+    """
+    columns = [*truth.t.unbind(1), *truth.rotation_vector.unbind(1), *truth.extra.values()]
+    numbers = zip(*(c.tolist() for c in columns), strict=True)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*NAMES, *POSE, *truth.extra])
+    for frame, target, row in zip(truth.frame, truth.target, numbers, strict=True):
+        writer.writerow([frame, target, *map(format_number, row)])
+    write_text(path, text.getvalue())
+
+
+def read_truth(path: str | os.PathLike[str]) -> Truth:
+    """Reads a truth file: ``frame,target,tx,ty,tz,rx,ry,rz`` and further columns of numbers, in any order.
+
+    Raises:
+        ConfigError: the file is missing or not text, a column is missing or given twice, a row has another number of
+            fields than the header, or a field is not a number.
+    """
+    header, *rows = csv.reader(io.StringIO(read_text(path)))
+    for name in (*NAMES, *POSE):
+        if name not in header:
+            raise ConfigError(f"{path}: {name}: column is missing; the header needs {','.join((*NAMES, *POSE))}")
+    for name in header:
+        if header.count(name) > 1:
+            raise ConfigError(f"{path}: {name}: column is given twice; keep one")
+    for line, row in enumerate(rows, 2):
+        if len(row) != len(header):
+            raise ConfigError(f"{path}: line {line}: has {len(row)} fields; give {len(header)}, as in the header")
+    text = dict(zip(header, zip(*rows, strict=True), strict=True)) if rows else dict.fromkeys(header, ())
+    columns = {name: _numbers(path, name, text[name]) for name in header if name not in NAMES}
+    return Truth(
+        frame=list(text["frame"]),
+        target=list(text["target"]),
+        t=torch.stack([columns.pop(name) for name in POSE[:3]], 1),
+        rotation_vector=torch.stack([columns.pop(name) for name in POSE[3:]], 1),
+        extra=columns,
+    )
+
+
+def _numbers(path: str | os.PathLike[str], name: str, values: tuple[str, ...]) -> Tensor:
+    numbers = []
+    for line, value in enumerate(values, 2):
+        try:
+            numbers.append(float(value))
+        except ValueError:
+            raise ConfigError(f"{path}: {name}: {value!r} in line {line} is not a number; write one") from None
+    return torch.tensor(numbers, dtype=torch.float64)

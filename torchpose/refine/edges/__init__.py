@@ -1,0 +1,1 @@
+"""Refinement on the edge points of the rings."""

@@ -1,0 +1,1 @@
+"""Refinement on the grey values around the rings."""

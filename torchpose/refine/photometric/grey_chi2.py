@@ -1,0 +1,78 @@
+"""Chi-squared of the grey values around the rings under two poses of the same frame."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchpose.geometry.segments import segment_sum
+from torchpose.refine.photometric.band import band_width
+from torchpose.refine.photometric.gauss_newton import POSE, QUANTISATION, solve_ridged
+from torchpose.refine.photometric.grey_levels import (
+    CUT,
+    TILE,
+    columns_of,
+    first_levels,
+    inliers,
+    model_misfit,
+    noise_spread,
+    sum_products,
+)
+from torchpose.refine.photometric.ring_model import Sight, gather_pixels, ring_model
+from torchpose.refine.photometric.sectors import clear_sectors, misfit, sum_sectors
+from torchpose.refine.result import Refined
+
+_LEVEL_STEPS = 3  # of the grey levels alone
+
+
+def grey_chi2(sight: Sight, one: Refined, two: Refined) -> tuple[Tensor, Tensor]:
+    """Chi-squared (N,) of the grey values under the refined poses ``two`` less that under ``one``.
+
+    Also whether each of the two (N, 2) explains most of the sectors of every marker, by a ring that is there.
+
+    Both are judged on the same pixels, those that either explains, each with grey levels of its own; no pixel counts
+    for more than an outlier would. Where not even the better pose explains them within noise the difference counts
+    for less, by as much as the displacements of its sectors exceed theirs.
+    """
+    rows = len(sight.frame)
+    band = band_width(torch.maximum(one.blur, two.blur))
+    b = gather_pixels(sight, band, TILE)
+    squares, weights, variances, misfits, explained = [], [], [], [], []
+    for pose in (one, two):
+        model = ring_model(b, pose.R, pose.t, pose.blur, check=True)
+        levels = first_levels(b, pose.R, pose.t, pose.blur)
+        for _ in range(_LEVEL_STEPS):
+            columns, slope = columns_of(b, model, levels)
+            residual = columns[:, :, -1].flatten(1)
+            usable, weight = inliers(residual, b, model, levels)
+            sectors = sum_sectors(residual, slope, usable, weight, b, model)
+            clear = clear_sectors(sectors, noise_spread(residual, b), model_misfit(levels))
+            weight = weight * sectors.of_pixels(clear.to(weight.dtype))
+            sums = sum_products(columns, weight)
+            levels = levels + solve_ridged(sums[:, POSE:-1, POSE:-1], sums[:, POSE:-1, -1:]).squeeze(-1)
+        used = segment_sum(weight.sum(-1).double(), b.row, rows).clamp_min(1)
+        variance = (segment_sum(sums[:, -1, -1], b.row, rows) / used).clamp_min(QUANTISATION)
+        squares.append(residual.square())
+        weights.append(weight)
+        variances.append(variance)
+        misfits.append(misfit(sectors, clear, variance[b.row], b.row, rows))
+        shows = clear.any(-1) & _has_contrast(levels, sums[:, POSE:-1, POSE:-1], variance[b.row])
+        explained.append(segment_sum((~shows).double(), b.row, rows) == 0)
+    variance = torch.minimum(*variances)
+    most = (CUT**2 * variance[b.row, None]).to(squares[0].dtype)
+    of_one, of_two = (torch.minimum(s, most) for s in squares)
+    difference = (torch.maximum(*weights) * (of_two - of_one)).sum(-1).double()
+    chi2 = segment_sum(difference, b.row, rows) / variance / torch.minimum(*misfits).clamp_min(1)
+    return chi2, torch.stack(explained, -1)
+
+
+def _has_contrast(levels: Tensor, information: Tensor, variance: Tensor) -> Tensor:
+    """Markers (K,) bool whose ring and paper differ beyond noise: levels that are equal explain a cover.
+
+    Args:
+        levels: (K, 6). information: (K, 6, 6) about them at unit noise. variance: (K,) of noise.
+    """
+    by_level = torch.zeros_like(levels)
+    by_level[:, 0], by_level[:, 3] = -1.0, 1.0
+    spread2 = variance * (by_level * solve_ridged(information, by_level[..., None]).squeeze(-1)).sum(-1)
+    return (by_level * levels).sum(-1).square() > CUT**2 * spread2

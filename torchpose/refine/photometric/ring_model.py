@@ -1,0 +1,257 @@
+"""What the pixels around the edges of a ring should show: prediction and derivatives, for padded blocks of pixels.
+
+    F = Phi(z_outer) + 1 - Phi(z_inner),   z = (d + q^2 k / 2) / q
+
+is the fraction of paper in a pixel; d is its distance in px from the projected circle, k the curvature of the circle's
+image, q the blur (point-spread function and pixel together). The second term of z is the pull of blur on a curved edge;
+Phi carries the fourth cumulant of the square pixel. The distortion of the lens enters once, as the ray of each pixel.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchpose.camera import Camera
+from torchpose.geometry.rotations import plane_axes
+from torchpose.geometry.segments import values_at
+from torchpose.refine.photometric.band import band_pixels
+
+_FULL_SCALES = (255.0, 1023.0, 4095.0, 16383.0, 65520.0, 65535.0)  # of 8 to 16 bits; 12 bits in the upper ones of 16
+_DEEP = 0.7  # of the radius of curvature: nearer to its centre a pixel sees edges on all sides
+_BENT = 0.4  # of a distance from an edge: the most that its second-order term may be
+_FAR = 3.5  # standard deviations of the blur from an edge, from where on neither matters
+
+
+class Sight(NamedTuple):
+    """N rows of markers seen in frames, and where; arguments as in `refine_photometric`."""
+
+    frames: Tensor
+    camera: Camera
+    frame: Tensor
+    mask: Tensor
+    rings: Tensor
+    centers: Tensor
+    normals: Tensor
+    radii: Tensor
+
+    def rows(self, index: Tensor) -> Sight:
+        """Some of the rows, in the same frames."""
+        return Sight(self.frames, self.camera, *(v[index] for v in self[2:]))
+
+
+@dataclass(frozen=True, eq=False)
+class PixelBlocks:
+    """Pixels of K markers, padded to P; one plane of numbers (K, P) for every component.
+
+    row: (K,) int64. origin: (K, 2), a ray near each marker, on the plane z = 1. ray_x, ray_y: the pixels', from there.
+    warp: 4 planes, d(ray)/d(pixel) row by row. grey, valid. size: (K,) int64, pixels of each marker; what follows in
+    its row repeats the last one and is not valid. center, normal: (K, 3), target frame. radii: (K, 2). limits: (K, 2),
+    the grey levels at which the frame's noise is clipped, -inf and inf where it is not.
+    """
+
+    row: Tensor
+    origin: Tensor
+    ray_x: Tensor
+    ray_y: Tensor
+    warp: tuple[Tensor, ...]
+    grey: Tensor
+    valid: Tensor
+    size: Tensor
+    center: Tensor
+    normal: Tensor
+    radii: Tensor
+    limits: Tensor
+
+    def every(self, nth: int, most: int | None = None) -> PixelBlocks:
+        """The same with one pixel of ``nth``, or as many fewer as leave ``most`` of each marker."""
+        count = self.grey.shape[1] // nth
+        count = count if most is None else min(count, most)
+        i = torch.arange(count, device=self.row.device)
+        index = i * self.size.clamp_min(nth * count)[:, None] // count
+        inside = index < self.size[:, None]
+        index = index.minimum((self.size[:, None] - 1).clamp_min(0))
+        planes = {n: getattr(self, n).gather(1, index) for n in ("ray_x", "ray_y", "grey", "valid")}
+        planes["valid"] *= inside
+        return replace(self, **planes, warp=tuple(w.gather(1, index) for w in self.warp))
+
+
+class RingModel(NamedTuple):
+    """Prediction and derivatives at one pose; planes (K, P) in float32.
+
+    fraction: of paper, F. by_d, by_q: dF/dd through both circles, dF/dq. by_pose: 6 planes, derivative of d.
+    x, y: plane coordinates over the outer radius. sound: bool, False where the expansions below do not hold: deep in
+    a hole that is small for its blur, or where it is flat; None if not asked for.
+    """
+
+    fraction: Tensor
+    by_d: Tensor
+    by_q: Tensor
+    by_pose: tuple[Tensor, ...]
+    x: Tensor
+    y: Tensor
+    sound: Tensor | None
+
+
+def gather_pixels(sight: Sight, band: Tensor, grain: int) -> PixelBlocks:
+    """The pixels within ``band`` (N,) px of either circle of every marker seen.
+
+    ``grain``: the padded length P is a multiple of it.
+    """
+    frames, camera, frame, mask, rings, centers, normals, radii = sight
+    height, width = frames.shape[-2:]
+    row, marker = mask.nonzero().unbind(-1)
+    both = rings[row, marker]  # (K, 2, 5)
+    block, u, v = band_pixels(both[:, 0], both[:, 1], band[row], height, width)
+    if block.numel() == 0:  # of rings beyond the frame: one pixel that does not count
+        block, u, v = (torch.zeros(min(1, row.numel()), dtype=torch.int64, device=frames.device) for _ in range(3))
+    count = row.numel()
+    size = torch.bincount(block, minlength=count)
+    most = (int(size.max()) // grain + 1) * grain if count else grain
+    first = size.cumsum(0) - size
+    place = torch.arange(most, device=block.device)
+    inside = place < size[:, None]
+    index = (first[:, None] + torch.minimum(place, (size[:, None] - 1).clamp_min(0))).clamp_max(block.numel() - 1)
+
+    def padded(values: Tensor) -> Tensor:
+        return values.float().index_select(0, index.flatten()).view_as(index)
+
+    of = row.index_select(0, block)
+    grey = values_at(frames, (frame.index_select(0, of) * height + v) * width + u)
+    limits = _clipping(grey, of, frame.numel())[row]
+    low, high = (limit.contiguous().index_select(0, block) for limit in limits.unbind(-1))
+    xy = camera.undistort_points(torch.stack([u, v]).double().mT)
+    x, y = xy.unbind(-1)
+    # what is clipped is no measurement
+    sound = (x + y).isfinite() & grey.isfinite() & (grey > low) & (grey < high)
+    # rays count from that of the marker's middle pixel; what is not sound gets one of the marker, too, and stays finite
+    origin = xy.index_select(0, (first + size // 2).clamp_max(block.numel() - 1)).nan_to_num(nan=0.0)
+    x0, y0 = (o.contiguous().index_select(0, block) for o in origin.unbind(-1))
+    aside = (both[:, 0, 2] / camera.matrix[0, 0].to(x)).index_select(0, block)
+    x, y = (torch.where(sound, ray - start, aside) for ray, start in ((x, x0), (y, y0)))
+    j00, j01, j10, j11 = camera.slopes((x0 + x).float(), (y0 + y).float())
+    det = j00 * j11 - j01 * j10
+    return PixelBlocks(
+        row,
+        origin,
+        padded(x),
+        padded(y),
+        tuple(padded(w / det) for w in (j11, -j01, -j10, j00)),
+        padded(torch.where(sound, grey, 0.0)),
+        padded(sound) * inside,
+        size,
+        centers[row, marker],
+        normals[row, marker],
+        radii[row, marker],
+        limits,
+    )
+
+
+def _clipping(grey: Tensor, row: Tensor, rows: int) -> Tensor:
+    """Limits (N, 2) at which each row's grey values are clipped: 0, and the full scale of its brightest pixel."""
+    ends = torch.tensor([torch.inf, -torch.inf], device=grey.device).repeat(rows, 1)
+    darkest = ends[:, 0].scatter_reduce(0, row, grey, "amin")
+    brightest = ends[:, 1].scatter_reduce(0, row, grey, "amax")
+    full = torch.isin(brightest, torch.tensor(_FULL_SCALES, dtype=grey.dtype, device=grey.device))
+    low = torch.where(darkest <= 0, 0.0, -torch.inf)
+    return torch.stack([low, torch.where(full, brightest, torch.inf)], -1)
+
+
+def ring_model(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor, *, check: bool = False) -> RingModel:
+    """Predicts every pixel, and with ``check`` says where that is sound.
+
+    The radius in the plane is formed in float64, what is small beside it in float32.
+    """
+    rk = r[b.row]
+    normal = (rk @ b.normal[..., None]).squeeze(-1)
+    arm = (rk @ b.center[..., None]).squeeze(-1)  # marker's centre about the target's origin, camera axes
+    center = arm + t[b.row]
+    one, two = plane_axes(normal)
+
+    def scalar(value: Tensor) -> Tensor:
+        return value[:, None]
+
+    # the ray of the pixel meets the plane at depth * ray; coordinates there, about the circle's centre, are quotients
+    # of linear functions of the ray, which counts from a ray near the marker, so that float32 holds it
+    away = (normal * center).sum(-1, keepdim=True)
+    near = torch.nn.functional.pad(b.origin, (0, 1), value=1.0)
+    over = (normal * near).sum(-1, keepdim=True)
+
+    def linear(vector: Tensor) -> Tensor:
+        at_x, at_y, _ = (scalar(c) for c in (vector / over).unbind(-1))
+        return (vector * near).sum(-1, keepdim=True) / over + at_x * b.ray_x + at_y * b.ray_y
+
+    one_c, two_c = (one * center).sum(-1, keepdim=True), (two * center).sum(-1, keepdim=True)
+    toward = 1 / linear(normal)
+    x, y = linear(away * one - one_c * normal) * toward, linear(away * two - two_c * normal) * toward
+    radius = (x * x + y * y).sqrt().clamp_min(1e-9)
+    outer, inner = ((radius - scalar(size)).float() for size in b.radii.unbind(-1))
+
+    x, y, radius, toward = (v.float() for v in (x, y, radius, toward / over))
+    depth, over_away = away.float() * toward, 1 / away.float()
+    one_c, two_c, q = one_c.float(), two_c.float(), scalar(blur[b.row]).float()
+    axes = [[scalar(c).float() for c in v.unbind(-1)] for v in (one, two, normal, arm)]
+    (ax, ay, az), (bx, by, bz), (nx, ny, nz), (cx, cy, cz) = axes
+    ex, ey = x / radius, y / radius
+    # a displacement w of the ray's foot, or of the plane against it, changes the radius by m . w
+    s = (radius + ex * one_c + ey * two_c) * over_away
+    mx, my, mz = ex * ax + ey * bx - s * nx, ex * ay + ey * by - s * ny, ex * az + ey * bz - s * nz
+    w00, w01, w10, w11 = b.warp
+    gu, gv = mx * w00 + my * w10, mx * w01 + my * w11  # gradient of the radius in the image, over the depth
+    flat = (gu.square() + gv.square()).clamp_min(1e-30).rsqrt()
+    per_mm = flat / depth  # px for a mm of radius
+    # area of a pixel in the plane, mm^2; curvature of the circle's image, 1/px
+    area = depth.square() * (w00 * w11 - w01 * w10).abs() * toward.abs()
+    bend = area.square() * per_mm.pow(3) / radius
+    # to second order in the distance: along the image's normal the radius bends where that normal is oblique in the
+    # plane, and by perspective; both as second over first derivative, 1/px, halved
+    nu, nv = gu * flat, gv * flat
+    side = (ex * two_c - ey * one_c) * over_away
+    hx, hy = ex * bx - ey * ax - side * nx, ex * by - ey * ay - side * ny  # as m, but across the radius
+    oblique = (hx * w00 + hy * w10) * nu + (hx * w01 + hy * w11) * nv
+    recede = ((nx * w00 + ny * w10) * nu + (nx * w01 + ny * w11) * nv) * toward
+    second = 0.5 * oblique.square() * depth * flat / radius - recede
+    d_outer, d_inner = outer * per_mm, inner * per_mm
+    straight = d_inner
+    d_outer, d_inner = d_outer + second * d_outer.square(), d_inner + second * d_inner.square()
+    sound = None
+    if check:
+        near = (-bend * straight < _DEEP) & ((second * straight).abs() < _BENT)
+        sound = near | (d_inner.abs() > _FAR * q)
+    pull = 0.5 * q * bend
+    z_outer, z_inner = d_outer / q + pull, d_inner / q + pull
+    square = square_cumulant(nu, nv, q)
+    f_outer, p_outer = blurred_step(z_outer, square)
+    f_inner, p_inner = blurred_step(z_inner, square)
+    px, py, pz = x * ax + y * bx + cx, x * ay + y * by + cy, x * az + y * bz + cz
+    by_pose = tuple(-per_mm * v for v in (mx, my, mz, py * mz - pz * my, pz * mx - px * mz, px * my - py * mx))
+    size = scalar(b.radii[:, 0]).float()
+    return RingModel(
+        f_outer + 1 - f_inner,
+        (p_outer - p_inner) / q,
+        p_outer * (bend - z_outer / q) - p_inner * (bend - z_inner / q),
+        by_pose,
+        x / size,
+        y / size,
+        sound,
+    )
+
+
+def square_cumulant(nu: Tensor, nv: Tensor, blur: Tensor) -> Tensor:
+    """What a pixel, a square and no Gaussian, adds to an edge of the normal (nu, nv): for `blurred_step`.
+
+    Its fourth cumulant along the normal, -(nu^4 + nv^4) / 120 px^4, over -24 blur^4.
+    """
+    return (1 - 2 * (nu * nv).square()) / (24 * 120) / blur.square().square()
+
+
+def blurred_step(z: Tensor, square: Tensor) -> tuple[Tensor, Tensor]:
+    """Blurred step and its slope at ``z`` standard deviations: the normal law and its fourth-order Edgeworth term."""
+    z2 = z.square()
+    density = torch.exp(-0.5 * z2) * (1 / math.sqrt(2 * math.pi))
+    step = 0.5 * torch.erfc(-z * math.sqrt(0.5)) + square * density * z * (z2 - 3)
+    return step, density * (1 - square * (z2 * (z2 - 6) + 3))

@@ -1,0 +1,216 @@
+"""Stage: concentric pairs. From candidate ellipses to rings with both circles measured."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from torchpose import ellipse
+from torchpose.camera import Camera
+from torchpose.detect import Candidates
+from torchpose.ellipse import EllipseFit
+from torchpose.geometry import conics
+from torchpose.geometry.segments import segment_mean, segment_sum
+from torchpose.rings import zernike
+from torchpose.rings.edges import REACH, RingEdges, ring_edges
+from torchpose.rings.inner_circles import ANGLES, clear_directions, find_inner
+from torchpose.rings.small_rings import fit_small_rings
+
+_LEAST_COVER = (0.4, 0.33)  # of the perimeter with edge points, outer and inner circle
+_SMALL = 4.0  # px: circles of a smaller semi-minor axis fill the mask of an edge
+_LEAST_SEMI_MINOR = (4.0, 1.2)  # px, outer and inner circle: smaller ones are letters and specks as well as rings
+_LARGE = 20.0  # px, of the outer semi-minor axis, from which on a fit of all pixels costs too much
+_BLURRED = 0.6  # slope of the offsets (`zernike.blur_slope`): a blur above 1.3 px, out of the mask's reach
+_BLURRED_LARGE = 50.0  # px, of the outer semi-major axis of a blurred ring
+_EDGE_APART = 0.8  # ... and so do two edges closer than 5 px
+_STEP_RANGE = (0.4, 2.5)  # inner to outer grey step
+
+
+@dataclass(frozen=True, eq=False)
+class Rings:
+    """K rings with both circles measured, flat.
+
+    Attributes:
+        frame: (K,) int64. polarity: (K,) float64, +1 dark ring on light, -1 light on dark.
+        outer_raw, inner_raw: (K, 5) float64, ellipses in the pixels of the frame.
+        outer, inner: fits in ideal pixels, that is of the same camera without lens distortion.
+    """
+
+    frame: Tensor
+    polarity: Tensor
+    outer_raw: Tensor
+    inner_raw: Tensor
+    outer: EllipseFit
+    inner: EllipseFit
+
+    def __len__(self) -> int:
+        return self.frame.shape[0]
+
+    def __getitem__(self, index: Tensor) -> Rings:
+        return Rings(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+
+    @classmethod
+    def cat(cls, parts: Sequence[Self]) -> Self:
+        """The rings of all parts."""
+
+        def fits(name: str) -> EllipseFit:
+            some = [getattr(part, name) for part in parts]
+            return EllipseFit(*(torch.cat([getattr(f, n) for f in some]) for n in EllipseFit.__dataclass_fields__))
+
+        def tensor(name: str) -> Tensor:
+            return torch.cat([getattr(part, name) for part in parts])
+
+        return cls(
+            tensor("frame"), tensor("polarity"), tensor("outer_raw"), tensor("inner_raw"), fits("outer"), fits("inner")
+        )
+
+    @property
+    def ratio(self) -> Tensor:
+        """(K,) inner to outer radius: the square root of the paper's ring-area code."""
+        i, o = self.inner.params, self.outer.params
+        return (i[:, 2] * i[:, 3] / (o[:, 2] * o[:, 3])).sqrt()
+
+
+def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera, *, correct: bool = True) -> Rings:
+    """Measures outer and inner circle of every candidate that has both, each fitted separately.
+
+    Args:
+        frames: (B, H, W) grey, any real dtype. candidates: with the polarity of the rings looked for.
+        camera: its distortion is taken off the sub-pixel points before the final fit.
+        correct: free the edges from what blur and curvature do to them; False leaves them as the moments read them.
+    """
+    inside = find_inner(frames, candidates, camera)
+    found = inside.found
+    return _measure(frames, candidates[found], inside.ellipse[found], inside.seen[found], camera, correct)[0]
+
+
+def measure_predicted(
+    frames: Tensor, candidates: Candidates, inner: Tensor, camera: Camera, *, correct: bool = True
+) -> tuple[Rings, Tensor]:
+    """The same where the inner ellipses (M, 5) are known, about; also which candidate each ring is of, (K,) int64."""
+    return _measure(frames, candidates, inner, find_inner(frames, candidates, camera).seen, camera, correct)
+
+
+def _measure(
+    frames: Tensor, candidates: Candidates, inner: Tensor, seen: Tensor, camera: Camera, correct: bool
+) -> tuple[Rings, Tensor]:
+    """Rings of candidates with rough inner ellipses (M, 5), and whose they are; ``seen`` is that of `find_inner`."""
+    outer, clear = candidates.ellipse, clear_directions(seen)
+    ratio = (inner[:, 2:4].prod(-1) / outer[:, 2:4].prod(-1)).sqrt()
+    count = len(candidates)
+    # no search band may reach the other circle, nor the centre
+    gap = torch.minimum(0.5 * (1 - ratio), 0.6 * ratio) * outer[:, 3]
+    rough = torch.cat([outer, inner])
+    frame = candidates.frame.repeat(2)
+    reach = torch.cat([gap, gap]).clamp(1.0, REACH)
+    outward = torch.cat([candidates.polarity, -candidates.polarity])
+    edges = ring_edges(frames, frame, rough, outward, reach)
+    edges = edges[clear.repeat(2, 1)[edges.ring, _direction(edges, rough)]]
+
+    raw, keep = ellipse.fit_robust(edges.points, edges.ring, 2 * count, start=rough)
+    points, blurred = edges.points, torch.zeros_like(candidates.frame, dtype=torch.bool)
+    if correct:
+        distance = edges.offset - ellipse.distance(edges.points, edges.ring, raw) * outward[edges.ring]
+        points = _unbiased(edges, distance, raw, keep, outward, frame, frames.shape[0])
+        blurred = zernike.blur_slope(edges.offset[keep], distance[keep], edges.ring[keep] % count, count) < _BLURRED
+    raw, keep = ellipse.fit_robust(points, edges.ring, 2 * count, start=raw, scales=(0.5,))
+    ring, points = edges.ring[keep], points[keep]
+    ideal_points = ideal_pixels(camera, points)
+    ideal = ellipse.fit(ideal_points, ring, 2 * count)
+    fit = ellipse.with_covariance(ideal_points, ring, ideal, correlation=zernike.edge_correlation())
+
+    one = torch.ones_like(ring, dtype=torch.float64)
+    cover = segment_sum(one, ring, 2 * count) / conics.perimeter(raw)
+    step = segment_mean(edges.step[keep], ring, 2 * count)
+    step_ratio = step[count:] / step[:count]
+    offset = torch.linalg.vector_norm(raw[count:, :2] - inner[:, :2], dim=-1)
+    # all points lie within reach of the rough ellipse; a fit that does not has followed the stump of a circle cut off
+    shift = torch.linalg.vector_norm(raw[:, :2] - rough[:, :2], dim=-1)
+    growth = (conics.shape_matrix(raw) - conics.shape_matrix(rough)).abs().amax((1, 2))
+    near = torch.maximum(shift, growth) < reach + 1.5
+    good = (
+        fit.covariance.isfinite().all(-1).all(-1).view(2, count).all(0)
+        & near.view(2, count).all(0)
+        & (cover[:count] > _LEAST_COVER[0])
+        & (cover[count:] > _LEAST_COVER[1])
+        & (step_ratio > _STEP_RANGE[0])
+        & (step_ratio < _STEP_RANGE[1])
+        & (offset < 0.25 * raw[:count, 3])  # concentric but for perspective
+        & (raw[count:, 2] < raw[:count, 2])
+    )
+    narrow = torch.minimum((1 - ratio) * _EDGE_APART, ratio) * outer[:, 3] < _SMALL
+    small = (narrow & (outer[:, 3] < _LARGE)) | (blurred & (outer[:, 2] < _BLURRED_LARGE))
+    index = (good & ~small).nonzero()[:, 0]
+    second = index + count
+    large = Rings(candidates.frame[index], candidates.polarity[index], raw[index], raw[second], fit[index], fit[second])
+    if not bool(small.any()):
+        return large, index
+    rest = small.nonzero()[:, 0]
+    measured, which = _measure_small(frames, candidates[rest], ratio[rest], clear[rest], camera)
+    return Rings.cat([large, measured]), torch.cat([index, rest[which]])
+
+
+def _direction(edges: RingEdges, ellipses: Tensor) -> Tensor:
+    """Number (E,) of each edge point's direction, see `inner_circles.find_inner`."""
+    inverse = torch.linalg.inv(conics.shape_matrix(ellipses)).flatten(1)
+    each = (*inverse[:, [0, 1, 3]].unbind(-1), *ellipses[:, :2].unbind(-1))
+    i11, i12, i22, cx, cy = (v.contiguous().index_select(0, edges.ring) for v in each)
+    u, v = edges.points.unbind(-1)
+    dx, dy = u - cx, v - cy
+    turn = torch.atan2(i12 * dx + i22 * dy, i11 * dx + i12 * dy)
+    return (turn * (ANGLES / (2 * torch.pi))).round().long() % ANGLES
+
+
+def _measure_small(
+    frames: Tensor, candidates: Candidates, ratio: Tensor, seen: Tensor, camera: Camera
+) -> tuple[Rings, Tensor]:
+    """The same for rings whose circles are too close to each other, or too small, to be measured one by one."""
+    focal = camera.matrix.diagonal()[:2].mean()
+    found = fit_small_rings(frames, candidates.frame, candidates.ellipse, ratio, seen, candidates.polarity, focal)
+    least_outer, least_inner = _LEAST_SEMI_MINOR
+    large = (found.outer.params[:, 3] > least_outer) & (found.inner.params[:, 3] > least_inner)
+    index = (found.good & large).nonzero()[:, 0]
+    outer, inner = found.outer[index], found.inner[index]
+    rings = Rings(
+        candidates.frame[index],
+        candidates.polarity[index],
+        outer.params,
+        inner.params,
+        replace(outer, params=_ideal(camera, outer.params)),
+        replace(inner, params=_ideal(camera, inner.params)),
+    )
+    return rings, index
+
+
+def _ideal(camera: Camera, ellipses: Tensor) -> Tensor:
+    """Ellipses (K, 5) of raw pixels in ideal ones."""
+    return mapped(ellipses, lambda points: ideal_pixels(camera, points))
+
+
+def mapped(ellipses: Tensor, mapping: Callable[[Tensor], Tensor]) -> Tensor:
+    """Images (K, 5) of ellipses under a mapping of points (P, 2) that is nearly affine across each of them."""
+    angle = torch.arange(ANGLES, dtype=torch.float64, device=ellipses.device) * (2 * torch.pi / ANGLES)
+    points = conics.points_on(ellipses[:, None], angle.expand(ellipses.shape[0], -1)).flatten(0, 1)
+    ring = torch.arange(ellipses.shape[0], device=ellipses.device).repeat_interleave(ANGLES)
+    return ellipse.fit(mapping(points), ring, ellipses.shape[0])
+
+
+def _unbiased(
+    edges: RingEdges, distance: Tensor, fitted: Tensor, keep: Tensor, outward: Tensor, frame: Tensor, frames: int
+) -> Tensor:
+    """Edge points (E, 2) freed from what each frame's blur and the edges' curvature do to their offsets."""
+    group = frame[edges.ring]
+    slope = zernike.blur_slope(edges.offset[keep], distance[keep], group[keep], frames)[group]
+    pushed = zernike.curvature_shift(slope) * ellipse.curvature(edges.points, edges.ring, fitted)
+    change = zernike.deblur(edges.offset, slope) - edges.offset - pushed * outward[edges.ring]
+    return edges.points + change[:, None] * edges.normal
+
+
+def ideal_pixels(camera: Camera, points: Tensor) -> Tensor:
+    """Pixels (..., 2) that a camera with the same matrix and no distortion would see; float64."""
+    k = camera.matrix.to(points.device)
+    return camera.undistort_points(points.double()) * k.diagonal()[:2] + k[:2, 2]
