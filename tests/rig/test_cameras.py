@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from torchpose.errors import ConfigError
-from torchpose.rig.camera import CameraFault, CameraReason, CameraSettings
 from torchpose.rig.cameras import Cameras
-from torchpose.rig.settings import load_rig
+from torchpose.rig.faults import CameraFault, CameraReason
+from torchpose.rig.settings import CameraSettings, load_rig
 
 pytest.importorskip("pypylon.pylon", reason="pypylon is not installed (extra: rig)")
 

@@ -9,16 +9,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from torchpose.rig.camera import CameraSettings
-from torchpose.rig.capture import _expose, difference, frame_id, middle, missing
+from torchpose.rig.capture import _expose, frame_id, missing
+from torchpose.rig.faults import RobotFault, RobotReason
 from torchpose.rig.plan import CapturePlan, Waypoint
-from torchpose.rig.robot_faults import RobotFault, RobotReason
-from torchpose.rig.robot_settings import RobotReading, RobotSettings, Workspace
-from torchpose.rig.settings import Rig
+from torchpose.rig.poses import difference, middle
+from torchpose.rig.robot import RobotReading
+from torchpose.rig.settings import CameraSettings, Rig, RobotSettings, Workspace
 
 POSE = (400.0, 0.0, 300.0, math.pi, 0.0, 0.0)
 ROBOT = RobotSettings(host="127.0.0.2", workspace=Workspace(min=[0.0, -9.0, 0.0], max=[500.0, 9.0, 500.0]))
-PLAN = CapturePlan("p", "p.yaml", POSE, tuple(Waypoint(f"{i:04d}", POSE, "static", origin=True) for i in range(3)))
+WAYPOINTS = tuple(Waypoint(id=f"{i:04d}", pose=POSE, kind="static", origin=True) for i in range(3))
+PLAN = CapturePlan("p", "p.yaml", POSE, WAYPOINTS)
 
 
 def rig(*names):
@@ -67,7 +68,9 @@ class Drifting:
         self.poses = iter(poses)
 
     def read(self, fresh=1):
-        return RobotReading(next(self.poses), POSE, 0.0, 0.0, 7, 1, 1, 2)
+        times = {"robot_time_s": 0.0, "host_time_s": 0.0}
+        modes = {"robot_mode": 7, "safety_mode": 1, "safety_bits": 1, "runtime_state": 2}
+        return RobotReading(pose=next(self.poses), joints=POSE, **times, **modes)
 
 
 class NoCameras:

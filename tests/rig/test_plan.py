@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from torchpose.errors import ConfigError
 from torchpose.rig.plan import load_plan
-from torchpose.rig.robot_settings import Workspace
+from torchpose.rig.settings import Workspace
 
 ROOT = Path(__file__).parents[2]
 DOWN = [math.pi, 0.0, 0.0]

@@ -7,7 +7,7 @@ from pathlib import Path
 from torchpose.io.writers import atomic_path
 from torchpose.report.figures import COLOURS, GREY, subplots
 from torchpose.rig.plan import CapturePlan
-from torchpose.rig.robot_settings import Workspace
+from torchpose.rig.settings import Workspace
 
 
 def draw_path(plan: CapturePlan, workspace: Workspace, out: Path) -> None:

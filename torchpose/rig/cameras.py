@@ -6,18 +6,21 @@ taken for the frame of this one.
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
 from torchpose.errors import ConfigError
-from torchpose.rig.camera import EMULATOR, BaslerCamera, CameraFault, CameraReason, CameraSettings, first_line
+from torchpose.rig import camera as basler
+from torchpose.rig.camera import EMULATOR, BaslerCamera, first_line
+from torchpose.rig.faults import CameraFault, CameraReason
+from torchpose.rig.settings import CameraSettings
 
+T = TypeVar("T")
 _PASSING = (CameraReason.NOT_READY, CameraReason.TIMED_OUT, CameraReason.FAILED_BUFFER)  # worth another attempt
 
 
@@ -26,18 +29,23 @@ class Frame:
     """One image with its circumstances.
 
     Attributes:
-        camera: name. image: (H, W) uint8 or uint16.
-        trigger_time_s: Unix time of this machine just before the trigger. camera_time: the camera's own counter, 0
-            where it has none.
-        attempts: how many it took. failures: reasons of those that failed.
+        camera: name.
+        image: (H, W) uint8 or uint16.
+        trigger_time_s: Unix time of this machine just before the trigger.
+        camera_time: the camera's own counter, 0 where it has none.
+        failures: reasons of the attempts that failed before.
     """
 
     camera: str
-    image: np.ndarray
+    image: np.ndarray[Any, Any]
     trigger_time_s: float
     camera_time: int
-    attempts: int
     failures: tuple[str, ...]
+
+    @property
+    def attempts(self) -> int:
+        """How many it took."""
+        return len(self.failures) + 1
 
 
 class Cameras:
@@ -48,7 +56,8 @@ class Cameras:
         scene: the image file that an emulated camera shall see now, by camera name; makes every camera an emulated one.
 
     Raises:
-        ConfigError: pypylon is not installed. CameraFault: a camera is missing, in use or refuses a setting.
+        ConfigError: pypylon is not installed.
+        CameraFault: a camera is missing, in use or refuses a setting.
     """
 
     def __init__(self, settings: Sequence[CameraSettings], scene: Callable[[str], Path] | None = None) -> None:
@@ -87,81 +96,71 @@ class Cameras:
         Raises:
             CameraFault: a camera has none left, has been removed or gives frames of another size.
         """
-        waiting = [self._open[name] for name in self._open if name in names]
+        waiting = {name: camera for name, camera in self._open.items() if name in names}
         if self._scene is not None:
-            for camera in waiting:
-                camera.show(self._scene(camera.settings.name))
-        failures: dict[str, list[str]] = {name: [] for name in names}
+            for name, camera in waiting.items():
+                camera.show(self._scene(name))
+        failures: dict[str, tuple[str, ...]] = dict.fromkeys(waiting, ())
         done: dict[str, Frame] = {}
         while waiting:
-            faults = self._attempt(waiting, failures, done)
-            for camera, fault in faults:
-                tried = failures[camera.settings.name]
-                tried.append(fault.reason.value)
-                if fault.reason not in _PASSING or len(tried) >= camera.settings.attempts:
+            taken, faults = _attempt(waiting)
+            for name, (trigger_time, image, stamp) in taken.items():
+                done[name] = Frame(name, image, trigger_time, stamp, failures[name])
+            for name, fault in faults.items():
+                failures[name] += (fault.reason.value,)
+                if fault.reason not in _PASSING or len(failures[name]) >= waiting[name].settings.attempts:
                     raise fault
-            waiting = [camera for camera, _ in faults]
+            waiting = {name: waiting[name] for name in faults}
         return [done[name] for name in self._open if name in done]
-
-    def _attempt(
-        self, cameras: Sequence[BaslerCamera], failures: dict[str, list[str]], done: dict[str, Frame]
-    ) -> list[tuple[BaslerCamera, CameraFault]]:
-        """Tries every camera once, adds the frames to ``done`` and returns the faults."""
-        faults: dict[BaslerCamera, CameraFault] = {}
-        times: dict[BaslerCamera, float] = {}
-        try:
-            for camera in cameras:
-                with _noted(faults, camera):
-                    camera.start()
-            for camera in (c for c in cameras if c not in faults):
-                with _noted(faults, camera):
-                    times[camera] = camera.trigger()
-            for camera, trigger_time in times.items():
-                with _noted(faults, camera):
-                    image, stamp = camera.fetch()
-                    name = camera.settings.name
-                    failed = tuple(failures[name])
-                    done[name] = Frame(name, image, trigger_time, stamp, len(failed) + 1, failed)
-        finally:
-            for camera in cameras:
-                camera.stop()
-        return list(faults.items())
 
     def _devices(self) -> list[tuple[CameraSettings, Any]]:
         """The device of each camera: by serial number, the others in the order of the enumeration."""
+        if basler.pylon is None:
+            raise ConfigError("cameras: pypylon is not installed; pip install 'torchpose[rig]'")
         try:
-            from pypylon import genicam, pylon
-        except ImportError:
-            raise ConfigError("cameras: pypylon is not installed; pip install 'torchpose[rig]'") from None
-        try:
-            found = list(pylon.TlFactory.GetInstance().EnumerateDevices())
-        except genicam.GenericException as error:
+            found = list(basler.pylon.TlFactory.GetInstance().EnumerateDevices())
+        except basler.genicam.GenericException as error:
             raise CameraFault(
                 CameraReason.NOT_FOUND, f"cameras: the search failed ({first_line(error)}); check the drivers"
             ) from None
-        if self._scene is not None:
-            found = [device for device in found if device.GetDeviceClass() == EMULATOR]
-        by_serial = {} if self._scene is not None else {device.GetSerialNumber(): device for device in found}
-        named = {s.serial for s in self._settings if s.serial is not None}
-        free = [device for device in found if self._scene is not None or device.GetSerialNumber() not in named]
+        emulated = self._scene is not None
+        devices = {d.GetSerialNumber(): d for d in found if not emulated or d.GetDeviceClass() == EMULATOR}
+        wanted = {s.name: None if emulated else s.serial for s in self._settings}
+        free = [serial for serial in devices if serial not in wanted.values()]
         pairs = []
         for settings in self._settings:
-            fixed = settings.serial is not None and self._scene is None
-            device = by_serial.get(settings.serial) if fixed else (free.pop(0) if free else None)
-            if device is None:
-                wanted = f"with serial number {settings.serial} " if fixed else ""
-                there = ", ".join(by_serial) or "none"
+            serial = wanted[settings.name] or (free.pop(0) if free else None)
+            if serial not in devices:
+                which = f"with serial number {serial} " if serial else ""
+                there = ", ".join(devices) or "none"
                 raise CameraFault(
                     CameraReason.NOT_FOUND,
-                    f"camera {settings.name}: no camera {wanted}is there (found: {there}); check power, cable, serial",
+                    f"camera {settings.name}: no camera {which}is there (found: {there}); check power, cable, serial",
                 )
-            pairs.append((settings, device))
+            pairs.append((settings, devices[serial]))
         return pairs
 
 
-@contextlib.contextmanager
-def _noted(faults: dict[BaslerCamera, CameraFault], camera: BaslerCamera) -> Iterator[None]:
+def _attempt(
+    cameras: Mapping[str, BaslerCamera],
+) -> tuple[dict[str, tuple[float, np.ndarray[Any, Any], int]], dict[str, CameraFault]]:
+    """One try at a frame of each camera: trigger time, image and time stamp by name; the faults of the others."""
+    faults: dict[str, CameraFault] = {}
+
+    def each(step: Callable[[BaslerCamera], T]) -> dict[str, T]:
+        results = {}
+        for name in [name for name in cameras if name not in faults]:
+            try:
+                results[name] = step(cameras[name])
+            except CameraFault as fault:
+                faults[name] = fault
+        return results
+
     try:
-        yield
-    except CameraFault as fault:
-        faults[camera] = fault
+        each(lambda camera: camera.start())
+        times = each(lambda camera: camera.trigger())
+        images = each(lambda camera: camera.fetch())
+    finally:
+        for camera in cameras.values():
+            camera.stop()
+    return {name: (times[name], *image) for name, image in images.items()}, faults

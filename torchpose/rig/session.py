@@ -1,7 +1,7 @@
 """The folder of a capture session: images and their manifest, written so that a fault leaves every earlier frame.
 
 An image is written under a temporary name, synced and renamed, then its line is appended to the manifest and synced:
-a line is there only for an image that is whole. ``torchpose.io.manifest`` describes the manifest.
+a line is there only for an image that is whole. ``torchpose.io.manifest`` describes what all manifests have in common.
 """
 
 from __future__ import annotations
@@ -9,48 +9,37 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
-import json
 import os
 import platform
 import shutil
 import time
 from collections.abc import Mapping
-from enum import StrEnum
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import cv2
 import numpy as np
+from pydantic import BaseModel
 
+from torchpose.config import validate
 from torchpose.errors import ConfigError
 from torchpose.io.manifest import read_records
-from torchpose.rig.faults import RigFault
+from torchpose.rig.faults import SessionFault, SessionReason
+from torchpose.rig.records import EndRecord, FrameRecord, SessionRecord
 
-SCHEMA = "torchpose.capture/1"
 MANIFEST = "manifest.jsonl"
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-
-
-class SessionReason(StrEnum):
-    """Why a session cannot be written on."""
-
-    DISK_FULL = "disk_full"
-    NOT_WRITABLE = "not_writable"
-
-
-class SessionFault(RigFault):
-    """A file of the session cannot be written."""
-
-    reason: SessionReason
 
 
 class Session:
     """A session's folder, for use in a ``with`` block.
 
     Args:
-        folder: made where it is missing. plan: digest of the waypoints. images: what the images depend on, by camera.
+        folder: made where it is missing.
+        plan: digest of the waypoints.
+        images: what the images depend on, by camera.
         resume: go on with the session that is there.
 
     Attributes:
@@ -58,7 +47,7 @@ class Session:
 
     Raises:
         ConfigError: a session is there and ``resume`` is not given; or it is, and none is there, it has another plan or
-            other cameras, or one of its images is missing; or the folder cannot be written.
+            other cameras, one of its records is wrong or one of its images is missing; or the folder cannot be written.
     """
 
     def __init__(self, folder: Path, *, plan: str, images: Mapping[str, Any], resume: bool = False) -> None:
@@ -66,7 +55,7 @@ class Session:
         self.manifest = folder / MANIFEST
         self.done: set[str] = set()
         self._origin: dict[str, Any] = {"plan_digest": plan, "images": dict(images)}
-        self._earlier: dict[str, Any] | None = None
+        self._earlier: SessionRecord | None = None
         self._file: int | None = None
         if resume:
             self._recover()
@@ -99,13 +88,18 @@ class Session:
                 f"{self.folder}: {free / 1e9:.1f} GB are left and the images may need {size / 1e9:.1f} GB; free some",
             )
 
-    def begin(self, *, emulated: bool, record: Mapping[str, Any]) -> None:
-        """Appends the session record: with what, in which units, whether any part of the rig is emulated.
+    def begin(self, *, emulated: bool, **contents: Any) -> None:
+        """Appends the session record.
+
+        Args:
+            emulated: whether any part of the rig is.
+            contents: plan, waypoints, robot and cameras of a `SessionRecord`, and further entries.
 
         Raises:
-            ConfigError: the session to be resumed has the other ``emulated``. SessionFault: it cannot be written.
+            ConfigError: the session to be resumed has the other ``emulated``.
+            SessionFault: it cannot be written.
         """
-        if self._earlier is not None and self._earlier.get("emulated") != emulated:
+        if self._earlier is not None and self._earlier.emulated != emulated:
             raise ConfigError(
                 f"{self.manifest}: --resume: emulated is {not emulated} there and {emulated} now; choose another --out"
             )
@@ -113,23 +107,25 @@ class Session:
             self._file = os.open(self.manifest, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
         except OSError as error:
             raise _fault(self.manifest, error) from None
+        versions = {name: _version(name) for name in ("torchpose", "pypylon", "ur-rtde")}
         self._append(
-            {
-                "record": "session",
-                "schema": SCHEMA,
-                "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-                "units": {"length": "mm", "angle": "rad", "time": "s"},
+            SessionRecord(
                 **self._origin,
-                "emulated": emulated,
-                "resumed": self._earlier is not None,
-                "versions": {name: _version(name) for name in ("torchpose", "pypylon", "ur-rtde")}
-                | {"python": platform.python_version()},
-                **record,
-            }
+                started=_now(),
+                emulated=emulated,
+                resumed=self._earlier is not None,
+                versions=versions | {"python": platform.python_version()},
+                **contents,
+            )
         )
 
-    def write(self, frame: str, image: np.ndarray, record: Mapping[str, Any]) -> None:
+    def write(self, frame: str, image: np.ndarray[Any, Any], **taken: Any) -> None:
         """Stores one frame: its image, then its record.
+
+        Args:
+            frame: id of the frame and name of the image.
+            image: (H, W) uint8 or uint16.
+            taken: the entries of a `FrameRecord` that the image does not tell.
 
         Raises:
             SessionFault: one of both cannot be written; nothing of the frame is left in the manifest.
@@ -154,17 +150,7 @@ class Session:
                 temporary.unlink(missing_ok=True)
         height, width = image.shape
         digest = hashlib.sha256(encoded).hexdigest()
-        self._append(
-            {
-                "record": "frame",
-                "id": frame,
-                "image": name,
-                "sha256": digest,
-                "width": width,
-                "height": height,
-                **record,
-            }
-        )
+        self._append(FrameRecord(id=frame, image=name, sha256=digest, width=width, height=height, **taken))
         self.done.add(frame)
 
     def end(self, reason: str, detail: str = "") -> None:
@@ -172,19 +158,15 @@ class Session:
 
         Its absence says too that the session was cut short.
         """
-        if self._file is None:
-            return
-        ended = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
-        with contextlib.suppress(SessionFault):
-            self._append(
-                {"record": "end", "frames": len(self.done), "reason": reason, "detail": detail, "ended": ended}
-            )
+        if self._file is not None:
+            with contextlib.suppress(SessionFault):
+                self._append(EndRecord(frames=len(self.done), reason=reason, detail=detail, ended=_now()))
 
-    def _append(self, record: Mapping[str, Any]) -> None:
+    def _append(self, record: BaseModel) -> None:
         """One line, on the disk when this returns; nothing of it is left where that fails."""
         assert self._file is not None
         before = os.fstat(self._file).st_size
-        line = (json.dumps(record, allow_nan=False) + "\n").encode()
+        line = f"{record.model_dump_json(by_alias=True)}\n".encode()
         try:
             while line:
                 line = line[os.write(self._file, line) :]
@@ -195,39 +177,34 @@ class Session:
             raise _fault(self.manifest, error) from None
 
     def _recover(self) -> None:
-        """Reads what an earlier run finished and cuts a line off that it left unfinished."""
+        """Reads what an earlier run finished and closes its last line."""
         if not self.manifest.exists():
             raise ConfigError(f"{self.manifest}: --resume: does not exist; leave --resume out to start the session")
-        records = [record for _, record in read_records(self.manifest)]
-        self._earlier = next((record for record in records if record.get("record") == "session"), None)
+        records = read_records(self.manifest)
         words = {"plan_digest": "has another plan", "images": "has other cameras or image sizes"}
-        for key, value in self._origin.items():
-            if self._earlier is not None and self._earlier.get(key) != value:
-                raise ConfigError(
-                    f"{self.manifest}: --resume: the session {words[key]}; give the same, or another --out"
-                )
-        for record in records:
-            if record.get("record") != "frame":
-                continue
-            image = self.folder / record["image"]
-            if not image.is_file():
-                raise ConfigError(f"{image}: --resume: is missing, but the manifest lists it; restore it or start anew")
-            self.done.add(record["id"])
-        self._close_last_line()
-
-    def _close_last_line(self) -> None:
-        """Ends a whole last line that lacks its newline, and cuts off one that is torn, as `read_records` drops it."""
+        for number, record in records:
+            where = f"{self.manifest}: line {number}"
+            if record.get("record") == "session" and self._earlier is None:
+                self._earlier = validate(SessionRecord, record, where)
+                for key, value in self._origin.items():
+                    if getattr(self._earlier, key) != value:
+                        raise ConfigError(
+                            f"{self.manifest}: --resume: the session {words[key]}; give the same, or another --out"
+                        )
+            elif record.get("record") == "frame":
+                frame = validate(FrameRecord, record, where)
+                image = self.folder / frame.image
+                if not image.is_file():
+                    raise ConfigError(
+                        f"{image}: --resume: is missing, but the manifest lists it; restore it or start anew"
+                    )
+                self.done.add(frame.id)
         content = self.manifest.read_bytes()
-        last = content.rpartition(b"\n")[2]
-        if not last:
-            return
-        try:
-            json.loads(last)
-        except ValueError:
-            os.truncate(self.manifest, len(content) - len(last))
-        else:
+        if records and records[-1][0] > content.count(b"\n"):  # a whole last line lacks its newline
             with self.manifest.open("ab") as file:
                 file.write(b"\n")
+        else:  # of a line that is torn, nothing is left
+            os.truncate(self.manifest, content.rfind(b"\n") + 1)
 
 
 def _fault(path: Path, error: OSError) -> SessionFault:
@@ -246,8 +223,12 @@ def _sync_folder(folder: Path) -> None:
             os.close(handle)
 
 
+def _now() -> str:
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+
+
 def _version(package: str) -> str | None:
     try:
         return version(package)
-    except ModuleNotFoundError:
+    except PackageNotFoundError:
         return None

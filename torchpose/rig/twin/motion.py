@@ -25,21 +25,18 @@ def matrix(rotation_vector: Array) -> Array:
 def vector(rotation: Array) -> Array:
     """Rotation vector (3,) in rad, of length 0 to pi, of a rotation matrix (3, 3).
 
-    The quaternion's largest component is divided by, so no digits are lost at any angle (Shepperd 1978).
+    Its quaternion q is read from the row of 4 q q^T with the largest diagonal, which loses no digits (Shepperd 1978).
     """
-    m = rotation
-    four = np.array([1 + np.trace(m), *(1 - np.trace(m) + 2 * np.diag(m))])  # 4 w^2, 4 x^2, 4 y^2, 4 z^2
-    skew = np.array([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
-    best = int(four.argmax())
-    if best == 0:
-        q = np.array([four[0], *skew])
-    else:
-        axis = best - 1
-        q = np.array([skew[axis], *(m[:, axis] + m[axis])])
-        q[best] = four[best]
-    q /= np.linalg.norm(q) * (-1.0 if q[0] < 0 else 1.0)
-    sine = float(np.linalg.norm(q[1:]))
-    result: Array = q[1:] * (2 * math.atan2(sine, q[0]) / sine if sine > 1e-12 else 2.0)
+    skew = rotation[[2, 0, 1], [1, 2, 0]] - rotation[[1, 2, 0], [2, 0, 1]]
+    trace = np.trace(rotation)
+    products = np.block(
+        [[1 + trace, skew], [skew[:, None], rotation + rotation.T + (1 - trace) * np.eye(3)]]
+    )  # 4 q q^T
+    w, *xyz = products[products.diagonal().argmax()]
+    sine = math.hypot(*xyz)
+    angle = 2 * math.atan2(sine, abs(w))
+    factor = math.copysign(angle / sine if sine > 1e-12 else 2 / abs(w), w)
+    result: Array = factor * np.array(xyz)
     return result
 
 
