@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self, TypeVar
 
 import numpy as np
@@ -26,21 +25,13 @@ _PASSING = (CameraReason.NOT_READY, CameraReason.TIMED_OUT, CameraReason.FAILED_
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One image with its circumstances.
+    """One image with its circumstances."""
 
-    Attributes:
-        camera: name.
-        image: (H, W) uint8 or uint16.
-        trigger_time_s: Unix time of this machine just before the trigger.
-        camera_time: the camera's own counter, 0 where it has none.
-        failures: reasons of the attempts that failed before.
-    """
-
-    camera: str
-    image: np.ndarray[Any, Any]
-    trigger_time_s: float
-    camera_time: int
-    failures: tuple[str, ...]
+    camera: str  # its name
+    image: np.ndarray[Any, Any]  # (H, W) uint8 or uint16
+    trigger_time_s: float  # Unix time of this machine just before the trigger
+    camera_time: int  # the camera's own counter, 0 where it has none
+    failures: tuple[str, ...]  # reasons of the attempts that failed before
 
     @property
     def attempts(self) -> int:
@@ -74,7 +65,7 @@ class Cameras:
             raise
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

@@ -8,17 +8,17 @@ terminal reaches only the parent, which decides what to do.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
-import queue
 import subprocess
 import sys
 import tempfile
 import threading
-import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import torchpose
 
@@ -59,12 +59,11 @@ class Child:
             env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
             start_new_session=True,
         )
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self._requests, self._number = self._process.stdin, 0
-        self._answers: queue.Queue[str] = queue.Queue()
+        self._numbers = itertools.count(1)
+        self._waiting: dict[int, Future[dict[str, Any] | None]] = {}  # requests by their number
+        self._ended = False
         self._lock = threading.Lock()
-        threading.Thread(target=_pump, args=(self._process.stdout, self._answers), daemon=True).start()
+        threading.Thread(target=self._receive, daemon=True).start()
 
     @property
     def pid(self) -> int:
@@ -72,51 +71,53 @@ class Child:
         return self._process.pid
 
     def call(self, name: str, timeout_s: float, **arguments: Any) -> Any:
-        """The result of one request.
+        """The result of one request; one of another thread is answered first.
 
         Raises:
-            ChildLate: no answer within `timeout_s`, waiting for a request of another thread included.
+            ChildLate: no answer within `timeout_s`.
             ChildEnded: the child has ended.
             ChildError: the request failed.
         """
-        deadline = time.monotonic() + timeout_s
+        number, reply = next(self._numbers), Future[dict[str, Any] | None]()
+        self._waiting[number] = reply
+        assert self._process.stdin is not None
         try:
-            if not self._lock.acquire(timeout=timeout_s):
-                raise queue.Empty
-            try:
-                self._number += 1
-                self._requests.write(json.dumps({"call": name, "id": self._number, **arguments}) + "\n")
-                self._requests.flush()
-                answer = self._wait(self._number, deadline)
-            finally:
-                self._lock.release()
-        except queue.Empty:
+            with self._lock:
+                self._process.stdin.write(json.dumps({"call": name, "id": number, **arguments}) + "\n")
+                self._process.stdin.flush()
+            answer = None if self._ended else reply.result(timeout_s)
+        except TimeoutError:
             self.kill()
             raise ChildLate(f"{name}: no answer within {timeout_s:g} s") from None
         except (OSError, ValueError):  # the pipe is broken or closed
             answer = None
+        finally:
+            self._waiting.pop(number, None)  # a late answer, given up for a Ctrl-C came, is for nobody
         if answer is None:
             raise ChildEnded(self._last_words())
         if "error" in answer:
             raise ChildError(answer["error"], answer["reason"])
         return answer["result"]
 
-    def _wait(self, number: int, deadline: float) -> dict[str, Any] | None:
-        """The answer to a request; None when the child has ended."""
-        while line := self._answers.get(timeout=max(0.0, deadline - time.monotonic())):
-            answer: dict[str, Any] = json.loads(line)
-            if answer["id"] == number:  # an older one was given up, for a Ctrl-C came
-                return answer
-        self._answers.put("")  # for whoever asks next
-        return None
+    def _receive(self) -> None:
+        """Hands answers to whom they belong, in a thread of its own: so they can be waited for with a deadline."""
+        assert self._process.stdout is not None
+        with self._process.stdout as stream, contextlib.suppress(ValueError):  # a last line may be torn
+            for line in stream:
+                answer = json.loads(line)
+                if reply := self._waiting.pop(answer["id"], None):
+                    reply.set_result(answer)
+        self._ended = True
+        for reply in list(self._waiting.values()):
+            reply.set_result(None)
 
     def _last_words(self) -> str:
         """The last line that a quiet child has printed."""
-        lines = []
         if self._log is not None:
             self._log.seek(0)
-            lines = self._log.read().decode(errors="replace").split("\n")
-        return next((line.strip() for line in reversed(lines) if line.strip()), "it printed nothing")
+            if lines := self._log.read().decode(errors="replace").strip().splitlines():
+                return lines[-1].strip()
+        return "it printed nothing"
 
     def kill(self) -> None:
         """Ends the child at once."""
@@ -125,7 +126,7 @@ class Child:
     def close(self, timeout_s: float) -> None:
         """Ends the child by closing its standard input; kills it when that takes longer than `timeout_s`."""
         with contextlib.suppress(OSError):  # what a dead child did not read
-            self._requests.close()
+            self._process.stdin.close()  # type: ignore[union-attr]
         try:
             self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
@@ -133,14 +134,6 @@ class Child:
             self._process.wait()
         if self._log is not None:
             self._log.close()
-
-
-def _pump(stream: IO[str], answers: queue.Queue[str]) -> None:
-    """Moves lines from the child to the queue, so that they can be waited for with a deadline; "" is the end."""
-    with stream:
-        for line in stream:
-            answers.put(line)
-    answers.put("")
 
 
 def serve(answer: Callable[..., Any]) -> None:

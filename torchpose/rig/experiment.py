@@ -36,15 +36,10 @@ _GROUPS = (("static", None), *(("rotation" if k > 2 else "translation", axis) fo
 
 @dataclass(frozen=True, eq=False)
 class Static(Rows):
-    """N frames of a target at rest.
+    """N frames of a target at rest, mm and rad along and about the camera's axes."""
 
-    Attributes:
-        deviation: from their mean, mm and rad along and about the camera's axes.
-        sigma: standard deviations that the poses claim.
-    """
-
-    deviation: Float[Tensor, "N 6"]
-    sigma: Float[Tensor, "N 6"]
+    deviation: Float[Tensor, "N 6"]  # from their mean
+    sigma: Float[Tensor, "N 6"]  # standard deviations that the poses claim
 
     @property
     def spread(self) -> Float[Tensor, " 6"]:
@@ -59,20 +54,13 @@ class Static(Rows):
 
 @dataclass(frozen=True, eq=False)
 class Moves:
-    """N moves along, or turns about, one axis, all from one origin.
+    """N moves along, or turns about, one axis, all from one origin; mm or rad."""
 
-    Attributes:
-        axis: one of `AXES`.
-        value: commanded, mm or rad; its sign is that of ``robot`` and ``camera``.
-        robot, camera: distance or angle from the origin, mm or rad.
-        covariance: of the camera's, from the poses' covariances; they share their origin.
-    """
-
-    axis: str
-    value: Float[Tensor, " N"]
-    robot: Float[Tensor, " N"]
+    axis: str  # one of `AXES`
+    value: Float[Tensor, " N"]  # commanded; its sign is that of the next two
+    robot: Float[Tensor, " N"]  # distance or angle from the origin
     camera: Float[Tensor, " N"]
-    covariance: Float[Tensor, "N N"]
+    covariance: Float[Tensor, "N N"]  # of the camera's, from the poses' covariances; they share their origin
 
     @property
     def turn(self) -> bool:
@@ -106,31 +94,22 @@ class Moves:
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """What `evaluate_experiment` found.
+    """What `evaluate_experiment` found."""
 
-    Attributes:
-        static: None where there are fewer than three frames of it.
-        moves: by axis, those that were captured.
-        distance: mean of the target's depth, mm.
-        emulated: whether any part of the rig was.
-        unused: images without a pose.
-        bound: the same with the bound of every pose in place of its covariance, where one was given.
-    """
-
-    static: Static | None
-    moves: list[Moves]
-    distance: float
-    emulated: bool = False
-    unused: tuple[str, ...] = ()
-    bound: Experiment | None = None
+    static: Static | None  # None where there are fewer than three frames of it
+    moves: list[Moves]  # by axis, those that were captured
+    distance: float  # mean of the target's depth, mm
+    emulated: bool = False  # whether any part of the rig was
+    unused: tuple[str, ...] = ()  # images without a pose
+    bound: Experiment | None = None  # with the bound of every pose in place of its covariance, where one was given
 
 
 @dataclass(frozen=True, eq=False)
 class _Frames(Rows):
-    """Frames with a pose of camera and robot: place in `_GROUPS`, commanded value (mm, deg), whether at the origin."""
+    """Frames with a pose of camera and robot."""
 
-    group: Int[Tensor, " N"]
-    value: Float[Tensor, " N"]
+    group: Int[Tensor, " N"]  # place in `_GROUPS`
+    value: Float[Tensor, " N"]  # commanded, mm or deg
     origin: Bool[Tensor, " N"]
     R: Float[Tensor, "N 3 3"]
     t: Float[Tensor, "N 3"]

@@ -29,7 +29,6 @@ from torchpose.target import RigidTransformFile, Vector
 
 _AXES = {"x": 0, "y": 1, "z": 2, "pitch": 3, "yaw": 4, "roll": 5}  # places in a shift (mm) and rotation vector (rad)
 
-_Numbers = Annotated[list[FiniteFloat], Field(min_length=1)]
 _Range = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
 _Count = Annotated[int, Field(ge=1, le=10000)]
 _NONE = [0.0, 0.0]
@@ -44,16 +43,16 @@ class Static(Strict):
 class Translation(Strict):
     """The origin and moves away from it, axis by axis; ``repeats`` frames at each pose."""
 
-    axes: list[Literal["x", "y", "z"]] = Field(["x", "y", "z"], min_length=1)
-    values_mm: _Numbers
+    axes: list[Literal["x", "y", "z"]] = Field(default=["x", "y", "z"], min_length=1)
+    values_mm: list[FiniteFloat] = Field(min_length=1)
     repeats: _Count = 1
 
 
 class Rotation(Strict):
     """The origin and turns there, axis by axis; ``repeats`` frames at each pose."""
 
-    axes: list[Literal["roll", "pitch", "yaw"]] = Field(["roll", "pitch", "yaw"], min_length=1)
-    values_deg: _Numbers
+    axes: list[Literal["roll", "pitch", "yaw"]] = Field(default=["roll", "pitch", "yaw"], min_length=1)
+    values_deg: list[FiniteFloat] = Field(min_length=1)
     repeats: _Count = 1
 
 
@@ -66,7 +65,7 @@ class Spread(Strict):
     z_mm: _Range = _NONE
     tilt_deg: _Range = _NONE
     roll_deg: _Range = _NONE
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: int = Field(default=0, ge=0)
 
     @field_validator("x_mm", "y_mm", "z_mm", "tilt_deg", "roll_deg")
     @classmethod
@@ -100,26 +99,18 @@ class PlanFile(Strict):
     name: str
     origin: RigidTransformFile
     axes: Literal["tool", "base"] | Vector = "tool"
-    steps: Annotated[list[Step], Field(min_length=1)]
+    steps: list[Step] = Field(min_length=1)
 
 
 class Label(BaseModel):
-    """What a frame is for; part of its record in the manifest.
-
-    Attributes:
-        id: of the waypoint, in frame ids and image names.
-        kind: static, translation, rotation, handeye, calibration or pose.
-        axis: x, y, z, roll, pitch or yaw of a translation or rotation, else None.
-        value: along or about the axis, mm or deg.
-        origin: whether it is the reference of its axis, or a static frame.
-    """
+    """What a frame is for; part of its record in the manifest."""
 
     model_config = ConfigDict(frozen=True)
-    id: str = ""
-    kind: str
-    axis: str | None = None
-    value: float = 0.0
-    origin: bool = False
+    id: str = ""  # of the waypoint, in frame ids and image names
+    kind: str  # static, translation, rotation, handeye, calibration or pose
+    axis: str | None = None  # x, y, z, roll, pitch or yaw of a translation or rotation
+    value: float = 0.0  # along or about the axis, mm or deg
+    origin: bool = False  # the reference of its axis, or a static frame
 
 
 class Waypoint(Label):
@@ -181,11 +172,7 @@ class CapturePlan:
 
 
 def load_plan(path: str | os.PathLike[str]) -> CapturePlan:
-    """Reads a capture plan and expands it.
-
-    Raises:
-        ConfigError: one line ``FILE: FIELD: what is wrong; the fix``.
-    """
+    """Reads a capture plan and expands it. Raises ConfigError: one line ``FILE: FIELD: what is wrong; the fix``."""
     file = validate(PlanFile, read_yaml(path), path)
     origin = as_pose([*file.origin.translation, *file.origin.rotation])
     R, t = to_transform(origin)

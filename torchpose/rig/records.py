@@ -12,39 +12,26 @@ from torchpose.rig.robot import RobotReading
 
 
 class SessionRecord(BaseModel):
-    """A session begins, or goes on: with what, and whether any part of the rig is emulated.
-
-    Attributes:
-        plan_digest: of the waypoints.
-        images: width, height and pixel format by camera.
-        plan, waypoints: name of the plan and number of its waypoints.
-        robot, cameras: what they say of themselves, settings read back.
-    """
+    """A session begins, or goes on: with what, and whether any part of the rig is emulated."""
 
     model_config = ConfigDict(extra="allow")
     record: Literal["session"] = "session"
-    version: Literal["torchpose.capture/1"] = Field("torchpose.capture/1", alias="schema")
+    version: Literal["torchpose.capture/1"] = Field(default="torchpose.capture/1", alias="schema")
     started: str
     units: dict[str, str] = {"length": "mm", "angle": "rad", "time": "s"}
-    plan_digest: str
-    images: dict[str, list[int | str]]
+    plan_digest: str  # of the waypoints
+    images: dict[str, list[int | str]]  # width, height and pixel format by camera
     emulated: bool
     resumed: bool
     versions: dict[str, str | None]
-    plan: str
-    waypoints: int
-    robot: dict[str, Any]
+    plan: str  # its name
+    waypoints: int  # how many it has
+    robot: dict[str, Any]  # what it says of itself, as the cameras do, their settings read back
     cameras: list[dict[str, Any]]
 
 
 class FrameRecord(BaseModel):
-    """An image that is there, where the robot stood and when the camera exposed.
-
-    Attributes:
-        robot_pose: the middle of the readings before and after the exposure.
-        trigger_time_s: Unix time of this machine; camera_time is the camera's own counter.
-        attempts, failures: how many it took, and why the earlier ones failed.
-    """
+    """An image that is there, where the robot stood and when the camera exposed."""
 
     record: Literal["frame"] = "frame"
     id: str
@@ -55,13 +42,13 @@ class FrameRecord(BaseModel):
     camera: str
     waypoint: Label
     commanded_pose: Pose
-    robot_pose: Pose
+    robot_pose: Pose  # the middle of the readings before and after the exposure
     before: RobotReading
     after: RobotReading
-    trigger_time_s: float
-    camera_time: int
-    attempts: int
-    failures: list[str]
+    trigger_time_s: float  # Unix time of this machine
+    camera_time: int  # the camera's own counter
+    attempts: int  # how many it took
+    failures: list[str]  # why the earlier ones failed
 
 
 class EndRecord(BaseModel):

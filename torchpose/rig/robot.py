@@ -11,7 +11,6 @@ import math
 import threading
 import time
 from collections.abc import Iterable, Sequence
-from types import TracebackType
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict
@@ -33,21 +32,13 @@ _STOPPED_STATES = (0, 1)  # of runtime_state: stopping, stopped
 
 
 class RobotReading(BaseModel):
-    """One sample of the controller's stream.
-
-    Attributes:
-        pose: tool in the base, mm and rotation vector in rad.
-        joints: rad.
-        robot_time_s: the controller's clock.
-        host_time_s: this computer's clock (Unix time) when the sample came in.
-        robot_mode, safety_mode, safety_bits, runtime_state: as the controller numbers them (RTDE guide).
-    """
+    """One sample of the controller's stream; modes, bits and states as the controller numbers them (RTDE guide)."""
 
     model_config = ConfigDict(frozen=True)
-    pose: Pose
-    joints: Pose
-    robot_time_s: float
-    host_time_s: float
+    pose: Pose  # tool in the base
+    joints: Pose  # rad
+    robot_time_s: float  # the controller's clock
+    host_time_s: float  # this computer's (Unix time) when the sample came in
     robot_mode: int
     safety_mode: int
     safety_bits: int
@@ -76,7 +67,7 @@ class Robot:
     def __enter__(self) -> Robot:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def preflight(self, poses: Iterable[Sequence[float]] = ()) -> dict[str, Any]:
@@ -86,7 +77,7 @@ class Robot:
             poses: every pose of the plan.
 
         Returns:
-            host, model, serial, polyscope, robot_mode, safety_status, remote (None where the controller cannot say),
+            The answers to `robot_faults.QUESTIONS` (remote is None where the controller cannot say), host,
             tcp_offset (mm, rad), pose (mm, rad), emulated (the controller is torchpose's twin).
 
         Raises:
@@ -108,11 +99,9 @@ class Robot:
         for pose in dict.fromkeys(plan):  # each once
             if not self._call("is_reachable", _CALL_S, pose=pose):
                 self._state()  # a stop or the end of the program explains it better
-                raise self._fault(
-                    RobotReason.UNREACHABLE_POSE,
-                    f"pose {plan.index(pose)} of the plan, {_shown(pose)}, is beyond its reach or "
-                    "its safety limits; move the plan",
-                )
+                which = f"pose {plan.index(pose)} of the plan, {_shown(pose)},"
+                why = f"{which} is beyond its reach or its safety limits; move the plan"
+                raise self._fault(RobotReason.UNREACHABLE_POSE, why)
         return {**report, "tcp_offset": tcp, "pose": list(reading.pose)}
 
     def check(self, pose: Sequence[float]) -> Pose:
@@ -126,10 +115,8 @@ class Robot:
         except (TypeError, ValueError):
             numbers = as_pose([math.nan] * 6)
         if not all(map(math.isfinite, numbers)):
-            raise self._fault(
-                RobotReason.INVALID_POSE,
-                f"pose {_shown(pose)} is not six finite numbers; give x, y, z (mm), rx, ry, rz (rad)",
-            )
+            why = f"pose {_shown(pose)} is not six finite numbers; give x, y, z (mm), rx, ry, rz (rad)"
+            raise self._fault(RobotReason.INVALID_POSE, why)
         self._require_inside(numbers, "the commanded pose lies", 0.0)
         return numbers
 
@@ -174,34 +161,22 @@ class Robot:
             dashboard.stop(self.settings.host, STOP_S)
             child.close(_CLOSE_S)
 
-    # the steps of preflight and move
-
     def _look(self) -> dict[str, Any]:
         """What the dashboard says, before the robot is touched."""
         host, limit = self.settings.host, self.settings.connect_timeout_s
         try:
-            answers = dashboard.ask(host, robot_faults.QUESTIONS, limit)
+            answers = dashboard.ask(host, list(robot_faults.QUESTIONS.values()), limit)
         except TimeoutError:
-            raise self._fault(
-                RobotReason.TIMED_OUT, f"does not answer within {limit:g} s; check the address, restart the controller"
-            ) from None
+            why = f"does not answer within {limit:g} s; check the address, restart the controller"
+            raise self._fault(RobotReason.TIMED_OUT, why) from None
         except OSError as error:
-            raise self._fault(
-                RobotReason.UNREACHABLE,
-                f"cannot be reached ({error.strerror or error}); check address, cable and power",
-            ) from None
-        model, serial, polyscope, mode, safety, remote, running = (a.split(": ", 1)[-1] for a in answers)
-        self._raise(robot_faults.of_dashboard(mode, safety, remote, running))
-        return {
-            "host": host,
-            "model": model,
-            "serial": serial,
-            "polyscope": polyscope,
-            "robot_mode": mode,
-            "safety_status": safety,
-            "remote": True if remote == "true" else None,
-            "emulated": "torchpose twin" in model,
-        }
+            why = f"cannot be reached ({error.strerror or error}); check address, cable and power"
+            raise self._fault(RobotReason.UNREACHABLE, why) from None
+        said = dict(zip(robot_faults.QUESTIONS, (answer.split(": ", 1)[-1] for answer in answers), strict=True))
+        running, remote = said.pop("running"), said.pop("remote")
+        self._raise(robot_faults.of_dashboard(said["robot_mode"], said["safety_status"], remote, running))
+        emulated = "torchpose twin" in said["model"]
+        return {"host": host, **said, "remote": True if remote == "true" else None, "emulated": emulated}
 
     def _travel(self, goal: Pose, state: _State) -> None:
         """Sends the move and waits until the controller reports its end."""
@@ -217,11 +192,9 @@ class Robot:
             raise self._fault(RobotReason.PROGRAM_STOPPED, "does not take the move; see the log at the pendant")
         while state.move_changes == before or state.move_running:
             if time.monotonic() > deadline:
-                raise self._fault(
-                    RobotReason.TIMED_OUT,
-                    f"has not finished a move of {_words(distance, turn_deg)} within {limit:.3g} s; "
-                    "see what slows it down, or raise move_margin_s",
-                )
+                why = f"has not finished a move of {_words(distance, turn_deg)} within {limit:.3g} s"
+                fix = "see what slows it down, or raise move_margin_s"
+                raise self._fault(RobotReason.TIMED_OUT, f"{why}; {fix}")
             state = self._state()
             if state.runtime_state in _STOPPED_STATES:
                 raise self._fault(RobotReason.PROGRAM_STOPPED, "has ended the program; see the log at the pendant")
@@ -237,33 +210,26 @@ class Robot:
             if good >= rule.samples:
                 return reading
             if time.monotonic() > deadline:
-                raise self._fault(
-                    RobotReason.NOT_SETTLED,
-                    f"stands {_words(distance, turn_deg)} from the commanded pose {rule.timeout_s:g} s after the move; "
-                    "check the tool offset and the payload, or widen settle",
-                )
-
-    # faults
+                why = f"stands {_words(distance, turn_deg)} from the commanded pose {rule.timeout_s:g} s after the move"
+                fix = "check the tool offset and the payload, or widen settle"
+                raise self._fault(RobotReason.NOT_SETTLED, f"{why}; {fix}")
 
     def _fault(self, reason: RobotReason, what: str) -> RobotFault:
         return RobotFault(reason, f"robot {self.settings.host}: {what}")
-
-    def _raise_if_stopped(self) -> None:
-        if self._stopped.is_set():
-            raise self._fault(RobotReason.STOPPED, "was stopped; start anew")
 
     def _raise(self, cause: robot_faults.Cause | None) -> None:
         if cause is not None:
             raise self._fault(*cause)
 
+    def _raise_if_stopped(self) -> None:
+        if self._stopped.is_set():
+            raise self._fault(RobotReason.STOPPED, "was stopped; start anew")
+
     def _require_inside(self, pose: Pose, what: str, slack_mm: float) -> None:
         if left := self.settings.workspace.left_by(pose, slack_mm):
             axis, value, low, high = left
-            raise self._fault(
-                RobotReason.OUTSIDE_WORKSPACE,
-                f"{what} at {axis} = {value:.6g} mm, outside the workspace ({low:g} to {high:g} mm); "
-                "change the pose or the workspace",
-            )
+            why = f"{what} at {axis} = {value:.6g} mm, outside the workspace ({low:g} to {high:g} mm)"
+            raise self._fault(RobotReason.OUTSIDE_WORKSPACE, f"{why}; change the pose or the workspace")
 
     def _state(self, fresh: int = 1) -> _State:
         """The child's state after `fresh` more samples, with safety looked at."""

@@ -7,10 +7,10 @@ from torchpose.rig.faults import RobotReason
 
 Cause = tuple[RobotReason, str]  # what is wrong; the fix
 
-QUESTIONS = [
-    "get robot model", "get serial number", "PolyscopeVersion", "robotmode", "safetystatus", "is in remote control",
-    "running",
-]  # fmt: skip
+QUESTIONS = {
+    "model": "get robot model", "serial": "get serial number", "polyscope": "PolyscopeVersion",
+    "robot_mode": "robotmode", "safety_status": "safetystatus", "remote": "is in remote control", "running": "running",
+}  # fmt: skip
 
 _EMERGENCY: Cause = (RobotReason.EMERGENCY_STOP, "is in emergency stop; release the button and start the robot there")
 _PROTECTIVE: Cause = (
@@ -30,7 +30,7 @@ def of_safety_bits(bits: int) -> Cause | None:
 
 
 def of_dashboard(mode: str, safety: str, remote: str, running: str) -> Cause | None:
-    """The cause in the dashboard's answers to the last four `QUESTIONS`; None where all is well."""
+    """The cause in what the dashboard answers; None where all is well."""
     for word, cause in _SAFETY_WORDS.items():
         if safety.endswith(word):
             return cause

@@ -49,62 +49,45 @@ class Workspace(Strict):
 class Settle(Strict):
     """When a move has arrived: `samples` fresh samples in a row, all within the tolerances of the commanded pose."""
 
-    samples: Annotated[int, Field(ge=1, le=1000)] = 10
+    samples: int = Field(default=10, ge=1, le=1000)
     tolerance_mm: Positive = 0.05
     tolerance_deg: Positive = 0.02
     timeout_s: Positive = 3.0
 
 
 class RobotSettings(Strict):
-    """The `robot:` part of a rig file.
+    """The `robot:` part of a rig file."""
 
-    Attributes:
-        host: name or address of the controller.
-        tcp: tool in the flange, mm and rotation vector in rad; the one that is set at the pendant where it is left out.
-        speed_mm_s, acceleration_mm_s2: of every move; 50 mm/s turns a tool that only rotates at 0.05 rad/s.
-        connect_timeout_s: for each step of connecting.
-        move_margin_s: what a move may take beyond its computed time.
-        frequency_hz: of the stream; the controller divides 500 Hz (e-Series) or 125 Hz (CB3).
-    """
-
-    host: Annotated[str, Field(min_length=1)]
-    tcp: SixNumbers | None = None
+    host: str = Field(min_length=1)  # name or address of the controller
+    tcp: SixNumbers | None = None  # tool in the flange, mm and rotation vector in rad; None: as set at the pendant
     workspace: Workspace
-    speed_mm_s: Annotated[FiniteFloat, Field(gt=0, le=MAX_SPEED_MM_S)] = 50.0
-    acceleration_mm_s2: Annotated[FiniteFloat, Field(gt=0, le=MAX_ACCELERATION_MM_S2)] = 200.0
+    speed_mm_s: FiniteFloat = Field(
+        default=50.0, gt=0, le=MAX_SPEED_MM_S
+    )  # turns a tool that only rotates at 0.05 rad/s
+    acceleration_mm_s2: FiniteFloat = Field(default=200.0, gt=0, le=MAX_ACCELERATION_MM_S2)
     settle: Settle = Settle()
-    connect_timeout_s: Positive = 10.0
-    move_margin_s: Positive = 3.0
-    frequency_hz: Annotated[FiniteFloat, Field(ge=10, le=500)] = 125.0
+    connect_timeout_s: Positive = 10.0  # for each step of connecting
+    move_margin_s: Positive = 3.0  # what a move may take beyond its computed time
+    frequency_hz: FiniteFloat = Field(
+        default=125.0, ge=10, le=500
+    )  # of the stream; divides the controller's 500 or 125 Hz
 
 
 class CameraSettings(Strict):
-    """One of the `cameras:` of a rig file.
+    """One of the `cameras:` of a rig file."""
 
-    Attributes:
-        name: in frame ids and image names.
-        serial: as printed on the camera; None takes the first that is free.
-        width, height: of the frame, px.
-        offset_x, offset_y: of its corner on the sensor; the middle by default.
-        pixel_format: more than 8 bits are stored as 16-bit images with the values as the camera gives them.
-        exposure_us, gain_db: fixed; the automatic functions are switched off.
-        timeout_s: from trigger to image.
-        attempts: at one frame, before the session ends.
-        nodes: further GenICam features by name, set in this order.
-    """
-
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=40)] = "camera"
-    serial: str | None = None
-    width: Annotated[int, Field(ge=1)]
-    height: Annotated[int, Field(ge=1)]
-    offset_x: Annotated[int, Field(ge=0)] | None = None
-    offset_y: Annotated[int, Field(ge=0)] | None = None
-    pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono16"] = "Mono8"
-    exposure_us: Positive
+    name: str = Field(default="camera", pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=40)  # in image names
+    serial: str | None = None  # as printed on the camera; None takes the first that is free
+    width: int = Field(ge=1)  # of the frame, px
+    height: int = Field(ge=1)
+    offset_x: int | None = Field(default=None, ge=0)  # of its corner on the sensor; the middle by default
+    offset_y: int | None = Field(default=None, ge=0)
+    pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono16"] = "Mono8"  # above 8: 16-bit images, values as given
+    exposure_us: Positive  # fixed, and the gain: the automatic functions are switched off
     gain_db: FiniteFloat = 0.0
-    timeout_s: Positive = 5.0
-    attempts: Annotated[int, Field(ge=1, le=20)] = 3
-    nodes: dict[str, bool | int | FiniteFloat | str] = {}
+    timeout_s: Positive = 5.0  # from trigger to image
+    attempts: int = Field(default=3, ge=1, le=20)  # at one frame, before the session ends
+    nodes: dict[str, bool | int | FiniteFloat | str] = {}  # further GenICam features, set in this order
 
     @field_validator("serial", mode="before")
     @classmethod
@@ -131,11 +114,11 @@ class CameraSettings(Strict):
 
 
 class Rig(Strict):
-    """What a rig file holds; `dwell_s` is waited between the settled move and the exposure: vibrations fade."""
+    """What a rig file holds."""
 
     robot: RobotSettings
-    cameras: Annotated[list[CameraSettings], Field(min_length=1)]
-    dwell_s: Annotated[FiniteFloat, Field(ge=0, le=60)] = 0.2
+    cameras: list[CameraSettings] = Field(min_length=1)
+    dwell_s: FiniteFloat = Field(default=0.2, ge=0, le=60)  # before the exposure, for vibrations to fade
 
     @field_validator("cameras")
     @classmethod
@@ -148,9 +131,5 @@ class Rig(Strict):
 
 
 def load_rig(path: str | os.PathLike[str]) -> Rig:
-    """Reads a rig file.
-
-    Raises:
-        ConfigError: one line ``FILE: FIELD: what is wrong; the fix``.
-    """
+    """Reads a rig file. Raises ConfigError: one line ``FILE: FIELD: what is wrong; the fix``."""
     return validate(Rig, read_yaml(path), path)

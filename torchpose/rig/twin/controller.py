@@ -9,7 +9,6 @@ import argparse
 import sys
 import threading
 from collections.abc import Sequence
-from types import TracebackType
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
@@ -28,20 +27,13 @@ _NotNegative = Annotated[FiniteFloat, Field(ge=0)]
 
 
 class TwinErrors(BaseModel):
-    """How the simulated robot deviates from an ideal one; part of a twin file.
-
-    Attributes:
-        repeatability_mm, repeatability_deg: standard deviations by axis of the true pose about the reported one, drawn
-            anew for every move.
-        scale: how much true displacements from the start are longer than reported ones, relative.
-        reading_noise_mm: standard deviation by axis of every reported position.
-    """
+    """How the simulated robot deviates from an ideal one; part of a twin file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    repeatability_mm: _NotNegative = 0.0
-    repeatability_deg: _NotNegative = 0.0
-    scale: FiniteFloat = 0.0
-    reading_noise_mm: _NotNegative = 0.0
+    repeatability_mm: _NotNegative = 0.0  # standard deviation by axis of the true pose about the reported one, drawn
+    repeatability_deg: _NotNegative = 0.0  # anew for every move
+    scale: FiniteFloat = 0.0  # how much longer true displacements from the start are than reported ones, relative
+    reading_noise_mm: _NotNegative = 0.0  # standard deviation by axis of every reported position
 
 
 class TwinController:
@@ -81,13 +73,8 @@ class TwinController:
     def __enter__(self) -> TwinController:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
-
-    @property
-    def pid(self) -> int:
-        """Number of its process."""
-        return self._child.pid
 
     def inject(self, fault: Fault | str, at_fraction: float | None = None) -> None:
         """Makes a fault, now or at a share (0 to 1) of the path of the present or the next move."""
@@ -107,8 +94,7 @@ class TwinController:
         Keys: pose and true_pose (mm, rad), moving, fraction (of the path), program (running), safety, faults, moves
         (how many were begun), unlocks (how often somebody unlocked a protective stop).
         """
-        state: dict[str, Any] = self._child.call("state", _ANSWER_S)
-        return state
+        return dict(self._child.call("state", _ANSWER_S))
 
     def true_pose(self) -> tuple[float, ...]:
         """Where the tool really is in the base now: mm and rotation vector in rad."""

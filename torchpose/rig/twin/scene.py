@@ -35,19 +35,12 @@ _Grey = Annotated[FiniteFloat, Field(ge=0, le=255)]
 
 
 class TwinCamera(Strict):
-    """What one camera of the rig really is, and where.
+    """What one camera of the rig really is, and where."""
 
-    Attributes:
-        name: as in the rig file.
-        camera: its camera file.
-        focal_scale: the true focal length over that of the file.
-        base_from_camera, tool_from_camera: where it is, one of both.
-    """
-
-    name: str = "camera"
-    camera: str
-    focal_scale: Positive = 1.0
-    base_from_camera: RigidTransformFile | None = None
+    name: str = "camera"  # as in the rig file
+    camera: str  # its camera file
+    focal_scale: Positive = 1.0  # the true focal length over that of the file
+    base_from_camera: RigidTransformFile | None = None  # where it is, one of both
     tool_from_camera: RigidTransformFile | None = None
 
     @model_validator(mode="after")
@@ -64,22 +57,22 @@ class TwinImaging(Strict):
     dark: _Grey = 30.0
     light: _Grey = 220.0
     surround: _Grey = 90.0
-    plate: Annotated[list[Positive], Field(min_length=2, max_length=2)] | None = None
-    noise: Annotated[FiniteFloat, Field(ge=0)] = 1.0
+    plate: list[Positive] | None = Field(default=None, min_length=2, max_length=2)
+    noise: FiniteFloat = Field(default=1.0, ge=0)
     full_well: Positive | None = None
 
 
 class TwinFile(Strict):
     """A twin file, see docs/rig.md."""
 
-    host: Annotated[str, Field(pattern=r"^127(\.\d{1,3}){3}$")] = "127.0.0.2"
+    host: str = Field(default="127.0.0.2", pattern=r"^127(\.\d{1,3}){3}$")
     robot: TwinErrors = TwinErrors()
-    cameras: Annotated[list[TwinCamera], Field(min_length=1)]
+    cameras: list[TwinCamera] = Field(min_length=1)
     target: str
     tool_from_target: RigidTransformFile | None = None
     base_from_target: RigidTransformFile | None = None
     imaging: TwinImaging = TwinImaging()
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: int = Field(default=0, ge=0)
 
     @model_validator(mode="after")
     def _one_place(self) -> TwinFile:
@@ -90,25 +83,15 @@ class TwinFile(Strict):
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What the cameras of a twin see.
-
-    Attributes:
-        file: what the twin file says.
-        cameras: the true ones by name, in the file's order.
-        target: the target.
-    """
+    """What the cameras of a twin see."""
 
     file: TwinFile
-    cameras: dict[str, Camera]
+    cameras: dict[str, Camera]  # the true ones by name, in the file's order
     target: Target
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Scene:
-        """Reads a twin file; files that it names are relative to it.
-
-        Raises:
-            ConfigError: one line ``FILE: FIELD: what is wrong; the fix``.
-        """
+        """Reads a twin file; files that it names are relative to it. Raises ConfigError."""
         path = Path(path)
         file = validate(TwinFile, read_yaml(path), path)
         cameras = {}

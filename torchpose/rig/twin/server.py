@@ -24,8 +24,6 @@ from torchpose.rig.twin.machine import Fault, Machine, Safety
 
 RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
 VERSION = (5, 11, 1, 108318)
-MODEL = "UR5 torchpose twin"  # names the twin to whoever asks the dashboard for the model
-SERIAL = "20990000001"
 TICK_S = 0.004
 
 Handler = Callable[[StreamReader, StreamWriter], Awaitable[None]]
@@ -95,8 +93,8 @@ class Server:
                 elif kind == wire.INPUTS:
                     recipe = wire.Recipe(len(inputs) + 1, wire.names(payload))
                     inputs[recipe.id] = recipe
-                    taken = Fault.REGISTERS_IN_USE in self.machine.faults
-                    reply = bytes([recipe.id]) + ",".join(["IN_USE"] if taken else recipe.types).encode()
+                    types = ["IN_USE"] if Fault.REGISTERS_IN_USE in self.machine.faults else recipe.types
+                    reply = bytes([recipe.id]) + ",".join(types).encode()
                 elif kind in (wire.START, wire.PAUSE):
                     if sender is not None:
                         sender.cancel()
@@ -151,15 +149,14 @@ class Server:
         if command == "unlock protective stop":
             machine.unlocks += 1
             return "Protective stop releasing"
-        version = ".".join(map(str, VERSION))
         answers = {
             "robotmode": f"Robotmode: {'POWER_OFF' if machine.safety is Safety.EMERGENCY_STOP else 'RUNNING'}",
             "safetystatus": f"Safetystatus: {machine.safety.value[2]}",
             "safetymode": f"Safetymode: {machine.safety.value[2]}",
             "is in remote control": str(Fault.NOT_REMOTE not in machine.faults).lower(),
-            "PolyscopeVersion": f"URSoftware {version} (torchpose twin)",
-            "get serial number": SERIAL,
-            "get robot model": MODEL,
+            "PolyscopeVersion": f"URSoftware {'.'.join(map(str, VERSION))} (torchpose twin)",
+            "get serial number": "20990000001",
+            "get robot model": "UR5 torchpose twin",  # `torchpose.rig.robot` knows the twin by it
             "running": f"Program running: {str(machine.program).lower()}",
             "programState": f"{'PLAYING' if machine.program else 'STOPPED'} rtde_control",
             "quit": "Disconnected",
