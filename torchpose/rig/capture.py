@@ -16,10 +16,7 @@ from torchpose.rig.plan import CapturePlan, Waypoint
 from torchpose.rig.poses import Pose, difference, middle
 from torchpose.rig.robot import Robot, RobotReading
 from torchpose.rig.session import Session
-from torchpose.rig.settings import Rig, Settle
-
-COMPLETE = "complete"
-INTERRUPTED = "interrupted"
+from torchpose.rig.settings import Rig
 
 OnFrame = Callable[[Waypoint, Frame], None]
 
@@ -87,12 +84,12 @@ def capture(
         session.end(fault.reason.value, str(fault))
         raise
     except KeyboardInterrupt:
-        session.end(INTERRUPTED)
+        session.end("interrupted")
         raise
     except BaseException as error:
         session.end("internal_error", f"{type(error).__name__}: {error}")
         raise
-    session.end(COMPLETE)
+    session.end("complete")
 
 
 def _take_all(
@@ -129,39 +126,33 @@ def _expose(
     waypoint: Waypoint, names: list[str], rig: Rig, robot: Robot, cameras: Cameras
 ) -> tuple[RobotReading, list[Frame], RobotReading]:
     """Frames of the named cameras between two fresh readings of the robot at rest on the waypoint."""
-    before = robot.read(fresh=2)
-    _check_rest(waypoint, before, waypoint.pose, rig.robot.settle)
+
+    def read_at(pose: Pose) -> RobotReading:
+        reading, settle = robot.read(fresh=2), rig.robot.settle
+        distance, angle = difference(reading.pose, pose)
+        if distance > settle.tolerance_mm or angle > settle.tolerance_deg:
+            why = f"moved by {distance:.3f} mm and {angle:.3f} deg around the exposure of waypoint {waypoint}"
+            fix = "look for vibration, or raise robot.settle of the rig file"
+            raise RobotFault(RobotReason.NOT_SETTLED, f"robot: {why}; {fix}")
+        return reading
+
+    before = read_at(waypoint.pose)
     frames = cameras.grab(names)
-    after = robot.read(fresh=2)
-    _check_rest(waypoint, after, before.pose, rig.robot.settle)
-    return before, frames, after
-
-
-def _check_rest(waypoint: Waypoint, reading: RobotReading, pose: Pose, settle: Settle) -> None:
-    """Raises a RobotFault when the robot is not where it was."""
-    distance, angle = difference(reading.pose, pose)
-    if distance > settle.tolerance_mm or angle > settle.tolerance_deg:
-        raise RobotFault(
-            RobotReason.NOT_SETTLED,
-            f"robot: moved by {distance:.3f} mm and {angle:.3f} deg around the exposure of waypoint {waypoint}; "
-            "look for vibration, or raise robot.settle of the rig file",
-        )
+    return before, frames, read_at(before.pose)
 
 
 @contextlib.contextmanager
 def stopped_by_signals(robot: Robot) -> Iterator[None]:
-    """While the block runs, the first SIGINT or SIGTERM stops the robot and raises KeyboardInterrupt; later ones wait.
+    """While the block runs, SIGINT or SIGTERM stops the robot and raises KeyboardInterrupt; further ones are ignored.
 
     In a thread that is not the main one, which gets no signals, this does nothing.
     """
-    caught = False
 
     def stop(_number: int, _frame: FrameType | None) -> None:
-        nonlocal caught
-        if not caught:
-            caught = True
-            robot.stop()
-            raise KeyboardInterrupt
+        for number in previous:
+            signal.signal(number, signal.SIG_IGN)
+        robot.stop()
+        raise KeyboardInterrupt
 
     previous: dict[signal.Signals, Any] = {}
     with contextlib.suppress(ValueError):  # not the main thread

@@ -11,7 +11,7 @@ import json
 import math
 import os
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -27,17 +27,23 @@ from torchpose.rig.poses import Pose, as_pose, from_transform, to_transform
 from torchpose.rig.settings import SixNumbers, Strict, Workspace
 from torchpose.target import RigidTransformFile, Vector
 
-_AXES = {"x": 0, "y": 1, "z": 2, "pitch": 3, "yaw": 4, "roll": 5}  # places in a shift (mm) and rotation vector (rad)
+_AXES = {"x": 0, "y": 1, "z": 2, "pitch": 3, "yaw": 4, "roll": 5}  # places in a move
+_F64 = torch.float64
 
 _Range = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
-_Count = Annotated[int, Field(ge=1, le=10000)]
 _NONE = [0.0, 0.0]
+_Count = Annotated[int, Field(ge=1, le=10000)]
+# shift in mm and rotation vector in rad along the plan's axes; what the waypoint's label says besides its kind
+Moves = Iterator[tuple[Float[Tensor, " 6"], dict[str, Any]]]
 
 
 class Static(Strict):
     """Frames at the origin, the robot at rest."""
 
     repeats: _Count
+
+    def moves(self) -> Moves:
+        yield from [(torch.zeros(6, dtype=_F64), {"origin": True})] * self.repeats
 
 
 class Translation(Strict):
@@ -47,6 +53,9 @@ class Translation(Strict):
     values_mm: list[FiniteFloat] = Field(min_length=1)
     repeats: _Count = 1
 
+    def moves(self) -> Moves:
+        return _sweep(self.axes, self.values_mm, self.repeats)
+
 
 class Rotation(Strict):
     """The origin and turns there, axis by axis; ``repeats`` frames at each pose."""
@@ -54,6 +63,17 @@ class Rotation(Strict):
     axes: list[Literal["roll", "pitch", "yaw"]] = Field(default=["roll", "pitch", "yaw"], min_length=1)
     values_deg: list[FiniteFloat] = Field(min_length=1)
     repeats: _Count = 1
+
+    def moves(self) -> Moves:
+        return _sweep(self.axes, self.values_deg, self.repeats)
+
+
+def _sweep(axes: Sequence[str], values: Sequence[float], repeats: int) -> Moves:
+    for axis in axes:
+        for value in [0.0, *(value for value in values if value != 0)]:  # the origin comes first, and once
+            move = torch.zeros(6, dtype=_F64)
+            move[_AXES[axis]] = value if axis in "xyz" else math.radians(value)
+            yield from [(move, {"axis": axis, "value": value, "origin": value == 0})] * repeats
 
 
 class Spread(Strict):
@@ -73,6 +93,17 @@ class Spread(Strict):
         if value[0] > value[1]:
             raise ValueError(f"has the limits {value[0]:g} > {value[1]:g}; swap them")
         return value
+
+    def moves(self) -> Moves:
+        engine = torch.quasirandom.SobolEngine(6, scramble=True, seed=self.seed)
+        ranges = (self.x_mm, self.y_mm, self.z_mm, self.tilt_deg, self.roll_deg)
+        for *points, around in engine.draw(self.count, dtype=_F64).tolist():
+            x, y, z, tilt, roll = (low + (high - low) * p for (low, high), p in zip(ranges, points, strict=True))
+            azimuth, tilt = 2 * math.pi * around, math.radians(tilt)
+            lean = torch.tensor([tilt * math.cos(azimuth), tilt * math.sin(azimuth), 0], dtype=_F64)
+            spin = torch.tensor([0, 0, math.radians(roll)], dtype=_F64)
+            turn = rotations.log(rotations.exp(lean) @ rotations.exp(spin))
+            yield torch.cat([torch.tensor([x, y, z], dtype=_F64), turn]), {}
 
 
 class Step(Strict):
@@ -164,11 +195,10 @@ class CapturePlan:
         """Raises ConfigError where a waypoint lies outside of the box; straight moves between others stay inside."""
         for waypoint in self.waypoints:
             if left := workspace.left_by(waypoint.pose):
-                name, value, low, high = left
-                raise ConfigError(
-                    f"{self.path}: steps: waypoint {waypoint} has {name} = {value:.1f} mm, outside of the "
-                    f"workspace [{low:g}, {high:g}]; change the plan, or the rig's robot.workspace if it is safe"
-                )
+                axis, value, low, high = left
+                problem = f"waypoint {waypoint} has {axis} = {value:.1f} mm, outside of the workspace"
+                fix = f"[{low:g}, {high:g}]; change the plan, or the rig's robot.workspace if it is safe"
+                raise ConfigError(f"{self.path}: steps: {problem} {fix}")
 
 
 def load_plan(path: str | os.PathLike[str]) -> CapturePlan:
@@ -177,48 +207,16 @@ def load_plan(path: str | os.PathLike[str]) -> CapturePlan:
     origin = as_pose([*file.origin.translation, *file.origin.rotation])
     R, t = to_transform(origin)
     if file.axes == "base":
-        axes = torch.eye(3, dtype=torch.float64)
+        axes = torch.eye(3, dtype=_F64)
     else:
-        axes = R if file.axes == "tool" else rotations.exp(torch.tensor(file.axes, dtype=torch.float64))
+        axes = R if file.axes == "tool" else rotations.exp(torch.tensor(file.axes, dtype=_F64))
     waypoints: list[Waypoint] = []
     for step in file.steps:
         for given in step.poses or ():
             waypoints.append(Waypoint(id=f"{len(waypoints):04d}", pose=as_pose(given), kind="pose"))
-        for move, label in _expand(step):
-            # along and about the axes (columns in the base), about the tool's point
-            pose = from_transform(axes @ rotations.exp(move[3:]) @ axes.mT @ R, t + axes @ move[:3])
-            waypoints.append(Waypoint(id=f"{len(waypoints):04d}", pose=pose, **label))
+        for kind in step.model_fields_set - {"poses"}:
+            for move, label in getattr(step, kind).moves():
+                # along and about the axes (columns in the base), about the tool's point
+                pose = from_transform(axes @ rotations.exp(move[3:]) @ axes.mT @ R, t + axes @ move[:3])
+                waypoints.append(Waypoint(id=f"{len(waypoints):04d}", pose=pose, kind=kind, **label))
     return CapturePlan(file.name, os.fspath(path), origin, tuple(waypoints))
-
-
-def _expand(step: Step) -> Iterator[tuple[Float[Tensor, " 6"], dict[str, Any]]]:
-    """Shifts in mm with rotation vectors in rad along the plan's axes, and labels, of one step."""
-    still = torch.zeros(6, dtype=torch.float64)
-    if step.static is not None:
-        for _ in range(step.static.repeats):
-            yield still, {"kind": "static", "origin": True}
-    for kind, sweep in (("translation", step.translation), ("rotation", step.rotation)):
-        if sweep is not None:
-            values = sweep.values_mm if isinstance(sweep, Translation) else sweep.values_deg
-            for axis in sweep.axes:
-                for value in [0.0, *(v for v in values if v != 0)]:  # the origin comes first, and once
-                    move = still.clone()
-                    move[_AXES[axis]] = value if kind == "translation" else math.radians(value)
-                    for _ in range(sweep.repeats):
-                        yield move, {"kind": kind, "axis": axis, "value": value, "origin": value == 0}
-    for kind, spread in (("handeye", step.handeye), ("calibration", step.calibration)):
-        if spread is not None:
-            yield from ((move, {"kind": kind}) for move in _spread(spread))
-
-
-def _spread(spread: Spread) -> Iterator[Float[Tensor, " 6"]]:
-    """Shifts and turns that cover the ranges."""
-    engine = torch.quasirandom.SobolEngine(6, scramble=True, seed=spread.seed)
-    ranges = (spread.x_mm, spread.y_mm, spread.z_mm, spread.tilt_deg, spread.roll_deg)
-    for *points, around in engine.draw(spread.count, dtype=torch.float64).tolist():
-        x, y, z, tilt, roll = (low + (high - low) * p for (low, high), p in zip(ranges, points, strict=True))
-        azimuth, tilt = 2 * math.pi * around, math.radians(tilt)
-        lean = torch.tensor([tilt * math.cos(azimuth), tilt * math.sin(azimuth), 0], dtype=torch.float64)
-        spin = torch.tensor([0, 0, math.radians(roll)], dtype=torch.float64)
-        turn = rotations.log(rotations.exp(lean) @ rotations.exp(spin))
-        yield torch.cat([torch.tensor([x, y, z], dtype=torch.float64), turn])

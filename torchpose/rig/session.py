@@ -28,7 +28,6 @@ from torchpose.io.manifest import read_records
 from torchpose.rig.faults import SessionFault, SessionReason
 from torchpose.rig.records import EndRecord, FrameRecord, SessionRecord
 
-MANIFEST = "manifest.jsonl"
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -51,7 +50,7 @@ class Session:
 
     def __init__(self, folder: Path, *, plan: str, images: Mapping[str, Any], resume: bool = False) -> None:
         self.folder = folder
-        self.manifest = folder / MANIFEST
+        self.manifest = folder / "manifest.jsonl"
         self.done: set[str] = set()
         self._origin: dict[str, Any] = {"plan_digest": plan, "images": dict(images)}
         self._earlier: SessionRecord | None = None
@@ -82,10 +81,8 @@ class Session:
         """Raises a SessionFault where the disk has less than ``size`` bytes left."""
         free = shutil.disk_usage(self.folder).free
         if free < size:
-            raise SessionFault(
-                SessionReason.DISK_FULL,
-                f"{self.folder}: {free / 1e9:.1f} GB are left and the images may need {size / 1e9:.1f} GB; free some",
-            )
+            need = f"{free / 1e9:.1f} GB are left and the images may need {size / 1e9:.1f} GB"
+            raise SessionFault(SessionReason.DISK_FULL, f"{self.folder}: {need}; free some")
 
     def begin(self, *, emulated: bool, **contents: Any) -> None:
         """Appends the session record.
@@ -99,9 +96,8 @@ class Session:
             SessionFault: it cannot be written.
         """
         if self._earlier is not None and self._earlier.emulated != emulated:
-            raise ConfigError(
-                f"{self.manifest}: --resume: emulated is {not emulated} there and {emulated} now; choose another --out"
-            )
+            problem = f"emulated is {not emulated} there and {emulated} now"
+            raise ConfigError(f"{self.manifest}: --resume: {problem}; choose another --out")
         try:
             self._file = os.open(self.manifest, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
         except OSError as error:
@@ -131,9 +127,7 @@ class Session:
         """
         name = f"images/{frame}.png"
         path = self.folder / name
-        done, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-        assert done  # of uint8 or uint16 every time
-        encoded = data.tobytes()
+        encoded = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
         temporary = path.with_name(f".{path.name}.tmp")
         try:
             with temporary.open("wb") as file:
@@ -180,24 +174,22 @@ class Session:
         if not self.manifest.exists():
             raise ConfigError(f"{self.manifest}: --resume: does not exist; leave --resume out to start the session")
         records = read_records(self.manifest)
-        words = {"plan_digest": "has another plan", "images": "has other cameras or image sizes"}
         for number, record in records:
             where = f"{self.manifest}: line {number}"
             if record.get("record") == "session" and self._earlier is None:
                 self._earlier = validate(SessionRecord, record, where)
-                for key, value in self._origin.items():
-                    if getattr(self._earlier, key) != value:
-                        raise ConfigError(
-                            f"{self.manifest}: --resume: the session {words[key]}; give the same, or another --out"
-                        )
             elif record.get("record") == "frame":
                 frame = validate(FrameRecord, record, where)
                 image = self.folder / frame.image
                 if not image.is_file():
-                    raise ConfigError(
-                        f"{image}: --resume: is missing, but the manifest lists it; restore it or start anew"
-                    )
+                    problem = "is missing, but the manifest lists it"
+                    raise ConfigError(f"{image}: --resume: {problem}; restore it or start anew")
                 self.done.add(frame.id)
+        words = {"plan_digest": "has another plan", "images": "has other cameras or image sizes"}
+        for key, value in self._origin.items():
+            if self._earlier is not None and getattr(self._earlier, key) != value:
+                problem = f"the session {words[key]}"
+                raise ConfigError(f"{self.manifest}: --resume: {problem}; give the same, or another --out")
         content = self.manifest.read_bytes()
         if records and records[-1][0] > content.count(b"\n"):  # a whole last line lacks its newline
             with self.manifest.open("ab") as file:

@@ -47,10 +47,9 @@ class LiveStatus:
         for path, settings in zip(cameras, rig, strict=False):
             camera = Camera.load(path)
             if (camera.width, camera.height) != (settings.width, settings.height):
-                raise ConfigError(
-                    f"{path}: image_width, image_height: {camera.width} x {camera.height}, but camera {settings.name} "
-                    f"of the rig has {settings.width} x {settings.height}; give its own camera file"
-                )
+                there = f"camera {settings.name} of the rig has {settings.width} x {settings.height}"
+                size = f"image_width, image_height: {camera.width} x {camera.height}"
+                raise ConfigError(f"{path}: {size}, but {there}; give its own camera file")
             estimators[settings.name] = PoseEstimator(camera, known, method="centers")
         return cls(estimators)
 

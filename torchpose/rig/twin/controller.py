@@ -66,9 +66,8 @@ class TwinController:
             self._child.call("start", _START_S, host=host, **setup)
         except ChildError as error:
             self.close()
-            raise ConfigError(
-                f"{host}: twin: cannot serve there ({error}); end the other twin or give another 127.0.0.x"
-            ) from None
+            fix = "end the other twin or give another 127.0.0.x"
+            raise ConfigError(f"{host}: twin: cannot serve there ({error}); {fix}") from None
 
     def __enter__(self) -> TwinController:
         return self

@@ -111,10 +111,8 @@ class Scene:
             if true is None:
                 raise ConfigError(f"{path}: cameras: {camera.name!r} of the rig file is missing; add it")
             if (true.width, true.height) != (camera.width, camera.height):
-                raise ConfigError(
-                    f"{path}: cameras: {camera.name!r} has {true.width} x {true.height} px, in the rig file "
-                    f"{camera.width} x {camera.height}; make both the same"
-                )
+                sizes = f"{true.width} x {true.height} px, in the rig file {camera.width} x {camera.height}"
+                raise ConfigError(f"{path}: cameras: {camera.name!r} has {sizes}; make both the same")
 
     def camera_from_target(self, name: str, tool: Sequence[float]) -> tuple[Float[Tensor, "3 3"], Float[Tensor, " 3"]]:
         """R and t (mm) of the target in a camera while the tool is at the pose ``tool`` in the base."""

@@ -14,9 +14,9 @@ from pathlib import Path
 HEADER = struct.Struct(">HB")
 PROTOCOL, VERSION, OUTPUTS, INPUTS, START, PAUSE, DATA = (ord(c) for c in "VvOISPU")
 
-_FORMATS = dict(DOUBLE="d", VECTOR6D="6d", VECTOR3D="3d", VECTOR6INT32="6i", INT32="i", UINT32="I", UINT64="Q")
-_VARIABLES = json.loads(Path(__file__).with_name("variables.json").read_text(encoding="utf-8"))
-TYPES = {name: kind for kind, names in _VARIABLES.items() for name in names}
+_KINDS = json.loads(Path(__file__).with_name("variables.json").read_text(encoding="utf-8"))
+_FORMATS = {kind: given["format"] for kind, given in _KINDS.items()}
+TYPES = {name: kind for kind, given in _KINDS.items() for name in given["names"]}
 for _register in (f"{side}_{{}}_register_{i}" for side in ("input", "output") for i in range(48)):
     TYPES |= {_register.format("int"): "INT32", _register.format("double"): "DOUBLE"}
 
