@@ -140,9 +140,11 @@ def evaluate_experiment(
 
 
 def _evaluate(frames: _Frames, manifest: Path) -> Experiment:
-    static, *groups = (frames[frames.group == number] for number in range(len(_GROUPS)))
+    rest, *groups = (frames[frames.group == number] for number in range(len(_GROUPS)))
+    values = torch.cat([rest.t, rotations.log(rest.R @ rest.R[:1].mT)], -1)
+    static = Static(values - values.mean(0), rest.covariance.diagonal(dim1=-2, dim2=-1).sqrt())
     moves = [_moves(group, axis, manifest) for axis, group in zip(AXES, groups, strict=True) if len(group)]
-    return Experiment(_static(static) if len(static) > 2 else None, moves, float(frames.t[:, 2].mean()))
+    return Experiment(static if len(rest) > 2 else None, moves, float(frames.t[:, 2].mean()))
 
 
 def _join(manifest: Path, poses: Path) -> tuple[_Frames, tuple[str, ...], bool]:
@@ -190,11 +192,6 @@ def _covariance(row: dict[str, Any]) -> Float[Tensor, "6 6"]:
     if row.get("covariance") is not None:
         return torch.tensor([list(map(float, line)) for line in row["covariance"]], dtype=torch.float64)
     return torch.tensor([float(row[column]) for column in _SIGMA], dtype=torch.float64).square().diag()
-
-
-def _static(frames: _Frames) -> Static:
-    values = torch.cat([frames.t, rotations.log(frames.R @ frames.R[:1].mT)], -1)
-    return Static(values - values.mean(0), frames.covariance.diagonal(dim1=-2, dim2=-1).sqrt())
 
 
 def _moves(frames: _Frames, axis: str, manifest: Path) -> Moves:

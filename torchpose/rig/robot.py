@@ -46,7 +46,7 @@ class RobotReading(BaseModel):
 
 
 class _State(RobotReading):
-    """A reading with what `Robot.move` needs besides: see `torchpose.rig.robot_child`."""
+    """A reading with what `Robot.move` needs besides."""
 
     speed_fraction: float
     move_running: bool
@@ -174,7 +174,8 @@ class Robot:
             raise self._fault(RobotReason.UNREACHABLE, why) from None
         said = dict(zip(robot_faults.QUESTIONS, (answer.split(": ", 1)[-1] for answer in answers), strict=True))
         running, remote = said.pop("running"), said.pop("remote")
-        self._raise(robot_faults.of_dashboard(said["robot_mode"], said["safety_status"], remote, running))
+        if cause := robot_faults.of_dashboard(said["robot_mode"], said["safety_status"], remote, running):
+            raise self._fault(*cause)
         emulated = "torchpose twin" in said["model"]
         return {"host": host, **said, "remote": True if remote == "true" else None, "emulated": emulated}
 
@@ -217,10 +218,6 @@ class Robot:
     def _fault(self, reason: RobotReason, what: str) -> RobotFault:
         return RobotFault(reason, f"robot {self.settings.host}: {what}")
 
-    def _raise(self, cause: robot_faults.Cause | None) -> None:
-        if cause is not None:
-            raise self._fault(*cause)
-
     def _raise_if_stopped(self) -> None:
         if self._stopped.is_set():
             raise self._fault(RobotReason.STOPPED, "was stopped; start anew")
@@ -235,7 +232,8 @@ class Robot:
         """The child's state after `fresh` more samples, with safety looked at."""
         state = self._call("read", _CALL_S + fresh / self.settings.frequency_hz, fresh=fresh)
         self._raise_if_stopped()
-        self._raise(robot_faults.of_safety_bits(state["safety_bits"]))
+        if cause := robot_faults.of_safety_bits(state["safety_bits"]):
+            raise self._fault(*cause)
         return _State.model_validate(state)
 
     def _call(self, name: str, timeout_s: float, **arguments: Any) -> Any:

@@ -98,8 +98,7 @@ class Driver:
         """Ends the program on the robot and disconnects both interfaces; each waits half a second in there."""
         if self.control is not None:
             dashboard.stop(self.host, STOP_S)
-        interfaces = [interface for interface in (self.control, self.receive) if interface is not None]
-        threads = [threading.Thread(target=interface.disconnect, daemon=True) for interface in interfaces]
+        threads = [threading.Thread(target=end.disconnect, daemon=True) for end in (self.control, self.receive) if end]
         for thread in threads:
             thread.start()
         for thread in threads:

@@ -13,7 +13,7 @@ import os
 import platform
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Self
@@ -27,8 +27,6 @@ from torchpose.errors import ConfigError
 from torchpose.io.manifest import read_records
 from torchpose.rig.faults import SessionFault, SessionReason
 from torchpose.rig.records import EndRecord, FrameRecord, SessionRecord
-
-_NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class Session:
@@ -98,10 +96,8 @@ class Session:
         if self._earlier is not None and self._earlier.emulated != emulated:
             problem = f"emulated is {not emulated} there and {emulated} now"
             raise ConfigError(f"{self.manifest}: --resume: {problem}; choose another --out")
-        try:
+        with _disk(self.manifest):
             self._file = os.open(self.manifest, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-        except OSError as error:
-            raise _fault(self.manifest, error) from None
         versions = {name: _version(name) for name in ("torchpose", "pypylon", "ur-rtde")}
         self._append(
             SessionRecord(
@@ -130,14 +126,13 @@ class Session:
         encoded = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
         temporary = path.with_name(f".{path.name}.tmp")
         try:
-            with temporary.open("wb") as file:
-                file.write(encoded)
-                file.flush()
-                os.fsync(file.fileno())
-            temporary.replace(path)
-            _sync_folder(path.parent)
-        except OSError as error:
-            raise _fault(path, error) from None
+            with _disk(path):
+                with temporary.open("wb") as file:
+                    file.write(encoded)
+                    file.flush()
+                    os.fsync(file.fileno())
+                temporary.replace(path)
+                _sync_folder(path.parent)
         finally:
             with contextlib.suppress(OSError):  # its space is needed for the end record
                 temporary.unlink(missing_ok=True)
@@ -147,10 +142,7 @@ class Session:
         self.done.add(frame)
 
     def end(self, reason: str, detail: str = "") -> None:
-        """Appends the end record, if the session has begun and the disk lets it.
-
-        Its absence says too that the session was cut short.
-        """
+        """Appends the end record, if the session has begun and the disk lets it; its absence says something too."""
         if self._file is not None:
             with contextlib.suppress(SessionFault):
                 self._append(EndRecord(frames=len(self.done), reason=reason, detail=detail, ended=_now()))
@@ -161,13 +153,14 @@ class Session:
         before = os.fstat(self._file).st_size
         line = f"{record.model_dump_json(by_alias=True)}\n".encode()
         try:
-            while line:
-                line = line[os.write(self._file, line) :]
-            os.fsync(self._file)
-        except OSError as error:
+            with _disk(self.manifest):
+                while line:
+                    line = line[os.write(self._file, line) :]
+                os.fsync(self._file)
+        except SessionFault:
             with contextlib.suppress(OSError):
                 os.ftruncate(self._file, before)
-            raise _fault(self.manifest, error) from None
+            raise
 
     def _recover(self) -> None:
         """Reads what an earlier run finished and closes its last line."""
@@ -198,10 +191,16 @@ class Session:
             os.truncate(self.manifest, content.rfind(b"\n") + 1)
 
 
-def _fault(path: Path, error: OSError) -> SessionFault:
-    if error.errno in _NO_SPACE:
-        return SessionFault(SessionReason.DISK_FULL, f"{path}: no space left on the disk; free some")
-    return SessionFault(SessionReason.NOT_WRITABLE, f"{path}: cannot be written ({error.strerror}); check the folder")
+@contextlib.contextmanager
+def _disk(path: Path) -> Iterator[None]:
+    """Names the errors of the disk."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            raise SessionFault(SessionReason.DISK_FULL, f"{path}: no space left on the disk; free some") from None
+        why = f"cannot be written ({error.strerror}); check the folder"
+        raise SessionFault(SessionReason.NOT_WRITABLE, f"{path}: {why}") from None
 
 
 def _sync_folder(folder: Path) -> None:

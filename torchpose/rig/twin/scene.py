@@ -142,12 +142,7 @@ def _in_base(
 
 
 class Twin:
-    """A running twin of a rig; see `running_twin`.
-
-    Attributes:
-        rig: the rig with the twin in the place of its robot.
-        controller: the robot's twin.
-    """
+    """A running twin of a rig, see `running_twin`; `rig` has it in the place of its robot."""
 
     def __init__(self, scene: Scene, rig: Rig, controller: TwinController, folder: Path, number: int) -> None:
         self.scene = scene
