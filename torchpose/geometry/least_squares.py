@@ -181,7 +181,7 @@ class Normal(Rows):
         return replace(chosen, eliminated=mine.where(condition[mine.owner], theirs))
 
     def with_prior(self, information: Tensor, moved: Tensor) -> Self:
-        """With prior information (N, n, n) about the own unknowns, which ``moved`` (N, n) away from where it puts them."""
+        """With prior information (N, n, n) about the own unknowns, now ``moved`` (N, n) from where it puts them."""
         pull = (information @ moved[..., None]).squeeze(-1)
         cost = self.cost + (pull * moved).sum(-1)
         return replace(self, information=self.information + information, right=self.right - pull, cost=cost)
