@@ -6,6 +6,8 @@ import errno
 import hashlib
 import json
 import os
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,7 +29,7 @@ READING = {
     "safety_bits": 1,
     "runtime_state": 2,
 }
-TAKEN = {
+TAKEN: dict[str, Any] = {
     "camera": "camera",
     "waypoint": {"kind": "static", "id": "0000", "origin": True},
     "commanded_pose": POSE,
@@ -41,21 +43,21 @@ TAKEN = {
 }
 
 
-def opened(folder, **changes):
+def opened(folder: Path, **changes: Any) -> Session:
     return Session(folder, **{"plan": "p", "images": {"camera": [64, 48, "Mono16"]}, **changes})
 
 
-def begun(folder, **changes):
+def begun(folder: Path, **changes: Any) -> Session:
     session = opened(folder, **changes).__enter__()
     session.begin(emulated=True, plan="small", waypoints=2, robot={}, cameras=[])
     return session
 
 
-def records(folder):
+def records(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (folder / "manifest.jsonl").read_text().splitlines()]
 
 
-def test_a_frame_is_an_image_and_a_line(tmp_path):
+def test_a_frame_is_an_image_and_a_line(tmp_path: Path) -> None:
     with begun(tmp_path) as session:
         session.write("0000", IMAGE, **TAKEN)
         session.end("complete")
@@ -76,13 +78,15 @@ def test_a_frame_is_an_image_and_a_line(tmp_path):
         (errno.EIO, SessionReason.NOT_WRITABLE),
     ],
 )
-def test_a_line_that_does_not_fit_leaves_nothing(tmp_path, monkeypatch, number, reason):
+def test_a_line_that_does_not_fit_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, reason: SessionReason
+) -> None:
     session = begun(tmp_path)
     session.write("0000", IMAGE, **TAKEN)
     before = (tmp_path / "manifest.jsonl").read_bytes()
     write = os.write
 
-    def full(file, data):
+    def full(file: int, data: bytes) -> int:
         if len(data) > 20:
             return write(file, data[:20])  # a part of it still fits
         raise OSError(number, os.strerror(number))
@@ -97,7 +101,7 @@ def test_a_line_that_does_not_fit_leaves_nothing(tmp_path, monkeypatch, number, 
     assert session.done == {"0000"}
 
 
-def test_an_image_that_does_not_fit_leaves_nothing(tmp_path):
+def test_an_image_that_does_not_fit_leaves_nothing(tmp_path: Path) -> None:
     with begun(tmp_path) as session:
         (tmp_path / "images" / ".0000.png.tmp").symlink_to("/dev/full")
         with pytest.raises(SessionFault, match="no space left") as caught:
@@ -108,7 +112,7 @@ def test_an_image_that_does_not_fit_leaves_nothing(tmp_path):
     assert [r["record"] for r in records(tmp_path)] == ["session", "end"]
 
 
-def test_a_resumed_session_knows_what_is_there(tmp_path):
+def test_a_resumed_session_knows_what_is_there(tmp_path: Path) -> None:
     with begun(tmp_path) as session:
         session.write("0000", IMAGE, **TAKEN)
         session.write("0001", IMAGE, **TAKEN)
@@ -126,7 +130,30 @@ def test_a_resumed_session_knows_what_is_there(tmp_path):
     assert [r["record"] for r in records(tmp_path)][2:] == ["session", "frame", "session", "end"]
 
 
-def test_what_cannot_be_resumed(tmp_path):
+@pytest.mark.parametrize(
+    ("line", "change", "message"),
+    [
+        (0, {"images": 1}, "line 1: images: "),
+        (0, {"schema": "torchpose.capture/2"}, "line 1: schema: "),
+        (1, {"sha256": None}, "line 2: sha256: is not text"),
+        (1, {"robot_pose": [1.0, 2.0]}, "line 2: robot_pose"),
+        (1, {"before": {**READING, "pose": "home"}}, "line 2: before.pose: "),
+    ],
+)
+def test_a_manifest_that_was_changed_is_refused_by_line_and_field(
+    tmp_path: Path, line: int, change: dict[str, Any], message: str
+) -> None:
+    with begun(tmp_path) as session:
+        session.write("0000", IMAGE, **TAKEN)
+    lines = records(tmp_path)
+    lines[line] |= change
+    (tmp_path / "manifest.jsonl").write_text("".join(json.dumps(record) + "\n" for record in lines))
+    with pytest.raises(ConfigError, match=message) as caught:
+        opened(tmp_path, resume=True)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_cannot_be_resumed(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="--resume: does not exist"):
         opened(tmp_path, resume=True)
     with begun(tmp_path):
@@ -141,7 +168,7 @@ def test_what_cannot_be_resumed(tmp_path):
         session.begin(emulated=False)
 
 
-def test_a_session_that_cannot_begin(tmp_path):
+def test_a_session_that_cannot_begin(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.touch()
     with pytest.raises(ConfigError, match="--out: cannot be made"):

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Self, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torchpose.errors import ConfigError
 from torchpose.rig.faults import CameraFault, CameraReason
@@ -88,7 +89,7 @@ class BaslerCamera:
             self._camera.ExecuteSoftwareTrigger()
         return now
 
-    def fetch(self) -> tuple[np.ndarray[Any, Any], int]:
+    def fetch(self) -> tuple[NDArray[np.integer[Any]], int]:
         """The triggered image (H, W) and the camera's time stamp.
 
         Raises:
@@ -205,7 +206,7 @@ class Frame:
     """One image with its circumstances."""
 
     camera: str  # its name
-    image: np.ndarray[Any, Any]  # (H, W) uint8 or uint16
+    image: NDArray[np.integer[Any]]  # (H, W) uint8 or uint16
     trigger_time_s: float  # Unix time of this machine just before the trigger
     camera_time: int  # the camera's own counter, 0 where it has none
     failures: tuple[str, ...]  # reasons of the attempts that failed before
@@ -303,7 +304,7 @@ class Cameras:
 
 def _attempt(
     cameras: Mapping[str, BaslerCamera],
-) -> tuple[dict[str, tuple[float, np.ndarray[Any, Any], int]], dict[str, CameraFault]]:
+) -> tuple[dict[str, tuple[float, NDArray[np.integer[Any]], int]], dict[str, CameraFault]]:
     """One try at a frame of each camera: trigger time, image and time stamp by name; the faults of the others."""
     faults: dict[str, CameraFault] = {}
 

@@ -10,7 +10,7 @@ import importlib.util
 import math
 import threading
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict
@@ -70,7 +70,7 @@ class Robot:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def preflight(self, poses: Iterable[Sequence[float]] = ()) -> dict[str, Any]:
+    def preflight(self, poses: Iterable[Any] = ()) -> dict[str, Any]:
         """Looks at the robot, connects and asks whether all poses can be reached, before anything moves.
 
         Args:
@@ -104,8 +104,8 @@ class Robot:
                 raise self._fault(RobotReason.UNREACHABLE_POSE, why)
         return {**report, "tcp_offset": tcp, "pose": list(reading.pose)}
 
-    def check(self, pose: Sequence[float]) -> Pose:
-        """The pose as six floats (mm, rad).
+    def check(self, pose: Any) -> Pose:
+        """The pose, whatever it is, as six floats (mm, rad).
 
         Raises:
             RobotFault: it is not six finite numbers (`invalid_pose`) or leaves the workspace (`outside_workspace`).
@@ -130,7 +130,7 @@ class Robot:
         """
         return self._state(fresh)
 
-    def move(self, pose: Sequence[float]) -> RobotReading:
+    def move(self, pose: Any) -> RobotReading:
         """Moves the tool on a straight line, waits until it has settled, and returns the last reading.
 
         Raises:

@@ -20,6 +20,7 @@ from typing import Any, Self
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from torchpose.config import validate
@@ -110,7 +111,7 @@ class Session:
             )
         )
 
-    def write(self, frame: str, image: np.ndarray[Any, Any], **taken: Any) -> None:
+    def write(self, frame: str, image: NDArray[np.integer[Any]], **taken: Any) -> None:
         """Stores one frame: its image, then its record.
 
         Args:

@@ -106,7 +106,7 @@ class Motion:
 
     def moving(self, now: float) -> bool:
         """Whether the tool still moves at time `now`."""
-        return now - self.begin < self.duration
+        return bool(now - self.begin < self.duration)
 
     def halt(self, now: float, deceleration: float) -> Motion:
         """The same move, braked from time `now` on; one that is being braked already, or has ended, stays as it is.
