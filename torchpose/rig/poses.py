@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import torch
@@ -19,8 +19,8 @@ Pose = Annotated[
 ]
 
 
-def as_pose(numbers: Iterable[float]) -> Pose:
-    """Six numbers as a pose. Raises ValueError where they are not six."""
+def as_pose(numbers: Any) -> Pose:
+    """Six numbers as a pose. Raises ValueError or TypeError where they are none, or not six."""
     x, y, z, rx, ry, rz = map(float, numbers)
     return x, y, z, rx, ry, rz
 
