@@ -7,16 +7,16 @@ moving to a device. A field may be a tensor, other rows, a tuple of these, or No
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import field, fields, replace
+from dataclasses import MISSING, field, fields, replace
 from typing import Any, Self
 
 import torch
 from torch import Tensor
 
 
-def shared() -> Any:
+def shared(default: Any = MISSING) -> Any:
     """A dataclass field that belongs to all rows together: selecting rows leaves it alone, `Rows.to` moves it."""
-    return field(metadata={"shared": True})
+    return field(default=default, metadata={"shared": True})
 
 
 class Rows:
