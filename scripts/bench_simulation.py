@@ -78,7 +78,7 @@ def main() -> int:
         def noise(number: int) -> torch.Tensor:
             return add_noise(
                 pictures[number % 2],
-                plan.conditions["noise"][which[number]],
+                plan.conditions.noise[which[number]],
                 plan.file.seed,
                 index=which[number],
                 bits=sensor.bits,

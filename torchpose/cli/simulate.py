@@ -51,7 +51,7 @@ def simulate(
     import torch
 
     from torchpose.cli.terminal import FrameProgress
-    from torchpose.datasets.dataset import write_dataset
+    from torchpose.datasets.dataset import write_bop, write_dataset
     from torchpose.datasets.plan import load_plan
 
     cv2.setNumThreads(1)
@@ -64,11 +64,12 @@ def simulate(
                 out,
                 backend=backend.value,
                 resume=resume,
-                bop=bop,
                 batch=batch,
                 threads=threads or cores(),
                 progress=lambda done: progress.advance(done, Counter()),
             )
+            if bop:
+                write_bop(out)
         except KeyboardInterrupt:
             typer.echo(f"torchpose: error: interrupted: {out} keeps its frames; add --resume to go on", err=True)
             return INTERRUPTED

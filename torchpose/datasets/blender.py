@@ -185,11 +185,13 @@ def _render(bpy: Any, scene: Any, levels: dict[str, Any], plan: Plan, number: in
     from mathutils import Matrix
 
     width, height = plan.camera.width, plan.camera.height
-    c = {name: float(column[number]) / 255 for name, column in plan.conditions.items()}
-    ink, paper = (c["light"], c["dark"]) if plan.target.background == "dark" else (c["dark"], c["light"])
+    taken = plan.conditions
+    ink, paper, surround = (float(level[number]) / 255 for level in (taken.dark, taken.light, taken.surround))
+    if plan.target.background == "dark":
+        ink, paper = paper, ink
     levels["contrast"].default_value, levels["paper"].default_value = ink - paper, paper
-    levels["surround"].default_value = (c["surround"], c["surround"], c["surround"], 1.0)
-    image = torch.full((height, width), 255 * c["surround"])
+    levels["surround"].default_value = (surround, surround, surround, 1.0)
+    image = torch.full((height, width), 255 * surround)
     R, t = plan.R[number], plan.t[number]
     box = _plate_box(plan, R, t)
     if box is None:
@@ -202,7 +204,7 @@ def _render(bpy: Any, scene: Any, levels: dict[str, Any], plan: Plan, number: in
     render = scene.render  # the border is in fractions of the frame from the bottom left
     render.border_min_x, render.border_max_x = (u0 + 1e-3) / width, (u1 + 1e-3) / width
     render.border_min_y, render.border_max_y = (height - v1 + 1e-3) / height, (height - v0 + 1e-3) / height
-    scene.cycles.filter_width = filter_width(255 * c["psf_sigma"])
+    scene.cycles.filter_width = filter_width(float(taken.psf_sigma[number]))
     scene.cycles.seed = (plan.file.seed + number) % 2**31
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "tile.exr"

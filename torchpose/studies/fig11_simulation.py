@@ -71,7 +71,7 @@ def run(
     plan = paper_plan()
     order = torch.randperm(len(plan), generator=torch.Generator().manual_seed(seed))
     some = order[: frames or (len(plan) if full else QUICK_FRAMES)].sort().values
-    part = plan.rows(some)
+    part = plan[some]
     wrong = replace(plan.camera, matrix=plan.camera.matrix.clone())
     wrong.matrix[[0, 1], [0, 1]] *= FOCAL_ERROR  # the principal point stays
     truth = plan_truth(part)
@@ -90,7 +90,7 @@ def run(
         "analytic, focal length 0.25 % too long": evaluate(_estimates(poses[1]), truth),
     }
     if blender:
-        results["Blender"] = _by_blender(plan.rows(torch.arange(0, len(plan), blender)))
+        results["Blender"] = _by_blender(plan[torch.arange(0, len(plan), blender)])
     rows = [row for name, result in results.items() for row in _rows(name, result)]
     pictures = [
         picture
