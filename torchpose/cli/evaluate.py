@@ -64,7 +64,7 @@ def _rows_of(path: Path, truth: Truth) -> list[dict[str, Any]]:
 
     Names of frames may have a folder before them, as they do where the data set itself was the input.
     """
-    from torchpose.io.tables import read_table
+    from torchpose.io.writers import read_table
 
     rows = read_table(path)
     try:
