@@ -30,7 +30,7 @@ from torchpose.sim.shapes import Shapes
 REACH = 5.0  # the Gaussian is cut at this many standard deviations: 6e-7 of an edge's contrast
 _COARSE_CIRCLE, _COARSE_SIDE = 72, 9  # samples from which speed and extent in pixels are taken
 _MARGIN = 1.05  # for the speed between those samples
-_NODES, _PANEL = 16, 11.0  # Gauss-Legendre nodes on each panel of at most so many sigma; leaves about 5e-9
+_NODES, _PANEL = 16, 11.0  # Gauss-Legendre nodes on each panel of a side of so many sigma; leaves about 5e-9
 _CHUNK_CELLS = 1 << 18  # pixels of patches computed at a time: they stay in the processor's cache
 _MIN_CHORD = 1e-3  # px; chords below this blur by less than 1e-6 px^2, and differences over them would cancel
 
@@ -105,50 +105,43 @@ def sample_boundary(
     A shape has none where it reaches behind the camera or beyond the radius up to which the distortion model is
     one-to-one, or where it lies outside of the frame.
     """
-    parameter = torch.arange(_COARSE_CIRCLE, dtype=t.dtype, device=t.device) * (2 * math.pi / _COARSE_CIRCLE)
-    offset, slope = _on_circle(shapes.circles.axes[:, None], parameter)
-    circles = _posed(camera, R, t, shapes, shapes.circles.of, (shapes.circles.center[:, None] + offset, slope))
-
+    angle = torch.arange(_COARSE_CIRCLE, dtype=t.dtype, device=t.device) * (2 * math.pi / _COARSE_CIRCLE)
+    offset, slope = _on_circle(shapes.circles.axes[:, None], angle)
+    round_ = _posed(camera, R, t, shapes, shapes.circles.of, (shapes.circles.center[:, None] + offset, slope))
     fraction = torch.linspace(0, 1, _COARSE_SIDE, dtype=t.dtype, device=t.device)[:, None]
     first, last = shapes.sides.ends[:, :1], shapes.sides.ends[:, 1:]
     along = (last - first).expand(-1, _COARSE_SIDE, 3)
-    sides = _posed(camera, R, t, shapes, shapes.sides.of, (first + fraction * along, along))
+    straight = _posed(camera, R, t, shapes, shapes.sides.of, (first + fraction * along, along))
+    seen = _in_view(camera, shapes, (round_, straight), sigma)
 
-    seen = _in_view(camera, shapes, (circles, sides), sigma)
-    return Boundary.cat(
-        [_circle_samples(shapes, circles, seen, sigma), _side_samples(shapes, sides, seen, sigma)],
-    )
+    # circles: the trapezoidal rule
+    trapezoidal = t.new_zeros(1), t.new_ones(1)
+    use, angle, weight = _quadrature(round_, seen, sigma, 2 * math.pi, 1.0, 24, trapezoidal)
+    circles = shapes.circles[use]
+    offset, slope = _on_circle(circles.axes, angle)
+    weight = (_sign(round_.area) * shapes.circles.sign)[use] * weight
+    arcs = Boundary(shapes.frame[circles.of], circles.of, circles.center + offset, weight[:, None] * slope)
+    # sides of polygons, which turn as the whole polygon does
+    turn = _sign(t.new_zeros(len(shapes)).index_add(0, straight.shape, straight.area))
+    use, fraction, weight = _quadrature(straight, seen, sigma, 1.0, _PANEL, 1, gauss_legendre(_NODES, t))
+    of, (start, end) = shapes.sides.of[use], shapes.sides.ends[use].unbind(1)
+    step = (turn[of] * weight)[:, None] * (end - start)
+    return Boundary.cat([arcs, Boundary(shapes.frame[of], of, start + fraction[:, None] * (end - start), step)])
 
 
-def _circle_samples(shapes: Shapes, curves: _Curves, seen: Tensor, sigma: Tensor) -> Boundary:
-    """The trapezoidal rule on the circles of the shapes that are seen (S,)."""
+def _quadrature(
+    curves: _Curves, seen: Tensor, sigma: Tensor, period: float, panel: float, least: int, rule: tuple[Tensor, Tensor]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Curve, parameter from 0 to ``period`` and weight of each sample of the curves of the shapes that are seen (S,).
+
+    Nodes and weights of ``rule`` on panels of at most ``panel`` sigma, at least ``least`` panels.
+    """
     use = seen[curves.shape].nonzero().squeeze(1)
-    count = (2 * math.pi * _MARGIN * curves.speed[use] / sigma[curves.frame[use]]).ceil().clamp(min=24).long()
+    count = (period * _MARGIN * curves.speed[use] / (panel * sigma[curves.frame[use]])).ceil().clamp(min=least).long()
     item, number = ragged_arange(count)
-    step = (2 * math.pi / count.to(sigma))[item]
-    chosen = use[item]
-    circles = shapes.circles[chosen]
-    offset, slope = _on_circle(circles.axes, number.to(sigma) * step)
-    weight = (_sign(curves.area) * shapes.circles.sign)[chosen] * step
-    return Boundary(curves.frame[chosen], circles.of, circles.center + offset, weight[:, None] * slope)
-
-
-def _side_samples(shapes: Shapes, curves: _Curves, seen: Tensor, sigma: Tensor) -> Boundary:
-    """Gauss-Legendre panels on the sides of the polygons that are seen (S,)."""
-    turn = _sign(sigma.new_zeros(len(shapes)).index_add(0, curves.shape, curves.area))
-    use = seen[curves.shape].nonzero().squeeze(1)
-    panels = (_MARGIN * curves.speed[use] / (_PANEL * sigma[curves.frame[use]])).ceil().clamp(min=1).long()
-    item, number = ragged_arange(panels)
-    node, weight = gauss_legendre(_NODES, sigma)
-    width = 1 / panels.to(sigma)[item]
-    position = ((number[:, None] + node) * width[:, None]).reshape(-1)
-    weight = (width[:, None] * weight).reshape(-1)
-    chosen = use[item].repeat_interleave(_NODES)
-    shape, (first, last) = curves.shape[chosen], shapes.sides.ends[chosen].unbind(1)
-    along = last - first
-    return Boundary(
-        curves.frame[chosen], shape, first + position[:, None] * along, (turn[shape] * weight)[:, None] * along
-    )
+    width = (period / count.to(sigma))[item, None]
+    chosen = use[item].repeat_interleave(len(rule[0]))
+    return chosen, ((number[:, None] + rule[0]) * width).reshape(-1), (width * rule[1]).reshape(-1)
 
 
 def project(
