@@ -35,6 +35,7 @@ from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.io.images import UnreadableImageError, decode
 from torchpose.io.truth import Truth, read_truth, write_truth
+from torchpose.io.writers import atomic_path
 from torchpose.sim.clutter import random_clutter, random_covers
 from torchpose.sim.renderer import Defocus, render
 from torchpose.sim.sensor import Lighting, add_noise
@@ -235,18 +236,8 @@ def _finished(tasks: Sequence[Future[None]]) -> int:
 
 def _write_png(path: Path, frame: np.ndarray) -> None:
     """Writes a frame that is there as a whole or not at all."""
-    written, data = cv2.imencode(".png", frame)
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
-        if not written:
-            raise OSError(0, "encoding failed")
-        temporary.write_bytes(data.tobytes())
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise ConfigError(
-            f"{path}: --out: cannot be written ({error.strerror}); free some space and go on with --resume"
-        ) from None
+    with atomic_path(path, option="--out: ", fix="free some space and go on with --resume", sync=False) as temporary:
+        temporary.write_bytes(cv2.imencode(".png", frame)[1].tobytes())
 
 
 def _prepare(plan: Plan, out: Path, backend: Backend, resume: bool) -> Path:

@@ -30,6 +30,7 @@ from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.geometry.rotations import plane_axes
 from torchpose.geometry.rows import Rows, shared
+from torchpose.io.sources import find_sources
 from torchpose.io.truth import read_truth
 from torchpose.target import Target
 
@@ -206,18 +207,15 @@ class Conditions(Rows):
 
 @dataclass(frozen=True, eq=False)
 class Plan(Rows):
-    """A plan that has been read: everything that the frames depend on, one row a frame.
+    """A plan that has been read: everything that the frames depend on, one row a frame, float64.
 
     Attributes:
-        R: float64, target to camera.
-        t: float64, target to camera, mm.
-        conditions: float64.
-        motion: float64, mm and rad during the exposure.
+        R: target to camera.
+        t: target to camera, mm.
+        conditions: blur, levels and noise.
+        motion: mm and rad during the exposure.
         seen: markers that lie in the frame as a whole.
-        file: what the plan file says.
-        path: where it lies.
-        camera: the model that it names.
-        target: the model that it names.
+        file: what the plan file ``path`` says, with the ``camera`` and the ``target`` that it names.
         backgrounds: pictures, in natural order; frame i takes the one of the number i modulo their count.
     """
 
@@ -308,10 +306,8 @@ def _check_view(plan: Plan) -> None:
         gone = len(plan.target) - int(plan.seen[lost[0]])
         what = f"{gone} of {len(plan.target)} markers of frame {lost[0]} are out of view ({len(lost)} such frames)"
     elif far:
-        what = (
-            f"frame {far[0]} is at {float(plan.t[far[0], 2]):g} mm, out of depth_range {plan.file.depth_range} "
-            f"({len(far)} such frames)"
-        )
+        where = f"at {float(plan.t[far[0], 2]):g} mm, out of depth_range {plan.file.depth_range}"
+        what = f"frame {far[0]} is {where} ({len(far)} such frames)"
     else:
         return
     raise ConfigError(f"{plan.path}: poses: {what}; {fix}")
@@ -385,8 +381,4 @@ def _floats(values: Any) -> Tensor:
 
 
 def _backgrounds(path: Path, name: str | None) -> list[Path]:
-    if name is None:
-        return []
-    from torchpose.io.sources import find_sources
-
-    return [source.path for source in find_sources([Path(beside(path, name))])]
+    return [] if name is None else [source.path for source in find_sources([Path(beside(path, name))])]

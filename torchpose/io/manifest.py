@@ -85,25 +85,20 @@ def read_manifest(path: Path, camera: str | None = None) -> list[ManifestFrame]:
             raise ConfigError(f"{where}: image: {frame.image!r} occurs twice; one record for every image")
         ids.add(frame.id)
         images.add(frame.image)
-        frames.append(_in_millimetres(frame, units, where))
+        if frame.robot_pose is not None:
+            if units is None:
+                fix = 'write "units": {"length": "mm"} (or "m") in the session record'
+                raise ConfigError(f"{where}: robot_pose: in unknown units; {fix}")
+            scale = {"mm": 1.0, "m": 1000.0}[units.length]
+            pose = (*(scale * value for value in frame.robot_pose[:3]), *frame.robot_pose[3:])
+            frame = frame.model_copy(update={"robot_pose": pose})
+        frames.append(frame)
     known = sorted({frame.camera for frame in frames})
     if camera is None and len(known) > 1:
         raise ConfigError(f"{path}: INPUT: has frames of {len(known)} cameras; pick one: {path.name}#{known[0]}")
     if camera is not None and camera not in known:
         raise ConfigError(f"{path}: INPUT: has no frame of camera {camera!r}; known are {', '.join(known)}")
     return [frame for frame in frames if camera in (None, frame.camera)]
-
-
-def _in_millimetres(frame: ManifestFrame, units: _Units | None, where: str) -> ManifestFrame:
-    if frame.robot_pose is None:
-        return frame
-    if units is None:
-        raise ConfigError(
-            f'{where}: robot_pose: in unknown units; write "units": {{"length": "mm"}} (or "m") in the session record'
-        )
-    scale = 1000.0 if units.length == "m" else 1.0
-    pose = (*(value * scale for value in frame.robot_pose[:3]), *frame.robot_pose[3:])
-    return frame.model_copy(update={"robot_pose": pose})
 
 
 def read_records(path: Path) -> list[tuple[int, dict[str, Any]]]:

@@ -9,6 +9,7 @@ line torn; a resumed one drops that line and goes on. A finished table is resume
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import os
@@ -76,23 +77,18 @@ class ResultStore:
         self._places: dict[str, tuple[int, int]] = {}  # frame -> offset and length of its line in the journal
         resumable = resume and self._journal_path.exists()
         finished = list(self._finished()) if resume and not resumable and out.exists() else []
-        try:
-            # unbuffered: what a full disk refuses must not be tried again when the file is closed
-            self._journal: FileIO = self._journal_path.open("a+b", buffering=0)
-        except OSError as error:
-            raise self._unwritable(error) from None
-        try:
-            self._lock()
-            if not (resumable and self._load()):
-                self._journal.truncate(0)
-                self._write([{"origin": self._origin}])
-                self.append(finished)
-        except OSError as error:
-            self.close()
-            raise self._unwritable(error) from None
-        except ConfigError:
-            self.close()
-            raise
+        with contextlib.ExitStack() as stack:
+            try:
+                # unbuffered: what a full disk refuses must not be tried again when the file is closed
+                self._journal: FileIO = stack.enter_context(self._journal_path.open("a+b", buffering=0))
+                self._lock()
+                if not (resumable and self._load()):
+                    self._journal.truncate(0)
+                    self._write([{"origin": self._origin}])
+                    self.append(finished)
+            except OSError as error:
+                raise self._unwritable(error) from None
+            stack.pop_all()  # nothing went wrong: it stays open
 
     def __contains__(self, frame: str) -> bool:
         return frame in self._places

@@ -79,20 +79,23 @@ def read_table(path: Path) -> list[Row]:
 
 
 @contextlib.contextmanager
-def atomic_path(path: Path) -> Iterator[Path]:
+def atomic_path(
+    path: Path, *, option: str = "", fix: str = "free some space or choose another", sync: bool = True
+) -> Iterator[Path]:
     """A place beside ``path`` to write to. It is moved to ``path`` when the block ends, removed when it fails.
 
-    Raises:
-        ConfigError: an operating-system error on the way.
+    With ``sync`` it survives a crash of the machine. An operating-system error is a ConfigError with ``option`` (such
+    as ``--out: ``) and ``fix``.
     """
     temporary = _temporary(path)
     try:
         yield temporary
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
+        if sync:
+            with temporary.open("rb") as file:
+                os.fsync(file.fileno())
         temporary.replace(path)
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be written ({error.strerror}); free some space or choose another") from None
+        raise ConfigError(f"{path}: {option}cannot be written ({error.strerror}); {fix}") from None
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)

@@ -15,7 +15,7 @@ docs/decisions/0003-renderer.md compares it with supersampling.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -37,13 +37,9 @@ _MIN_CHORD = 1e-3  # px; chords below this blur by less than 1e-6 px^2, and diff
 
 @dataclass(frozen=True, eq=False)
 class Boundary(Rows):
-    """Quadrature samples of region boundaries, fixed to the target.
+    """Quadrature samples of region boundaries, fixed to the target: pose, shape, point in mm.
 
-    Attributes:
-        frame: index of the pose.
-        shape: index of the shape.
-        point: on the boundary, mm.
-        step: tangent times quadrature weight, mm; runs so that the region in the image is positive.
+    ``step`` is the tangent times the quadrature weight, mm; it runs so that the region in the image is positive.
     """
 
     frame: Int[Tensor, " N"]
@@ -63,11 +59,6 @@ class Boxes(Rows):
     def stride(self) -> int:
         """Cells of a row: one more than the widest window has columns, which takes what lies right of the window."""
         return int(self.size[:, 0].amax()) + 1 if len(self) else 1
-
-    @property
-    def first_row(self) -> Int[Tensor, " P"]:
-        """Rows of the windows before each."""
-        return self.size[:, 1].cumsum(0) - self.size[:, 1]
 
     @property
     def rows(self) -> int:
@@ -193,10 +184,11 @@ def fill(
         return pixel.new_zeros(boxes.rows, boxes.stride)
     reach = 1.0 + REACH * float(sigma.detach().max())
     beside = reach + (0.0 if half_chord is None else float(half_chord.detach().max()))
-    rows = _offsets(math.floor(reach), math.floor(reach), pixel)
+    rows = torch.arange(-math.floor(reach), math.floor(reach) + 1).to(pixel)
     # the sum along a row ends where the kernel does, which is a pixel further right than left
-    columns = _offsets(math.floor(beside), math.ceil(beside), pixel)
-    corner, size, first_row, stride = boxes.corner[shape], boxes.size[shape], boxes.first_row[shape], boxes.stride
+    columns = torch.arange(-math.floor(beside), math.ceil(beside) + 1).to(pixel)
+    corner, size, stride = boxes.corner[shape], boxes.size[shape], boxes.stride
+    first_row = (boxes.size[:, 1].cumsum(0) - boxes.size[:, 1])[shape]
     increments = pixel.new_zeros(boxes.rows * stride)
     # each chunk copies all windows where a derivative is wanted
     cells = _CHUNK_CELLS * (16 if torch.is_grad_enabled() else 1)
@@ -206,12 +198,16 @@ def fill(
         nearest = pixel[part].detach().round()
         from_nearest = pixel[part] - nearest
         scale = sigma[part, None]
-        across = _box_gauss(rows - from_nearest[:, 1:], scale)
+        # the Gaussian and the pixel's box: along the column, and integrated along the row
+        across = _on_pixel(torch.special.ndtr, rows - from_nearest[:, 1:], scale)
         # differences from each column to the next; the first has the column before it as its neighbour
         x = torch.cat([columns[:1] - 1, columns]) - from_nearest[:, :1]
-        along = (
-            _box_gauss_integral(x, scale) if half_chord is None else _chord_integral(x, scale, half_chord[part, None])
-        ).diff(dim=1)
+        if half_chord is None:
+            along = (scale * _on_pixel(_normal_loss, x, scale)).diff(dim=1)
+        else:
+            half = half_chord[part, None]
+            right, left = (_on_pixel(_normal_loss_integral, x + side, scale) for side in (half, -half))
+            along = (scale * scale * (right - left) / (2 * half)).diff(dim=1)
         local = nearest.long() - corner[part]
         row, column = local[:, 1:] + rows.long(), local[:, :1] + columns.long()
         inside = (row >= 0) & (row < size[part, 1:])
@@ -311,27 +307,9 @@ def _sign(x: Tensor) -> Tensor:
     return torch.where(x < 0, -1.0, 1.0).to(x)
 
 
-def _offsets(before: int, behind: int, like: Tensor) -> Tensor:
-    return torch.arange(-before, behind + 1, dtype=like.dtype, device=like.device)
-
-
-def _box_gauss(x: Tensor, sigma: Tensor) -> Tensor:
-    """Gaussian of a standard deviation convolved with the unit box."""
-    return torch.special.ndtr((x + 0.5) / sigma) - torch.special.ndtr((x - 0.5) / sigma)
-
-
-def _box_gauss_integral(x: Tensor, sigma: Tensor) -> Tensor:
-    """Integral of `_box_gauss` from minus infinity to x."""
-    return sigma * (_normal_loss((x + 0.5) / sigma) - _normal_loss((x - 0.5) / sigma))
-
-
-def _chord_integral(x: Tensor, sigma: Tensor, half: Tensor) -> Tensor:
-    """Integral from minus infinity to x of `_box_gauss` convolved with a box of a half width and the area 1."""
-
-    def twice(y: Tensor) -> Tensor:
-        return _normal_loss_integral((y + 0.5) / sigma) - _normal_loss_integral((y - 0.5) / sigma)
-
-    return sigma * sigma * (twice(x + half) - twice(x - half)) / (2 * half)
+def _on_pixel(function: Callable[[Tensor], Tensor], x: Tensor, sigma: Tensor) -> Tensor:
+    """Difference of a function of x / sigma between the borders of a pixel about x."""
+    return function((x + 0.5) / sigma) - function((x - 0.5) / sigma)
 
 
 def _normal_loss(x: Tensor) -> Tensor:

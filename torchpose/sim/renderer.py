@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TypedDict, Unpack
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -62,21 +62,6 @@ class Defocus:
         return scale * (1 / depth.clamp_min(1e-6) - 1 / self.focus_distance).abs()
 
 
-class Settings(TypedDict, total=False):
-    """The keywords of `render`; `Imaging` says what they are and what they default to."""
-
-    psf_sigma: Level
-    dark: Level
-    light: Level
-    plate: Sequence[float] | None
-    surround: Level
-    defocus: Defocus | None
-    motion: Tensor | None
-    lighting: Lighting | None
-    clutter: Shapes | None
-    covers: Shapes | None
-
-
 @dataclass(frozen=True, eq=False)
 class Imaging:
     """Conditions under which B frames are rendered, apart from camera and poses.
@@ -108,10 +93,8 @@ class Imaging:
     covers: Shapes | None = None
 
 
-def render(
-    camera: Camera, target: Target | Shapes, R: Tensor, t: Tensor, **settings: Unpack[Settings]
-) -> Float[Tensor, "B H W"]:
-    """Noise-free frames of a target, grey values 0..255, differentiable in pose, blur and grey levels.
+def render(camera: Camera, target: Target | Shapes, R: Tensor, t: Tensor, **imaging: Any) -> Float[Tensor, "B H W"]:
+    """Noise-free float32 frames of a target, grey values 0..255, differentiable in pose, blur and grey levels.
 
     A shape, the plate too, is drawn from either side, and not at all where it reaches behind the camera or beyond the
     radius up to which the distortion model is one-to-one.
@@ -121,24 +104,21 @@ def render(
         target: the target, or shapes with levels of their own.
         R: (B, 3, 3), target to camera.
         t: (B, 3), target to camera, mm.
-        settings: of `Imaging`, such as ``psf_sigma``, ``dark``, ``light``, ``plate``, ``defocus``.
-
-    Returns:
-        (B, H, W) float32.
+        imaging: fields of `Imaging`: ``psf_sigma``, ``dark``, ``light``, ``plate``, ``surround`` and so on.
 
     Raises:
         ConfigError: ``psf_sigma`` is not above 0, or there are background pictures and no plate.
         FrameError: shapes of R and t, of ``motion`` or of background pictures disagree.
     """
     R, t = check_poses(R, t)
-    imaging = Imaging(**settings)
-    sigma, motion = check_blur(imaging.psf_sigma, t), imaging.motion
+    scene = Imaging(**imaging)
+    sigma, motion = check_blur(scene.psf_sigma, t), scene.motion
     if motion is not None and motion.shape != (len(t), 6):
         raise FrameError(f"motion: shape {tuple(motion.shape)} is not (B, 6) of {len(t)} poses")
-    ink, paper = per_frame(imaging.dark, t), per_frame(imaging.light, t)
+    ink, paper = per_frame(scene.dark, t), per_frame(scene.light, t)
     if isinstance(target, Target) and target.background == "dark":
         ink, paper = paper, ink
-    ground = _ground(camera, t, paper, imaging)
+    ground = _ground(camera, t, paper, scene)
     if len(t) == 0:
         return ground.new_zeros(0, camera.height, camera.width)
     together = max(1, _CHUNK_PIXELS // (camera.width * camera.height))
@@ -146,14 +126,14 @@ def render(
     for part in (slice(first, first + together) for first in range(0, len(t), together)):
         frames = ground[part].float().expand(len(t[part]), camera.height, camera.width).contiguous()
         twist = None if motion is None else motion[part].to(t)
-        for shapes in _layers(target, imaging, ink[part], paper[part], part.start):
-            boxes, coverage = cover(camera, shapes, R[part], t[part], sigma[part], imaging.defocus, twist)
+        for shapes in _layers(target, scene, ink[part], paper[part], part.start):
+            boxes, coverage = cover(camera, shapes, R[part], t[part], sigma[part], scene.defocus, twist)
             frames = _paint(frames, shapes, boxes, coverage.float())
-        out.append(frames if imaging.lighting is None else frames * imaging.lighting.gain(camera, R[part], t[part]))
+        out.append(frames if scene.lighting is None else frames * scene.lighting.gain(camera, R[part], t[part]))
     return torch.cat(out) if len(out) > 1 else out[0]
 
 
-def _layers(target: Target | Shapes, imaging: Imaging, ink: Tensor, paper: Tensor, first: int) -> list[Shapes]:
+def _layers(target: Target | Shapes, scene: Imaging, ink: Tensor, paper: Tensor, first: int) -> list[Shapes]:
     """What is drawn one over the other in the frames from the number ``first`` on, with levels ink and paper (B,)."""
 
     def alike(shapes: Shapes, level: Tensor) -> Shapes:
@@ -163,9 +143,9 @@ def _layers(target: Target | Shapes, imaging: Imaging, ink: Tensor, paper: Tenso
     def own(shapes: Shapes | None) -> list[Shapes]:
         return [] if shapes is None else [shapes.to(ink).of_frames(first, len(ink))]
 
-    plate = [] if imaging.plate is None else [alike(rectangle((0.0, 0.0), imaging.plate[0], imaging.plate[1]), paper)]
+    plate = [] if scene.plate is None else [alike(rectangle((0.0, 0.0), scene.plate[0], scene.plate[1]), paper)]
     marks = [alike(rings(target), ink)] if isinstance(target, Target) else own(target)
-    return [*plate, *own(imaging.clutter), *marks, *own(imaging.covers)]
+    return [*plate, *own(scene.clutter), *marks, *own(scene.covers)]
 
 
 def cover(
@@ -243,12 +223,12 @@ def _paint(frames: Tensor, shapes: Shapes, boxes: Boxes, coverage: Tensor) -> Te
     return boundary.accumulate(flat, index, change.view(-1)).view_as(frames)
 
 
-def _ground(camera: Camera, t: Tensor, paper: Tensor, imaging: Imaging) -> Tensor:
+def _ground(camera: Camera, t: Tensor, paper: Tensor, scene: Imaging) -> Tensor:
     """(B, 1, 1) or (B, H, W), what lies below all shapes."""
-    surround = imaging.surround
+    surround = scene.surround
     if not isinstance(surround, Tensor) or surround.ndim != 3:
-        return (paper if imaging.plate is None else per_frame(surround, t))[:, None, None]
-    if imaging.plate is None:
+        return (paper if scene.plate is None else per_frame(surround, t))[:, None, None]
+    if scene.plate is None:
         raise ConfigError("surround: background pictures need a plate before them; give its size")
     if surround.shape != (wanted := (len(t), camera.height, camera.width)):
         raise FrameError(f"surround: shape {tuple(surround.shape)} of the pictures is not {wanted}")
