@@ -1,6 +1,6 @@
 """Blender against the analytic renderer: the same plan, two independent programs. Runs where bpy is installed.
 
-pip install -e '.[blender,dev]' under Python 3.11, then pytest -m slow tests/sim/test_blender.py
+pip install -e '.[blender,dev]' under Python 3.11, then pytest -m slow tests/datasets/test_blender.py
 """
 
 from __future__ import annotations

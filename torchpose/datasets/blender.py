@@ -151,10 +151,10 @@ def _ring_material(bpy: Any, plan: Plan) -> tuple[Any, dict[str, Any]]:
     new, link = tree.nodes.new, tree.links.new
     place = new("ShaderNodeTexCoord").outputs["Object"]
 
-    def math_node(operation: str, a: Any, b: Any) -> Any:
+    def math_node(operation: str, *operands: Any) -> Any:
         node = new("ShaderNodeMath")
         node.operation = operation
-        for socket, value in zip(node.inputs, (a, b), strict=False):
+        for socket, value in zip(node.inputs, operands, strict=False):
             if isinstance(value, float):
                 socket.default_value = value
             else:

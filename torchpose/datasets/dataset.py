@@ -131,16 +131,8 @@ def analytic(plan: Plan) -> Renderer:
 
 def simulated_frames(plan: Plan, renderer: Renderer, which: Int[Tensor, " B"]) -> Shaped[Tensor, "B H W"]:
     """The frames numbered ``which``, uint8 or uint16, as the plan's sensor delivers them."""
-    sensor = plan.file.sensor
-    return add_noise(
-        renderer(which),
-        plan.conditions.noise[which],
-        plan.file.seed,
-        index=which,
-        bits=sensor.bits,
-        full_well=sensor.full_well,
-        gamma=sensor.gamma,
-    )
+    sensor = plan.file.sensor.model_dump(exclude={"noise"})
+    return add_noise(renderer(which), plan.conditions.noise[which], plan.file.seed, index=which, **sensor)
 
 
 def write_dataset(

@@ -79,7 +79,7 @@ def base_cells(poses: Poses) -> list[Row]:
     return list(_pose_cells(poses.cpu(), "base_"))
 
 
-def fault_row(frame: str, target: str, status: Status, reason: str) -> Row:
+def fault_row(frame: str, target: str, status: Status, reason: str | None) -> Row:
     """The row of a target in a frame that could not be read or used."""
     row: Row = dict.fromkeys(POSE_SCHEMA)
     return row | {"frame": frame, "target": target, "status": status.name.lower(), "markers": 0, "reason": reason}

@@ -198,16 +198,10 @@ def fill(
         nearest = pixel[part].detach().round()
         from_nearest = pixel[part] - nearest
         scale = sigma[part, None]
-        # the Gaussian and the pixel's box: along the column, and integrated along the row
         across = _on_pixel(torch.special.ndtr, rows - from_nearest[:, 1:], scale)
         # differences from each column to the next; the first has the column before it as its neighbour
         x = torch.cat([columns[:1] - 1, columns]) - from_nearest[:, :1]
-        if half_chord is None:
-            along = (scale * _on_pixel(_normal_loss, x, scale)).diff(dim=1)
-        else:
-            half = half_chord[part, None]
-            right, left = (_on_pixel(_normal_loss_integral, x + side, scale) for side in (half, -half))
-            along = (scale * scale * (right - left) / (2 * half)).diff(dim=1)
+        along = _row_integral(x, scale, None if half_chord is None else half_chord[part, None]).diff(dim=1)
         local = nearest.long() - corner[part]
         row, column = local[:, 1:] + rows.long(), local[:, :1] + columns.long()
         inside = (row >= 0) & (row < size[part, 1:])
@@ -310,6 +304,14 @@ def _sign(x: Tensor) -> Tensor:
 def _on_pixel(function: Callable[[Tensor], Tensor], x: Tensor, sigma: Tensor) -> Tensor:
     """Difference of a function of x / sigma between the borders of a pixel about x."""
     return function((x + 0.5) / sigma) - function((x - 0.5) / sigma)
+
+
+def _row_integral(x: Tensor, sigma: Tensor, half: Tensor | None) -> Tensor:
+    """Integral up to x of the Gaussian convolved with the pixel and with a box of a half width and the area 1."""
+    if half is None:
+        return sigma * _on_pixel(_normal_loss, x, sigma)
+    right, left = (_on_pixel(_normal_loss_integral, x + side, sigma) for side in (half, -half))
+    return sigma * sigma * (right - left) / (2 * half)
 
 
 def _normal_loss(x: Tensor) -> Tensor:

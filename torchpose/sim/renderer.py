@@ -87,7 +87,7 @@ class Imaging:
     plate: Sequence[float] | None = None
     surround: Level = 90.0
     defocus: Defocus | None = None
-    motion: Float[Tensor, "B 6"] | None = None
+    motion: Tensor | None = None
     lighting: Lighting | None = None
     clutter: Shapes | None = None
     covers: Shapes | None = None
