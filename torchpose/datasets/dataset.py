@@ -175,7 +175,7 @@ def write_dataset(
         size = max(1, min(16, _BATCH_PIXELS // (plan.camera.width * plan.camera.height)))
     with ThreadPoolExecutor(threads, thread_name_prefix="encode") as pool:
         ahead: list[Future[None]] = []
-        for which in pending.split(batch or size) if len(pending) else ():
+        for which in torch.split(pending, batch or size) if len(pending) else ():
             frames = simulated_frames(plan, renderer, which)
             progress(_finished(ahead))
             ahead = [
@@ -185,7 +185,7 @@ def write_dataset(
         progress(_finished(ahead))
     truth = plan_truth(plan)
     if plan.file.bounds:
-        std = torch.cat([bounds(plan, which) for which in torch.arange(len(plan)).split(64)])
+        std = torch.cat([bounds(plan, which) for which in torch.split(torch.arange(len(plan)), 64)])
         truth.extra.update(zip(BOUND, std.unbind(1), strict=True))
     write_truth(out / "truth.csv", truth)
     return len(pending)

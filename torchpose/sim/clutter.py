@@ -85,5 +85,6 @@ def _foreign_ratios(target: Target) -> np.ndarray:
     """Ratios inner/outer that are as far from those of the target as its own are from each other at the least."""
     own = (target.radii[:, 1] / target.radii[:, 0]).numpy()
     ratios = np.linspace(0.2, 0.85, 66)
-    distance = abs(ratios[:, None] - own).min(1)
-    return ratios[distance >= 0.5 * distance.max()]
+    distance: np.ndarray = abs(ratios[:, None] - own).min(1)
+    chosen: np.ndarray = ratios[distance >= 0.5 * distance.max()]
+    return chosen

@@ -18,7 +18,7 @@ from torchpose.geometry.rotations import plane_axes
 from torchpose.geometry.rows import Rows
 from torchpose.target import Target
 
-Place = Sequence[float]
+Place = Sequence[float] | np.ndarray
 """(x, y) mm in the plane z = 0, or (x, y, z) where a function says so."""
 
 
@@ -189,4 +189,5 @@ def _one(level: float, frame: int, center: Tensor, circles: Circles, sides: Side
 
 def _placed(corners: np.ndarray, center: Place, angle: float) -> np.ndarray:
     cos, sin = math.cos(angle), math.sin(angle)
-    return corners @ np.array([[cos, sin], [-sin, cos]]) + np.asarray(center, dtype=float)[:2]
+    placed: np.ndarray = corners @ np.array([[cos, sin], [-sin, cos]]) + np.asarray(center, dtype=float)[:2]
+    return placed
