@@ -30,18 +30,15 @@ _HAND_EYE_OUT = (
     "from the poses."
 )
 _LENSES = "pinhole|brown4|brown5|rational8|kannala_brandt"
-_Inputs = Annotated[
-    list[Path],
-    typer.Argument(metavar="INPUT...", help="Image files, folders or capture manifests (.jsonl) of one camera."),
-]
-_Out = Annotated[Path | None, typer.Option(help="Camera file to write; without it --camera is taken as it is.")]
+_INPUTS = "Image files, folders or capture manifests (.jsonl) of one camera."
+_OUT = "Camera file to write; without it --camera is taken as it is."
 
 
 def calibrate(
-    inputs: _Inputs,
+    inputs: Annotated[list[Path], typer.Argument(metavar="INPUT...", help=_INPUTS)],
     target: Annotated[str | None, typer.Option(help="Target file or name of a built-in target.")] = None,
     board: Annotated[str | None, typer.Option(help=_BOARD)] = None,
-    out: _Out = None,
+    out: Annotated[Path | None, typer.Option(help=_OUT)] = None,
     camera: Annotated[str | None, typer.Option(help="Camera file to start from, or to use.")] = None,
     model: Annotated[str, typer.Option(metavar=_LENSES, help="Distortion of the lens.")] = "brown5",
     hand_eye_out: Annotated[Path | None, typer.Option(help=_HAND_EYE_OUT)] = None,

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-STATUS_STYLE = {"ok": "green", "ambiguous": "yellow", "no_target": "red", "too_few_markers": "red", "rejected": "red"}
+STATUS_STYLE = {"ok": "green", "ambiguous": "yellow"}  # all others are red
 
 
 class _Bar:

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
+from matplotlib.figure import Figure
 
+from torchpose.calibration import Calibration, HandEyeFit
 from torchpose.geometry.segments import segment_mean
 from torchpose.io.writers import write_rows
 from torchpose.report.figures import COLOURS, GREY, subplots
 from torchpose.report.files import make_folder, save_figures
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from torchpose.calibration import Calibration, HandEyeFit
 
 _BLUE, _RED = COLOURS[:2]
 
@@ -94,11 +91,7 @@ def plot_hand_eye(fit: HandEyeFit) -> Figure:
 
 
 def save_calibration(calibration: Calibration | None, hand_eye: HandEyeFit | None, folder: Path) -> list[Path]:
-    """Writes residuals.png, residuals.csv and covariance.csv, and hand_eye.png; the paths.
-
-    Raises:
-        ConfigError: the folder cannot be written.
-    """
+    """Writes the plots and tables that there are; the paths. ConfigError: the folder cannot be written."""
     make_folder(folder, "--plots")
     figures = {}
     if calibration is not None:

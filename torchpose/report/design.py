@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from matplotlib.figure import Figure
+from torch import Tensor
 
 from torchpose.design import PrecisionMap
 from torchpose.report.figures import COLOURS, subplots
 from torchpose.report.files import save_figures
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-    from torch import Tensor
-
 _PANELS = ("across the optical axis, um", "along the optical axis, um", "rotation, mdeg")
-_Axis = tuple[str, "Tensor"]  # label and values
+_Axis = tuple[str, Tensor]  # label and values
 
 
 def plot_precision(found: PrecisionMap, title: str) -> Figure:
@@ -55,9 +54,5 @@ def _plot(panel: Any, across: _Axis, up: _Axis, values: Tensor, name: str) -> No
 
 
 def save_plot(found: PrecisionMap, title: str, path: Path) -> None:
-    """Writes `plot_precision` as PNG.
-
-    Raises:
-        ConfigError: the file cannot be written.
-    """
+    """Writes `plot_precision` as PNG. ConfigError: the file cannot be written."""
     save_figures({path.name: plot_precision(found, title)}, path.parent)

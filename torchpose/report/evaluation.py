@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
+from matplotlib.figure import Figure
 
 from torchpose.analysis.evaluation import AXES, UNITS, Evaluation
+from torchpose.io.truth import Truth
 from torchpose.report.figures import COLOURS, GREY, band, subplots
 from torchpose.report.files import make_folder, save_figures
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from torchpose.io.truth import Truth
 
 _MOST_NEES = 25.0  # shown; larger ones in the last bin
 
@@ -88,11 +84,7 @@ def plot_conditions(evaluation: Evaluation, truth: Truth, title: str) -> Figure:
 
 
 def save_plots(evaluation: Evaluation, truth: Truth, folder: Path, title: str) -> list[Path]:
-    """Writes errors.png, consistency.png and conditions.png; the paths.
-
-    Raises:
-        ConfigError: the folder cannot be written.
-    """
+    """Writes errors.png, consistency.png and conditions.png; the paths. ConfigError: the folder cannot be written."""
     make_folder(folder, "--plots")
     figures = {
         "errors.png": plot_errors(evaluation, title),

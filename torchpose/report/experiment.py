@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
+from matplotlib.figure import Figure
 
 from torchpose.analysis import rms
 from torchpose.report.figures import COLOURS, GREY, band, subplots
 from torchpose.rig.experiment import AXES, Experiment, Moves, Static, unit
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 def plot_experiment(experiment: Experiment, title: str) -> Figure:

@@ -1,15 +1,14 @@
-"""How the plots look: one style, no window, no global state."""
+"""How the plots look: one style, no window, no global state. Slow to import: commands do where they plot."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-    from torch import Tensor
+from matplotlib.figure import Figure
+from torch import Tensor
 
-    from torchpose.io.rows import Row
+from torchpose.io.rows import Row
 
 # of Okabe and Ito, told apart without red and green
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
@@ -25,8 +24,6 @@ def subplots(rows: int, columns: int, size: tuple[float, float], **options: Any)
         size: width and height.
         options: of `matplotlib.figure.Figure.subplots`.
     """
-    from matplotlib.figure import Figure  # slow to import, and only plots need it
-
     figure = Figure(size, layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False, **options)
     for panel in axes.flat:

@@ -14,11 +14,7 @@ if TYPE_CHECKING:
 
 
 def make_folder(folder: Path, option: str) -> None:
-    """Makes the folder that is the argument of ``option``.
-
-    Raises:
-        ConfigError: it cannot be created or written.
-    """
+    """Makes the folder that is the argument of ``option``. ConfigError: it cannot be created or written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         probe = folder / ".probe.tmp"
@@ -29,11 +25,7 @@ def make_folder(folder: Path, option: str) -> None:
 
 
 def save_figures(figures: Mapping[str, Figure], folder: Path, dpi: int = 120) -> list[Path]:
-    """Writes plots under their file names; the paths.
-
-    Raises:
-        ConfigError: one cannot be written.
-    """
+    """Writes plots under their file names; the paths. ConfigError: one cannot be written."""
     for name, figure in figures.items():
         with atomic_path(folder / name) as temporary:
             figure.savefig(temporary, format=name.rsplit(".", 1)[-1], dpi=dpi)

@@ -65,7 +65,7 @@ def _section(folder: Path, record: Row) -> str:
     for table in record["tables"]:
         note = f'<p class="soft">{escape(table["note"])}</p>' if table["note"] else ""
         parts.append(f"<h3>{escape(table['title'])}</h3>{_table(table['rows'])}{note}")
-    settings = "".join(f", {key} {_cell(value)}" for key, value in record["settings"].items())
+    settings = "".join(f", {key} {escape(cell(value))}" for key, value in record["settings"].items())
     parts.append(f'<p class="soft">Settings: seed {record["seed"]}{settings}.</p>')
     return f'<section id="{escape(record["study"])}">{"".join(parts)}</section>'
 
@@ -76,7 +76,7 @@ def _table(rows: list[Row], fold: bool = True) -> str:
     classes = {column: _class(column, rows) for column in rows[0]}
     head = "".join(f"<th{kind}>{escape(column.replace('_', ' '))}</th>" for column, kind in classes.items())
     body = "".join(
-        "<tr>" + "".join(f"<td{kind}>{_cell(row[column])}</td>" for column, kind in classes.items()) + "</tr>"
+        "<tr>" + "".join(f"<td{kind}>{escape(cell(row[column]))}</td>" for column, kind in classes.items()) + "</tr>"
         for row in rows
     )
     table = f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
@@ -92,12 +92,11 @@ def _class(column: str, rows: list[Row]) -> str:
     return f' class="{" ".join(names)}"' if names else ""
 
 
-def _cell(value: Any) -> str:
-    if value is None:
+def cell(value: Any) -> str:
+    """A value as a reader wants it: four digits, nothing for None and not a number."""
+    if value is None or value != value:
         return ""
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return f"{value:.4g}" if isinstance(value, float) else escape(str(value))
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _environment(records: list[Row], environment: dict[str, str]) -> str:

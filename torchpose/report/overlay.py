@@ -36,11 +36,7 @@ def picture_path(folder: Path, frame: str) -> Path:
 
 
 def write_picture(path: Path, picture: np.ndarray) -> None:
-    """Writes a PNG file whole or not at all.
-
-    Raises:
-        ConfigError: it cannot be written.
-    """
+    """Writes a PNG file whole or not at all. ConfigError: it cannot be written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.with_name(f".{path.name}.tmp")

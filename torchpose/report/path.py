@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from matplotlib.patches import Rectangle
+
 from torchpose.report.figures import COLOURS, GREY, subplots
 from torchpose.report.files import save_figures
 from torchpose.rig.plan import CapturePlan
@@ -13,13 +15,8 @@ from torchpose.rig.robot_settings import Workspace
 def draw_path(plan: CapturePlan, workspace: Workspace, out: Path) -> None:
     """Draws the path from above and from two sides with the workspace, and every turn from the origin.
 
-    As SVG, which no command takes for a frame of the session that it lies beside.
-
-    Raises:
-        ConfigError: the file cannot be written.
+    As SVG, which no command takes for a frame of the session that it lies beside. ConfigError: it cannot be written.
     """
-    from matplotlib.patches import Rectangle
-
     positions, turns = plan.positions().numpy(), plan.turns().rad2deg().numpy()
     kinds: dict[str, list[int]] = {}
     for number, waypoint in enumerate(plan.waypoints):

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+
+from matplotlib.figure import Figure
 
 from torchpose.analysis.evaluation import AXES, SCALE, UNITS
 from torchpose.analysis.sweep import Sweep, fit
 from torchpose.report.figures import COLOURS, GREY, subplots
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 POWERS = {"x": (0, 1), "y": (0, 1), "z": (1, 2)}  # of the line through the largest errors: with a linear term for focal
 

@@ -11,10 +11,12 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import torch
+from matplotlib import colormaps
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchpose import pnp
@@ -24,9 +26,6 @@ from torchpose.kernels import has_compiler
 from torchpose.report.figures import curve, subplots
 from torchpose.studies.study import Comparison, Picture, Progress, StudyResult, Table, ignore_progress
 from torchpose.studies.views import turned
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 NAME = "fig02_pnp"
 TITLE = "Fig. 2: methods of PnP, their errors and times"
@@ -193,8 +192,6 @@ def _ratio(rows: list[Row], of: str, over: str) -> float:
 
 def plot(rows: list[Row], seconds: dict[str, float]) -> Figure:
     """Errors against noise for all methods and for lines against points, and the times."""
-    from matplotlib import colormaps
-
     figure, axes = subplots(2, 3, (15, 8.5))
     names = list(seconds)
     colours = {name: colormaps["tab20"](i) for i, name in enumerate(names)}

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchpose.analysis import edge_noise, localisers
@@ -26,9 +26,6 @@ from torchpose.sim.shapes import rectangle
 from torchpose.studies.fig05_recognition import capacities, recognition
 from torchpose.studies.study import Comparison, Picture, Progress, StudyResult, Table, ignore_progress, load_data
 from torchpose.studies.views import turned
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 NAME = "fig05_shapes"
 TITLE = "Fig. 5: shapes of marks"

@@ -7,10 +7,10 @@ Zernike moment A_11, the sub-pixel edges, and the ellipses fitted to them with t
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import cv2
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchpose import ellipse
@@ -23,9 +23,6 @@ from torchpose.rings import measure_rings, zernike
 from torchpose.rings.edges import RingEdges, ring_edges
 from torchpose.sim import add_noise, render, shapes
 from torchpose.studies.study import Picture, Progress, StudyResult, Table, ignore_progress, load_data
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 NAME = "fig07_subpixel"
 TITLE = "Figs. 7 and 8: from the region to sub-pixel edges and ellipses"

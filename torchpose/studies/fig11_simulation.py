@@ -10,10 +10,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
 import cv2
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchpose.analysis.evaluation import BOUND, Estimates, Evaluation, evaluate
@@ -27,9 +27,6 @@ from torchpose.report.figures import frames as sheet_of
 from torchpose.report.overlay import Overlay
 from torchpose.results import Poses, Status
 from torchpose.studies.study import DATA, Comparison, Picture, Progress, StudyResult, Table, ignore_progress
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 NAME = "fig11_simulation"
 TITLE = "Figs. 10 and 11: poses of the simulated frames"

@@ -13,10 +13,10 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
 import torch
 import yaml
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchpose.analysis import rms
@@ -34,9 +34,6 @@ from torchpose.report.figures import frames
 from torchpose.rig.experiment import AXES, Experiment, evaluate_experiment, unit
 from torchpose.studies.study import DATA, Comparison, Picture, Progress, StudyResult, Table, ignore_progress, load_data
 from torchpose.target import Target
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 NAME = "fig13_experiment"
 TITLE = "Figs. 12 and 13: the experiment, on the digital twin"

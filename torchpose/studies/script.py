@@ -8,9 +8,9 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 from torchpose.errors import ConfigError
+from torchpose.report.html import cell
 from torchpose.studies.study import StudyResult, Table
 
 _COMMON = ("full", "seed", "progress")
@@ -56,14 +56,7 @@ def finish(result: StudyResult, out: Path | None) -> None:
 
 def text_of(table: Table) -> str:
     """The table as Markdown."""
-    cells = [table.columns] + [[_cell(row[column]) for column in table.columns] for row in table.rows]
+    cells = [table.columns] + [[cell(row[column]) for column in table.columns] for row in table.rows]
     widths = [max(len(line[i]) for line in cells) for i in range(len(table.columns))]
     lines = ["| " + " | ".join(text.ljust(w) for text, w in zip(line, widths, strict=True)) + " |" for line in cells]
     return "\n".join([lines[0], "| " + " | ".join("-" * w for w in widths) + " |", *lines[1:]])
-
-
-def _cell(value: Any) -> str:
-    """A value as a reader wants it: four digits, nothing for None and not a number."""
-    if value is None or value != value:
-        return ""
-    return f"{value:.4g}" if isinstance(value, float) else str(value)

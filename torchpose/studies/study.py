@@ -7,16 +7,14 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import yaml
+from matplotlib.figure import Figure
 
 from torchpose.io.rows import Row
 from torchpose.io.writers import atomic_path, write_rows
 from torchpose.report.files import make_folder, save_figures
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 Progress = Callable[[float], None]  # told the part that is done, 0 to 1
 RESULT = "result.json"

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import TYPE_CHECKING
 
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchpose import pnp
@@ -24,9 +24,6 @@ from torchpose.report.figures import COLOURS, curve, subplots
 from torchpose.studies.fig04_sensitivity import DISTANCES_MM, FOCAL_ERROR, paper_camera
 from torchpose.studies.study import Comparison, Picture, Progress, StudyResult, Table, ignore_progress, load_data
 from torchpose.target import Target
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 NAME = "table01_orientation"
 TITLE = "Table I: errors of orientation"

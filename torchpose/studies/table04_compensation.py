@@ -9,9 +9,9 @@ pixel by which the ring is off the axis drawn at random; RMS length of the error
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 import torchpose as tp
@@ -25,9 +25,6 @@ from torchpose.report.figures import COLOURS, GREY, curve, subplots
 from torchpose.rings import measure_rings
 from torchpose.sim import add_noise, render
 from torchpose.studies.study import Comparison, Picture, Progress, StudyResult, Table, ignore_progress, load_data
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 NAME = "table04_compensation"
 TITLE = "Table IV: the centre of a tilted ring, compensated"
