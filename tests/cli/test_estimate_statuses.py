@@ -94,9 +94,7 @@ def statuses(files: Path, tmp_path: Path) -> Callable[..., tuple[int, dict[str, 
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_alone_in_its_batch(
-    statuses: Callable[..., tuple[int, dict[str, str]]], method: str, kind: str
-) -> None:
+def test_alone_in_its_batch(statuses: Callable[..., tuple[int, dict[str, str]]], method: str, kind: str) -> None:
     assert statuses(method, kind) == (int(kind == "unreadable"), {kind: KINDS[kind]})
 
 
@@ -107,9 +105,7 @@ def test_beside_the_others(statuses: Callable[..., tuple[int, dict[str, str]]], 
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_no_frame_of_the_batch_has_a_target(
-    statuses: Callable[..., tuple[int, dict[str, str]]], method: str
-) -> None:
+def test_no_frame_of_the_batch_has_a_target(statuses: Callable[..., tuple[int, dict[str, str]]], method: str) -> None:
     kinds = [kind for kind in KINDS if kind != "good"]
     assert statuses(method, *kinds) == (1, {kind: KINDS[kind] for kind in kinds})
 

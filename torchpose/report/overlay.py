@@ -52,17 +52,19 @@ class Overlay:
     Args:
         camera: as for `PoseEstimator`.
         targets: as for `PoseEstimator`.
-        folder: where the pictures go, created if missing.
+        folder: where the pictures go, created if missing; only `write` needs it.
         threads: pictures that are drawn and written side by side.
 
     Raises:
         ConfigError: the folder cannot be created or written.
     """
 
-    def __init__(self, camera: Camera, targets: Sequence[Target], folder: Path, *, threads: int = 1) -> None:
+    def __init__(
+        self, camera: Camera, targets: Sequence[Target], folder: Path | None = None, *, threads: int = 1
+    ) -> None:
         self._camera = camera
         self._names = [target.name for target in targets]
-        self._folder = folder
+        self._folder = folder or Path()
         self._threads = threads
         centers = [target.centers for target in targets]
         middle = torch.stack([c.mean(0) for c in centers])
@@ -70,7 +72,8 @@ class Overlay:
         steps = torch.linspace(0, 1, _AXIS_POINTS, dtype=torch.float64)
         # (T, 3 axes, points, 3): from the target's origin, about as long as the target is wide
         self._axes = extent[:, None, None, None] * torch.eye(3, dtype=torch.float64)[:, None] * steps[:, None]
-        make_folder(folder, "--overlay")
+        if folder is not None:
+            make_folder(folder, "--overlay")
 
     def write(self, frames: Tensor, poses: Poses, names: Sequence[str]) -> None:
         """Writes one picture a frame.

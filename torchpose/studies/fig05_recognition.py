@@ -33,7 +33,7 @@ AREA_RANGE = (0.45, 1.5)  # of the area of a mark face on
 CODE_NOISE = (2.0, 8.0)
 CODE_BLUR = (0.7, 1.0, 1.5)
 SPREAD = 6.0  # standard deviations between two codes
-RANGES = {"concentric rings": (0.15, 0.9), "cross": (0.1, 0.8), "rectangle": (1.0, 3.0)}
+RANGES = {"concentric rings": (0.15, 0.9), "cross": (0.1, 0.8), "rectangle": (1.0, 3.0)}  # of the codes
 
 
 def recognition(frames: int, seed: int) -> list[Row]:
@@ -227,7 +227,8 @@ def _corners(lines: Tensor) -> Tensor:
 
 def _area(corner: Tensor) -> Tensor:
     following = corner.roll(-1, 1)
-    return 0.5 * (corner[..., 0] * following[..., 1] - corner[..., 1] * following[..., 0]).sum(-1).abs()
+    cross_product = corner[..., 0] * following[..., 1] - corner[..., 1] * following[..., 0]
+    return cross_product.sum(-1).abs() / 2
 
 
 def _sized(area: Tensor) -> Tensor:
