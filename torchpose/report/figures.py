@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -37,8 +38,10 @@ def curve(panel: Any, rows: Sequence[Row], x: str, y: str, style: str = "o-", **
     panel.plot([row[x] for row in rows], [row[y] for row in rows], style, **options)
 
 
-def frames(pictures: Sequence[tuple[str, Any]], rows: int, size: tuple[float, float], fontsize: int = 12) -> Figure:
-    """A sheet of titled pictures: grey (H, W) of 0 to 255 or colour (H, W, 3), in rows of one length."""
+def frames(
+    pictures: Sequence[tuple[str, np.ndarray]], rows: int, size: tuple[float, float], fontsize: int = 12
+) -> Figure:
+    """A sheet of titled arrays: grey (H, W) of 0 to 255 or colour (H, W, 3), in rows of one length."""
     figure, axes = subplots(rows, len(pictures) // rows, size)
     for panel, (title, picture) in zip(axes.flat, pictures, strict=True):
         panel.imshow(picture, cmap="gray", vmin=0, vmax=255)

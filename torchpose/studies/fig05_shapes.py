@@ -278,5 +278,5 @@ def plot_marks() -> Figure:
     for condition in (Condition(), Condition(tilt=45.0), Condition(cover=0.3, noise=8.0)):
         for mark in marks(AREA_MM2):
             title = mark.name if condition == Condition() else ""
-            sheet.append((title, pictures(mark, condition, view(condition, 1, 3), 3)[0]))
+            sheet.append((title, pictures(mark, condition, view(condition, 1, 3), 3)[0].numpy()))
     return frames(sheet, 3, (11, 7), fontsize=9)

@@ -55,7 +55,7 @@ def run(*, full: bool = False, seed: int = 0, progress: Progress = ignore_progre
         row, overlay = _counted(name, images, truth)
         rows.append(row)
         height, width = overlay.shape[:2]
-        sheet = frames([("", images[0]), ("", overlay)], 1, (13, 6.6 * height / width))
+        sheet = frames([("", images[0].numpy()), ("", overlay)], 1, (13, 6.6 * height / width))
         title = f"Fig. 6 ({letters}): the {name} and what was found in it"
         pictures.append(Picture(f"fig06_{name}", title, sheet))
         progress(len(rows) / 2)

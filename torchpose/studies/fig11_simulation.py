@@ -129,5 +129,5 @@ def _frames(plan: Plan) -> Figure:
     tiles = [cv2.resize(frame.numpy(), (228, 152), interpolation=cv2.INTER_AREA) for frame in others]
     sheet = cv2.vconcat([cv2.hconcat(tiles[k : k + 3]) for k in (0, 3, 6)])
     titles = ("(a) rendered", "(b) processed", "(c) of the test set")
-    pictures = (first, cv2.cvtColor(drawn, cv2.COLOR_BGR2RGB), sheet)
+    pictures = (first.numpy(), cv2.cvtColor(drawn, cv2.COLOR_BGR2RGB), sheet)
     return sheet_of(list(zip(titles, pictures, strict=True)), 1, (15, 3.8))
