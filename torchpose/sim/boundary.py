@@ -316,16 +316,16 @@ def _row_integral(x: Tensor, sigma: Tensor, half: Tensor | None) -> Tensor:
 
 def _normal_loss(x: Tensor) -> Tensor:
     """Integral of the normal distribution function: x Phi(x) + phi(x)."""
-    density, probability = _normal(x)
+    probability, density = _normal(x)
     return x * probability + density
 
 
 def _normal_loss_integral(x: Tensor) -> Tensor:
     """Integral of `_normal_loss`: ((x^2 + 1) Phi(x) + x phi(x)) / 2."""
-    density, probability = _normal(x)
+    probability, density = _normal(x)
     return 0.5 * ((x.square() + 1) * probability + x * density)
 
 
 def _normal(x: Tensor) -> tuple[Tensor, Tensor]:
-    """Density phi(x) and distribution function Phi(x) of the normal distribution."""
-    return (-0.5 * x.square()).exp() / math.sqrt(2 * math.pi), torch.special.ndtr(x)
+    """Distribution function Phi(x) and density phi(x) of the normal distribution."""
+    return torch.special.ndtr(x), (-0.5 * x.square()).exp() / math.sqrt(2 * math.pi)
