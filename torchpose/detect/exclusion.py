@@ -15,7 +15,7 @@ from torch import Tensor
 from torchpose.detect.regions import Gradient
 from torchpose.detect.validation import LEAST_COVER, WHOLE, Candidates, Samples, Verdict, false_alarms, sample_edges
 from torchpose.geometry import conics
-from torchpose.geometry.segments import pairs_in_group, ragged_arange
+from torchpose.geometry.segments import marked, members, pairs_in_group, positions
 
 _NEAR = 1.5  # cells between an edge and the ellipse that explains it
 _COS = 0.8  # of the edge's gradient with the normal of that ellipse: 37 degrees
@@ -25,12 +25,9 @@ _ROUNDS = 4
 def explain_once(grad: Gradient, found: Candidates, known: Candidates | None = None) -> Candidates:
     """The same candidates; those of which too little remains without the edges of better ones become `EXPLAINED`.
 
-    Ellipses that are seen whole stay as they are.
-
-    Args:
-        found: in cells. known: accepted ellipses of a finer scale, in the same cells.
+    Ellipses that are seen whole stay as they are. All are in cells; ``known`` are accepted ellipses of a finer scale.
     """
-    part = ((found.verdict == Verdict.ACCEPTED) & (found.cover <= WHOLE)).nonzero()[:, 0]
+    part = positions((found.verdict == Verdict.ACCEPTED) & (found.cover <= WHOLE))
     if part.numel() == 0:
         return found
     weak, every = found[part], found if known is None else Candidates.cat([found, known])
@@ -40,27 +37,23 @@ def explain_once(grad: Gradient, found: Candidates, known: Candidates | None = N
     # order of false alarms
     kept = torch.ones(len(every), dtype=torch.bool, device=part.device)
     for _ in range(_ROUNDS):
-        free = torch.ones_like(samples.of, dtype=torch.bool)
-        free[sample[kept[other]]] = False
+        free = ~marked(sample[kept[other]], len(samples))
         nfa, cover = false_alarms(grad, samples.error[free], samples.of[free], part.numel())
         kept[part] = (nfa < 0) & (cover >= LEAST_COVER)
-    lost = ~kept[: len(found)]
-    return replace(found, verdict=torch.where(lost, int(Verdict.EXPLAINED), found.verdict))
+    return replace(found, verdict=torch.where(kept[: len(found)], found.verdict, int(Verdict.EXPLAINED)))
 
 
 def _explained(samples: Samples, weak: Candidates, every: Candidates) -> tuple[Tensor, Tensor]:
     """Which of the samples of ``weak`` (Q,) lie on the edges of which better ones of ``every`` (Q,)."""
-    best = (every.verdict == Verdict.ACCEPTED).nonzero()[:, 0]
+    best = positions(every.verdict == Verdict.ACCEPTED)
     best = best[torch.argsort(every.frame[best], stable=True)]
     i, j = pairs_in_group(weak.frame, every.frame[best])
     j = best[j]
     apart = torch.linalg.vector_norm(weak.ellipse[i, :2] - every.ellipse[j, :2], dim=-1)
     meet = (every.log10_nfa[j] < weak.log10_nfa[i]) & (apart < weak.ellipse[i, 2] + every.ellipse[j, 2] + _NEAR)
     i, j = i[meet], j[meet]
-    size = torch.bincount(samples.of, minlength=len(weak))
-    start = size.cumsum(0) - size
-    pair, offset = ragged_arange(size[i])
-    sample, other = start[i[pair]] + offset, j[pair]
+    pair, sample = members(torch.bincount(samples.of, minlength=len(weak)), i)
+    other = j[pair]
     off, normal = conics.signed_distance(every.ellipse[other], samples.xy[sample])
     gradient = samples.gradient[sample]
     rise = (gradient * normal).sum(-1) * every.polarity[other]
