@@ -28,58 +28,36 @@ _BAND_COS = 0.9  # of a gradient with the normal of the ellipse: 26 degrees
 
 @dataclass(frozen=True, eq=False)
 class Arcs(Rows):
-    """Smooth curve pieces.
-
-    Attributes:
-        middle: px, mean of the cells.
-        normal: mean direction of the gradient.
-        curvature: 1/px, positive where the gradient points away from the centre of curvature.
-        turn: rad, from end to end.
-        size: in cells.
-    """
+    """Smooth curve pieces."""
 
     frame: Int[Tensor, " N"]
-    middle: Float[Tensor, "N 2"]
-    normal: Float[Tensor, "N 2"]
-    curvature: Float[Tensor, " N"]
-    turn: Float[Tensor, " N"]
-    size: Int[Tensor, " N"]
+    middle: Float[Tensor, "N 2"]  # px, mean of the cells
+    normal: Float[Tensor, "N 2"]  # mean direction of the gradient
+    curvature: Float[Tensor, " N"]  # 1/px, positive where the gradient points away from the centre of curvature
+    turn: Float[Tensor, " N"]  # rad, from end to end
+    size: Int[Tensor, " N"]  # cells
 
 
 @dataclass(frozen=True, eq=False)
 class Perimeter(Rows):
-    """Samples of the perimeters of ellipses.
+    """Samples of the perimeters of ellipses."""
 
-    Attributes:
-        of: the ellipse.
-        xy: position.
-        normal: of unit length, outwards.
-        turn: how far along the perimeter, in [0, 1).
-    """
-
-    of: Int[Tensor, " S"]
+    of: Int[Tensor, " S"]  # the ellipse
     xy: Float[Tensor, "S 2"]
-    normal: Float[Tensor, "S 2"]
-    turn: Float[Tensor, " S"]
+    normal: Float[Tensor, "S 2"]  # of unit length, outwards
+    turn: Float[Tensor, " S"]  # how far along the perimeter, in [0, 1)
 
 
 @dataclass(frozen=True, eq=False)
 class Band(Rows):
-    """Cells beside samples of a perimeter, from inside to outside.
-
-    Attributes:
-        at: the samples.
-        x, y: centres of the cells.
-        gx, gy: gradient.
-        rise: of the gradient across the ellipse, 0 where its direction is another or it is weak.
-    """
+    """Cells beside samples of a perimeter, from inside to outside."""
 
     at: Perimeter
-    x: Float[Tensor, "S K"]
+    x: Float[Tensor, "S K"]  # centres of the cells
     y: Float[Tensor, "S K"]
     gx: Float[Tensor, "S K"]
     gy: Float[Tensor, "S K"]
-    rise: Float[Tensor, "S K"]
+    rise: Float[Tensor, "S K"]  # of the grey value across the ellipse, 0 where the gradient is weak or has another way
 
 
 def describe_arcs(regions: Regions, xy: Float[Tensor, "P 2"]) -> Arcs:

@@ -11,12 +11,20 @@ from torch import Tensor
 
 from torchpose import ellipse
 from torchpose.detect.arcs import chain_pairs, describe_arcs, fit_joint, follow
-from torchpose.detect.exclusion import explain_once
 from torchpose.detect.finer import SIDE, cut_outs, promising_places
 from torchpose.detect.partial import free_of_stumps
 from torchpose.detect.reduce import area_reduce, reduction_factor
 from torchpose.detect.regions import Gradient, Regions, gradient, level_line_regions, region_polarity, strong_cells
-from torchpose.detect.validation import SAME, WHOLE, Candidates, Verdict, accepted, merge_duplicates, score
+from torchpose.detect.validation import (
+    SAME,
+    WHOLE,
+    Candidates,
+    Verdict,
+    accepted,
+    explain_once,
+    merge_duplicates,
+    score,
+)
 from torchpose.geometry import conics
 from torchpose.geometry.segments import marked, members, positions, segment_mean
 
@@ -154,11 +162,11 @@ def _on_ellipses(
     regions: Regions, xy: Tensor, params: Tensor, polarity: Tensor, magnitude: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Which cells (P,) lie on the ellipse of their region, and which belong to its edge, a blurred one included."""
-    conic = conics.conic_from_ellipse(params)
-    each = [v.contiguous().index_select(0, regions.region) for v in (*conic.unbind(-1), polarity)]
-    off, (nx, ny) = conics.conic_distance(tuple(each[:6]), xy.unbind(-1))
+    each = (*conics.conic_from_ellipse(params).unbind(-1), polarity)
+    *conic, outwards = (v.contiguous().index_select(0, regions.region) for v in each)
+    off, nx, ny = conics.signed_distance(conic, *xy.unbind(-1))
     gx, gy = regions.gradient.unbind(-1)
-    rise = (nx * gx + ny * gy) * each[6]
+    rise = (nx * gx + ny * gy) * outwards
     off = off.abs()
     follows = off < _ON_ELLIPSE
     return follows, follows | ((off < _FLANK) & (rise > _FLANK_COS * magnitude))

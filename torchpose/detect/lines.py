@@ -11,16 +11,9 @@ from torch import Tensor
 
 from torchpose.detect.regions import Gradient, Regions, connected_components, level_line_regions
 from torchpose.detect.validation import edges_at, log10_nfa
+from torchpose.geometry import segments
 from torchpose.geometry.rows import Rows
-from torchpose.geometry.segments import (
-    earlier_in_group,
-    marked,
-    pairs_in_group,
-    positions,
-    ragged_arange,
-    segment_mean,
-    segment_sum,
-)
+from torchpose.geometry.segments import marked, positions, segment_mean, segment_sum
 
 _SECTORS = 8  # directions of one edge stay within 45 degrees
 _MIN_CELLS = 10
@@ -109,7 +102,7 @@ def _straight(grad: Gradient, regions: Regions) -> _Lines:
     reach, direction, frame = torch.stack([low, high], -1)[good], direction[good], regions.frame[good]
     ends = middle[good, None] + reach[..., None] * direction[:, None]
 
-    which, position = ragged_arange((reach[:, 1] - reach[:, 0]).ceil().long())
+    which, position = segments.ragged_arange((reach[:, 1] - reach[:, 0]).ceil().long())
     at = ends[which, 0] + (position[:, None] + 0.5) * direction[which]
     error = edges_at(grad, frame, which, at, _left(direction)[which]).error
     size = torch.bincount(which, minlength=len(good)).double()
@@ -123,7 +116,7 @@ def _left(direction: Tensor) -> Tensor:
 
 def _repeated(frame: Tensor, ends: Tensor) -> Tensor:
     """Segments (N,) bool that lie along an earlier one of their frame, which has fewer false alarms."""
-    i, j = earlier_in_group(frame)
+    i, j = segments.earlier_in_group(frame)
     axis = ends[j, 1] - ends[j, 0]
     length = torch.linalg.vector_norm(axis, dim=-1)
     axis = (axis / length[:, None])[:, None]
@@ -139,7 +132,7 @@ def _repeated(frame: Tensor, ends: Tensor) -> Tensor:
 def _chains(frame: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
     """Polygon (N,) int64 of each segment, -1 for none, and its place along it, by mutually nearest ends."""
     count = frame.numel()
-    i, j = pairs_in_group(frame, frame)
+    i, j = segments.pairs_in_group(frame, frame)
     gap = torch.linalg.vector_norm(ends[j, 0] - ends[i, 1], dim=-1)
     meets = positions((gap < _JOIN) & (i != j))
     i, j, gap = i[meets], j[meets], gap[meets]

@@ -30,25 +30,15 @@ _SETTLE = 4  # fits to what agrees
 
 @dataclass(frozen=True, eq=False)
 class Ridge(Rows):
-    """Edges beside samples of the perimeters of M ellipses.
+    """Edges beside samples of the perimeters of M ellipses."""
 
-    Attributes:
-        of: the ellipse.
-        sector: which sixteenth of its perimeter.
-        xy: where the gradient across the ellipse peaks, cells.
-        gradient: there.
-        offset: cells from the ellipse, positive outside.
-        found: an edge of its direction.
-        support: in [0, 1], share of the perimeter whose edge lies on it; an edge a cell away counts nothing, one on it
-            fully.
-    """
-
-    of: Int[Tensor, " S"]
-    sector: Int[Tensor, " S"]
-    xy: Float[Tensor, "S 2"]
-    gradient: Float[Tensor, "S 2"]
-    offset: Float[Tensor, " S"]
-    found: Bool[Tensor, " S"]
+    of: Int[Tensor, " S"]  # the ellipse
+    sector: Int[Tensor, " S"]  # which sixteenth of its perimeter
+    xy: Float[Tensor, "S 2"]  # where the gradient across the ellipse peaks, cells
+    gradient: Float[Tensor, "S 2"]  # there
+    offset: Float[Tensor, " S"]  # cells from the ellipse, positive outside
+    found: Bool[Tensor, " S"]  # an edge of its direction
+    # share of the perimeter whose edge lies on it; an edge a cell away counts nothing, one on it fully
     support: Float[Tensor, " M"] = shared()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import TypeVar
 
 import cv2
@@ -40,19 +39,17 @@ def area_reduce(frames: Shaped[Tensor, "B H W"], factor: int, *, exact: bool = F
     h, w = height // factor, width // factor
     if 0 in (batch, h, w):
         return torch.zeros(batch, h, w, dtype=torch.uint8 if whole else torch.float32, device=frames.device)
-    exact = exact or frames.dtype not in (torch.uint8, torch.uint16)
+    exact |= frames.dtype not in (torch.uint8, torch.uint16)
     reduced = _in_parts if frames.device.type == "cpu" else _at_once
     means = reduced(frames[:, : h * factor, : w * factor], factor, exact)
     return means.to(torch.uint8 if whole else torch.float32)
 
 
-def _steps(factor: int) -> Iterator[int]:
+def _steps(factor: int) -> list[int]:
     """The factors by which frames are reduced one after the other: every 2, then what is left."""
-    while factor % 2 == 0:
-        yield 2
-        factor //= 2
-    if factor > 1:
-        yield factor
+    if factor % 2:
+        return [factor] if factor > 1 else []
+    return [2, *_steps(factor // 2)]
 
 
 def _at_once(frames: Tensor, factor: int, exact: bool) -> Tensor:

@@ -31,15 +31,10 @@ _PART_PIXELS = 300_000  # of the frames whose gradients are formed at a time
 
 @dataclass(frozen=True, eq=False)
 class Gradient(Rows):
-    """2 x 2 gradient of frames, formed where it is asked for; cell (x, y) is centred at (x + 0.5, y + 0.5).
+    """2 x 2 gradient of frames, formed where it is asked for; cell (x, y) is centred at (x + 0.5, y + 0.5)."""
 
-    Attributes:
-        frames: uint8 or float32, contiguous.
-        threshold: magnitude that pure white noise exceeds in one cell of a thousand at most.
-    """
-
-    frames: Real[Tensor, "B h w"]
-    threshold: Float[Tensor, " B"]
+    frames: Real[Tensor, "B h w"]  # uint8 or float32, contiguous
+    threshold: Float[Tensor, " B"]  # magnitude that pure white noise exceeds in one cell of a thousand at most
 
     @property
     def shape(self) -> torch.Size:
@@ -68,18 +63,12 @@ class Gradient(Rows):
 
 @dataclass(frozen=True, eq=False)
 class Regions(Rows):
-    """Pixels of the regions, flat.
+    """Cells of R regions."""
 
-    Attributes:
-        cell: flat index into (B, h, w).
-        region: in [0, R).
-        frame: of each region.
-    """
-
-    cell: Int[Tensor, " P"]
+    cell: Int[Tensor, " P"]  # flat index into (B, h, w)
     region: Int[Tensor, " P"]
     gradient: Float[Tensor, "P 2"]
-    frame: Int[Tensor, " R"] = shared()
+    frame: Int[Tensor, " R"] = shared()  # of each region
 
 
 def gradient(frames: Real[Tensor, "B h w"]) -> Gradient:
@@ -210,18 +199,18 @@ def _search(rising: Tensor, values: Tensor) -> Tensor:
     return torch.searchsorted(rising, values)
 
 
-def connected_components(a: Int[Tensor, " E"], b: Int[Tensor, " E"], count: int) -> Int[Tensor, " count"]:
-    """Smallest member of each node's component in the graph with edges (a_i, b_i)."""
-    parent = torch.arange(count, device=a.device)
-    while a.numel():
-        first, second = parent.index_select(0, a), parent.index_select(0, b)
+def connected_components(one: Int[Tensor, " E"], other: Int[Tensor, " E"], count: int) -> Int[Tensor, " count"]:
+    """Smallest member of each node's component in the graph whose edges join ``one`` and ``other``."""
+    parent = torch.arange(count, device=one.device)
+    while one.numel():
+        first, second = parent.index_select(0, one), parent.index_select(0, other)
         low = torch.minimum(first, second)
         parent = parent.scatter_reduce(0, first, low, "amin").scatter_reduce_(0, second, low, "amin")
         while not torch.equal(shorter := parent.index_select(0, parent), parent):
             parent = shorter
         # what is joined stays so
         apart = positions(parent.index_select(0, first) != parent.index_select(0, second))
-        a, b = first.index_select(0, apart), second.index_select(0, apart)
+        one, other = first.index_select(0, apart), second.index_select(0, apart)
     return parent
 
 

@@ -1,4 +1,9 @@
-"""What became of the ellipses that were looked at: false alarms, duplicates, and edges that others explain better."""
+"""What became of the ellipses that were looked at: false alarms, duplicates, and edges that others explain better.
+
+An edge is explained once, after the exclusion principle of a-contrario detection (Desolneux, Moisan and Morel 2008):
+what is seen belongs to its best interpretation, the one with the fewest false alarms, and the others are judged by what
+is left. Two circles side by side have arcs that a third ellipse joins, too long to be an accident, and yet it is none.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +19,14 @@ from torchpose.detect.arcs import cells_at, perimeter_samples
 from torchpose.detect.regions import Gradient
 from torchpose.geometry import conics
 from torchpose.geometry.rows import Rows
-from torchpose.geometry.segments import earlier_in_group, marked, segment_sum
+from torchpose.geometry.segments import earlier_in_group, marked, members, pairs_in_group, positions, segment_sum
 
 WHOLE = 0.9  # cover from which on an ellipse is seen whole
 SAME = 0.08  # of the semi-minor axis, plus a pixel: ellipses nearer than that are one
 LEAST_COVER = 0.58  # a circle in a square is covered by 0.5
+_NEAR = 1.5  # cells between an edge and the ellipse that explains it
+_COS = 0.8  # of the edge's gradient with the normal of that ellipse: 37 degrees
+_ROUNDS = 4
 _COVER_ERROR = 0.125  # 22.5 degrees in units of pi: a sample with a smaller error belongs to the arc
 
 
@@ -64,19 +72,12 @@ def accepted(found: Candidates) -> Candidates:
 
 @dataclass(frozen=True, eq=False)
 class Samples(Rows):
-    """What lies along curves, one sample a pixel.
+    """What lies along curves, one sample a pixel."""
 
-    Attributes:
-        of: the curve.
-        xy: cells.
-        gradient: in the cell there.
-        error: angle between gradient and normal, divided by pi; 0.5 beyond the frame.
-    """
-
-    of: Int[Tensor, " S"]
-    xy: Float[Tensor, "S 2"]
-    gradient: Float[Tensor, "S 2"]
-    error: Float[Tensor, " S"]
+    of: Int[Tensor, " S"]  # the curve
+    xy: Float[Tensor, "S 2"]  # cells
+    gradient: Float[Tensor, "S 2"]  # in the cell there
+    error: Float[Tensor, " S"]  # angle between gradient and normal, divided by pi; 0.5 beyond the frame
 
 
 def sample_edges(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> Samples:
@@ -146,3 +147,43 @@ def merge_duplicates(found: Candidates, tolerance: float = SAME, *, explain: boo
     if not explain:
         return found[~again]
     return replace(found, verdict=torch.where(again, int(Verdict.DUPLICATE), found.verdict))
+
+
+def explain_once(grad: Gradient, found: Candidates, known: Candidates | None = None) -> Candidates:
+    """The same candidates; those of which too little remains without the edges of better ones become `EXPLAINED`.
+
+    Ellipses that are seen whole stay as they are. All are in cells; ``known`` are accepted ellipses of a finer scale.
+    """
+    part = positions((found.verdict == Verdict.ACCEPTED) & (found.cover <= WHOLE))
+    if part.numel() == 0:
+        return found
+    weak, every = found[part], found if known is None else Candidates.cat([found, known])
+    samples = sample_edges(grad, weak.frame, weak.ellipse, weak.polarity)
+    sample, other = _explained(samples, weak, every)
+    # who explains must be kept itself: the rounds close in, from below and above, on the choice made one by one in the
+    # order of false alarms
+    kept = torch.ones(len(every), dtype=torch.bool, device=part.device)
+    for _ in range(_ROUNDS):
+        free = ~marked(sample[kept[other]], len(samples))
+        nfa, cover = false_alarms(grad, samples.error[free], samples.of[free], part.numel())
+        kept[part] = (nfa < 0) & (cover >= LEAST_COVER)
+    return replace(found, verdict=torch.where(kept[: len(found)], found.verdict, int(Verdict.EXPLAINED)))
+
+
+def _explained(samples: Samples, weak: Candidates, every: Candidates) -> tuple[Tensor, Tensor]:
+    """Which of the samples of ``weak`` (Q,) lie on the edges of which better ones of ``every`` (Q,)."""
+    best = positions(every.verdict == Verdict.ACCEPTED)
+    best = best[torch.argsort(every.frame[best], stable=True)]
+    i, j = pairs_in_group(weak.frame, every.frame[best])
+    j = best[j]
+    apart = torch.linalg.vector_norm(weak.ellipse[i, :2] - every.ellipse[j, :2], dim=-1)
+    meet = (every.log10_nfa[j] < weak.log10_nfa[i]) & (apart < weak.ellipse[i, 2] + every.ellipse[j, 2] + _NEAR)
+    i, j = i[meet], j[meet]
+    pair, sample = members(torch.bincount(samples.of, minlength=len(weak)), i)
+    other = j[pair]
+    conic = conics.conic_from_ellipse(every.ellipse[other]).unbind(-1)
+    off, nx, ny = conics.signed_distance(conic, *samples.xy[sample].unbind(-1))
+    gradient = samples.gradient[sample]
+    rise = (gradient[:, 0] * nx + gradient[:, 1] * ny) * every.polarity[other]
+    on = (off.abs() < _NEAR) & (rise > _COS * torch.linalg.vector_norm(gradient, dim=-1))
+    return sample[on], other[on]

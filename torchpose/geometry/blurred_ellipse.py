@@ -37,8 +37,6 @@ def blurred_ellipse(
     """Blurred indicators, in [0, 1], of K ellipses at P points each, and their derivatives.
 
     Args:
-        xy: the points.
-        center: of the ellipses.
         shape: symmetric, see `conics.shape_matrix`.
         scale: factor on the shape.
         sigma: standard deviation of the blur.

@@ -51,20 +51,13 @@ class Tiles:
     """Flat values laid out in K tiles of one group each, padded: sums of many columns become small matrix products.
 
     `segment_sum` adds row by row, which costs most where the columns are many and the groups few.
-
-    Attributes:
-        order: which value comes first, second, ...; None where they are sorted by group already.
-        place: where in the tiles each value goes.
-        group: the group of each tile.
-        count: number of groups.
-        size: places of a tile.
     """
 
-    order: Int[Tensor, " E"] | None
-    place: Int[Tensor, " E"]
-    group: Int[Tensor, " K"]
-    count: int
-    size: int
+    order: Int[Tensor, " E"] | None  # which value comes first, second, ...; None where they are sorted by group already
+    place: Int[Tensor, " E"]  # where in the tiles each value goes
+    group: Int[Tensor, " K"]  # of each tile
+    count: int  # of groups
+    size: int  # places of a tile
 
     @classmethod
     def of(cls, index: Int[Tensor, " E"], count: int, size: int = 32) -> Tiles:
@@ -118,15 +111,7 @@ def rank_in_group(
 
 
 def members(size: Int[Tensor, " K"], group: Int[Tensor, " P"]) -> tuple[Int[Tensor, " E"], Int[Tensor, " E"]]:
-    """Elements of the groups asked for, one after the other, where all elements are sorted by group.
-
-    Args:
-        size: of each group.
-        group: those asked for, in any order, repeated or not.
-
-    Returns:
-        For each element its place in ``group`` and its own index.
-    """
+    """Elements of the groups asked for, all sorted by group: for each its place in ``group`` and its own index."""
     which, offset = ragged_arange(size[group])
     return which, (size.cumsum(0) - size)[group][which] + offset
 
