@@ -27,6 +27,7 @@ _FLAT = 1e-12  # squared ratio of the extents of a point set across and along, b
 Method = Literal["halir-flusser", "taubin"]
 Points = Float[Tensor, "E 2"]
 Index = Int[Tensor, " E"]
+Weights = Real[Tensor, " E"] | None
 Ellipses = Float[Tensor, "M 5"]
 Vector = tuple[Tensor, Tensor, Tensor]
 
@@ -56,9 +57,8 @@ class EllipseFit(Rows):
 
 
 def fit(
-    points: Points, index: Index, count: int, weights: Real[Tensor, " E"] | None = None, *,
-    method: Method = "halir-flusser",
-) -> Ellipses:  # fmt: skip
+    points: Points, index: Index, count: int, weights: Weights = None, *, method: Method = "halir-flusser"
+) -> Ellipses:
     """Direct least-squares ellipses in float64.
 
     "halir-flusser" minimises the weighted sum of squared algebraic distances subject to 4AC - B^2 = 1 (Fitzgibbon 1999
@@ -369,12 +369,7 @@ def fit_robust(
 
 
 def with_covariance(
-    points: Points,
-    index: Index,
-    ellipses: Ellipses,
-    weights: Real[Tensor, " E"] | None = None,
-    *,
-    correlation: float = 1.0,
+    points: Points, index: Index, ellipses: Ellipses, weights: Weights = None, *, correlation: float = 1.0
 ) -> EllipseFit:
     """First-order covariance of fitted ellipses from the scatter of their own points.
 
