@@ -25,7 +25,7 @@ _MOST_PADDING = 4  # places a point: beyond, points are summed one by one
 _FLAT = 1e-12  # squared ratio of the extents of a point set across and along, below which it is a line
 
 Method = Literal["halir-flusser", "taubin"]
-Points = Float[Tensor, "E 2"]
+Points = Real[Tensor, "E 2"]
 Index = Int[Tensor, " E"]
 Weights = Real[Tensor, " E"] | None
 Ellipses = Float[Tensor, "M 5"]
