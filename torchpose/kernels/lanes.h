@@ -82,4 +82,14 @@ template <class T> INLINE T magnitude(T x) { return select(lt(x, T{}), -x, x); }
 #define EACH(name, function) \
     INLINE F name(F x) { for (int l = 0; l < LANES; ++l) x[l] = std::function(x[l]); return x; } \
     INLINE D name(D x) { for (int l = 0; l < LANES; ++l) x[l] = std::function(x[l]); return x; }
-EACH(root, sqrt) EACH(arctangent, atan)
+EACH(root, sqrt) EACH(arctangent, atan) EACH(sine, sin) EACH(cosine, cos)
+
+#define PAIRS(name, function) \
+    INLINE F name(F x, F y) { for (int l = 0; l < LANES; ++l) x[l] = function(x[l], y[l]); return x; } \
+    INLINE D name(D x, D y) { for (int l = 0; l < LANES; ++l) x[l] = function(x[l], y[l]); return x; }
+// of the sign of the divisor, as in Python
+template <class S> INLINE S modulus(S x, S y) {
+    const S rest = std::fmod(x, y);
+    return rest != 0 && (rest < 0) != (y < 0) ? rest + y : rest;
+}
+PAIRS(angle, std::atan2) PAIRS(length, std::hypot) PAIRS(power, std::pow) PAIRS(modulo, modulus)

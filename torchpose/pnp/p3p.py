@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchpose.geometry.small_linalg import cross, det3, inverse3, matmul3
+from torchpose.geometry.small_linalg import cross, det, inverse3, matmul3
 from torchpose.pnp.candidates import Candidates, batch_last, rank
 
 _PAIRS = ((0, 1), (0, 2), (1, 2))
@@ -76,7 +76,7 @@ def _distances(corners: Tensor, rays: Tensor) -> Tensor:
     m23 = torch.stack([zero, zero, zero, zero, one, -b23, zero, -b23, one]).unflatten(0, (3, 3))
     d1 = m12 * squares[2] - m23 * squares[0]
     d2 = m13 * squares[2] - m23 * squares[1]
-    gamma = _cubic_root(det3(d2), _mixed(d2, d1), _mixed(d1, d2), det3(d1))
+    gamma = _cubic_root(det(d2), _mixed(d2, d1), _mixed(d1, d2), det(d1))
     lines = _split(d1 + gamma * d2)  # (3, 2, B)
     other = gamma * d1 - d2
 
