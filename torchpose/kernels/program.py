@@ -73,7 +73,9 @@ class Program:
         tensor = len(self._tensors)
         self._tensors.append(layout)
         step = f"strides[{self._strides(tensor) + len(layout.shape)}]"
-        read = "all(*{})" if layout.shared else f"gather({{0}} + b * {step}, {step})" if layout.strided else "load({} + b)"
+        read = (
+            "all(*{})" if layout.shared else f"gather({{0}} + b * {step}, {step})" if layout.strided else "load({} + b)"
+        )
         numbers = []
         for index in product(*map(range, layout.shape)):
             text = read.format(_pointer(tensor, index))

@@ -103,7 +103,9 @@ class _Translator(Interpreter):
         if target in _EACH:
             return _each(program, like, _EACH[target], *args, **kwargs)
         if target in _FOLDS:
-            return program.fold(_FOLDS[target], program.array(args[0], like.dtype), args[1] if args[1:] else (), like.shape)
+            return program.fold(
+                _FOLDS[target], program.array(args[0], like.dtype), args[1] if args[1:] else (), like.shape
+            )
         if target not in _OPERATIONS:
             raise NotImplementedError(f"{target} in a compiled function")
         return _OPERATIONS[target](program, like, *args, **kwargs)
@@ -132,9 +134,21 @@ _MOVES: dict[Any, Callable[..., Any]] = {
     **{
         move: move
         for move in (
-            *(_aten.expand.default, _aten.permute.default, _aten.transpose.int, _aten.t.default, _aten.unsqueeze.default),
+            *(
+                _aten.expand.default,
+                _aten.permute.default,
+                _aten.transpose.int,
+                _aten.t.default,
+                _aten.unsqueeze.default,
+            ),
             *(_aten.squeeze.dim, _aten.squeeze.dims, _aten.select.int, _aten.slice.Tensor, _aten.diagonal.default),
-            *(_aten.unbind.int, _aten.split.Tensor, _aten.split_with_sizes.default, _aten.stack.default, _aten.cat.default),
+            *(
+                _aten.unbind.int,
+                _aten.split.Tensor,
+                _aten.split_with_sizes.default,
+                _aten.stack.default,
+                _aten.cat.default,
+            ),
             *(_aten.select_scatter.default, _aten.slice_scatter.default, _aten.diagonal_scatter.default),
             *(_aten.copy.default, _aten.fill.Tensor, _aten.flip.default),
         )
@@ -232,12 +246,16 @@ def _inverse_root(program: Program, like: Tensor, a: Array) -> Array:
 
 @_of(_aten.pow.Tensor_Scalar)
 def _power(program: Program, like: Tensor, a: Array, exponent: float) -> Array:
-    return _each(program, like, "{} * {}", a, a) if exponent == 2 else _each(program, like, "power({}, {})", a, exponent)
+    return (
+        _each(program, like, "{} * {}", a, a) if exponent == 2 else _each(program, like, "power({}, {})", a, exponent)
+    )
 
 
 @_of(_aten.sign.default)
 def _sign(program: Program, like: Tensor, a: Array) -> Array:
-    above, below = (program.each(f"{name}({{}}, {{}})", torch.bool, a, program.array(0, a.dtype)) for name in ("gt", "lt"))
+    above, below = (
+        program.each(f"{name}({{}}, {{}})", torch.bool, a, program.array(0, a.dtype)) for name in ("gt", "lt")
+    )
     return _each(program, like, "{} - {}", above, below)
 
 

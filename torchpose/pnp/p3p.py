@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchpose.geometry.small_linalg import cross, det, inverse3, matmul3
+from torchpose.geometry.small_linalg import cofactors3, cross, det, inverse3, matmul3
 from torchpose.pnp.candidates import Candidates, batch_last, rank
 
 _PAIRS = ((0, 1), (0, 2), (1, 2))
@@ -123,8 +123,7 @@ def _distances(corners: Tensor, rays: Tensor) -> Tensor:
 
 def _mixed(a: Tensor, b: Tensor) -> Tensor:
     """trace(adj(a) b): the coefficient of s in det(a + s b)."""
-    cofactors = torch.stack([cross(a[1], a[2]), cross(a[2], a[0]), cross(a[0], a[1])])
-    return (cofactors * b).sum((0, 1))
+    return (cofactors3(a) * b).sum((0, 1))
 
 
 def _cubic_root(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
@@ -155,8 +154,8 @@ def _cubic_root(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
 
 def _split(conic: Tensor) -> Tensor:
     """The two lines (3, 2, B) of degenerate conics (3, 3, B); NaN where they are not real."""
-    adjugate = torch.stack([cross(conic[1], conic[2]), cross(conic[2], conic[0]), cross(conic[0], conic[1])])
-    diagonal = torch.stack([adjugate[0, 0], adjugate[1, 1], adjugate[2, 2]])
+    adjugate = cofactors3(conic)
+    diagonal = adjugate.diagonal(dim1=0, dim2=1).T
     k = diagonal.argmin(0)
     column = adjugate.gather(1, k.expand(3, 1, -1)).squeeze(1)
     p = column / (-diagonal.gather(0, k[None])).sqrt()

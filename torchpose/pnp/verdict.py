@@ -32,6 +32,8 @@ COINCIDENCE = 1.0
 # least 1 - (multiple correlation)^2 of a parameter below which the points do not fix the pose
 INDEPENDENCE = 1e-11
 
+Bad = tuple[tuple[Tensor, PnPCode], ...]  # (B,) bool, and why these poses have no answer
+
 
 class Found(NamedTuple):
     """Minima found: [R | t] (3, 4, ...), cost, iterations and converged (...)."""
@@ -113,8 +115,7 @@ def choose(obs: Observations, found: Found, compile: bool = False) -> Minima:
         return Found(*(v.gather(-2, order[k].expand(*v.shape[:-2], 1, batch)).squeeze(-2) for v in found))
 
     pose, cost, iterations, converged = pick(0)
-    equations = compiled(normal_equations) if compile else normal_equations
-    normal = equations(obs, pose)
+    normal = (compiled(normal_equations) if compile else normal_equations)(obs, pose)
     # a minimum is known by the cost that its last step promised; one behind the camera from the start by none
     normal[COST] = cost
     best = Estimate(pose, normal, iterations, converged)
@@ -143,13 +144,7 @@ def _coincide(a: Estimate, b: Tensor) -> Tensor:
     return distance(a.normal, step) < COINCIDENCE
 
 
-def write(
-    problem: Problem,
-    minima: Minima,
-    bad: tuple[tuple[Tensor, PnPCode], ...],
-    table: Table,
-    again: Tensor | None = None,
-) -> None:
+def write(problem: Problem, minima: Minima, bad: Bad, table: Table, again: Tensor | None = None) -> None:
     """Writes the columns of ``table``; ``bad`` are the codes of poses without a sensible problem, the last one wins.
 
     Poses that will be written ``again`` (B,) need not be made NaN.
