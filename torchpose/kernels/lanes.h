@@ -79,6 +79,8 @@ template <class T> INLINE T most(T x, T y) { return select(gt(x, y) | ne(x, x), 
 
 template <class T> INLINE T magnitude(T x) { return select(lt(x, T{}), -x, x); }
 
+template <class T> INLINE T inverse(T x) { return (T{} + 1) / x; }
+
 #define EACH(name, function) \
     INLINE F name(F x) { for (int l = 0; l < LANES; ++l) x[l] = std::function(x[l]); return x; } \
     INLINE D name(D x) { for (int l = 0; l < LANES; ++l) x[l] = std::function(x[l]); return x; }

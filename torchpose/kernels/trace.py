@@ -14,9 +14,9 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch._subclasses.fake_tensor import UnsupportedFakeTensorException
 from torch.fx import Interpreter
 from torch.fx.experimental.proxy_tensor import make_fx
+from torch.fx.experimental.symbolic_shapes import GuardOnDataDependentSymNode
 from torch.utils._pytree import TreeSpec, tree_flatten, tree_leaves, tree_map
 
 from torchpose.geometry import small_linalg
@@ -49,9 +49,7 @@ def trace(
         whole = torch.func.functionalize(flat, remove="mutations")
         try:
             graph = make_fx(whole, decomposition_table=_DECOMPOSED, tracing_mode="fake")(*examples)
-        except (UnsupportedFakeTensorException, RuntimeError) as error:
-            if "data-dependent" not in str(error).lower() and not isinstance(error, UnsupportedFakeTensorException):
-                raise
+        except GuardOnDataDependentSymNode as error:
             raise NotImplementedError("a look at numbers in a compiled function") from error
     graph.graph.eliminate_dead_code()
     program = Program()
@@ -86,13 +84,14 @@ class _Translator(Interpreter):
 
     def call_function(self, target: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         assert self._node is not None
-        program, like = self._program, self._node.meta.get("val")
+        program = self._program
         if target is operator.getitem:
             return args[0][args[1]]
         if target is _aten.copy_.default:  # functionalized, only what the function was given is left to be changed
             array = program.array(args[1], args[0].dtype)
             program.write(array, self._placeholders.index(self._node.args[0]))
             return array
+        like: Any = self._node.meta["val"]
         if target in _FILLS:
             value = _FILLS[target]
             return self._constant(torch.full(like.shape, args[-1] if value is None else value, dtype=like.dtype))
@@ -103,9 +102,8 @@ class _Translator(Interpreter):
         if target in _EACH:
             return _each(program, like, _EACH[target], *args, **kwargs)
         if target in _FOLDS:
-            return program.fold(
-                _FOLDS[target], program.array(args[0], like.dtype), args[1] if args[1:] else (), like.shape
-            )
+            array, *rest = program.array(args[0], like.dtype), *args[1:], ()
+            return program.fold(_FOLDS[target], array, rest[0], like.shape)
         if target not in _OPERATIONS:
             raise NotImplementedError(f"{target} in a compiled function")
         return _OPERATIONS[target](program, like, *args, **kwargs)
@@ -118,42 +116,52 @@ def _move(program: Program, like: Any, move: Callable[..., Any], args: Any, kwar
     return tree_map(lambda numbers: Array(numbers, dtype), move(*args, **kwargs))
 
 
-def _same(numbers: Tensor, **_: Any) -> Tensor:
-    return numbers
+def _each(program: Program, like: Tensor, text: str, *operands: Any, alpha: int = 1) -> Array:
+    if alpha != 1:
+        raise NotImplementedError("a factor in a sum of a compiled function")
+    return program.each(text, like.dtype, *(program.array(v, like.dtype) for v in operands))
 
 
+def _compare(name: str) -> Callable[..., Array]:
+    def compare(program: Program, like: Tensor, *operands: Any) -> Array:
+        examples = [torch.empty([1] * v.numbers.ndim, dtype=v.dtype) if isinstance(v, Array) else v for v in operands]
+        dtype = torch.result_type(*examples)
+        if dtype == torch.bool:
+            raise NotImplementedError("comparing truths in a compiled function")
+        return program.each(name + "({}, {})", torch.bool, *(program.array(v, dtype) for v in operands))
+
+    return compare
+
+
+def _divide(program: Program, like: Tensor, above: Any, below: Any) -> Array:
+    """By one reciprocal for all that is divided by a number: a division takes as long as a dozen products."""
+    return _each(program, like, "{} * {}", above, _each(program, like, "inverse({})", below))
+
+
+def _where(program: Program, like: Tensor, condition: Array, yes: Any, no: Any) -> Array:
+    return program.each("select({}, {}, {})", like.dtype, condition, *(program.array(v, like.dtype) for v in (yes, no)))
+
+
+def _pad(program: Program, like: Tensor, array: Array, widths: Sequence[int], value: float = 0) -> Array:
+    return Array(_aten.constant_pad_nd(array.numbers, widths, program.constant(value, array.dtype)), array.dtype)
+
+
+# operations that put elements elsewhere, or nowhere
 _MOVES: dict[Any, Callable[..., Any]] = {
-    **dict.fromkeys((_aten.view.default, _aten._unsafe_view.default), torch.reshape),
-    **dict.fromkeys(
-        (
-            *(_aten.clone.default, _aten.detach.default, _aten.alias.default, _aten.lift_fresh_copy.default),
-            _aten._to_copy.default,
-        ),
-        _same,
-    ),
-    **{
-        move: move
-        for move in (
-            *(
-                _aten.expand.default,
-                _aten.permute.default,
-                _aten.transpose.int,
-                _aten.t.default,
-                _aten.unsqueeze.default,
-            ),
-            *(_aten.squeeze.dim, _aten.squeeze.dims, _aten.select.int, _aten.slice.Tensor, _aten.diagonal.default),
-            *(
-                _aten.unbind.int,
-                _aten.split.Tensor,
-                _aten.split_with_sizes.default,
-                _aten.stack.default,
-                _aten.cat.default,
-            ),
-            *(_aten.select_scatter.default, _aten.slice_scatter.default, _aten.diagonal_scatter.default),
-            *(_aten.copy.default, _aten.fill.Tensor, _aten.flip.default),
-        )
-    },
-}
+    **{operation: lambda numbers, **_: numbers for operation in (
+        _aten.clone.default, _aten.detach.default, _aten.alias.default, _aten.lift_fresh_copy.default,
+        _aten._to_copy.default,
+    )},
+    **{operation: operation for operation in (
+        _aten.expand.default, _aten.permute.default, _aten.transpose.int, _aten.t.default, _aten.diagonal.default,
+        _aten.unsqueeze.default, _aten.squeeze.dim, _aten.squeeze.dims, _aten.select.int, _aten.slice.Tensor,
+        _aten.unbind.int, _aten.split.Tensor, _aten.split_with_sizes.default, _aten.stack.default, _aten.cat.default,
+        _aten.select_scatter.default, _aten.slice_scatter.default, _aten.diagonal_scatter.default,
+        _aten.copy.default, _aten.fill.Tensor,
+    )},
+    _aten.view.default: torch.reshape,
+    _aten._unsafe_view.default: torch.reshape,
+}  # fmt: skip
 # tensors of one number; None: of the last argument
 _FILLS = {
     **dict.fromkeys((_aten.zeros_like.default, _aten.empty_like.default, _aten.empty.memory_format), 0),
@@ -165,6 +173,8 @@ _EACH = {
     _aten.neg.default: "-{}",
     _aten.abs.default: "magnitude({})",
     _aten.sqrt.default: "root({})",
+    _aten.reciprocal.default: "inverse({})",
+    _aten.rsqrt.default: "inverse(root({}))",
     _aten.atan.default: "arctangent({})",
     _aten.cos.default: "cosine({})",
     _aten.sin.default: "sine({})",
@@ -194,157 +204,83 @@ _FOLDS = {
     _aten.all.dim: "{} & {}",
     _aten.any.dim: "{} | {}",
 }
-_Operation = Callable[..., Any]
-_OPERATIONS: dict[Any, _Operation] = {}
+_OPERATIONS: dict[Any, Callable[..., Array]] = {
+    _aten.div.Tensor: _divide,
+    _aten.where.self: _where,
+    _aten.constant_pad_nd.default: _pad,
+    **{
+        getattr(getattr(_aten, name), kind): _compare(name)
+        for name in ("eq", "ne", "lt", "le", "gt", "ge")
+        for kind in ("Tensor", "Scalar")
+    },
+}
 
 
-def _of(*targets: Any) -> Callable[[_Operation], _Operation]:
-    def register(operation: _Operation) -> _Operation:
-        _OPERATIONS.update(dict.fromkeys(targets, operation))
-        return operation
-
-    return register
+def _mean(x: Tensor, dims: Sequence[int], keep: bool = False) -> Tensor:
+    total = x.sum(dims, keep)
+    return total / (x.numel() // total.numel())
 
 
-def _each(program: Program, like: Tensor, text: str, *operands: Any, alpha: int = 1) -> Array:
-    if alpha != 1:
-        raise NotImplementedError("a factor in a sum of a compiled function")
-    return program.each(text, like.dtype, *(program.array(v, like.dtype) for v in operands))
+def _clamp(x: Tensor, low: float | None = None, high: float | None = None) -> Tensor:
+    x = x if low is None else x.clamp_min(low)
+    return x if high is None else x.clamp_max(high)
 
 
-def _compare(name: str) -> _Operation:
-    def compare(program: Program, like: Tensor, *operands: Any) -> Array:
-        examples = [torch.empty([1] * v.numbers.ndim, dtype=v.dtype) if isinstance(v, Array) else v for v in operands]
-        dtype = torch.result_type(*examples)
-        if dtype == torch.bool:
-            raise NotImplementedError("comparing truths in a compiled function")
-        return program.each(name + "({}, {})", torch.bool, *(program.array(v, dtype) for v in operands))
-
-    return compare
+def _matmul(left: Tensor, right: Tensor) -> Tensor:
+    return (left[..., :, :, None] * right[..., None, :, :]).sum(-2)
 
 
-for _name in ("eq", "ne", "lt", "le", "gt", "ge"):
-    for _kind in ("Tensor", "Scalar"):
-        _OPERATIONS[getattr(getattr(_aten, _name), _kind)] = _compare(_name)
+def _solve(matrix: Tensor, right: Tensor, **_: Any) -> tuple[Tensor, ...]:
+    vector = right.ndim < matrix.ndim
+    x = small_linalg.solve(_first(matrix), _first(right[..., None] if vector else right)).movedim((0, 1), (-2, -1))
+    return x.squeeze(-1) if vector else x, matrix, *_unused(matrix)
 
 
-@_of(_aten.reciprocal.default)
-def _reciprocal(program: Program, like: Tensor, a: Array) -> Array:
-    return _each(program, like, "{} / {}", 1, a)
-
-
-@_of(_aten.div.Tensor)
-def _divide(program: Program, like: Tensor, a: Any, b: Any) -> Array:
-    """By one reciprocal for all that is divided by a number: a division takes as long as a dozen products."""
-    return _each(program, like, "{} * {}", a, _each(program, like, "{} / {}", 1, b))
-
-
-@_of(_aten.rsqrt.default)
-def _inverse_root(program: Program, like: Tensor, a: Array) -> Array:
-    return _reciprocal(program, like, _each(program, like, "root({})", a))
-
-
-@_of(_aten.pow.Tensor_Scalar)
-def _power(program: Program, like: Tensor, a: Array, exponent: float) -> Array:
-    return (
-        _each(program, like, "{} * {}", a, a) if exponent == 2 else _each(program, like, "power({}, {})", a, exponent)
-    )
-
-
-@_of(_aten.sign.default)
-def _sign(program: Program, like: Tensor, a: Array) -> Array:
-    above, below = (
-        program.each(f"{name}({{}}, {{}})", torch.bool, a, program.array(0, a.dtype)) for name in ("gt", "lt")
-    )
-    return _each(program, like, "{} - {}", above, below)
-
-
-@_of(_aten.addcmul.default)
-def _add_product(program: Program, like: Tensor, a: Array, b: Array, c: Array, *, value: float = 1) -> Array:
-    if value not in (1, -1):
-        raise NotImplementedError(f"factor {value} in a compiled function")
-    return _each(program, like, "{} + {}" if value == 1 else "{} - {}", a, _each(program, like, "{} * {}", b, c))
-
-
-@_of(_aten.where.self)
-def _where(program: Program, like: Tensor, condition: Array, a: Any, b: Any) -> Array:
-    a, b = (program.array(v, like.dtype) for v in (a, b))
-    return program.each("select({}, {}, {})", like.dtype, condition, a, b)
-
-
-@_of(_aten.clamp.default)
-def _clamp(program: Program, like: Tensor, a: Array, low: float | None = None, high: float | None = None) -> Array:
-    a = a if low is None else _each(program, like, "most({}, {})", a, low)
-    return a if high is None else _each(program, like, "least({}, {})", a, high)
-
-
-@_of(_aten.isinf.default)
-def _isinf(program: Program, like: Tensor, a: Array) -> Array:
-    size = program.each("magnitude({})", a.dtype, a)
-    return program.each("eq({}, {})", torch.bool, size, program.array(torch.inf, a.dtype))
-
-
-@_of(_aten.mean.dim)
-def _mean(program: Program, like: Tensor, a: Array, dims: Sequence[int], _: bool = False) -> Array:
-    total = program.fold("{} + {}", a, dims, like.shape)
-    return _divide(program, like, total, a.numbers.numel() // total.numbers.numel())
-
-
-@_of(_aten.mm.default, _aten.bmm.default)
-def _matmul(program: Program, like: Tensor, a: Array, b: Array) -> Array:
-    left, right = Array(a.numbers[..., :, :, None], a.dtype), Array(b.numbers[..., None, :, :], b.dtype)
-    return program.fold("{} + {}", _each(program, like, "{} * {}", left, right), (-2,), like.shape)
-
-
-@_of(_aten.constant_pad_nd.default)
-def _pad(program: Program, like: Tensor, a: Array, widths: Sequence[int], value: float = 0) -> Array:
-    return Array(_aten.constant_pad_nd(a.numbers, widths, program.constant(value, a.dtype)), a.dtype)
-
-
-def _solve(a: Tensor, b: Tensor, **_: Any) -> tuple[Tensor, ...]:
-    vector = b.ndim < a.ndim
-    x = small_linalg.solve(_first(a), _first(b[..., None] if vector else b)).movedim((0, 1), (-2, -1))
-    return x.squeeze(-1) if vector else x, a, *_unused(a)
-
-
-def _inverse(a: Tensor, **_: Any) -> tuple[Tensor, ...]:
-    inverse, _, _, info = _solve(a, torch.eye(a.shape[-1], dtype=a.dtype).expand_as(a))
+def _inverse(matrix: Tensor, **_: Any) -> tuple[Tensor, ...]:
+    inverse, _, _, info = _solve(matrix, torch.eye(matrix.shape[-1], dtype=matrix.dtype).expand_as(matrix))
     return inverse, info
 
 
-def _det(a: Tensor) -> tuple[Tensor, ...]:
-    return small_linalg.det(_first(a)), a, _unused(a)[0]
+def _det(matrix: Tensor) -> tuple[Tensor, ...]:
+    return small_linalg.det(_first(matrix)), matrix, _unused(matrix)[0]
 
 
-def _unused(a: Tensor) -> tuple[Tensor, Tensor]:
+def _unused(matrix: Tensor) -> tuple[Tensor, Tensor]:
     """LAPACK's pivots and codes."""
-    return a.new_zeros(a.shape[:-1], dtype=torch.int32), a.new_zeros(a.shape[:-2], dtype=torch.int32)
+    pivots = matrix.new_zeros(matrix.shape[:-1], dtype=torch.int32)
+    return pivots, pivots[..., 0]
 
 
-def _eigh(a: Tensor, *_: Any) -> tuple[Tensor, Tensor]:
-    values, vectors = small_linalg.eigh(_first(a))
+def _eigh(matrix: Tensor, *_: Any) -> tuple[Tensor, Tensor]:
+    values, vectors = small_linalg.eigh(_first(matrix))
     return values.movedim(0, -1), vectors.movedim((0, 1), (-2, -1))
 
 
-def _cross(a: Tensor, b: Tensor, *, dim: int = -1) -> Tensor:
-    return small_linalg.cross(a.movedim(dim, 0), b.movedim(dim, 0)).movedim(0, dim)
-
-
-def _diag_embed(a: Tensor) -> Tensor:
-    return torch.where(torch.eye(a.shape[-1]) > 0, a[..., None], 0)
+def _cross(x: Tensor, y: Tensor, *, dim: int = -1) -> Tensor:
+    return small_linalg.cross(x.movedim(dim, 0), y.movedim(dim, 0)).movedim(0, dim)
 
 
 def _first(matrices: Tensor) -> Tensor:
     return matrices.movedim((-2, -1), (0, 1))
 
 
-# what torch has LAPACK do, in the operations above; a singular matrix is no error here
-_DECOMPOSED = {
+# what comes down to the operations above, LAPACK's among it; a singular matrix is no error here
+_DECOMPOSED: dict[Any, Callable[..., Any]] = {
+    _aten.addcmul.default: lambda x, y, z, *, value=1: (
+        x - y * z if value == -1 else x + (y if value == 1 else value * y) * z
+    ),
+    _aten.pow.Tensor_Scalar: lambda x, exponent: x * x if exponent == 2 else x.pow(torch.full_like(x, exponent)),
+    _aten.sign.default: lambda x: (x > 0).to(x.dtype) - (x < 0).to(x.dtype),
+    _aten.isinf.default: lambda x: x.abs() == torch.inf,
+    _aten.clamp.default: _clamp,
+    _aten.mean.dim: _mean,
+    _aten.mm.default: _matmul,
+    _aten.bmm.default: _matmul,
+    _aten.diag_embed.default: lambda x: torch.where(torch.eye(x.shape[-1]) > 0, x[..., None], 0),
+    _aten.linalg_cross.default: _cross,
+    _aten._linalg_det.default: _det,
+    _aten._linalg_eigh.default: _eigh,
     _aten._linalg_solve_ex.default: _solve,
     _aten.linalg_inv_ex.default: _inverse,
-    _aten._linalg_eigh.default: _eigh,
-    _aten._linalg_det.default: _det,
     _aten._linalg_check_errors.default: lambda *_, **__: None,
-    _aten.linalg_cross.default: _cross,
-    _aten.diag_embed.default: _diag_embed,
 }
