@@ -86,34 +86,37 @@ def repeated(function: Callable[..., Any]) -> Callable[..., Any]:
 def mapped(function: Callable[..., Any]) -> Callable[..., Any]:
     """``function`` of small tensors with the problems first, `compiled` where that is possible.
 
-    Arguments are those of `compiled`, but for tensors (N, ...) or (1, ...), as are the results. Where tensors are not
-    on the CPU, gradients are wanted or there is no problem, the call is one of ``function`` itself; so are all calls,
-    after one warning, where there is no C++ compiler or an operation is unknown. LAPACK's errors are none here: the
-    solution of a singular system is not finite.
+    Arguments are those of `compiled`, but for tensors (N, ...) or (1, ...), as are the results. Where no compiler is
+    found, an operation is unknown or tensors are on another device than the CPU, ``function`` itself is called, and a
+    warning says so once; without one where gradients are wanted or N is 0. LAPACK's errors are none here: the solution
+    of a singular system is not finite. Eigenvectors may have other signs.
     """
     last = compiled(_problems_last(function)) if has_compiler() else None
-    refused = None if last else "needs a C++ compiler and found none; install g++ or clang++"
+    refused = "" if last else "needs a C++ compiler and found none; install g++ or clang++"
 
     @wraps(function)
     def call(*args: Any) -> Any:
         nonlocal refused
         tensors = [v for v in tree_leaves(args) if isinstance(v, Tensor)]
         count = max((len(v) for v in tensors), default=0)
-        wanted = torch.is_grad_enabled() and any(v.requires_grad for v in tensors)
-        if count == 0 or wanted or any(v.device.type != "cpu" for v in tensors):
+        if count == 0 or (torch.is_grad_enabled() and any(v.requires_grad for v in tensors)):
             return function(*args)
-        if last is not None and refused is None:
+        elsewhere = next((f"a tensor is on {v.device}" for v in tensors if v.device.type != "cpu"), "")
+        if last is not None and not (refused or elsewhere):
             try:
                 result = last(*tree_map(lambda v: _prepared(v, count) if isinstance(v, Tensor) else v, args))
                 return tree_map(lambda v: v.movedim(-1, 0)[:count], result)
             except (NotImplementedError, ConfigError) as error:
                 refused = str(error).splitlines()[0]
-        if refused:
-            warnings.warn(f"{function.__name__} is not compiled: {refused}", stacklevel=2)
-            refused = ""
+        _say_once(f"{function.__name__} is not compiled: {refused or elsewhere}")
         return function(*args)
 
     return call
+
+
+@cache
+def _say_once(text: str) -> None:
+    warnings.warn(text, stacklevel=3)
 
 
 def _problems_last(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -2,6 +2,7 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <type_traits>
 #ifdef _OPENMP
 #include <omp.h>
 #endif
@@ -53,7 +54,6 @@ template <class S, class T> INLINE void scatter(S* p, int64_t stride, T x) {
 INLINE void scatter(uint8_t* p, int64_t stride, M x) { scatter<uint8_t, M>(p, stride, x & 1); }
 INLINE void store(uint8_t* p, M x) { store(p, __builtin_convertvector(x & 1, B)); }
 
-template <class T, class S> INLINE T to(S x) { return __builtin_convertvector(x, T); }
 template <class T> INLINE T of_mask(M x) { return __builtin_convertvector(x & 1, T); }
 
 #define COMPARE(name, op) \
@@ -61,6 +61,12 @@ template <class T> INLINE T of_mask(M x) { return __builtin_convertvector(x & 1,
     INLINE M name(D x, D y) { return __builtin_convertvector(x op y, M); } \
     INLINE M name(J x, J y) { return __builtin_convertvector(x op y, M); }
 COMPARE(eq, ==) COMPARE(ne, !=) COMPARE(lt, <) COMPARE(le, <=) COMPARE(gt, >) COMPARE(ge, >=)
+
+template <class T, class S> INLINE T to(S x) {
+    if constexpr (std::is_same_v<S, M>) return __builtin_convertvector(x & 1, T);
+    else if constexpr (std::is_same_v<T, M>) return ne(x, S{});
+    else return __builtin_convertvector(x, T);
+}
 
 INLINE F select(M m, F x, F y) { return m ? x : y; }
 INLINE M select(M m, M x, M y) { return m ? x : y; }

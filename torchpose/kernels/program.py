@@ -73,9 +73,8 @@ class Program:
         tensor = len(self._tensors)
         self._tensors.append(layout)
         step = f"strides[{self._strides(tensor) + len(layout.shape)}]"
-        read = (
-            "all(*{})" if layout.shared else f"gather({{0}} + b * {step}, {step})" if layout.strided else "load({} + b)"
-        )
+        read = f"gather({{0}} + b * {step}, {step})" if layout.strided else "load({} + b)"
+        read = "all(*{})" if layout.shared else read
         numbers = []
         for index in product(*map(range, layout.shape)):
             text = read.format(_pointer(tensor, index))
@@ -121,10 +120,7 @@ class Program:
             return Array(torch.tensor(self.constant(value, dtype)), dtype)
         if value.dtype == dtype:
             return value
-        convert = f"of_mask<{TYPES[dtype][0]}>({{}})" if value.dtype == torch.bool else f"to<{TYPES[dtype][0]}>({{}})"
-        if dtype == torch.bool:
-            return self.each("ne({}, {})", dtype, value, self.array(0, value.dtype))
-        return self.each(convert, dtype, value)
+        return self.each(f"to<{TYPES[dtype][0]}>({{}})", dtype, value)
 
     def each(self, text: str, dtype: torch.dtype, *operands: Array) -> Array:
         """An operation on every element; operands broadcast against each other."""

@@ -112,8 +112,8 @@ class _Translator(Interpreter):
 def _move(program: Program, like: Any, move: Callable[..., Any], args: Any, kwargs: Any) -> Any:
     """An operation that puts elements elsewhere, done to their numbers."""
     dtype = (like if isinstance(like, Tensor) else like[0]).dtype
-    args, kwargs = tree_map(lambda v: program.array(v, dtype).numbers if isinstance(v, Array) else v, (args, kwargs))
-    return tree_map(lambda numbers: Array(numbers, dtype), move(*args, **kwargs))
+    moved = tree_map(lambda v: program.array(v, dtype).numbers if isinstance(v, Array) else v, (args, kwargs))
+    return tree_map(lambda numbers: Array(numbers, dtype), move(*moved[0], **moved[1]))
 
 
 def _each(program: Program, like: Tensor, text: str, *operands: Any, alpha: int = 1) -> Array:
@@ -217,7 +217,7 @@ _OPERATIONS: dict[Any, Callable[..., Array]] = {
 
 
 def _mean(x: Tensor, dims: Sequence[int], keep: bool = False) -> Tensor:
-    total = x.sum(dims, keep)
+    total = x.sum(list(dims), keep)
     return total / (x.numel() // total.numel())
 
 
@@ -237,8 +237,8 @@ def _solve(matrix: Tensor, right: Tensor, **_: Any) -> tuple[Tensor, ...]:
 
 
 def _inverse(matrix: Tensor, **_: Any) -> tuple[Tensor, ...]:
-    inverse, _, _, info = _solve(matrix, torch.eye(matrix.shape[-1], dtype=matrix.dtype).expand_as(matrix))
-    return inverse, info
+    solved = _solve(matrix, torch.eye(matrix.shape[-1], dtype=matrix.dtype).expand_as(matrix))
+    return solved[0], solved[3]
 
 
 def _det(matrix: Tensor) -> tuple[Tensor, ...]:

@@ -158,7 +158,7 @@ def ray_frame(xy: Tensor) -> Tensor:
 
 
 def translation(r: Tensor, points: Tensor, xy: Tensor, weight: Tensor | None, center: Tensor) -> Tensor:
-    """Linear least-squares t (3, S, B) of R (3, 3, S, B) with the centroid (3, B): minimises sum |(x, y) Z - (X, Y)|^2."""
+    """Translations t (3, S, B) of R (3, 3, S, B) of least |(x, y) Z - (X, Y)|^2, summed; ``center`` is the centroid."""
     offset = points - center[:, None]
     mean = weighted_mean(xy, weight)  # (2, B)
     xy_offset = xy - mean[:, None]

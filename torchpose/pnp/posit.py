@@ -54,15 +54,14 @@ def posit(object_points: Tensor, image_points: Tensor, mask: Tensor | None = Non
     turned = torch.stack([x, y]) / z
 
     # one more dimension for branches
-    each = [None if v is None else v.unsqueeze(-2) for v in (local, basis, turned, weight)]
-    model, basis_of, image, share = each
-    assert model is not None and basis_of is not None and image is not None
-    r, t = _linear_poses(basis_of, image, share, flat)
+    local, basis, image = (v.unsqueeze(-2) for v in (local, basis, turned))
+    share = None if weight is None else weight.unsqueeze(-2)
+    r, t = _linear_poses(basis, image, share, flat)
     r, t = r[..., 0, :], t[..., 0, :]  # (3, 3, 2, B), (3, 2, B): both poses of scaled orthography
     for _ in range(_ITERATIONS):
-        depth = 1 + (r[2, :, None] * model).sum(0) / t[2]  # (N, S, B), over that of the centroid
-        r, t = _linear_poses(basis_of, image * depth, share, flat)  # two descendants a branch
-        error = torch.stack([_error(r[:, :, k], t[:, k], model, image, share) for k in (0, 1)])
+        depth = 1 + (r[2, :, None] * local).sum(0) / t[2]  # (N, S, B), over that of the centroid
+        r, t = _linear_poses(basis, image * depth, share, flat)  # two descendants a branch
+        error = torch.stack([_error(r[:, :, k], t[:, k], local, image, share) for k in (0, 1)])
         first = error[0] <= error[1]
         r, t = torch.where(first, r[:, :, 0], r[:, :, 1]), torch.where(first, t[:, 0], t[:, 1])
     second = flat | (torch.arange(2, device=xy.device) == 0)[:, None]
