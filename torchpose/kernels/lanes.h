@@ -54,8 +54,6 @@ template <class S, class T> INLINE void scatter(S* p, int64_t stride, T x) {
 INLINE void scatter(uint8_t* p, int64_t stride, M x) { scatter<uint8_t, M>(p, stride, x & 1); }
 INLINE void store(uint8_t* p, M x) { store(p, __builtin_convertvector(x & 1, B)); }
 
-template <class T> INLINE T of_mask(M x) { return __builtin_convertvector(x & 1, T); }
-
 #define COMPARE(name, op) \
     INLINE M name(F x, F y) { return x op y; } \
     INLINE M name(D x, D y) { return __builtin_convertvector(x op y, M); } \
@@ -101,3 +99,23 @@ template <class S> INLINE S modulus(S x, S y) {
     return rest != 0 && (rest < 0) != (y < 0) ? rest + y : rest;
 }
 PAIRS(angle, std::atan2) PAIRS(length, std::hypot) PAIRS(power, std::pow) PAIRS(modulo, modulus)
+
+// of the blocks of LANES problems, from the first up to the last: what is made for every function follows this file
+static void solve(void* const* data, const int64_t* strides, int64_t batch, int64_t limit,
+                  int64_t first, int64_t last);
+
+extern "C" void kernel(void* const* data, const int64_t* strides, int64_t batch, int64_t limit,
+                       int threads) {
+    const int64_t blocks = (batch + LANES - 1) / LANES;
+#ifdef _OPENMP
+    if (threads > 1) {
+#pragma omp parallel num_threads(threads)
+        {
+            const int64_t k = omp_get_thread_num(), n = omp_get_num_threads();
+            solve(data, strides, batch, limit, blocks * k / n, blocks * (k + 1) / n);
+        }
+        return;
+    }
+#endif
+    solve(data, strides, batch, limit, 0, blocks);
+}

@@ -234,20 +234,4 @@ const int64_t b = block * LANES < batch - LANES ? block * LANES : batch - LANES;
 {work}
 }}
 }}
-
-extern "C" void kernel(void* const* data, const int64_t* strides, int64_t batch, int64_t limit,
-                       int threads) {{
-    const int64_t blocks = (batch + LANES - 1) / LANES;
-#ifdef _OPENMP
-    if (threads > 1) {{
-#pragma omp parallel num_threads(threads)
-        {{
-            const int64_t k = omp_get_thread_num(), n = omp_get_num_threads();
-            solve(data, strides, batch, limit, blocks * k / n, blocks * (k + 1) / n);
-        }}
-        return;
-    }}
-#endif
-    solve(data, strides, batch, limit, 0, blocks);
-}}
 """
