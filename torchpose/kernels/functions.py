@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.utils._pytree import TreeSpec, tree_leaves, tree_map, tree_unflatten
+from torch.utils._pytree import TreeSpec, tree_map, tree_unflatten
 
 from torchpose.errors import ConfigError
 from torchpose.kernels.build import Kernel, build, find_compiler, has_compiler
@@ -86,10 +86,11 @@ def repeated(function: Callable[..., Any]) -> Callable[..., Any]:
 def mapped(function: Callable[..., Any]) -> Callable[..., Any]:
     """``function`` of small tensors with the problems first, `compiled` where that is possible.
 
-    Arguments are those of `compiled`, but for tensors (N, ...) or (1, ...), as are the results. Where no compiler is
-    found, an operation is unknown or tensors are on another device than the CPU, ``function`` itself is called, and a
-    warning says so once; without one where gradients are wanted or N is 0. LAPACK's errors are none here: the solution
-    of a singular system is not finite. Eigenvectors may have other signs.
+    Arguments are those of `compiled`, but for tensors (N, ...) or (1, ...) and no tuples; results are tensors (N, ...),
+    one or nested tuples of them. Where there is no compiler, an operation is unknown or a tensor is on another device
+    than the CPU, ``function`` itself is called, and a warning says so once; without one where gradients are wanted or N
+    is 0. LAPACK's errors are none here: the solution of a singular system is not finite. Eigenvectors may have other
+    signs.
     """
     last = compiled(_problems_last(function)) if has_compiler() else None
     refused = "" if last else "needs a C++ compiler and found none; install g++ or clang++"
@@ -97,15 +98,15 @@ def mapped(function: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(function)
     def call(*args: Any) -> Any:
         nonlocal refused
-        tensors = [v for v in tree_leaves(args) if isinstance(v, Tensor)]
+        tensors = [v for v in args if isinstance(v, Tensor)]
         count = max((len(v) for v in tensors), default=0)
         if count == 0 or (torch.is_grad_enabled() and any(v.requires_grad for v in tensors)):
             return function(*args)
         elsewhere = next((f"a tensor is on {v.device}" for v in tensors if v.device.type != "cpu"), "")
         if last is not None and not (refused or elsewhere):
             try:
-                result = last(*tree_map(lambda v: _prepared(v, count) if isinstance(v, Tensor) else v, args))
-                return tree_map(lambda v: v.movedim(-1, 0)[:count], result)
+                result = last(*(_prepared(v, count) if isinstance(v, Tensor) else v for v in args))
+                return _problems_first(result, count)
             except (NotImplementedError, ConfigError) as error:
                 refused = str(error).splitlines()[0]
         _say_once(f"{function.__name__} is not compiled: {refused or elsewhere}")
@@ -122,10 +123,16 @@ def _say_once(text: str) -> None:
 def _problems_last(function: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(function)
     def last(*args: Any) -> Any:
-        first = tree_map(lambda v: v.movedim(-1, 0) if isinstance(v, Tensor) and v.ndim else v, args)
+        first = (v.movedim(-1, 0) if isinstance(v, Tensor) and v.ndim else v for v in args)
         return tree_map(lambda v: v.movedim(0, -1), function(*first))
 
     return last
+
+
+def _problems_first(result: Any, count: int) -> Any:
+    if isinstance(result, Tensor):
+        return result.movedim(-1, 0)[:count]
+    return tree_map(lambda v: v.movedim(-1, 0)[:count], result)
 
 
 def _prepared(value: Tensor, count: int) -> Tensor:

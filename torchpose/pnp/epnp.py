@@ -114,12 +114,12 @@ def _least_squares(columns: Tensor, rhs: Tensor) -> Tensor:
     return solve_spd(damped, (columns * rhs).sum(1)[:, None])[0].squeeze(1)
 
 
-def _gauss_newton(beta: Tensor, d: Tensor, rho: Tensor) -> Tensor:
-    """Factors (K, B) that make the distances |sum_k beta_k d_k|^2 equal to rho (P, B), for d (K, P, 3, B)."""
+def _gauss_newton(beta: Tensor, apart: Tensor, rho: Tensor) -> Tensor:
+    """Factors (K, B) that make the distances |sum_k beta_k apart_k|^2 equal to rho (P, B), for apart (K, P, 3, B)."""
     for _ in range(_STEPS):
-        difference = (beta[:, None, None] * d).sum(0)  # (P, 3, B)
+        difference = (beta[:, None, None] * apart).sum(0)  # (P, 3, B)
         residual = rho - difference.square().sum(1)
-        step = _least_squares(2 * (d * difference).sum(2), residual)
-        better = (rho - ((beta + step)[:, None, None] * d).sum(0).square().sum(1)).square().sum(0)
+        step = _least_squares(2 * (apart * difference).sum(2), residual)
+        better = (rho - ((beta + step)[:, None, None] * apart).sum(0).square().sum(1)).square().sum(0)
         beta = torch.where(better < residual.square().sum(0), beta + step, beta)
     return beta

@@ -124,11 +124,11 @@ def robust(square: Tensor, huber: float) -> tuple[Tensor, Tensor]:
     return torch.where(outside, huber * (2 * length - huber), square), torch.where(outside, huber / length, 1)
 
 
-def product2(a: Tensor, b: Tensor) -> Tensor:
+def product2(left: Tensor, right: Tensor) -> Tensor:
     """Products of matrices (2, 2, N, ...), one of which may be diagonal, (2, N, ...)."""
-    if a.ndim != b.ndim:
-        return (a[:, None] if a.ndim < b.ndim else a) * b
-    return a[:, 0, None] * b[0] + a[:, 1, None] * b[1]
+    if left.ndim != right.ndim:
+        return (left[:, None] if left.ndim < right.ndim else left) * right
+    return left[:, 0, None] * right[0] + left[:, 1, None] * right[1]
 
 
 def differentiate(obs: Observations, pose: Tensor, fine: Observations | None = None) -> Derivatives:

@@ -52,9 +52,9 @@ def widest_triple(points: Tensor, weight: Tensor | None) -> Tensor:
     def far(measure: Tensor) -> Tensor:
         return (measure if weight is None else torch.where(weight > 0, measure, -1.0)).argmax(0)
 
-    def at(k: Tensor) -> Tensor:
-        spread = points.expand(-1, -1, k.shape[-1])
-        return spread.gather(1, k.expand(3, 1, -1))
+    def at(index: Tensor) -> Tensor:
+        spread = points.expand(-1, -1, index.shape[-1])
+        return spread.gather(1, index.expand(3, 1, -1))
 
     count = points.shape[1] if weight is None else weight.sum(0)
     first = far((points - points.sum(1, keepdim=True) / count).square().sum(0))
@@ -76,7 +76,9 @@ def _distances(corners: Tensor, rays: Tensor) -> Tensor:
     m23 = torch.stack([zero, zero, zero, zero, one, -b23, zero, -b23, one]).unflatten(0, (3, 3))
     d1 = m12 * squares[2] - m23 * squares[0]
     d2 = m13 * squares[2] - m23 * squares[1]
-    gamma = _cubic_root(det(d2), _mixed(d2, d1), _mixed(d1, d2), det(d1))
+    # det(d1 + gamma d2): its coefficients are traces of adj(a) b
+    mixed = [(cofactors3(a) * b).sum((0, 1)) for a, b in ((d2, d1), (d1, d2))]
+    gamma = _cubic_root(det(d2), *mixed, det(d1))
     lines = _split(d1 + gamma * d2)  # (3, 2, B)
     other = gamma * d1 - d2
 
@@ -121,14 +123,10 @@ def _distances(corners: Tensor, rays: Tensor) -> Tensor:
     return torch.where(positive & exact, x, torch.nan) * unit.sqrt()
 
 
-def _mixed(a: Tensor, b: Tensor) -> Tensor:
-    """trace(adj(a) b): the coefficient of s in det(a + s b)."""
-    return (cofactors3(a) * b).sum((0, 1))
-
-
-def _cubic_root(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
-    """A real root (B,) of a x^3 + b x^2 + c x + d, by the trigonometric formulas and Newton steps."""
-    scale = torch.where(a.abs() > 1e-14 * (b.abs() + c.abs() + d.abs()), a, torch.full_like(a, 1e-14))
+def _cubic_root(cubic: Tensor, *lower: Tensor) -> Tensor:
+    """A real root x (B,) of a cubic polynomial, from its leading coefficient down, by trigonometry and Newton steps."""
+    b, c, d = lower
+    scale = torch.where(cubic.abs() > 1e-14 * (b.abs() + c.abs() + d.abs()), cubic, 1e-14)
     b, c, d = b / scale, c / scale, d / scale
     shift = b / 3
     p = c / 3 - shift * shift

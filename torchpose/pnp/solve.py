@@ -78,8 +78,7 @@ def solve(
             only their own minima are then found.
         huber: residual, in standard deviations, above which the cost of a point grows linearly.
         max_iterations: of Levenberg-Marquardt, float32 and float64 together about.
-        compile: one C++ loop (`torchpose.kernels`); the first call with another number of points takes seconds. Without
-            effect on other devices than the CPU, and for more than 128 points.
+        compile: one C++ loop (`torchpose.kernels`), made in seconds for each number of points; on the CPU, up to 128.
         raise_on_failure: raise instead of returning codes other than CONVERGED and AMBIGUOUS.
 
     Returns:

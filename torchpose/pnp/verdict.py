@@ -111,8 +111,8 @@ def choose(obs: Observations, found: Found, compile: bool = False) -> Minima:
     options, batch = found.converged.shape
     chi2, order = found.cost.nan_to_num(nan=torch.inf, posinf=torch.inf).sort(0)
 
-    def pick(k: int) -> Found:
-        return Found(*(v.gather(-2, order[k].expand(*v.shape[:-2], 1, batch)).squeeze(-2) for v in found))
+    def pick(rank: int) -> Found:
+        return Found(*(v.gather(-2, order[rank].expand(*v.shape[:-2], 1, batch)).squeeze(-2) for v in found))
 
     pose, cost, iterations, converged = pick(0)
     normal = (compiled(normal_equations) if compile else normal_equations)(obs, pose)
@@ -131,17 +131,15 @@ def choose(obs: Observations, found: Found, compile: bool = False) -> Minima:
     return Minima(best, other, cost, different, reached)
 
 
-def _coincide(a: Estimate, b: Tensor) -> Tensor:
+def _coincide(best: Estimate, pose: Tensor) -> Tensor:
     """(B,): is a pose (3, 4, B) within a standard deviation of the estimate, by its information?"""
-    back = a.pose[:, :3].transpose(0, 1)
-    relative = matmul3(back, torch.cat([b[:, :3], (b[:, 3] - a.pose[:, 3])[:, None]], 1))
-    axis = torch.stack(
-        [relative[2, 1] - relative[1, 2], relative[0, 2] - relative[2, 0], relative[1, 0] - relative[0, 1]]
-    )
+    back = best.pose[:, :3].transpose(0, 1)
+    relative = matmul3(back, torch.cat([pose[:, :3], (pose[:, 3] - best.pose[:, 3])[:, None]], 1))
+    axis = torch.stack([relative[k - 1, k - 2] - relative[k - 2, k - 1] for k in range(3)])
     trace = relative[0, 0] + relative[1, 1] + relative[2, 2]
     # twice the tangent of half the angle; Cayley's vector, as in the steps of the minimiser
     step = torch.cat([relative[:, 3], 2 * axis / (1 + trace).clamp_min(1e-12)])
-    return distance(a.normal, step) < COINCIDENCE
+    return distance(best.normal, step) < COINCIDENCE
 
 
 def write(problem: Problem, minima: Minima, bad: Bad, table: Table, again: Tensor | None = None) -> None:
@@ -233,10 +231,10 @@ def covariance(best: Estimate, center: Tensor, unit: Tensor, mixed: Tensor | Non
     return (pivots / torch.stack([row[0] for row in rows])).amin(0)
 
 
-def _sum_of_products(a: Sequence[Tensor], b: Sequence[Tensor], out: Tensor) -> None:
+def _sum_of_products(left: Sequence[Tensor], right: Sequence[Tensor], out: Tensor) -> None:
     """Without a tensor for each product."""
-    torch.mul(a[0], b[0], out=out)
-    for x, y in zip(a[1:], b[1:], strict=True):
+    torch.mul(left[0], right[0], out=out)
+    for x, y in zip(left[1:], right[1:], strict=True):
         out.addcmul_(x, y)
 
 
