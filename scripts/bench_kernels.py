@@ -25,9 +25,9 @@ from torch import Tensor
 
 from torchpose import pnp
 from torchpose.geometry import conics, rotations
+from torchpose.geometry.least_squares import solve_scaled
 from torchpose.kernels import mapped
 from torchpose.pose.centers import exact
-from torchpose.refine.photometric.gauss_newton import solve_scaled
 
 SLICE_S = 0.005
 BATCHES = (1, 8, 64, 1024)
@@ -74,7 +74,7 @@ def problems(batch: int) -> dict[str, tuple[Callable[..., Any], Callable[..., An
     upright = torch.eye(3, dtype=torch.float64).expand(batch, 3, 3)
     table: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
         "pose.centers.exact, two circles": (exact, (pair, covariances, radii)),
-        "gauss_newton.solve_scaled, 7 x 7": (solve_scaled, (root @ root.mT, right)),
+        "least_squares.solve_scaled, 7 x 7": (solve_scaled, (root @ root.mT, right)),
         "conics.conic_from_ellipse": (conics.conic_from_ellipse, (ellipses,)),
         "conics.ellipse_from_conic": (conics.ellipse_from_conic, (conics.conic_from_ellipse(ellipses),)),
         "image of a circle": (circles, (MATRIX.expand(batch, 3, 3), r, t, uniform(batch))),
