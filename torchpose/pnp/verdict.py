@@ -135,7 +135,7 @@ def _coincide(best: Estimate, pose: Tensor) -> Tensor:
     """(B,): is a pose (3, 4, B) within a standard deviation of the estimate, by its information?"""
     back = best.pose[:, :3].transpose(0, 1)
     relative = matmul3(back, torch.cat([pose[:, :3], (pose[:, 3] - best.pose[:, 3])[:, None]], 1))
-    axis = torch.stack([relative[k - 1, k - 2] - relative[k - 2, k - 1] for k in range(3)])
+    axis = torch.stack([relative[i, k] - relative[k, i] for i, k in ((2, 1), (0, 2), (1, 0))])
     trace = relative[0, 0] + relative[1, 1] + relative[2, 2]
     # twice the tangent of half the angle; Cayley's vector, as in the steps of the minimiser
     step = torch.cat([relative[:, 3], 2 * axis / (1 + trace).clamp_min(1e-12)])
