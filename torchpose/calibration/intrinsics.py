@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field, replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchpose import pnp
@@ -43,17 +44,20 @@ class Calibration:
 
     Attributes:
         camera: the calibrated camera, with ``camera.covariance`` of fx, fy, cx, cy.
-        covariance: (n, n) of fx, fy, cx, cy (px) and the distortion; ``names`` says which is which.
-        views: those that were used, with the points that were used. bundle: poses and residuals of these.
+        covariance: of fx, fy, cx, cy (px) and the distortion.
+        names: of the intrinsics.
+        views: those that were used, with the points that were used.
+        bundle: poses and residuals of these.
         left_out: points left out because they contradict the others.
-        chi2: sum over all points. degrees: of freedom. Their quotient is the reduced chi-squared.
+        chi2: sum over all points.
+        degrees: of freedom.
         common_sigma_px: standard deviation, px per axis, that had to be added to every point (print, flatness, lens
             model) to make the reduced chi-squared 1; 0 where the covariances of the points explain the residuals.
         warnings: what makes the result doubtful, one sentence each.
     """
 
     camera: Camera
-    covariance: Tensor
+    covariance: Float[Tensor, "n n"]
     names: tuple[str, ...]
     views: Views
     bundle: Bundle
@@ -73,8 +77,8 @@ class Calibration:
         return self.chi2 / self.degrees
 
     @property
-    def pose_covariance(self) -> Tensor:
-        """(N, 6, 6) of the views' poses, the uncertainty of the intrinsics included."""
+    def pose_covariance(self) -> Float[Tensor, "N 6 6"]:
+        """Of the views' poses, the uncertainty of the intrinsics included."""
         gain = self.bundle.gain
         return self.bundle.pose_covariance + gain @ self.covariance @ gain.mT
 
@@ -86,8 +90,8 @@ def start_cameras(width: int, height: int, lens: str) -> list[Camera]:
         ConfigError: an unknown lens model.
     """
     model, names = _lens(lens)
-    matrices = [[[f * width, 0, (width - 1) / 2], [0, f * width, (height - 1) / 2], [0, 0, 1]] for f in _START_FOCALS]
-    return [Camera(width, height, torch.tensor(m).double(), torch.zeros(len(names)).double(), model) for m in matrices]
+    ideal = [Camera.pinhole(width, height, focal * width) for focal in _START_FOCALS]
+    return [replace(camera, model=model, distortion=camera.matrix.new_zeros(len(names))) for camera in ideal]
 
 
 def _lens(name: str) -> tuple[Model, tuple[str, ...]]:
@@ -104,8 +108,8 @@ def with_lens(camera: Camera, lens: str) -> Camera:
     """
     model, names = _lens(lens)
     old = camera.distortion if camera.model == model else camera.distortion[:0]
-    distortion = torch.nn.functional.pad(old, (0, max(0, len(names) - len(old))))[: len(names)]
-    return replace(camera, model=model, distortion=distortion.double(), matrix=camera.matrix.double(), covariance=None)
+    distortion = torch.nn.functional.pad(old, (0, len(names) - len(old)))
+    return replace(camera, model=model, distortion=distortion, covariance=None).to(torch.float64)
 
 
 def calibrate_intrinsics(views: Views, starts: list[Camera], *, lens: str = "brown5") -> Calibration:
@@ -129,15 +133,12 @@ def calibrate_intrinsics(views: Views, starts: list[Camera], *, lens: str = "bro
     names = ("fx", "fy", "cx", "cy", *coefficients)
     views = views.of_views(views.counts >= MIN_POINTS)
     _check_count(views, len(names))
-    best = min(
-        (one for start in starts for one in [_first_fit(views, with_lens(start, lens))] if one is not None),
-        key=lambda one: float(one[0].chi2.sum()),
-        default=None,
-    )
+    fits = [_first_fit(views, with_lens(start, lens).to(views.pixels)) for start in starts]
+    best = min(filter(None, fits), key=lambda one: float(one[1].chi2.sum()), default=None)
     if best is None:
         raise ConfigError("INPUT: no pose explains the views; give --camera to start from and check the target")
-    before = len(best[1].view)
-    views, bundle, common = _weigh(best[1], best[0], len(names))
+    before = len(best[0].view)
+    views, bundle, common = _weigh(*best, len(names))
     if not bundle.converged:
         raise ConfigError("INPUT: calibration did not converge; use a simpler --model or more varied views")
     covariance = _covariance(bundle, names)
@@ -162,11 +163,10 @@ def locate_views(views: Views, camera: Camera) -> tuple[Views, Bundle]:
         ConfigError: no view has a pose.
     """
     views = views.of_views(views.counts >= MIN_POINTS)
-    first = _first_fit(views, camera, free=False) if len(views) else None
+    first = _first_fit(views, camera.to(views.pixels), free=False) if len(views) else None
     if first is None:
         raise ConfigError("INPUT: no view has a pose; check --camera, the target and the frames")
-    views, bundle, _ = _weigh(first[1], first[0], 0)
-    return views, bundle
+    return _weigh(*first, 0)[:2]
 
 
 def _weigh(views: Views, bundle: Bundle, unknowns: int) -> tuple[Views, Bundle, float]:
@@ -187,16 +187,17 @@ def _weigh(views: Views, bundle: Bundle, unknowns: int) -> tuple[Views, Bundle, 
     return views, bundle, common
 
 
-def common_sigma(residual: Tensor, covariance: Tensor, degrees: int) -> float:
+def common_sigma(residual: Float[Tensor, "K 2"], covariance: Float[Tensor, "K 2 2"], degrees: int) -> float:
     """Standard deviation s, px per axis, with sum of r^T (C + s^2 I)^-1 r = degrees of freedom; 0 where C suffices.
 
     Args:
-        residual: (K, 2) px. covariance: (K, 2, 2) px^2, zero where unknown. degrees: of freedom.
+        residual: px.
+        covariance: px^2, zero where unknown.
+        degrees: of freedom.
     """
 
-    def excess(s: float) -> float:
-        c = covariance + s * s * torch.eye(2, dtype=covariance.dtype)
-        return float((residual * torch.linalg.solve(c, residual)).sum()) / degrees - 1
+    def excess(sigma: float) -> float:
+        return float((residual * torch.linalg.solve(_widened(covariance, sigma), residual)).sum()) / degrees - 1
 
     high = max(float(residual.square().sum() / degrees) ** 0.5, 1e-9)
     low = 1e-6 * high
@@ -209,34 +210,36 @@ def common_sigma(residual: Tensor, covariance: Tensor, degrees: int) -> float:
     return high
 
 
+def _widened(covariance: Tensor, sigma: float) -> Tensor:
+    return covariance + sigma * sigma * torch.eye(2, dtype=covariance.dtype, device=covariance.device)
+
+
 def _with_common(views: Views, sigma: float) -> Views:
-    eye = torch.eye(2, dtype=torch.float64)
-    return replace(views, covariance=views.covariance + sigma * sigma * eye)
+    return replace(views, covariance=_widened(views.covariance, sigma))
 
 
-def _first_fit(views: Views, start: Camera, *, free: bool = True) -> tuple[Bundle, Views] | None:
+def _first_fit(views: Views, camera: Camera, *, free: bool = True) -> tuple[Views, Bundle] | None:
     """Fit with equal weights from one start: poses, everything, poses anew (the other planar solution), everything."""
-    equal = replace(views, covariance=_START_SIGMA**2 * torch.eye(2, dtype=torch.float64).expand(len(views.view), 2, 2))
-    camera, bundle = start, None
+    bundle = None
     for _ in range(2):
-        points, pixels, mask = equal.padded()
+        points, pixels, mask = views.padded()
         poses = pnp.solve(points, pixels, camera, mask=mask)
         solved = poses.R.isfinite().all(-1).all(-1) & (poses.t[:, 2] > 0)
-        if int(solved.sum()) < len(equal):
-            equal, views = equal.of_views(solved), views.of_views(solved)
-            if len(equal) == 0:
-                return None
+        if not bool(solved.any()):
+            return None
+        views = views.of_views(solved)
+        equal = _with_common(replace(views, covariance=torch.zeros_like(views.covariance)), _START_SIGMA)
         try:
             bundle = adjust(equal, camera, poses.R[solved], poses.t[solved], free=free)
         except (ConfigError, torch.linalg.LinAlgError):
             return None
         camera = bundle.camera
-    return None if bundle is None else (bundle, views)
+    return None if bundle is None else (views, bundle)
 
 
 def _without(views: Views, bundle: Bundle, keep: Tensor) -> tuple[Views, Bundle]:
     """Views and state without some of the points, and without views that have too few left."""
-    rest = views.of_points(keep)
+    rest = views[keep]
     enough = rest.counts >= MIN_POINTS
     return rest.of_views(enough), replace(bundle, R=bundle.R[enough], t=bundle.t[enough])
 
@@ -270,8 +273,8 @@ def _covariance(bundle: Bundle, names: tuple[str, ...]) -> Tensor:
     return 0.5 * (covariance + covariance.T)
 
 
-def tilt_spread_deg(rotation: Tensor) -> float:
-    """Largest angle between the normals of any two views (N, 3, 3), in degrees."""
+def tilt_spread_deg(rotation: Float[Tensor, "N 3 3"]) -> float:
+    """Largest angle between the normals of any two views, in degrees."""
     normal = rotation[:, :, 2]
     return float((normal @ normal.T).clamp(-1, 1).acos().max().rad2deg())
 
