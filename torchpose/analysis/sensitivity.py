@@ -9,20 +9,23 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.geometry import rotations
+from torchpose.geometry.least_squares import scaled_inverse
+from torchpose.geometry.projection import image_by_point
 from torchpose.geometry.rotations import plane_axes
 from torchpose.target import Target
 
 Features = Literal["centers", "rings"]
 MIN_MARKERS = 3
+_COLUMNS = 16  # by pose 6, fx fy cx cy 4, the marker's centre in its axes 3, its radii 2, scale; then distortion
 _POINTS = 24  # on a circle: the sums over it are exact to the perspective's sixth power
-_SINGULAR = 1e-12  # least eigenvalue of the information, scaled to a unit diagonal
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,18 +74,18 @@ class ErrorBudget:
 
     Attributes:
         sources: by the names of the fields of `Uncertainty`, and ``calibration`` for `Camera.covariance`; those that
-            are not zero. Each (B, 6, 6) float64, mm and rad: translation, then rotation w with R_true = exp(w) R, in
+            are not zero. In mm and rad: translation, then rotation w with R_true = exp(w) R, in
             camera axes. NaN where the markers in view do not determine the pose.
-        total: (B, 6, 6), their sum.
-        seen: (B, M) bool, the markers in view.
+        total: their sum.
+        seen: the markers in view.
     """
 
-    sources: dict[str, Tensor]
-    total: Tensor
-    seen: Tensor
+    sources: dict[str, Float[Tensor, "B 6 6"]]
+    total: Float[Tensor, "B 6 6"]
+    seen: Bool[Tensor, "B M"]
 
-    def std(self, source: str | None = None) -> Tensor:
-        """(B, 6) standard deviations, mm and rad, of one source or of all together."""
+    def std(self, source: str | None = None) -> Float[Tensor, "B 6"]:
+        """Standard deviations, mm and rad, of one source or of all together."""
         covariance = self.total if source is None else self.sources[source]
         return covariance.diagonal(dim1=-2, dim2=-1).sqrt()
 
@@ -100,8 +103,8 @@ def edge_noise(noise: float, contrast: float, blur: float) -> float:
 def propagate(
     camera: Camera,
     target: Target,
-    R: Tensor,
-    t: Tensor,
+    R: Float[Tensor, "B 3 3"],
+    t: Float[Tensor, "B 3"],
     uncertainty: Uncertainty,
     *,
     features: Features = "centers",
@@ -109,7 +112,10 @@ def propagate(
     """Covariances that the sources give the estimated poses, to first order, through the full camera model.
 
     Args:
-        R, t: (B, 3, 3), (B, 3) mm, target to camera.
+        camera: as the estimator has it.
+        target: as the estimator has it.
+        R: target to camera.
+        t: target to camera, mm.
         uncertainty: of measurement, camera and print.
         features: what the pose is fitted to. "centers": the compensated marker centres, as `torchpose.pnp.solve`.
             "rings": both edges of every ring, weighted by their length in the image, as the refinements on edges and
@@ -126,50 +132,62 @@ def propagate(
     R, t = R.double(), t.double()
     camera, target = camera.to(R), target.to(R)
     seen = markers_seen(camera, target, R, t)
-    # columns of the Jacobian: pose 6, fx fy cx cy 4, the marker's centre in its axes 3, its radii 2, scale, distortion
-    zero = t.new_zeros(16 + coefficients)
     observe = _center_images if features == "centers" else _edge_images
 
     def image(delta: Tensor) -> Tensor:
         return observe(camera, target, R, t, delta)
 
-    jacobian = torch.func.jacfwd(image)(zero)  # (B, M, N, 2, 16 + n): N points of each marker
+    jacobian = torch.func.jacfwd(image)(t.new_zeros(_COLUMNS + coefficients))  # (B, M, N, 2, 16 + n): N points a marker
     jacobian = torch.where(seen[:, :, None, None, None], jacobian, 0.0)
-    if features == "centers":
-        inverse = _inverse_covariances(uncertainty.image, jacobian)
-        variance = 1.0 if isinstance(uncertainty.image, Tensor) else uncertainty.image**2
-    else:
-        inverse, variance = _edge_weights(camera, target, R, t), float(uncertainty.image) ** 2
+    inverse = _weights(camera, target, R, t, uncertainty.image, features).to(jacobian)
     weighted = jacobian[..., :6].mT @ inverse  # (B, M, N, 6, 2)
-    information = (weighted @ jacobian[..., :6]).sum((1, 2))
-    inverted = _invert(information)
+    inverted, known = scaled_inverse((weighted @ jacobian[..., :6]).sum((1, 2)))
+    inverted = torch.where(known[:, None, None], inverted, torch.nan)
     # (B, M, 6, columns): how an error common to the points of a marker moves the pose
     gain = inverted[:, None] @ (weighted @ jacobian[..., 6:]).sum(2)
+    by_covariance = features == "centers" and isinstance(uncertainty.image, Tensor)
+    variance = 1.0 if by_covariance else float(uncertainty.image) ** 2
+    sources = ({"image": variance * inverted} if variance else {}) | _shares(camera, gain, uncertainty)
+    return ErrorBudget(sources, torch.stack([0 * inverted, *sources.values()]).sum(0), seen)
+
+
+def _weights(camera: Camera, target: Target, R: Tensor, t: Tensor, image: float | Tensor, features: Features) -> Tensor:
+    """Information (B | 1, M, N, 2, 2) of the points at unit noise, or of the covariances ``image`` of centres.
+
+    That of an edge is n n^T ds, n the normal in the image.
+    """
+    if features == "centers":
+        if isinstance(image, Tensor):
+            return torch.linalg.inv(image).reshape(-1, len(target), 1, 2, 2)
+        return torch.eye(2, device=R.device).expand(1, 1, 1, 2, 2)
+    edge = ring_edges(camera, target, R, t, _POINTS)
+    information = edge.normal[..., :, None] * (edge.length[..., None] * edge.normal)[..., None, :]
+    return information.unflatten(1, (len(target), -1))
+
+
+def _shares(camera: Camera, gain: Tensor, uncertainty: Uncertainty) -> dict[str, Tensor]:
+    """Covariance (B, 6, 6) by every source but the image that is not exact, from `propagate`'s gains of markers."""
     whole = gain.sum(1)
-    shares = {
-        "focal_length": _outer(whole[:, :, :2] @ camera.matrix.diagonal()[:2, None]),
-        "principal_point": _outer(whole[:, :, 2:4]),
-        "distortion": _outer(whole[:, :, 10:] * t.new_tensor(uncertainty.distortion or (0.0,) * coefficients)),
-        "print_centers": _outer(gain[..., 4:6]).sum(1),
-        "print_flatness": _outer(gain[..., 6:7]).sum(1),
-        "print_radii": _outer(gain[..., 7:9]).sum(1),
-        "print_scale": _outer(whole[:, :, 9:10]),
+    bent = any(uncertainty.distortion)
+    # what moves with every marker on its own (B, M, 6, ...), and with all of them together (B, 1, 6, ...)
+    columns = {
+        "focal_length": whole[:, None, :, :2] @ camera.matrix.diagonal()[:2, None],
+        "principal_point": whole[:, None, :, 2:4],
+        "distortion": whole[:, None, :, 10:] * whole.new_tensor(uncertainty.distortion if bent else 0.0),
+        "print_centers": gain[..., 4:6],
+        "print_flatness": gain[..., 6:7],
+        "print_radii": gain[..., 7:9],
+        "print_scale": whole[:, None, :, 9:10],
     }
-    sources = {"image": variance * inverted} if variance else {}
-    for name, share in shares.items():
-        size = getattr(uncertainty, name)
-        if name == "distortion":
-            sources |= {name: share} if any(size) else {}
-        elif size:
-            sources[name] = size**2 * share
+    sizes = {name: float(bent if name == "distortion" else getattr(uncertainty, name)) for name in columns}
+    shares = {name: size**2 * (columns[name] @ columns[name].mT).sum(1) for name, size in sizes.items() if size}
     if camera.covariance is not None:
-        sources["calibration"] = whole[:, :, :4] @ camera.covariance @ whole[:, :, :4].mT
-    total = torch.stack([torch.zeros_like(inverted), *sources.values()]).sum(0) + 0 * inverted
-    return ErrorBudget(sources, total, seen)
+        shares["calibration"] = whole[:, :, :4] @ camera.covariance @ whole[:, :, :4].mT
+    return shares
 
 
-def markers_seen(camera: Camera, target: Target, R: Tensor, t: Tensor) -> Tensor:
-    """(B, M) bool: the marker's centre is inside the frame and its printed side faces the camera."""
+def markers_seen(camera: Camera, target: Target, R: Tensor, t: Tensor) -> Bool[Tensor, "B M"]:
+    """Whether the marker's centre is inside the frame and its printed side faces the camera."""
     centers = target.centers @ R.mT + t[:, None]
     pixel = camera.project(centers)
     size = pixel.new_tensor([camera.width - 0.5, camera.height - 0.5])
@@ -181,10 +199,9 @@ def markers_seen(camera: Camera, target: Target, R: Tensor, t: Tensor) -> Tensor
 def _center_images(camera: Camera, target: Target, R: Tensor, t: Tensor, delta: Tensor) -> Tensor:
     """Pixels (B, M, 1, 2) of the compensated centres where pose, camera and print differ by ``delta``."""
     R, t = rotations.exp(delta[3:6]) @ R, t + delta[:3]
-    centers, radii = _print(target, delta)
+    centers, radii = changed_print(target, delta[10:13], delta[13:15], delta[15])
     c = centers @ R.mT + t[:, None]
-    n = target.normals @ R.mT
-    xy = c[..., :2] / c[..., 2:] + radius_shift(c, n, radii, target.radii)
+    xy = c[..., :2] / c[..., 2:] + radius_shift(c, target.normals @ R.mT, radii, target.radii)
     return _pixels(camera, xy, delta)[:, :, None]
 
 
@@ -196,7 +213,10 @@ def radius_shift(centers: Tensor, normals: Tensor, true: Tensor, nominal: Tensor
     from the dual conic). On the normalised plane.
 
     Args:
-        centers, normals: (..., 3) of the circles, camera frame. true, nominal: (..., 2) outer and inner radius.
+        centers: (..., 3) of the circles, camera frame.
+        normals: (..., 3) of the circles, camera frame.
+        true: (..., 2) outer and inner radius.
+        nominal: (..., 2) the same, as told.
     """
     nz, cz = normals[..., 2:], centers[..., 2:]
 
@@ -215,67 +235,62 @@ def radius_shift(centers: Tensor, normals: Tensor, true: Tensor, nominal: Tensor
 def _edge_images(camera: Camera, target: Target, R: Tensor, t: Tensor, delta: Tensor) -> Tensor:
     """Pixels (B, M, 2 `_POINTS`, 2) of points on both circles of every ring."""
     R, t = rotations.exp(delta[3:6]) @ R, t + delta[:3]
-    centers, radii = _print(target, delta)
-    points = centers[:, None] + _circle(target, radii)
-    return _pixels(camera, _normalised(points, R, t), delta)
-
-
-def _edge_weights(camera: Camera, target: Target, R: Tensor, t: Tensor) -> Tensor:
-    """Information (B, M, 2 `_POINTS`, 2, 2) of the edges at unit noise: n n^T ds, n the normal in the image."""
-
-    def image(turn: Tensor) -> Tensor:
-        points = target.centers[:, None] + _circle(target, target.radii, turn)
-        return camera.distort(_normalised(points, R, t))
-
-    tangent = torch.func.jacfwd(image)(t.new_zeros(()))  # px per rad
-    speed = tangent.norm(dim=-1, keepdim=True)
-    normal = torch.stack([-tangent[..., 1], tangent[..., 0]], -1) / speed
-    return normal[..., :, None] * normal[..., None, :] * (speed * 2 * torch.pi / _POINTS)[..., None]
-
-
-def _circle(target: Target, radii: Tensor, turn: float | Tensor = 0.0) -> Tensor:
-    """Offsets (M, 2 `_POINTS`, 3) mm of points of both circles from their centre."""
-    angle = torch.arange(_POINTS, dtype=radii.dtype, device=radii.device) * (2 * torch.pi / _POINTS) + turn
-    one, two = plane_axes(target.normals)
-    direction = angle.cos()[:, None] * one[:, None] + angle.sin()[:, None] * two[:, None]
-    return (radii[:, :, None, None] * direction[:, None]).flatten(1, 2)
-
-
-def _normalised(points: Tensor, R: Tensor, t: Tensor) -> Tensor:
-    """(B, M, N, 2) of points (M, N, 3) in the target frame."""
+    centers, radii = changed_print(target, delta[10:13], delta[13:15], delta[15])
+    points = centers[:, None] + (radii[..., None, None] * around(target, _POINTS)[0][:, None]).flatten(1, 2)
     c = points @ R[:, None].mT + t[:, None, None]
-    return c[..., :2] / c[..., 2:]
+    return _pixels(camera, c[..., :2] / c[..., 2:], delta)
 
 
-def _print(target: Target, delta: Tensor) -> tuple[Tensor, Tensor]:
-    """Centres (M, 3) and radii (M, 2) of a print that differs from the target by ``delta``."""
-    one, two = plane_axes(target.normals)
-    offset = delta[10] * one + delta[11] * two + delta[12] * target.normals
-    return target.centers * (1 + delta[15]) + offset, target.radii * (1 + delta[15]) + delta[13:15]
+class RingEdges(NamedTuple):
+    """Points on both circles of every ring (P = M * 2 * count) and the bits of edge around them.
+
+    Place about the target's origin in camera axes and depth, mm; derivatives of the image by the place; normal and
+    length of the bit, px.
+    """
+
+    arm: Float[Tensor, "B P 3"]
+    depth: Float[Tensor, "B P"]
+    by_point: Float[Tensor, "B P 2 3"]
+    normal: Float[Tensor, "B P 2"]
+    length: Float[Tensor, "B P"]
+
+
+def ring_edges(camera: Camera, target: Target, R: Tensor, t: Tensor, count: int) -> RingEdges:
+    """The edges of a target's rings at poses (B, 3, 3), (B, 3) mm, ``count`` points on every circle."""
+    radii, (out, ahead) = target.radii[..., None, None], around(target, count)
+    arm = (target.centers[:, None, None] + radii * out[:, None]).flatten(0, 2) @ R.mT
+    along = (radii * ahead[:, None]).flatten(0, 2) @ R.mT * (2 * math.pi / count)
+    point = arm + t[:, None]
+    depth, xy = point[..., 2], point[..., :2] / point[..., 2:]
+    by_point = camera.J_distort(xy) @ image_by_point(xy, depth)
+    x, y = (by_point @ along[..., None])[..., 0].unbind(-1)
+    length = torch.hypot(x, y)
+    return RingEdges(arm, depth, by_point, torch.stack([y, -x], -1) / length[..., None], length)
+
+
+def around(target: Target, count: int) -> tuple[Float[Tensor, "M count 3"], Float[Tensor, "M count 3"]]:
+    """Unit vectors around each ring in its plane, and those a quarter turn ahead of them."""
+    angle = torch.arange(count, dtype=target.radii.dtype, device=target.radii.device)[:, None] * (2 * math.pi / count)
+    one, two = (axis[:, None] for axis in plane_axes(target.normals))
+    return angle.cos() * one + angle.sin() * two, angle.cos() * two - angle.sin() * one
+
+
+def changed_print(target: Target, offset: Tensor, radii: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
+    """Centres (..., M, 3) and radii (..., M, 2) of a print that is off.
+
+    Args:
+        target: as it should be.
+        offset: (..., 3) mm of the centres, two directions in the plane and along the normal.
+        radii: (..., 2) mm, what they are larger by.
+        scale: relative, what the whole is larger by.
+    """
+    axes = torch.stack([*plane_axes(target.normals), target.normals], 1)
+    moved = (offset[..., None, :] @ axes).squeeze(-2)
+    return target.centers * (1 + scale) + moved, target.radii * (1 + scale) + radii
 
 
 def _pixels(camera: Camera, xy: Tensor, delta: Tensor) -> Tensor:
     """Pixels of normalised points (..., 2) with a camera that differs by ``delta``."""
-    bent = replace(camera, distortion=camera.distortion + delta[16:], covariance=None)
+    bent = replace(camera, distortion=camera.distortion + delta[_COLUMNS:], covariance=None)
     focal, center = camera.matrix.diagonal()[:2], camera.matrix[:2, 2]
     return (bent.distort(xy) - center) * (1 + delta[6:8] / focal) + center + delta[8:10]
-
-
-def _inverse_covariances(image: float | Tensor, jacobian: Tensor) -> Tensor:
-    """Weights (B | 1, M, 1, 2, 2) of the centres; the identity where all are alike."""
-    if not isinstance(image, Tensor):
-        return torch.eye(2).to(jacobian)
-    return torch.linalg.inv(image.to(jacobian)).reshape(-1, jacobian.shape[1], 1, 2, 2)
-
-
-def _outer(columns: Tensor) -> Tensor:
-    return columns @ columns.mT
-
-
-def _invert(information: Tensor) -> Tensor:
-    """Inverse of positive semidefinite (B, 6, 6), whatever the units; NaN where it is singular."""
-    scale = information.diagonal(dim1=-2, dim2=-1).clamp_min(torch.finfo(information.dtype).tiny).rsqrt()
-    values, vectors = torch.linalg.eigh(information * scale[:, :, None] * scale[:, None])
-    values = torch.where(values[:, :1] > _SINGULAR, values, torch.nan)
-    vectors = scale[:, :, None] * vectors
-    return (vectors / values[:, None]) @ vectors.mT

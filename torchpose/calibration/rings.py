@@ -47,7 +47,7 @@ def find_rings(names: Sequence[str], frames: Tensor, cameras: Sequence[Camera], 
         center, covariance = common_center(rings.outer[at], rings.inner[at], target.radii[marker])
         # ellipses are in the pixels of the first camera without its distortion
         pixels, covariance = raw_centers(cameras[0], center, covariance)
-        every.append(Views(tuple(names), view, target.ids[marker], target.centers[marker], pixels, covariance))
+        every.append(Views(view, target.ids[marker], target.centers[marker], pixels, covariance, tuple(names)))
     return every
 
 
@@ -88,4 +88,4 @@ def measure_centers(names: Sequence[str], frames: Tensor, camera: Camera, target
     covariance = jacobian @ refined.covariance[:, :3, :3] @ jacobian.mT
     pixels = camera.distort(xy)
     good = refined.good & (refined.kept > _LEAST_KEPT) & pixels.isfinite().all(-1)
-    return Views(tuple(names), found.frame, found.marker, points, pixels, covariance)[good]
+    return Views(found.frame, found.marker, points, pixels, covariance, tuple(names))[good]

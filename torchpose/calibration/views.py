@@ -20,20 +20,23 @@ class Views(Rows):
     """K points seen in N views of one camera. Indexing selects points, `len` is the number of views.
 
     Attributes:
-        names: of the N views (of the frames).
         view: index of the view.
         point: id of the marker, or number of the board's corner.
         points: in the frame of the target, mm.
         pixels: raw (distorted) px.
         covariance: px^2; zero where it is not known, see `torchpose.calibration.intrinsics.calibrate_intrinsics`.
+        names: of the N views (of the frames).
     """
 
-    names: tuple[str, ...] = shared()
     view: Int[Tensor, " K"]
     point: Int[Tensor, " K"]
     points: Float[Tensor, "K 3"]
     pixels: Float[Tensor, "K 2"]
     covariance: Float[Tensor, "K 2 2"]
+    names: tuple[str, ...] = shared()
+
+    def __len__(self) -> int:
+        return len(self.names)
 
     @property
     def counts(self) -> Int[Tensor, " N"]:

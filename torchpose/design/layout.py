@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.camera import Camera
@@ -38,7 +39,10 @@ class Limits:
     """What the stages need of a ring, for one camera, in px of its semi-minor axis in the worst view.
 
     Attributes:
-        outer, inner: least semi-minor axes. width: least difference of both. scale: px a mm in the worst view.
+        outer: least semi-minor axis.
+        inner: the same of the inner circle.
+        width: least difference of both.
+        scale: px a mm in the worst view.
     """
 
     outer: float
@@ -56,8 +60,8 @@ class Limits:
         """Width in mm of the zone around a ring of ``radius`` mm that stays free."""
         return max(_QUIET * radius, _QUIET_PX / self.scale)
 
-    def ratios(self, count: int, radius: float) -> Tensor | None:
-        """Inner/outer ratios (count,), rising, as far apart as the ring allows; None where it cannot hold so many.
+    def ratios(self, count: int, radius: float) -> Float[Tensor, " count"] | None:
+        """Inner/outer ratios, rising, as far apart as the ring allows; None where it cannot hold so many.
 
         Neighbours differ by at least twice the tolerance of `torchpose.identify.markers`, so that a reading within the
         tolerance of one code is outside that of every other.
@@ -70,7 +74,7 @@ class Limits:
         gap = (high - low) / (count - 1)
         if gap < max(MIN_RATIO_GAP, 2 * ratio_tolerance(semi_minor)):
             return None
-        return torch.linspace(low, high, count, dtype=torch.float64)
+        return torch.linspace(low, high, count, dtype=torch.float64, device="cpu")
 
     def largest_radius(self, count: int, plate: tuple[float, float]) -> float:
         """Largest outer radius in mm that leaves the quiet zones of ``count`` rings on a plate; 0 where none does."""
@@ -86,8 +90,8 @@ class Limits:
             return False
         return bool(torch.pdist(self.places(count, plate, radius)).min() >= 2 * radius + self.quiet(radius))
 
-    def places(self, count: int, plate: tuple[float, float], radius: float) -> Tensor:
-        """Centres (count, 2) in mm: the outermost rings leave just their quiet zone to the plate's rim."""
+    def places(self, count: int, plate: tuple[float, float], radius: float) -> Float[Tensor, "count 2"]:
+        """Centres in mm: the outermost rings leave just their quiet zone to the plate's rim."""
         columns, rows, whole = ARRANGEMENTS[count]
         if plate[1] > plate[0]:
             columns, rows = rows, columns
@@ -98,11 +102,11 @@ class Limits:
             for i in range(columns)
             if whole or i in (0, columns - 1) or k in (0, rows - 1)
         ]
-        return torch.tensor(grid, dtype=torch.float64)
+        return torch.tensor(grid, dtype=torch.float64, device="cpu")
 
 
-def assign_codes(places: Tensor, ratios: Tensor) -> Tensor:
-    """Ratios (M,) by place (M, 2): the order that differs most from itself under every symmetry of the places.
+def assign_codes(places: Float[Tensor, "M 2"], ratios: Float[Tensor, " M"]) -> Float[Tensor, " M"]:
+    """Ratios by place: the order that differs most from itself under every symmetry of the places.
 
     Codes that rise along a row would look alike in a target turned or mirrored: each ring would show its neighbour's.
     The score of an order is the mean difference of codes between a place and its image, for the worst symmetry.
@@ -110,10 +114,10 @@ def assign_codes(places: Tensor, ratios: Tensor) -> Tensor:
     images = _symmetries(places)
     count = len(places)
     if math.factorial(count) <= _SHUFFLES:
-        orders = torch.tensor(list(itertools.permutations(range(count))))
+        orders = torch.tensor(list(itertools.permutations(range(count))), device=ratios.device)
     else:
-        draw = torch.rand(_SHUFFLES, count, generator=torch.Generator().manual_seed(count))
-        orders = draw.argsort(1)
+        draw = torch.rand(_SHUFFLES, count, generator=torch.Generator().manual_seed(count), device="cpu")
+        orders = draw.argsort(1).to(ratios.device)
     by_order = ratios[orders]  # (P, M)
     if not images:
         return by_order[0]
@@ -123,10 +127,10 @@ def assign_codes(places: Tensor, ratios: Tensor) -> Tensor:
 
 def _symmetries(places: Tensor) -> list[Tensor]:
     """Permutations (M,) of the places by the turns and mirror images of the plane that map them onto themselves."""
-    found = []
-    for swap, sx, sy in itertools.product((False, True), (1.0, -1.0), (1.0, -1.0)):
-        image = (places.flip(1) if swap else places) * torch.tensor([sx, sy], dtype=places.dtype)
+    found, still = [], torch.arange(len(places), device=places.device)
+    for swap, *signs in itertools.product((False, True), (1.0, -1.0), (1.0, -1.0)):
+        image = (places.flip(1) if swap else places) * places.new_tensor(signs)
         distance, index = torch.cdist(image, places).min(1)
-        if bool((distance < 1e-6 * places.abs().max()).all()) and bool((index != torch.arange(len(places))).any()):
+        if bool((distance < 1e-6 * places.abs().max()).all()) and not torch.equal(index, still):
             found.append(index)
     return found
