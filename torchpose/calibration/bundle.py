@@ -18,7 +18,6 @@ from torchpose.geometry.least_squares import (
     Pose,
     Unknowns,
     Vector,
-    eliminate,
     minimise,
     scaled_inverse,
 )
@@ -96,6 +95,7 @@ def adjust(
     part = normal.eliminated
     if moved is None or part is None or not bool(normal.cost.isfinite().all()):
         raise ConfigError("INPUT: a view has points behind the camera that calibration starts from; remove --camera")
+    covariance, _ = scaled_inverse(part.information)
     residual = views.pixels - moved.project(_placed(views, pose)[1])
     return Bundle(
         moved,
@@ -104,8 +104,8 @@ def adjust(
         residual,
         (whiten @ residual[..., None]).square().sum((-1, -2)),
         normal.solve().information[0],
-        scaled_inverse(part.information)[0],
-        -eliminate(part.information, part)[0],
+        covariance,
+        -covariance @ part.mixed.mT,
         int(found.code) == Code.CONVERGED,
     )
 

@@ -14,7 +14,7 @@ from torchpose.geometry.projection import image_by_point
 from torchpose.identify import MarkerTable, identify
 from torchpose.pipeline import PoseEstimator
 from torchpose.pose import common_center, raw_centers
-from torchpose.refine import refine_photometric
+from torchpose.refine import Sight, refine_photometric
 from torchpose.results import Status
 from torchpose.rings import measure_rings
 from torchpose.target import Target
@@ -70,19 +70,19 @@ def measure_centers(names: Sequence[str], frames: Tensor, camera: Camera, target
     points, rotation = target.centers[marker], poses.R[found.frame]
     arm = (rotation @ points[..., None])[..., 0]
     held = torch.diag(points.new_tensor([0.0, 0, 0, _HELD, _HELD, _HELD])).expand(len(marker), 6, 6)
-    refined = refine_photometric(
-        _grey(frames),
-        camera,
+    one = torch.ones_like(points[:, :1])
+    sight = Sight(
         found.frame,
-        rotation,
-        arm + poses.t[found.frame],
-        torch.ones_like(marker[:, None], dtype=torch.bool),
+        one > 0,
         torch.stack([found.outer, found.inner], 1)[:, None],
-        torch.zeros_like(points[:, None]),
+        one if target.background == "light" else -one,
+        torch.zeros_like(points)[:, None],
         target.normals[marker][:, None],
         target.radii[marker][:, None],
-        prior=held,
+        _grey(frames),
+        camera,
     )
+    refined = refine_photometric(sight, rotation, arm + poses.t[found.frame], prior=held)
     xy = refined.t[:, :2] / refined.t[:, 2:]
     jacobian = camera.J_distort(xy) @ image_by_point(xy, refined.t[:, 2])
     covariance = jacobian @ refined.covariance[:, :3, :3] @ jacobian.mT

@@ -15,7 +15,7 @@ from torchpose.analysis.sensitivity import around, ring_edges
 from torchpose.camera import Camera
 from torchpose.errors import ConfigError
 from torchpose.geometry.projection import by_pose
-from torchpose.refine import refine_photometric
+from torchpose.refine import Sight, refine_photometric
 from torchpose.sim import Defocus, add_noise, render
 from torchpose.target import Target
 
@@ -120,7 +120,6 @@ def predicted_covariance(
     Arguments and result as of `edge_covariance`; NaN where the refinement fails.
     """
     rings, out = rims(target), []
-    seen = torch.ones(1, len(target), dtype=torch.bool, device=t.device)
     index = torch.arange(len(rings), device=t.device).repeat_interleave(_SAMPLES)
     level = {"psf_sigma": imaging.psf_sigma, "dark": imaging.dark, "light": imaging.light}
     for i in range(len(t)):
@@ -132,17 +131,9 @@ def predicted_covariance(
         crop = replace(camera, width=width, height=height, matrix=matrix)
         pose = R[i : i + 1], t[i : i + 1]
         frame = render(crop, target, *pose, defocus=imaging.lens, **level)
-        refined = refine_photometric(
-            add_noise(frame, imaging.noise, index=index.new_tensor([i])),
-            crop,
-            index.new_zeros(1),
-            *pose,
-            seen,
-            ellipse.fit((pixel - low).flatten(0, 1), index, len(pixel)).view(1, len(target), 2, 5),
-            target.centers[None],
-            target.normals[None],
-            target.radii[None],
-        )
+        noisy = add_noise(frame, imaging.noise, index=index.new_tensor([i]))
+        seen = ellipse.fit((pixel - low).flatten(0, 1), index, len(pixel)).view(1, len(target), 2, 5)
+        refined = refine_photometric(Sight.of(noisy, crop, target, index.new_zeros(1), seen), *pose)
         out.append(torch.where(refined.good[:, None, None], refined.covariance, torch.nan))
     return torch.cat(out) if out else t.new_zeros(0, 6, 6)
 

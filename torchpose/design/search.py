@@ -7,7 +7,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import TypedDict, Unpack
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -102,7 +101,7 @@ def design_target(
     best: tuple[float, Design] | None = None
     counts = list(ARRANGEMENTS) if markers is None else [markers]
     for count in counts:
-        target = _best(camera, volume, need, imaging, _targets(limits, count, plate))
+        target = _best(camera, volume, need, imaging, _targets(limits, count, plate, camera.matrix.device))
         if target is None:
             continue
         name = choice.get("name") or f"rings{count}_{plate[0]:g}x{plate[1]:g}"
@@ -130,22 +129,20 @@ def _best(
     def excess(target: Target) -> float:
         return float(need.excess(deviations(edge_covariance(camera, target, R[some], t[some], imaging))).max())
 
-    moved = (target.to(camera.matrix.device) for target in targets)
-    return min(
-        (one for one in moved if in_view(camera, outlines(one), R, t, FRAME_MARGIN_PX)), key=excess, default=None
-    )
+    seen = (one for one in targets if in_view(camera, outlines(one), R, t, FRAME_MARGIN_PX))
+    return min(seen, key=excess, default=None)
 
 
-def _targets(limits: Limits, count: int, plate: tuple[float, float]) -> Iterator[Target]:
+def _targets(limits: Limits, count: int, plate: tuple[float, float], device: torch.device) -> Iterator[Target]:
     """Targets of ``count`` rings of all radii that fit."""
     least, most = limits.outer / limits.scale, limits.largest_radius(count, plate)
-    for radius in np.linspace(least, most, _RADII).tolist() if most >= least else []:
+    for radius in torch.linspace(least, most, _RADII, device="cpu").tolist() if most >= least else []:
         radius = math.floor(radius / _MICRON) * _MICRON
         ratios = limits.ratios(count, radius)
         if ratios is None:
             continue
-        places = limits.places(count, plate, radius)
-        ordered = assign_codes(places, ratios)
+        places = limits.places(count, plate, radius).to(device)
+        ordered = assign_codes(places, ratios.to(device))
         centers = torch.nn.functional.pad(places, (0, 1))
         yield Target(
             name="rings",
