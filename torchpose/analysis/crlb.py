@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TypedDict, Unpack
 
 import torch
@@ -21,32 +20,15 @@ _CHUNK_POSES = 16  # poses differentiated at a time
 
 
 class Settings(TypedDict, total=False):
-    """The keywords of `pose_crlb`; `Frames` says what they are and what they default to."""
+    """Conditions of B frames, numbers or (B,): Gaussian blur in px (0.7 if not given), grey levels of 0..255 (30, 220)
+    and their white noise (1), bits of the sensor (8), whose step is 255 / (2^bits - 1) grey levels.
+    """
 
     psf_sigma: float | Tensor
     dark: float | Tensor
     light: float | Tensor
     noise_sigma: float | Tensor
     bits: int
-
-
-@dataclass(frozen=True, eq=False)
-class Frames:
-    """Conditions of B frames: numbers, or (B,).
-
-    Attributes:
-        psf_sigma: Gaussian blur, px.
-        dark: grey level of 0..255.
-        light: grey level of 0..255.
-        noise_sigma: white noise, grey levels of 0..255.
-        bits: of the sensor; its step is 255 / (2^bits - 1) grey levels.
-    """
-
-    psf_sigma: float | Tensor = 0.7
-    dark: float | Tensor = 30.0
-    light: float | Tensor = 220.0
-    noise_sigma: float | Tensor = 1.0
-    bits: int = 8
 
 
 @torch.enable_grad()
@@ -65,7 +47,7 @@ def pose_crlb(
         target: as in `torchpose.sim.render`.
         R: (B, 3, 3), target to camera.
         t: (B, 3), target to camera, mm.
-        settings: of `Frames`: ``psf_sigma``, ``dark``, ``light``, ``noise_sigma``, ``bits``.
+        settings: ``psf_sigma``, ``dark``, ``light``, ``noise_sigma``, ``bits``, see `Settings`.
 
     Returns:
         float64, mm and rad: translation, then rotation w with R_true = exp(w) R. NaN where the markers in view do not
@@ -75,10 +57,10 @@ def pose_crlb(
         ConfigError: ``psf_sigma`` is not above 0. FrameError: shapes of R and t disagree.
     """
     R, t = renderer.check_poses(R, t)
-    frames = Frames(**settings)
-    sigma = renderer.check_blur(frames.psf_sigma, t)
-    dark, light, noise = (renderer.per_frame(x, t) for x in (frames.dark, frames.light, frames.noise_sigma))
-    step = GREY_MAX / (2**frames.bits - 1)
+    sigma = renderer.check_blur(settings.get("psf_sigma", 0.7), t)
+    levels = settings.get("dark", 30.0), settings.get("light", 220.0), settings.get("noise_sigma", 1.0)
+    dark, light, noise = (renderer.per_frame(level, t) for level in levels)
+    step = GREY_MAX / (2 ** settings.get("bits", 8) - 1)
     parts = zip(*(x.split(_CHUNK_POSES) for x in (R, t, sigma, light - dark)), strict=True)
     information = torch.cat([_fisher(camera, target, *part) for part in parts]) if len(t) else t.new_zeros(0, 7, 7)
     inverse, known = scaled_inverse(information / (noise.square() + step * step / 12)[:, None, None])

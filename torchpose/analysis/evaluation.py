@@ -24,74 +24,44 @@ NEES_MEAN = 6.0  # of errors with the predicted covariance, which has 6 degrees 
 
 @dataclass(frozen=True, eq=False)
 class Estimates:
-    """Rows of a result table in the order of a truth; NaN where there is no pose.
-
-    Attributes:
-        status: a word each.
-        R: target to camera.
-        t: target to camera, mm.
-        covariance: mm and rad.
-        full_covariance: whether the table held it; otherwise it is the diagonal of the standard deviations.
-    """
+    """Rows of a result table in the order of a truth, mm and rad; NaN where there is no pose."""
 
     status: list[str]
     R: Float[Tensor, "N 3 3"]
     t: Float[Tensor, "N 3"]
     covariance: Float[Tensor, "N 6 6"]
-    full_covariance: bool
+    full_covariance: bool  # whether the table held it; otherwise it is the diagonal of the standard deviations
 
 
 @dataclass(frozen=True)
 class AxisErrors:
-    """Errors along or about one camera axis, in the units of `UNITS`; frames with the status ok.
-
-    Attributes:
-        bias: mean.
-        spread: standard deviation.
-        worst: largest magnitude.
-        predicted: RMS of the standard deviations that the estimates claim.
-        bound: RMS of the Cramer-Rao standard deviations, NaN where the truth has none.
-    """
+    """Errors along or about one camera axis, in the units of `UNITS`; frames with the status ok."""
 
     axis: str
     unit: str
     bias: float
-    spread: float
+    spread: float  # standard deviation
     rms: float
-    worst: float
-    predicted: float
-    bound: float
+    worst: float  # largest magnitude
+    predicted: float  # RMS of the standard deviations that the estimates claim
+    bound: float  # RMS of the Cramer-Rao standard deviations, NaN where the truth has none
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Estimates against their truth.
-
-    Attributes:
-        errors: of all rows.
-        error: in the units of `UNITS`, NaN where the status is not ok.
-        predicted: standard deviations in the same units.
-        bound: the same.
-        axes: one of each.
-        counts: rows by status.
-        nees: mean over the ok rows, 6 where the covariances are right.
-        nees_interval: (low, high), where 95 % of such means lie.
-        center: largest lateral error of the target's origin over the ok rows, um.
-        visible: rows whose target is in view as a whole, where the truth says so.
-        found: ok rows among them.
-    """
+    """Estimates against their truth."""
 
     errors: PoseErrors
-    error: Float[Tensor, "N 6"]
-    predicted: Float[Tensor, "N 6"]
-    bound: Float[Tensor, "N 6"]
+    error: Float[Tensor, "N 6"]  # in the units of `UNITS`, NaN where the status is not ok
+    predicted: Float[Tensor, "N 6"]  # standard deviations in the same units
+    bound: Float[Tensor, "N 6"]  # the same
     axes: list[AxisErrors]
-    counts: Counter[str]
-    nees: float
-    nees_interval: tuple[float, float]
-    center: float
-    visible: int
-    found: int
+    counts: Counter[str]  # rows by status
+    nees: float  # mean over the ok rows, 6 where the covariances are right
+    nees_interval: tuple[float, float]  # where 95 % of such means lie
+    center: float  # largest lateral error of the target's origin over the ok rows, um
+    visible: int  # rows whose target is in view as a whole, where the truth says so
+    found: int  # ok rows among them
 
 
 def evaluate(estimates: Estimates, truth: Truth) -> Evaluation:

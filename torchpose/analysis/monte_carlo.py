@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Required, TypedDict, Unpack, cast
+from typing import Any, NamedTuple, Required, TypedDict, Unpack
 
 import torch
 from jaxtyping import Float
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchpose import pnp
 from torchpose.analysis.errors import Pose, pose_difference
-from torchpose.analysis.sensitivity import Uncertainty, changed_print, markers_seen, radius_shift
+from torchpose.analysis.sensitivity import Uncertainty, marker_axes, markers_seen, radius_shift
 from torchpose.camera import Camera
 from torchpose.pipeline import Method, PoseEstimator
 from torchpose.sim import add_noise, render
@@ -116,15 +116,15 @@ def simulate_frames(
     Raises:
         ConfigError: a drawn print is no valid target any more: its uncertainty is too large for the target's rings.
     """
-    draws, seed = trials.pop("draws"), trials.pop("seed", 0)
-    noise, bits, method = trials.pop("noise", 1.0), trials.pop("bits", 8), trials.pop("method", "photometric")
-    generator = torch.Generator().manual_seed(seed)
-    drawn = _draw(trials.pop("true_camera", camera), target, uncertainty, draws, generator)
+    imaging: dict[str, Any] = {**trials}
+    draws, seed, true = imaging.pop("draws"), imaging.pop("seed", 0), imaging.pop("true_camera", camera)
+    noise, bits, method = imaging.pop("noise", 1.0), imaging.pop("bits", 8), imaging.pop("method", "photometric")
+    drawn = _draw(true, target, uncertainty, draws, torch.Generator().manual_seed(seed))
     estimator = PoseEstimator(replace(camera, covariance=None), target, method=method)
     together = max(1, _FRAMES // len(t))
     errors = []
     for chunk in torch.arange(draws, device="cpu").split(together):
-        frames = [render(*drawn.scene(draw), R, t, **cast(dict[str, Any], trials)) for draw in chunk.tolist()]
+        frames = [render(*drawn.scene(draw), R, t, **imaging) for draw in chunk.tolist()]
         index = int(chunk[0]) * len(t) + torch.arange(len(chunk) * len(t), device=t.device)
         errors.append(_errors(estimator(add_noise(torch.cat(frames), noise, seed, index=index, bits=bits)), R, t))
     return torch.cat(errors)
@@ -168,7 +168,9 @@ def _draw(camera: Camera, target: Target, uncertainty: Uncertainty, draws: int, 
     distortion = camera.distortion + centers.new_tensor(uncertainty.distortion or 0.0) * shift[:, 7:]
     in_plane, along, radius = uncertainty.print_centers, uncertainty.print_flatness, uncertainty.print_radii
     off = normal(len(target), 5) * centers.new_tensor([in_plane, in_plane, along, radius, radius])
-    printed = changed_print(target, off[..., :3], off[..., 3:], uncertainty.print_scale * normal(1, 1))
+    scale = 1 + uncertainty.print_scale * normal(1, 1)
+    moved = (off[..., None, :3] @ marker_axes(target)).squeeze(-2)
+    printed = target.centers * scale + moved, target.radii * scale + off[..., 3:]
     return _Draws(camera, target, focal, center, distortion, *printed)
 
 

@@ -8,7 +8,7 @@ moves the pose by (J^T W J)^-1 J^T W S e to first order. `torchpose.analysis.mon
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Literal, NamedTuple
 
 import torch
@@ -16,15 +16,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.camera import Camera
-from torchpose.geometry import rotations
+from torchpose.camera.derivatives import by_intrinsics
 from torchpose.geometry.least_squares import scaled_inverse
-from torchpose.geometry.projection import image_by_point
+from torchpose.geometry.projection import by_pose, image_by_point
 from torchpose.geometry.rotations import plane_axes
 from torchpose.target import Target
 
 Features = Literal["centers", "rings"]
 MIN_MARKERS = 3
-_COLUMNS = 16  # by pose 6, fx fy cx cy 4, the marker's centre in its axes 3, its radii 2, scale; then distortion
 _POINTS = 24  # on a circle: the sums over it are exact to the perspective's sixth power
 
 
@@ -132,37 +131,53 @@ def propagate(
     R, t = R.double(), t.double()
     camera, target = camera.to(R), target.to(R)
     seen = markers_seen(camera, target, R, t)
-    observe = _center_images if features == "centers" else _edge_images
-
-    def image(delta: Tensor) -> Tensor:
-        return observe(camera, target, R, t, delta)
-
-    jacobian = torch.func.jacfwd(image)(t.new_zeros(_COLUMNS + coefficients))  # (B, M, N, 2, 16 + n): N points a marker
-    jacobian = torch.where(seen[:, :, None, None, None], jacobian, 0.0)
-    inverse = _weights(camera, target, R, t, uncertainty.image, features).to(jacobian)
-    weighted = jacobian[..., :6].mT @ inverse  # (B, M, N, 6, 2)
+    point = _centers(camera, target, R, t) if features == "centers" else ring_edges(camera, target, R, t, _POINTS)
+    image = uncertainty.image
+    information, variance = point.information, 1.0
+    if features == "centers" and isinstance(image, Tensor):
+        information = torch.linalg.inv(image.to(R)).reshape(-1, len(target), 1, 2, 2)
+    else:
+        variance = float(image) ** 2
+    jacobian = torch.where(seen[:, :, None, None, None], _jacobian(camera, target, R, point), 0.0)
+    weighted = jacobian[..., :6].mT @ information  # (B, M, N, 6, 2): N points of each marker
     inverted, known = scaled_inverse((weighted @ jacobian[..., :6]).sum((1, 2)))
     inverted = torch.where(known[:, None, None], inverted, torch.nan)
     # (B, M, 6, columns): how an error common to the points of a marker moves the pose
     gain = inverted[:, None] @ (weighted @ jacobian[..., 6:]).sum(2)
-    by_covariance = features == "centers" and isinstance(uncertainty.image, Tensor)
-    variance = 1.0 if by_covariance else float(uncertainty.image) ** 2
     sources = ({"image": variance * inverted} if variance else {}) | _shares(camera, gain, uncertainty)
     return ErrorBudget(sources, torch.stack([0 * inverted, *sources.values()]).sum(0), seen)
 
 
-def _weights(camera: Camera, target: Target, R: Tensor, t: Tensor, image: float | Tensor, features: Features) -> Tensor:
-    """Information (B | 1, M, N, 2, 2) of the points at unit noise, or of the covariances ``image`` of centres.
+class Points(NamedTuple):
+    """N measured points of each marker.
 
-    That of an edge is n n^T ds, n the normal in the image.
+    Place about the target's origin in camera axes and depth, mm; image on the plane z = 1; derivatives of the pixels by
+    the place and by the marker's radii; information about the pixels at unit noise.
     """
-    if features == "centers":
-        if isinstance(image, Tensor):
-            return torch.linalg.inv(image).reshape(-1, len(target), 1, 2, 2)
-        return torch.eye(2, device=R.device).expand(1, 1, 1, 2, 2)
-    edge = ring_edges(camera, target, R, t, _POINTS)
-    information = edge.normal[..., :, None] * (edge.length[..., None] * edge.normal)[..., None, :]
-    return information.unflatten(1, (len(target), -1))
+
+    arm: Float[Tensor, "B M N 3"]
+    depth: Float[Tensor, "B M N"]
+    xy: Float[Tensor, "B M N 2"]
+    by_point: Float[Tensor, "B M N 2 3"]
+    by_radii: Float[Tensor, "B M N 2 2"]
+    information: Float[Tensor, "*any 2 2"]
+
+
+def _jacobian(camera: Camera, target: Target, R: Tensor, point: Points) -> Tensor:
+    """Derivatives (B, M, N, 2, 16 + n) of the pixels.
+
+    By pose 6, fx fy cx cy, the marker's centre along its axes 3, its radii 2, the scale of the print, distortion n.
+    """
+    camera_columns = by_intrinsics(camera, point.xy)
+    columns = [
+        by_pose(point.by_point, point.arm),
+        camera_columns[..., :4],
+        point.by_point @ (R[:, None] @ marker_axes(target).mT)[:, :, None],
+        point.by_radii,
+        point.by_point @ point.arm[..., None],
+        camera_columns[..., 4:],
+    ]
+    return torch.cat(columns, -1)
 
 
 def _shares(camera: Camera, gain: Tensor, uncertainty: Uncertainty) -> dict[str, Tensor]:
@@ -196,21 +211,23 @@ def markers_seen(camera: Camera, target: Target, R: Tensor, t: Tensor) -> Bool[T
     return enough & (enough.sum(-1, keepdim=True) >= MIN_MARKERS)
 
 
-def _center_images(camera: Camera, target: Target, R: Tensor, t: Tensor, delta: Tensor) -> Tensor:
-    """Pixels (B, M, 1, 2) of the compensated centres where pose, camera and print differ by ``delta``."""
-    R, t = rotations.exp(delta[3:6]) @ R, t + delta[:3]
-    centers, radii = changed_print(target, delta[10:13], delta[13:15], delta[15])
-    c = centers @ R.mT + t[:, None]
-    xy = c[..., :2] / c[..., 2:] + radius_shift(c, target.normals @ R.mT, radii, target.radii)
-    return _pixels(camera, xy, delta)[:, :, None]
+def _centers(camera: Camera, target: Target, R: Tensor, t: Tensor) -> Points:
+    """The compensated centres, one point a marker."""
+    arm, normal = target.centers @ R.mT, target.normals @ R.mT
+    xy, depth, by_point = _seen(camera, arm + t[:, None])
+    # of `radius_shift` by the true radii
+    outer, inner = target.radii.square().unbind(-1)
+    by_factor = torch.stack([inner, -outer], -1) * 2 * target.radii / (outer - inner).square()[:, None]
+    shift = _between_ellipses(arm + t[:, None], normal, target.radii)[..., None] * by_factor[:, None]
+    each = (arm, depth, xy, by_point, camera.J_distort(xy) @ shift)
+    return Points(*(value[:, :, None] for value in each), torch.eye(2, dtype=t.dtype, device=t.device))
 
 
 def radius_shift(centers: Tensor, normals: Tensor, true: Tensor, nominal: Tensor) -> Tensor:
     """Shift (..., 2) of the centre that eq. (7) finds where the circles have other radii than it is told.
 
-    Eq. (7) extrapolates the centres of both ellipses, e_inner + K2 (e_inner - e_outer), with K2 = r2^2 / (r1^2 - r2^2);
-    the circle of radius r has its ellipse's centre at (c_xy c_z + r^2 n_xy n_z) / (c_z^2 - r^2 (1 - n_z^2)) (derived
-    from the dual conic). On the normalised plane.
+    Eq. (7) extrapolates the centres of both ellipses, e_inner + K2 (e_inner - e_outer), with K2 = r2^2 / (r1^2 - r2^2).
+    On the plane z = 1.
 
     Args:
         centers: (..., 3) of the circles, camera frame.
@@ -218,54 +235,50 @@ def radius_shift(centers: Tensor, normals: Tensor, true: Tensor, nominal: Tensor
         true: (..., 2) outer and inner radius.
         nominal: (..., 2) the same, as told.
     """
-    nz, cz = normals[..., 2:], centers[..., 2:]
-
-    def ellipse_center(radius: Tensor) -> Tensor:
-        square = radius.square()[..., None]
-        numerator = centers[..., :2] * cz + square * normals[..., :2] * nz
-        return numerator / (cz.square() - square * (1 - nz.square()))
 
     def factor(radii: Tensor) -> Tensor:
         outer, inner = radii.square().unbind(-1)
         return (inner / (outer - inner))[..., None]
 
-    return (factor(nominal) - factor(true)) * (ellipse_center(true[..., 1]) - ellipse_center(true[..., 0]))
+    return (factor(nominal) - factor(true)) * _between_ellipses(centers, normals, true)
 
 
-def _edge_images(camera: Camera, target: Target, R: Tensor, t: Tensor, delta: Tensor) -> Tensor:
-    """Pixels (B, M, 2 `_POINTS`, 2) of points on both circles of every ring."""
-    R, t = rotations.exp(delta[3:6]) @ R, t + delta[:3]
-    centers, radii = changed_print(target, delta[10:13], delta[13:15], delta[15])
-    points = centers[:, None] + (radii[..., None, None] * around(target, _POINTS)[0][:, None]).flatten(1, 2)
-    c = points @ R[:, None].mT + t[:, None, None]
-    return _pixels(camera, c[..., :2] / c[..., 2:], delta)
+def _between_ellipses(centers: Tensor, normals: Tensor, radii: Tensor) -> Tensor:
+    """Centre of the inner ellipse minus that of the outer one, (..., 2).
 
-
-class RingEdges(NamedTuple):
-    """Points on both circles of every ring (P = M * 2 * count) and the bits of edge around them.
-
-    Place about the target's origin in camera axes and depth, mm; derivatives of the image by the place; normal and
-    length of the bit, px.
+    The circle of radius r has its ellipse's centre at (c_xy c_z + r^2 n_xy n_z) / (c_z^2 - r^2 (1 - n_z^2)) (derived
+    from the dual conic).
     """
+    nz, cz, square = normals[..., None, 2:], centers[..., None, 2:], radii.square()[..., None]
+    ellipse = (centers[..., None, :2] * cz + square * normals[..., None, :2] * nz) / (
+        cz.square() - square * (1 - nz.square())
+    )
+    return ellipse[..., 1, :] - ellipse[..., 0, :]
 
-    arm: Float[Tensor, "B P 3"]
-    depth: Float[Tensor, "B P"]
-    by_point: Float[Tensor, "B P 2 3"]
-    normal: Float[Tensor, "B P 2"]
-    length: Float[Tensor, "B P"]
+
+def ring_edges(camera: Camera, target: Target, R: Tensor, t: Tensor, count: int) -> Points:
+    """Bits of edge, ``count`` on each of both circles of every ring, at poses (B, 3, 3), (B, 3) mm.
+
+    The information about a bit is n n^T ds, n its normal in the image.
+    """
+    (out, ahead), radii = around(target, count), target.radii[..., None, None]
+    turn = R[:, None, None]
+    out, ahead = out[:, None] @ turn.mT, ahead[:, None] @ turn.mT  # (B, M, 1, count, 3)
+    arm = (target.centers @ R.mT)[:, :, None, None] + radii * out
+    xy, depth, by_point = _seen(camera, arm + t[:, None, None, None])
+    step = (by_point @ (radii * ahead * (2 * math.pi / count))[..., None])[..., 0]  # px from bit to bit
+    normal = torch.stack([step[..., 1], -step[..., 0]], -1)
+    information = normal[..., None] * normal[..., None, :] / step.norm(dim=-1)[..., None, None]
+    of_circle = torch.eye(2, dtype=t.dtype, device=t.device)[:, None, None]  # its own radius only
+    by_radii = (by_point @ out[..., None]) * of_circle
+    each = (arm, depth, xy, by_point, by_radii, information)
+    return Points(*(value.flatten(2, 3) for value in each))
 
 
-def ring_edges(camera: Camera, target: Target, R: Tensor, t: Tensor, count: int) -> RingEdges:
-    """The edges of a target's rings at poses (B, 3, 3), (B, 3) mm, ``count`` points on every circle."""
-    radii, (out, ahead) = target.radii[..., None, None], around(target, count)
-    arm = (target.centers[:, None, None] + radii * out[:, None]).flatten(0, 2) @ R.mT
-    along = (radii * ahead[:, None]).flatten(0, 2) @ R.mT * (2 * math.pi / count)
-    point = arm + t[:, None]
+def _seen(camera: Camera, point: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of points (..., 3): image on the plane z = 1, depth, derivatives (..., 2, 3) of the pixels."""
     depth, xy = point[..., 2], point[..., :2] / point[..., 2:]
-    by_point = camera.J_distort(xy) @ image_by_point(xy, depth)
-    x, y = (by_point @ along[..., None])[..., 0].unbind(-1)
-    length = torch.hypot(x, y)
-    return RingEdges(arm, depth, by_point, torch.stack([y, -x], -1) / length[..., None], length)
+    return xy, depth, camera.J_distort(xy) @ image_by_point(xy, depth)
 
 
 def around(target: Target, count: int) -> tuple[Float[Tensor, "M count 3"], Float[Tensor, "M count 3"]]:
@@ -275,22 +288,6 @@ def around(target: Target, count: int) -> tuple[Float[Tensor, "M count 3"], Floa
     return angle.cos() * one + angle.sin() * two, angle.cos() * two - angle.sin() * one
 
 
-def changed_print(target: Target, offset: Tensor, radii: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
-    """Centres (..., M, 3) and radii (..., M, 2) of a print that is off.
-
-    Args:
-        target: as it should be.
-        offset: (..., 3) mm of the centres, two directions in the plane and along the normal.
-        radii: (..., 2) mm, what they are larger by.
-        scale: relative, what the whole is larger by.
-    """
-    axes = torch.stack([*plane_axes(target.normals), target.normals], 1)
-    moved = (offset[..., None, :] @ axes).squeeze(-2)
-    return target.centers * (1 + scale) + moved, target.radii * (1 + scale) + radii
-
-
-def _pixels(camera: Camera, xy: Tensor, delta: Tensor) -> Tensor:
-    """Pixels of normalised points (..., 2) with a camera that differs by ``delta``."""
-    bent = replace(camera, distortion=camera.distortion + delta[_COLUMNS:], covariance=None)
-    focal, center = camera.matrix.diagonal()[:2], camera.matrix[:2, 2]
-    return (bent.distort(xy) - center) * (1 + delta[6:8] / focal) + center + delta[8:10]
+def marker_axes(target: Target) -> Float[Tensor, "M 3 3"]:
+    """Rows: two directions in the plane of each marker and its normal."""
+    return torch.stack([*plane_axes(target.normals), target.normals], 1)

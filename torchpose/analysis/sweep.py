@@ -21,21 +21,16 @@ from torchpose.target import Target
 class Sweep:
     """Errors of a target's pose at D distances on the optical axis; mm and rad, x y z and rotations about x y z.
 
-    Attributes:
-        distance: mm.
-        budget: predicted, by source. Its ``focal_length`` is the size of the effect of an error of exactly that share.
-        errors: of N draws, estimate minus truth. The focal length is wrong by its whole share in every draw.
-        lateral: size of eq. (3) for the distance between neighbouring markers, mm.
-        depth: the same of eq. (2).
-        depth_focal: the same of eq. (5).
+    The focal length is wrong by its whole share in every one of N draws; in the budget, ``focal_length`` is the size of
+    the effect of an error of exactly that share.
     """
 
     distance: Float[Tensor, " D"]
-    budget: ErrorBudget
-    errors: Float[Tensor, "N D 6"]
-    lateral: Float[Tensor, " D"]
-    depth: Float[Tensor, " D"]
-    depth_focal: Float[Tensor, " D"]
+    budget: ErrorBudget  # predicted, by source
+    errors: Float[Tensor, "N D 6"]  # estimate minus truth
+    lateral: Float[Tensor, " D"]  # size of eq. (3) for the distance between neighbouring markers
+    depth: Float[Tensor, " D"]  # the same of eq. (2)
+    depth_focal: Float[Tensor, " D"]  # the same of eq. (5)
 
     @property
     def largest(self) -> Float[Tensor, "D 6"]:

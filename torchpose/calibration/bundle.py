@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchpose.calibration.views import Views
 from torchpose.camera import Camera
+from torchpose.camera.derivatives import by_intrinsics
 from torchpose.errors import ConfigError
 from torchpose.geometry.least_squares import (
     Code,
@@ -132,7 +133,7 @@ def _normal(views: Views, camera: Camera, pose: Pose, whiten: Tensor, free: bool
     possible = (depth > 0).all() & (xy.norm(dim=-1) < camera.fold_radius).all()
     residual = whiten @ (views.pixels - camera.distort(xy))[..., None]
     by_view = whiten @ by_pose(camera.J_distort(xy) @ image_by_point(xy, depth), arm)
-    by_camera = whiten @ (intrinsics_jacobian(camera, xy) if free else xy.new_zeros(len(xy), 2, 0))
+    by_camera = whiten @ (by_intrinsics(camera, xy) if free else xy.new_zeros(len(xy), 2, 0))
 
     def of_views(values: Tensor) -> Tensor:
         return segment_sum(values, views.view, len(views))
@@ -148,29 +149,3 @@ def _normal(views: Views, camera: Camera, pose: Pose, whiten: Tensor, free: bool
             views.view.new_zeros(len(views)),
         ),
     )
-
-
-def intrinsics_jacobian(camera: Camera, xy: Float[Tensor, "K 2"]) -> Float[Tensor, "K 2 n"]:
-    """d(u, v) / d(fx, fy, cx, cy, distortion) at normalised coordinates."""
-    focal, center = camera.matrix.diagonal()[:2], camera.matrix[:2, 2]
-    bent = (camera.distort(xy) - center) / focal
-    eye = torch.eye(2, dtype=xy.dtype, device=xy.device).expand(len(xy), 2, 2)
-    return torch.cat([torch.diag_embed(bent), eye, focal[:, None] * _by_distortion(camera, xy)], -1)
-
-
-def _by_distortion(camera: Camera, xy: Tensor) -> Tensor:
-    """Derivatives (K, 2, n) of the distorted normalised coordinates by the coefficients, in their order."""
-    d, r2 = camera.distortion, xy.square().sum(-1, keepdim=True)
-    if camera.model == "kannala_brandt":
-        r = r2.sqrt().clamp_min(1e-12)
-        odd = torch.atan(r) ** torch.arange(3, 11, 2, device=r.device) / r
-        return xy[:, :, None] * odd[:, None]
-    powers = r2 ** torch.arange(1, 4, device=r2.device)
-    denominator = 1 + powers @ d[5:8] if len(d) == 8 else torch.ones_like(r2[:, 0])
-    radial = xy[:, :, None] * (powers / denominator[:, None])[:, None]
-    cross, (along, down) = 2 * xy.prod(-1), (2 * xy.square() + r2).unbind(-1)
-    tangential = torch.stack([cross, along, down, cross], -1).unflatten(-1, (2, 2))
-    columns = [radial[..., :2], tangential, radial[..., 2:]]
-    if len(d) == 8:
-        columns.append(-radial * ((1 + powers @ d[[0, 1, 4]]) / denominator)[:, None, None])
-    return torch.cat(columns, -1)[..., : len(d)]

@@ -102,10 +102,10 @@ def edge_covariance(camera: Camera, target: Target, R: Tensor, t: Tensor, imagin
         float64, mm and rad, translation first, rotation multiplied from the left.
     """
     edge = ring_edges(camera, target, R, t, _SAMPLES)
-    jacobian = by_pose(edge.normal[..., None, :] @ edge.by_point, edge.arm).squeeze(-2)
+    jacobian = by_pose(edge.by_point, edge.arm)
     blur = (imaging.blur(camera, edge.depth).square() + _PIXEL_VARIANCE).sqrt()
-    weight = edge.length / blur * (imaging.light - imaging.dark) ** 2 / (2 * math.sqrt(math.pi))
-    information = jacobian.mT @ (jacobian * weight[..., None]) / (imaging.noise**2 + _QUANTISATION)
+    weight = (imaging.light - imaging.dark) ** 2 / (2 * math.sqrt(math.pi) * (imaging.noise**2 + _QUANTISATION)) / blur
+    information = (weight[..., None, None] * jacobian.mT @ edge.information @ jacobian).sum((1, 2))
     return torch.linalg.inv(information)
 
 
@@ -121,7 +121,6 @@ def predicted_covariance(
     """
     rings, out = rims(target), []
     index = torch.arange(len(rings), device=t.device).repeat_interleave(_SAMPLES)
-    level = {"psf_sigma": imaging.psf_sigma, "dark": imaging.dark, "light": imaging.light}
     for i in range(len(t)):
         pixel = camera.project(rings @ R[i].T + t[i])  # (2 M, S, 2)
         low = (pixel.flatten(0, 1).amin(0) - _MARGIN_PX).floor()
@@ -130,8 +129,16 @@ def predicted_covariance(
         matrix[:2, 2] -= low
         crop = replace(camera, width=width, height=height, matrix=matrix)
         pose = R[i : i + 1], t[i : i + 1]
-        frame = render(crop, target, *pose, defocus=imaging.lens, **level)
-        noisy = add_noise(frame, imaging.noise, index=index.new_tensor([i]))
+        levels = render(
+            crop,
+            target,
+            *pose,
+            psf_sigma=imaging.psf_sigma,
+            dark=imaging.dark,
+            light=imaging.light,
+            defocus=imaging.lens,
+        )
+        noisy = add_noise(levels, imaging.noise, index=index.new_tensor([i]))
         seen = ellipse.fit((pixel - low).flatten(0, 1), index, len(pixel)).view(1, len(target), 2, 5)
         refined = refine_photometric(Sight.of(noisy, crop, target, index.new_zeros(1), seen), *pose)
         out.append(torch.where(refined.good[:, None, None], refined.covariance, torch.nan))
