@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple, Required, TypedDict, Unpack
 
 import torch
@@ -21,23 +21,19 @@ _FRAMES = 16  # estimated at a time
 
 
 class Trials(TypedDict, total=False):
-    """Keywords of the simulations: number of draws, seed of the random numbers.
-
-    ``true_camera`` is the one about which the cameras are drawn, where it is not the nominal one: for errors of known
-    size.
-    """
+    """Keywords of the simulations."""
 
     draws: Required[int]
     seed: int
-    true_camera: Camera
+    true_camera: Camera  # about which cameras are drawn, where it is not the nominal one: for errors of known size
 
 
 class FrameTrials(Trials, total=False):
-    """Besides: grey levels of ``noise`` (1), ``bits`` of the sensor (8), ``method`` of `PoseEstimator`."""
+    """Besides those."""
 
-    noise: float
-    bits: int
-    method: Method
+    noise: float  # grey levels, 1 if not given
+    bits: int  # of the sensor, 8 if not given
+    method: Method  # of `PoseEstimator`
 
 
 class _Pose(NamedTuple):
@@ -46,12 +42,7 @@ class _Pose(NamedTuple):
 
 
 def simulate_points(
-    camera: Camera,
-    target: Target,
-    R: Float[Tensor, "B 3 3"],
-    t: Float[Tensor, "B 3"],
-    uncertainty: Uncertainty,
-    **trials: Unpack[Trials],
+    camera: Camera, target: Target, R: Tensor, t: Tensor, uncertainty: Uncertainty, **trials: Unpack[Trials]
 ) -> Float[Tensor, "D B 6"]:
     """Errors of poses from marker centres: truth drawn about the nominal one, projected, solved.
 
@@ -61,8 +52,8 @@ def simulate_points(
     Args:
         camera: as the solver has it.
         target: as the solver has it.
-        R: target to camera.
-        t: target to camera, mm.
+        R: (B, 3, 3), target to camera.
+        t: (B, 3), target to camera, mm.
         uncertainty: as of `propagate` with features "centers".
         trials: ``draws``, ``seed`` and ``true_camera``, see `Trials`.
 
@@ -130,8 +121,7 @@ def simulate_frames(
     return torch.cat(errors)
 
 
-@dataclass(frozen=True, eq=False)
-class _Draws:
+class _Draws(NamedTuple):
     """D cameras and prints, and what they were drawn about."""
 
     camera: Camera

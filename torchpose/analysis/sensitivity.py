@@ -71,17 +71,14 @@ class Uncertainty:
 class ErrorBudget:
     """What every source contributes to the covariance of B poses.
 
-    Attributes:
-        sources: by the names of the fields of `Uncertainty`, and ``calibration`` for `Camera.covariance`; those that
-            are not zero. In mm and rad: translation, then rotation w with R_true = exp(w) R, in
-            camera axes. NaN where the markers in view do not determine the pose.
-        total: their sum.
-        seen: the markers in view.
+    By the names of the fields of `Uncertainty`, and ``calibration`` for `Camera.covariance`; those that are not zero.
+    In mm and rad: translation, then rotation w with R_true = exp(w) R, in camera axes. NaN where the markers in view do
+    not determine the pose.
     """
 
     sources: dict[str, Float[Tensor, "B 6 6"]]
-    total: Float[Tensor, "B 6 6"]
-    seen: Bool[Tensor, "B M"]
+    total: Float[Tensor, "B 6 6"]  # their sum
+    seen: Bool[Tensor, "B M"]  # the markers in view
 
     def std(self, source: str | None = None) -> Float[Tensor, "B 6"]:
         """Standard deviations, mm and rad, of one source or of all together."""
@@ -100,21 +97,15 @@ def edge_noise(noise: float, contrast: float, blur: float) -> float:
 
 
 def propagate(
-    camera: Camera,
-    target: Target,
-    R: Float[Tensor, "B 3 3"],
-    t: Float[Tensor, "B 3"],
-    uncertainty: Uncertainty,
-    *,
-    features: Features = "centers",
+    camera: Camera, target: Target, R: Tensor, t: Tensor, uncertainty: Uncertainty, *, features: Features = "centers"
 ) -> ErrorBudget:
     """Covariances that the sources give the estimated poses, to first order, through the full camera model.
 
     Args:
         camera: as the estimator has it.
         target: as the estimator has it.
-        R: target to camera.
-        t: target to camera, mm.
+        R: (B, 3, 3), target to camera.
+        t: (B, 3), target to camera, mm.
         uncertainty: of measurement, camera and print.
         features: what the pose is fitted to. "centers": the compensated marker centres, as `torchpose.pnp.solve`.
             "rings": both edges of every ring, weighted by their length in the image, as the refinements on edges and
@@ -133,11 +124,10 @@ def propagate(
     seen = markers_seen(camera, target, R, t)
     point = _centers(camera, target, R, t) if features == "centers" else ring_edges(camera, target, R, t, _POINTS)
     image = uncertainty.image
-    information, variance = point.information, 1.0
     if features == "centers" and isinstance(image, Tensor):
-        information = torch.linalg.inv(image.to(R)).reshape(-1, len(target), 1, 2, 2)
+        information, variance = torch.linalg.inv(image.to(R)).reshape(-1, len(target), 1, 2, 2), 1.0
     else:
-        variance = float(image) ** 2
+        information, variance = point.information, float(image) ** 2
     jacobian = torch.where(seen[:, :, None, None, None], _jacobian(camera, target, R, point), 0.0)
     weighted = jacobian[..., :6].mT @ information  # (B, M, N, 6, 2): N points of each marker
     inverted, known = scaled_inverse((weighted @ jacobian[..., :6]).sum((1, 2)))
@@ -149,18 +139,14 @@ def propagate(
 
 
 class Points(NamedTuple):
-    """N measured points of each marker.
+    """N measured points of each marker."""
 
-    Place about the target's origin in camera axes and depth, mm; image on the plane z = 1; derivatives of the pixels by
-    the place and by the marker's radii; information about the pixels at unit noise.
-    """
-
-    arm: Float[Tensor, "B M N 3"]
-    depth: Float[Tensor, "B M N"]
-    xy: Float[Tensor, "B M N 2"]
-    by_point: Float[Tensor, "B M N 2 3"]
-    by_radii: Float[Tensor, "B M N 2 2"]
-    information: Float[Tensor, "*any 2 2"]
+    arm: Float[Tensor, "B M N 3"]  # about the target's origin, camera axes, mm
+    depth: Float[Tensor, "B M N"]  # mm
+    xy: Float[Tensor, "B M N 2"]  # image on the plane z = 1
+    by_point: Float[Tensor, "B M N 2 3"]  # derivatives of the pixels by the place
+    by_radii: Float[Tensor, "B M N 2 2"]  # and by the marker's radii
+    information: Float[Tensor, "*any 2 2"]  # about the pixels at unit noise
 
 
 def _jacobian(camera: Camera, target: Target, R: Tensor, point: Points) -> Tensor:
@@ -168,16 +154,10 @@ def _jacobian(camera: Camera, target: Target, R: Tensor, point: Points) -> Tenso
 
     By pose 6, fx fy cx cy, the marker's centre along its axes 3, its radii 2, the scale of the print, distortion n.
     """
-    camera_columns = by_intrinsics(camera, point.xy)
-    columns = [
-        by_pose(point.by_point, point.arm),
-        camera_columns[..., :4],
-        point.by_point @ (R[:, None] @ marker_axes(target).mT)[:, :, None],
-        point.by_radii,
-        point.by_point @ point.arm[..., None],
-        camera_columns[..., 4:],
-    ]
-    return torch.cat(columns, -1)
+    by_camera, axes = by_intrinsics(camera, point.xy), R[:, None] @ marker_axes(target).mT
+    by_print = (point.by_point @ axes[:, :, None], point.by_radii, point.by_point @ point.arm[..., None])
+    both = by_camera.tensor_split([4], -1)
+    return torch.cat([by_pose(point.by_point, point.arm), both[0], *by_print, both[1]], -1)
 
 
 def _shares(camera: Camera, gain: Tensor, uncertainty: Uncertainty) -> dict[str, Tensor]:
@@ -227,13 +207,7 @@ def radius_shift(centers: Tensor, normals: Tensor, true: Tensor, nominal: Tensor
     """Shift (..., 2) of the centre that eq. (7) finds where the circles have other radii than it is told.
 
     Eq. (7) extrapolates the centres of both ellipses, e_inner + K2 (e_inner - e_outer), with K2 = r2^2 / (r1^2 - r2^2).
-    On the plane z = 1.
-
-    Args:
-        centers: (..., 3) of the circles, camera frame.
-        normals: (..., 3) of the circles, camera frame.
-        true: (..., 2) outer and inner radius.
-        nominal: (..., 2) the same, as told.
+    On the plane z = 1; centres and normals (..., 3) in the camera frame, radii (..., 2) outer and inner.
     """
 
     def factor(radii: Tensor) -> Tensor:
@@ -249,11 +223,9 @@ def _between_ellipses(centers: Tensor, normals: Tensor, radii: Tensor) -> Tensor
     The circle of radius r has its ellipse's centre at (c_xy c_z + r^2 n_xy n_z) / (c_z^2 - r^2 (1 - n_z^2)) (derived
     from the dual conic).
     """
-    nz, cz, square = normals[..., None, 2:], centers[..., None, 2:], radii.square()[..., None]
-    ellipse = (centers[..., None, :2] * cz + square * normals[..., None, :2] * nz) / (
-        cz.square() - square * (1 - nz.square())
-    )
-    return ellipse[..., 1, :] - ellipse[..., 0, :]
+    (c, cz), (n, nz) = (vector[..., None, :].tensor_split([2], -1) for vector in (centers, normals))
+    square = radii.square()[..., None]
+    return ((c * cz + square * n * nz) / (cz.square() - square * (1 - nz.square()))).diff(dim=-2).squeeze(-2)
 
 
 def ring_edges(camera: Camera, target: Target, R: Tensor, t: Tensor, count: int) -> Points:
