@@ -146,7 +146,7 @@ class Points(NamedTuple):
     xy: Float[Tensor, "B M N 2"]  # image on the plane z = 1
     by_point: Float[Tensor, "B M N 2 3"]  # derivatives of the pixels by the place
     by_radii: Float[Tensor, "B M N 2 2"]  # and by the marker's radii
-    information: Float[Tensor, "*any 2 2"]  # about the pixels at unit noise
+    information: Float[Tensor, "B M N 2 2"]  # about the pixels at unit noise
 
 
 def _jacobian(camera: Camera, target: Target, R: Tensor, point: Points) -> Tensor:
@@ -199,8 +199,8 @@ def _centers(camera: Camera, target: Target, R: Tensor, t: Tensor) -> Points:
     outer, inner = target.radii.square().unbind(-1)
     by_factor = torch.stack([inner, -outer], -1) * 2 * target.radii / (outer - inner).square()[:, None]
     shift = _between_ellipses(arm + t[:, None], normal, target.radii)[..., None] * by_factor[:, None]
-    each = (arm, depth, xy, by_point, camera.J_distort(xy) @ shift)
-    return Points(*(value[:, :, None] for value in each), torch.eye(2, dtype=t.dtype, device=t.device))
+    eye = torch.eye(2, dtype=t.dtype, device=t.device).expand(*xy.shape, 2)
+    return Points(*(value[:, :, None] for value in (arm, depth, xy, by_point, camera.J_distort(xy) @ shift, eye)))
 
 
 def radius_shift(centers: Tensor, normals: Tensor, true: Tensor, nominal: Tensor) -> Tensor:

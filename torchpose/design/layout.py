@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -15,6 +16,8 @@ from torchpose.detect.reduce import reduction_factor
 from torchpose.identify.markers import ratio_tolerance
 from torchpose.target import MIN_RATIO_GAP
 
+Size = tuple[float, float]
+"""Width and height, mm."""
 # columns, rows (columns along the longer side) and whether the places within the rim are used
 ARRANGEMENTS = {
     4: (2, 2, True),
@@ -36,19 +39,12 @@ _SHUFFLES = 3000  # orders of codes tried where all are too many
 
 @dataclass(frozen=True)
 class Limits:
-    """What the stages need of a ring, for one camera, in px of its semi-minor axis in the worst view.
+    """What the stages need of a ring, for one camera, in px of its semi-minor axis in the worst view."""
 
-    Attributes:
-        outer: least semi-minor axis.
-        inner: the same of the inner circle.
-        width: least difference of both.
-        scale: px a mm in the worst view.
-    """
-
-    outer: float
-    inner: float
-    width: float
-    scale: float
+    outer: float  # least semi-minor axis
+    inner: float  # the same of the inner circle
+    width: float  # least difference of both
+    scale: float  # px a mm in the worst view
 
     @classmethod
     def of(cls, camera: Camera, scale: float) -> Limits:
@@ -76,21 +72,17 @@ class Limits:
             return None
         return torch.linspace(low, high, count, dtype=torch.float64, device="cpu")
 
-    def largest_radius(self, count: int, plate: tuple[float, float]) -> float:
+    def largest_radius(self, count: int, plate: Size) -> float:
         """Largest outer radius in mm that leaves the quiet zones of ``count`` rings on a plate; 0 where none does."""
-        low, high = 0.0, min(plate) / 2
-        for _ in range(50):
-            middle = (low + high) / 2
-            low, high = (middle, high) if self._fits(count, plate, middle) else (low, middle)
-        return low
 
-    def _fits(self, count: int, plate: tuple[float, float], radius: float) -> bool:
-        half = [side / 2 - self.quiet(radius) - radius for side in plate]
-        if min(half) <= 0:
-            return False
-        return bool(torch.pdist(self.places(count, plate, radius)).min() >= 2 * radius + self.quiet(radius))
+        def fits(radius: float) -> bool:
+            quiet = self.quiet(radius)
+            apart = torch.pdist(self.places(count, plate, radius)).min()
+            return min(plate) / 2 - quiet - radius > 0 and bool(apart >= 2 * radius + quiet)
 
-    def places(self, count: int, plate: tuple[float, float], radius: float) -> Float[Tensor, "count 2"]:
+        return largest(fits, min(plate) / 2)
+
+    def places(self, count: int, plate: Size, radius: float) -> Float[Tensor, "count 2"]:
         """Centres in mm: the outermost rings leave just their quiet zone to the plate's rim."""
         columns, rows, whole = ARRANGEMENTS[count]
         if plate[1] > plate[0]:
@@ -103,6 +95,15 @@ class Limits:
             if whole or i in (0, columns - 1) or k in (0, rows - 1)
         ]
         return torch.tensor(grid, dtype=torch.float64, device="cpu")
+
+
+def largest(fits: Callable[[float], bool], most: float) -> float:
+    """Largest number from 0 to ``most`` that fits, where all below it do."""
+    low, high = 0.0, most
+    for _ in range(50):
+        middle = (low + high) / 2
+        low, high = (middle, high) if fits(middle) else (low, middle)
+    return low
 
 
 def assign_codes(places: Float[Tensor, "M 2"], ratios: Float[Tensor, " M"]) -> Float[Tensor, " M"]:

@@ -22,7 +22,6 @@ FRAME_MARGIN_PX = 10.0  # between rings and the border of the frame
 _TILTS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the largest one
 _DIRECTIONS = 8  # of the tilt, and turns about the axis, among which the weakest pose is searched
 _STEPS = 4  # of distance and tilt in a map
-_AZIMUTHS = 8  # directions of the tilt in a map
 _PLACES = 3  # across the offset, along x and y
 _COLUMNS = ["axis", "unit", "needed", "middle", "worst", "worst_x_mm", "worst_y_mm", "worst_z_mm", "worst_tilt_deg"]
 
@@ -54,18 +53,11 @@ class Need:
 
 @dataclass(frozen=True, eq=False)
 class Precision(Rows):
-    """Predicted standard deviations over a working volume, a row an axis, in the units of `deviations`.
+    """Predicted standard deviations over a working volume, a row an axis, in the units of `deviations`."""
 
-    Attributes:
-        middle: facing the camera in the middle.
-        worst: the largest.
-        R: of the pose where that was found.
-        t: the same, mm.
-    """
-
-    middle: Float[Tensor, " 6"]
-    worst: Float[Tensor, " 6"]
-    R: Float[Tensor, "6 3 3"]
+    middle: Float[Tensor, " 6"]  # facing the camera in the middle
+    worst: Float[Tensor, " 6"]  # the largest
+    R: Float[Tensor, "6 3 3"]  # where it was found
     t: Float[Tensor, "6 3"]
 
     def rows(self, need: Need | None = None) -> list[Row]:
@@ -79,23 +71,14 @@ class Precision(Rows):
 
 @dataclass(frozen=True, eq=False)
 class PrecisionMap:
-    """Largest predicted deviations: across (um), along (um) and about any (mdeg) axis, on two grids.
+    """Largest predicted deviations: across (um), along (um) and about any (mdeg) axis, on two grids."""
 
-    Attributes:
-        distance: mm.
-        tilt: rad.
-        by_tilt: on the optical axis, over all directions of the tilt.
-        x: mm.
-        y: mm.
-        by_place: at the farthest distance, over tilts of 0 and the largest.
-    """
-
-    distance: Float[Tensor, " D"]
-    tilt: Float[Tensor, " T"]
-    by_tilt: Float[Tensor, "D T 3"]
-    x: Float[Tensor, " X"]
-    y: Float[Tensor, " Y"]
-    by_place: Float[Tensor, "Y X 3"]
+    distance: Float[Tensor, " D"]  # mm
+    tilt: Float[Tensor, " T"]  # rad
+    by_tilt: Float[Tensor, "D T 3"]  # on the optical axis, over all directions of the tilt
+    x: Float[Tensor, " X"]  # mm
+    y: Float[Tensor, " Y"]  # mm
+    by_place: Float[Tensor, "Y X 3"]  # at the farthest distance, over tilts of 0 and the largest
 
 
 def predict_volume(camera: Camera, target: Target, volume: WorkingVolume, imaging: Imaging) -> Precision:
@@ -112,12 +95,8 @@ def predict_volume(camera: Camera, target: Target, volume: WorkingVolume, imagin
     # the closed form finds the weakest pose of every axis at each tilt; the full prediction compares the tilts
     tilts = [volume.tilt * part for part in _TILTS] if volume.tilt else [0.0]
     chosen = [on_device(volume.middle, camera)]
-    distances, rolls = sorted(set(volume.distance)), _DIRECTIONS if volume.roll else 1
     for tilt in tilts:
-        poses = volume.poses(
-            distances=distances, tilts=[tilt], azimuths=_DIRECTIONS, rolls=rolls, offsets=volume.corners
-        )
-        R, t = on_device(poses, camera)
+        R, t = on_device(volume.borders([tilt], _DIRECTIONS), camera)
         weakest = deviations(edge_covariance(camera, target, R, t, imaging)).argmax(0).unique()
         chosen.append((R[weakest], t[weakest]))
     R, t = (torch.cat(parts) for parts in zip(*chosen, strict=True))
@@ -135,7 +114,7 @@ def precision_map(camera: Camera, target: Target, volume: WorkingVolume, imaging
         """Largest deviations (distances * places, tilts, 3)."""
         columns = []
         for angle in tilts.tolist():
-            poses = volume.poses(distances=distances.tolist(), tilts=[angle], azimuths=_AZIMUTHS, offsets=places)
+            poses = volume.poses(distances=distances.tolist(), tilts=[angle], azimuths=_DIRECTIONS, offsets=places)
             found = deviations(predicted_covariance(camera, target, *on_device(poses, camera), imaging))
             found = found.unflatten(0, (len(distances) * len(places), -1)).amax(1)
             columns.append(torch.stack([found[:, :2].amax(1), found[:, 2], found[:, 3:].amax(1)], 1))

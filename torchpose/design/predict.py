@@ -55,10 +55,7 @@ class Imaging:
             raise ConfigError(f"levels: {self.dark:g} {self.light:g}; give dark and light, 0 <= dark < light <= 255")
 
     def blur(self, camera: Camera, depth: Tensor) -> Tensor:
-        """Standard deviation (...) in px at depths (...) in mm.
-
-        A disc of radius rho has the variance rho^2 / 4 along any axis.
-        """
+        """Standard deviation (...) in px at depths (...) in mm; a disc has the variance radius^2 / 4 along any axis."""
         rho = torch.zeros_like(depth) if self.lens is None else self.lens.radius(camera, depth)
         return (self.psf_sigma**2 + rho.square() / 4).sqrt()
 
@@ -105,8 +102,8 @@ def edge_covariance(camera: Camera, target: Target, R: Tensor, t: Tensor, imagin
     jacobian = by_pose(edge.by_point, edge.arm)
     blur = (imaging.blur(camera, edge.depth).square() + _PIXEL_VARIANCE).sqrt()
     weight = (imaging.light - imaging.dark) ** 2 / (2 * math.sqrt(math.pi) * (imaging.noise**2 + _QUANTISATION)) / blur
-    information = (weight[..., None, None] * jacobian.mT @ edge.information @ jacobian).sum((1, 2))
-    return torch.linalg.inv(information)
+    weighted = weight[..., None, None] * (edge.information @ jacobian)
+    return torch.linalg.inv(jacobian.flatten(1, 3).mT @ weighted.flatten(1, 3))
 
 
 def predicted_covariance(

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchpose.camera import Camera
-from torchpose.design.layout import ARRANGEMENTS, Limits, assign_codes
+from torchpose.design.layout import ARRANGEMENTS, Limits, Size, assign_codes, largest
 from torchpose.design.precision import FRAME_MARGIN_PX, Need, Precision, on_device, predict_volume
 from torchpose.design.predict import Imaging, deviations, edge_covariance, in_view, outlines
 from torchpose.design.volume import WorkingVolume
@@ -25,19 +25,12 @@ _MICRON = 1e-2  # mm, to which radii and places are rounded: a target file that 
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """A target and what it promises.
-
-    Attributes:
-        target: on the camera's device.
-        plate: width and height, mm.
-        limits: of its rings.
-        precision: over the working volume.
-    """
+    """A target and what it promises."""
 
     target: Target
-    plate: tuple[float, float]
-    limits: Limits
-    precision: Precision
+    plate: Size
+    limits: Limits  # of its rings
+    precision: Precision  # over the working volume
 
     @property
     def radius(self) -> float:
@@ -57,22 +50,15 @@ class Design:
 
 
 class Choice(TypedDict, total=False):
-    """Of a target: its name (by default number of rings and size), ``light`` or ``dark`` background, number of rings
-    (by default the fewest that do).
-    """
+    """What may be chosen of a target."""
 
-    name: str | None
-    background: str
-    markers: int | None
+    name: str | None  # by default number of rings and size
+    background: str  # light (by default) or dark
+    markers: int | None  # number of rings; by default the fewest that do
 
 
 def design_target(
-    camera: Camera,
-    volume: WorkingVolume,
-    plate: tuple[float, float],
-    need: Need,
-    imaging: Imaging,
-    **choice: Unpack[Choice],
+    camera: Camera, volume: WorkingVolume, plate: Size, need: Need, imaging: Imaging, **choice: Unpack[Choice]
 ) -> Design:
     """The target with the fewest rings whose predicted standard deviations meet the need everywhere in the volume.
 
@@ -133,7 +119,7 @@ def _best(
     return min(seen, key=excess, default=None)
 
 
-def _targets(limits: Limits, count: int, plate: tuple[float, float], device: torch.device) -> Iterator[Target]:
+def _targets(limits: Limits, count: int, plate: Size, device: torch.device) -> Iterator[Target]:
     """Targets of ``count`` rings of all radii that fit."""
     least, most = limits.outer / limits.scale, limits.largest_radius(count, plate)
     for radius in torch.linspace(least, most, _RADII, device="cpu").tolist() if most >= least else []:
@@ -159,16 +145,11 @@ def _rounded(length: Tensor) -> Tensor:
     return (length / _MICRON).round() / round(1 / _MICRON) + 0.0
 
 
-def _no_room(
-    camera: Camera, volume: WorkingVolume, plate: tuple[float, float], limits: Limits, count: int
-) -> ConfigError:
+def _no_room(camera: Camera, volume: WorkingVolume, plate: Size, limits: Limits, count: int) -> ConfigError:
     """Why no layout of ``count`` rings was found: they are out of view, or too small."""
     R, t = on_device(volume.extremes(), camera)
     corners = t.new_tensor([[x * plate[0], y * plate[1], 0.0] for x in (-0.5, 0.5) for y in (-0.5, 0.5)])
-    low, high = 0.0, 1.0
-    for _ in range(40):
-        middle = (low + high) / 2
-        low, high = (middle, high) if in_view(camera, middle * corners, R, t, FRAME_MARGIN_PX) else (low, middle)
+    low = largest(lambda share: in_view(camera, share * corners, R, t, FRAME_MARGIN_PX), 1.0)
     if low < 0.999:
         return ConfigError(
             f"plate: {plate[0]:g} x {plate[1]:g} mm is larger than what is in view everywhere in the working volume, "

@@ -21,6 +21,7 @@ Poses = tuple[Float[Tensor, "N 3 3"], Float[Tensor, "N 3"]]
 """R and t, target to camera, mm; from here in float64 on the host."""
 Offsets = Sequence[tuple[float, float]]
 """x and y, mm."""
+_AXIS = ((0.0, 0.0),)
 
 
 @dataclass(frozen=True)
@@ -63,42 +64,22 @@ class WorkingVolume:
         z = sum(self.distance) / 2 if self.nominal is None else self.nominal
         return self.poses(distances=[z], tilts=[0.0])
 
-    @property
-    def corners(self) -> Offsets:
-        """x, y of the corners of the offset, mm, each once."""
-        return _signs(self.offset)
-
     def extremes(self) -> Poses:
         """No and the largest tilt in all directions, at all rolls, at the borders of the volume.
 
         What a target needs of every view (all rings in the frame, large enough) holds within if it holds here.
         """
-        return self.poses(
-            distances=sorted(set(self.distance)),
-            tilts=sorted({0.0, self.tilt}),
-            azimuths=_TURNS,
-            rolls=_TURNS if self.roll else 1,
-            offsets=self.corners,
-        )
+        return self.borders(sorted({0.0, self.tilt}), _TURNS)
+
+    def borders(self, tilts: list[float], turns: int) -> Poses:
+        """Tilts in as many directions as rolls, at the borders of distance and offset."""
+        distances, rolls = sorted(set(self.distance)), turns if self.roll else 1
+        return self.poses(distances=distances, tilts=tilts, azimuths=turns, rolls=rolls, offsets=_signs(self.offset))
 
     def poses(
-        self,
-        *,
-        distances: list[float],
-        tilts: list[float],
-        azimuths: int = 1,
-        rolls: int = 1,
-        offsets: Offsets = ((0.0, 0.0),),
+        self, *, distances: list[float], tilts: list[float], azimuths: int = 1, rolls: int = 1, offsets: Offsets = _AXIS
     ) -> Poses:
-        """All combinations.
-
-        Args:
-            distances: mm.
-            tilts: rad.
-            azimuths: directions of each tilt but 0.
-            rolls: over -roll..roll.
-            offsets: off the optical axis.
-        """
+        """All combinations of distances, offsets, tilts in a number of directions (azimuths) and rolls."""
         leans = [
             (tilt * math.cos(2 * math.pi * k / azimuths), tilt * math.sin(2 * math.pi * k / azimuths))
             for tilt in tilts
@@ -125,7 +106,6 @@ class WorkingVolume:
         corner = t.new_tensor([(x, y, 0.0) for x, y in [*_signs(reach), (0.0, 0.0)]])
         point = corner @ R.mT + t[:, None]  # (N, 5, 3)
         xy = point[..., :2] / point[..., 2:]
-        # by a move in the target's plane
         by_place = camera.J_distort(xy) @ image_by_point(xy, point[..., 2]) @ R[:, None, :, :2]
         return float(torch.linalg.svdvals(by_place)[..., -1].min())
 
