@@ -12,16 +12,8 @@ from torchpose.calibration.views import Views
 from torchpose.camera import Camera
 from torchpose.camera.derivatives import by_intrinsics
 from torchpose.errors import ConfigError
-from torchpose.geometry.least_squares import (
-    Code,
-    Eliminated,
-    Normal,
-    Pose,
-    Unknowns,
-    Vector,
-    minimise,
-    scaled_inverse,
-)
+from torchpose.geometry import least_squares
+from torchpose.geometry.least_squares import Code, Eliminated, Normal, Pose, Unknowns, Vector
 from torchpose.geometry.projection import by_pose, image_by_point
 from torchpose.geometry.segments import segment_sum
 
@@ -32,46 +24,27 @@ _RELATIVE = 1e-10  # decrease that a step must promise, of the cost
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Least-squares estimate of n intrinsics (fx, fy, cx, cy, then the distortion) and N poses.
-
-    Attributes:
-        camera: the estimate.
-        R: target to camera.
-        t: target to camera, mm.
-        residual: seen - predicted, px.
-        chi2: in the covariances of the points.
-        information: of the intrinsics, the poses being unknown.
-        pose_covariance: of translation (mm), then rotation about the camera axes (rad), for exact intrinsics.
-        gain: d pose / d intrinsics at the optimum.
-        converged: whether the last step promised next to nothing.
-    """
+    """Least-squares estimate of n intrinsics (fx, fy, cx, cy, then the distortion) and N poses, target to camera."""
 
     camera: Camera
     R: Float[Tensor, "N 3 3"]
-    t: Float[Tensor, "N 3"]
-    residual: Float[Tensor, "K 2"]
-    chi2: Float[Tensor, " K"]
-    information: Float[Tensor, "n n"]
-    pose_covariance: Float[Tensor, "N 6 6"]
-    gain: Float[Tensor, "N 6 n"]
-    converged: bool
+    t: Float[Tensor, "N 3"]  # mm
+    residual: Float[Tensor, "K 2"]  # seen - predicted, px
+    chi2: Float[Tensor, " K"]  # in the covariances of the points
+    information: Float[Tensor, "n n"]  # about the intrinsics, the poses being unknown
+    pose_covariance: Float[Tensor, "N 6 6"]  # translation (mm), rotation about the camera axes; for exact intrinsics
+    gain: Float[Tensor, "N 6 n"]  # d pose / d intrinsics at the optimum
+    converged: bool  # whether the last step promised next to nothing
 
 
-def adjust(
-    views: Views,
-    camera: Camera,
-    rotation: Float[Tensor, "N 3 3"],
-    translation: Float[Tensor, "N 3"],
-    *,
-    free: bool = True,
-) -> Bundle:
+def adjust(views: Views, camera: Camera, R: Tensor, t: Tensor, *, free: bool = True) -> Bundle:
     """Levenberg-Marquardt over intrinsics and poses, the latter eliminated; residuals are whitened.
 
     Args:
         views: with regular covariances.
         camera: to start from; its model and number of coefficients stay.
-        rotation: to start from.
-        translation: to start from.
+        R: (N, 3, 3), to start from.
+        t: (N, 3), to start from, mm.
         free: whether the intrinsics are unknown; otherwise only poses are found.
 
     Raises:
@@ -79,7 +52,7 @@ def adjust(
     """
     whiten = torch.linalg.inv(torch.linalg.cholesky(views.covariance))
     own = {"intrinsics": Vector(views.pixels.new_zeros(1, 4 + len(camera.distortion)))} if free else {}
-    start = Unknowns(own, {"pose": Pose(rotation, translation)}, views.view.new_zeros(len(views)))
+    start = Unknowns(own, {"pose": Pose(R, t)}, views.view.new_zeros(len(views)))
 
     def bent(unknowns: Unknowns) -> Camera | None:
         return moved_camera(camera, unknowns.values("intrinsics")[0]) if free else camera
@@ -90,25 +63,18 @@ def adjust(
             return replace(problem(start), cost=views.pixels.new_full((1,), torch.inf))
         return _normal(views, moved, unknowns.pose, whiten, free)
 
-    found = minimise(problem, start, _ITERATIONS, damping=_DAMPING, adaptive=True, tolerance=_RELATIVE)
+    found = least_squares.minimise(problem, start, _ITERATIONS, damping=_DAMPING, adaptive=True, tolerance=_RELATIVE)
     moved, pose = bent(found.unknowns), found.unknowns.pose
     normal = found.normal if free or moved is None else _normal(views, moved, pose, whiten, True)
     part = normal.eliminated
     if moved is None or part is None or not bool(normal.cost.isfinite().all()):
         raise ConfigError("INPUT: a view has points behind the camera that calibration starts from; remove --camera")
-    covariance, _ = scaled_inverse(part.information)
+    covariance, _ = least_squares.scaled_inverse(part.information)
     residual = views.pixels - moved.project(_placed(views, pose)[1])
-    return Bundle(
-        moved,
-        pose.R,
-        pose.t,
-        residual,
-        (whiten @ residual[..., None]).square().sum((-1, -2)),
-        normal.solve().information[0],
-        covariance,
-        -covariance @ part.mixed.mT,
-        int(found.code) == Code.CONVERGED,
-    )
+    chi2 = (whiten @ residual[..., None]).square().sum((-1, -2))
+    gain, converged = -covariance @ part.mixed.mT, int(found.code) == Code.CONVERGED
+    information = normal.solve().information[0]
+    return Bundle(moved, pose.R, pose.t, residual, chi2, information, covariance, gain, converged)
 
 
 def moved_camera(camera: Camera, step: Tensor) -> Camera | None:

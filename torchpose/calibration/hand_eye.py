@@ -8,7 +8,7 @@ Both mounts are one equation, A_i X B_i = Z: B_i is the target in the camera, X 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, cast
+from typing import Literal, cast
 
 import torch
 from jaxtyping import Float
@@ -37,29 +37,17 @@ Noise = tuple[float, float]
 
 @dataclass(frozen=True, eq=False)
 class HandEyeFit:
-    """Result of `calibrate_hand_eye`.
+    """Result of `calibrate_hand_eye`."""
 
-    Attributes:
-        hand_eye: camera in its mount, with its covariance.
-        target_rotation: of the target on what does not move with the camera (Z).
-        target_translation: of the same, mm.
-        covariance: of X (translation, rotation), then Z; rotations multiplied from the left.
-        residual: target in the camera, seen - predicted: mm along and rad about the camera's axes.
-        chi2: of the fit.
-        degrees: of freedom of the fit.
-        robot_sigma_mm: standard deviation of the robot's position, per axis, given or estimated.
-        robot_sigma_rad: the same of its orientation.
-    """
-
-    hand_eye: HandEye
-    target_rotation: Float[Tensor, "3 3"]
-    target_translation: Float[Tensor, " 3"]
-    covariance: Float[Tensor, "12 12"]
-    residual: Float[Tensor, "N 6"]
+    hand_eye: HandEye  # camera in its mount, with its covariance
+    target_rotation: Float[Tensor, "3 3"]  # of the target on what does not move with the camera (Z)
+    target_translation: Float[Tensor, " 3"]  # mm
+    covariance: Float[Tensor, "12 12"]  # of X (translation, rotation), then Z; rotations multiplied from the left
+    residual: Float[Tensor, "N 6"]  # target in the camera, seen - predicted: mm along and rad about the camera's axes
     chi2: float
-    degrees: int
-    robot_sigma_mm: float
-    robot_sigma_rad: float
+    degrees: int  # of freedom of the fit
+    robot_sigma_mm: float  # standard deviation of the robot's position, per axis, given or estimated
+    robot_sigma_rad: float  # the same of its orientation
 
 
 def calibrate_hand_eye(
@@ -98,15 +86,16 @@ def calibrate_hand_eye(
         unknowns = moments.fit(unknowns, noise).unknowns
         noise = _estimate_noise(moments, unknowns, noise)
     found = moments.fit(unknowns, noise)
-    spread, at = found.covariance()[0][0], moments.linearised(found.unknowns, noise)
+    spread = found.covariance()[0][0]
+    residual, jacobian, weight = moments.linearised(found.unknowns, noise)
     if intrinsics is not None:
         gain, uncertainty = intrinsics
         # all poses move with the intrinsics, and the solution with the poses
-        shift = spread @ (at.jacobian.mT @ at.weight @ gain).sum(0)
+        shift = spread @ (jacobian.mT @ weight @ gain).sum(0)
         spread = spread + shift @ uncertainty @ shift.T
     (r, t), z = _transforms(found.unknowns)
     hand_eye = HandEye(mount, r, t, covariance=spread[:6, :6])
-    return HandEyeFit(hand_eye, *z, spread, at.residual, float(found.normal.cost), 6 * len(covariance) - 12, *noise)
+    return HandEyeFit(hand_eye, *z, spread, residual, float(found.normal.cost), 6 * len(covariance) - 12, *noise)
 
 
 def check_motion(rotation: Tensor) -> None:
@@ -133,12 +122,7 @@ def check_motion(rotation: Tensor) -> None:
 
 
 def linear_start(a: Transform, b: Transform) -> tuple[Transform, Transform]:
-    """X and Z of A_i X B_i = Z, rotations before translations (Shah 2013): exact without noise.
-
-    Args:
-        a: N rigid transforms, R (N, 3, 3), t (N, 3).
-        b: the same.
-    """
+    """X and Z of A_i X B_i = Z, N moments, rotations before translations (Shah 2013): exact without noise."""
     ra, rb = a[0], b[0]
     # vec(R_Z) = (R_B^T kron R_A) vec(R_X), column by column; their mean has R_X and R_Z as its first singular pair
     kron = torch.einsum("nij,nkl->nikjl", rb.mT, ra).reshape(-1, 9, 9).mean(0)
@@ -156,14 +140,6 @@ def _nearest_rotation(matrix: Tensor) -> Tensor:
     """Of a matrix that is a rotation up to a factor of either sign, and noise."""
     u, _, vh = torch.linalg.svd(matrix * torch.linalg.det(matrix).sign())
     return u @ vh
-
-
-class _Linearised(NamedTuple):
-    """Residual (N, 6) of B_i against X^-1 A_i^-1 Z, its Jacobian (N, 6, 12) by X and Z, and its weight (N, 6, 6)."""
-
-    residual: Tensor
-    jacobian: Tensor
-    weight: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +162,8 @@ class _Moments:
 
         return minimise(problem, unknowns, _ITERATIONS, tolerance=_RELATIVE)
 
-    def linearised(self, unknowns: Unknowns, noise: Noise) -> _Linearised:
+    def linearised(self, unknowns: Unknowns, noise: Noise) -> tuple[Tensor, Tensor, Tensor]:
+        """Residual (N, 6) of B_i against X^-1 A_i^-1 Z, its Jacobian (N, 6, 12) by X and Z, its weight (N, 6, 6)."""
         x, z = _transforms(unknowns)
         to_x = rotations.inverse(*rotations.compose(*self.a, *x))  # camera from what Z is given in
         r, t = rotations.compose(*to_x, *z)
@@ -198,7 +175,7 @@ class _Moments:
         # Z moves by (d, w): t_Z by d, R_Z by w, both turned into the camera
         by_z = torch.cat([torch.cat([to_x[0], zero], -1), torch.cat([zero, to_x[0]], -1)], -2)
         weight = torch.linalg.inv(self.covariance + self.robot_covariance(x, (r, t), noise))
-        return _Linearised(residual, torch.cat([by_x, by_z], -1), weight)
+        return residual, torch.cat([by_x, by_z], -1), weight
 
     def robot_covariance(self, x: Transform, target: Transform, noise: Noise) -> Tensor:
         """What noise of the tool's position and orientation does to the target in the camera, (N, 6, 6)."""

@@ -40,32 +40,20 @@ _SINGULAR = 1e-12  # least eigenvalue of the information, scaled to a unit diago
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Result of `calibrate_intrinsics`.
+    """Result of `calibrate_intrinsics`."""
 
-    Attributes:
-        camera: the calibrated camera, with ``camera.covariance`` of fx, fy, cx, cy.
-        covariance: of fx, fy, cx, cy (px) and the distortion.
-        names: of the intrinsics.
-        views: those that were used, with the points that were used.
-        bundle: poses and residuals of these.
-        left_out: points left out because they contradict the others.
-        chi2: sum over all points.
-        degrees: of freedom.
-        common_sigma_px: standard deviation, px per axis, that had to be added to every point (print, flatness, lens
-            model) to make the reduced chi-squared 1; 0 where the covariances of the points explain the residuals.
-        warnings: what makes the result doubtful, one sentence each.
-    """
-
-    camera: Camera
-    covariance: Float[Tensor, "n n"]
-    names: tuple[str, ...]
-    views: Views
-    bundle: Bundle
-    left_out: int
-    chi2: float
-    degrees: int
+    camera: Camera  # with ``camera.covariance`` of fx, fy, cx, cy
+    covariance: Float[Tensor, "n n"]  # of fx, fy, cx, cy (px) and the distortion
+    names: tuple[str, ...]  # of the intrinsics
+    views: Views  # that were used, with the points that were used
+    bundle: Bundle  # poses and residuals of these
+    left_out: int  # points left out because they contradict the others
+    chi2: float  # sum over all points
+    degrees: int  # of freedom
+    # px per axis, that had to be added to every point (print, flatness, lens model) to make the reduced chi-squared 1;
+    # 0 where the covariances of the points explain the residuals
     common_sigma_px: float
-    warnings: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)  # what makes the result doubtful, one sentence each
 
     @property
     def rms_px(self) -> float:
@@ -170,10 +158,7 @@ def locate_views(views: Views, camera: Camera) -> tuple[Views, Bundle]:
 
 
 def _weigh(views: Views, bundle: Bundle, unknowns: int) -> tuple[Views, Bundle, float]:
-    """Views without contradicting points, their fit with proper weights, and the common error in px.
-
-    ``unknowns``: number of intrinsics, 0 for a known camera.
-    """
+    """Views without contradicting points, their fit, weighted, of n unknown intrinsics, and the common error in px."""
     free, common = unknowns > 0, 0.0
     for _ in range(_ROUNDS):
         common = common_sigma(bundle.residual, views.covariance, _degrees(views, unknowns))
@@ -181,19 +166,18 @@ def _weigh(views: Views, bundle: Bundle, unknowns: int) -> tuple[Views, Bundle, 
         keep = bundle.chi2 < _OUTLIER * max(1.0, float(bundle.chi2.median()) / _MEDIAN)
         if bool(keep.all()):
             continue
-        views, bundle = _without(views, bundle, keep)
+        views = views[keep]
+        enough = views.counts >= MIN_POINTS
+        views = views.of_views(enough)
         _check_count(views, unknowns)
-        bundle = adjust(_with_common(views, common), bundle.camera, bundle.R, bundle.t, free=free)
+        bundle = adjust(_with_common(views, common), bundle.camera, bundle.R[enough], bundle.t[enough], free=free)
     return views, bundle, common
 
 
 def common_sigma(residual: Float[Tensor, "K 2"], covariance: Float[Tensor, "K 2 2"], degrees: int) -> float:
     """Standard deviation s, px per axis, with sum of r^T (C + s^2 I)^-1 r = degrees of freedom; 0 where C suffices.
 
-    Args:
-        residual: px.
-        covariance: px^2, zero where unknown.
-        degrees: of freedom.
+    The covariance C is zero where it is unknown.
     """
 
     def excess(sigma: float) -> float:
@@ -237,13 +221,6 @@ def _first_fit(views: Views, camera: Camera, *, free: bool = True) -> tuple[View
     return None if bundle is None else (views, bundle)
 
 
-def _without(views: Views, bundle: Bundle, keep: Tensor) -> tuple[Views, Bundle]:
-    """Views and state without some of the points, and without views that have too few left."""
-    rest = views[keep]
-    enough = rest.counts >= MIN_POINTS
-    return rest.of_views(enough), replace(bundle, R=bundle.R[enough], t=bundle.t[enough])
-
-
 def _degrees(views: Views, unknowns: int) -> int:
     return 2 * len(views.view) - 6 * len(views) - unknowns
 
@@ -268,15 +245,8 @@ def _covariance(bundle: Bundle, names: tuple[str, ...]) -> Tensor:
             f"INPUT: the views are too alike to tell the intrinsics apart (mostly {direction}); "
             "add views tilted by 20 to 45 degrees in different directions"
         )
-    vectors = scale[:, None] * vectors
-    covariance = (vectors / values) @ vectors.T
-    return 0.5 * (covariance + covariance.T)
-
-
-def tilt_spread_deg(rotation: Float[Tensor, "N 3 3"]) -> float:
-    """Largest angle between the normals of any two views, in degrees."""
-    normal = rotation[:, :, 2]
-    return float((normal @ normal.T).clamp(-1, 1).acos().max().rad2deg())
+    root = scale[:, None] * vectors * values.rsqrt()
+    return root @ root.T
 
 
 def _warnings(views: Views, bundle: Bundle, covariance: Tensor, common: float) -> list[str]:
@@ -286,17 +256,18 @@ def _warnings(views: Views, bundle: Bundle, covariance: Tensor, common: float) -
             f"the points are {common:.2g} px off, more than print and lens explain; check the target file, --model, "
             "and that all frames are of one camera with one focus"
         )
-    focal, sigma = bundle.camera.matrix.diagonal()[:2], covariance.diagonal()[:2].sqrt()
-    spread = tilt_spread_deg(bundle.R)
+    normal = bundle.R[:, :, 2]
+    spread = float((normal @ normal.T).clamp(-1, 1).acos().max().rad2deg())
     if spread < _LITTLE_TILT_DEG:
         notes.append(
             f"views too alike: their tilts differ by {spread:.0f} degrees at most, so focal length and distance are "
             "hard to tell apart; add views tilted by 20 to 45 degrees in different directions"
         )
-    if float((sigma / focal).max()) > _WIDE_SIGMA:
+    relative = float((covariance.diagonal()[:2].sqrt() / bundle.camera.matrix.diagonal()[:2]).max())
+    if relative > _WIDE_SIGMA:
         notes.append(
-            f"the focal length is known to {float((sigma / focal).max()):.2%} only, which is the relative error of "
-            "every distance; add tilted views, or views that fill the frame"
+            f"the focal length is known to {relative:.2%} only, which is the relative error of every distance; "
+            "add tilted views, or views that fill the frame"
         )
     reach = views.pixels.amax(0) - views.pixels.amin(0)
     size = reach.new_tensor([bundle.camera.width, bundle.camera.height])
