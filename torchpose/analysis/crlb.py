@@ -43,8 +43,6 @@ def pose_crlb(
     as noise of step^2 / 12, which holds from a noise of about half a step upwards; clipping is not modelled.
 
     Args:
-        camera: as in `torchpose.sim.render`.
-        target: as in `torchpose.sim.render`.
         R: (B, 3, 3), target to camera.
         t: (B, 3), target to camera, mm.
         settings: ``psf_sigma``, ``dark``, ``light``, ``noise_sigma``, ``bits``, see `Settings`.

@@ -136,7 +136,6 @@ def by_cross(edges: EdgePoints, bar: float) -> Tensor:
     (1 + 3 b^2 / (1 + b + b^2)) / n, one of the outer square, to which the short ends are extended, (1 + 3 / b^2) / n.
 
     Args:
-        edges: of those curves.
         bar: b, width of the bars over their extent.
     """
     lines, points = fit_lines(edges)

@@ -13,6 +13,7 @@ from torchpose import pnp
 from torchpose.analysis.errors import Pose, pose_difference
 from torchpose.analysis.sensitivity import Uncertainty, marker_axes, markers_seen, radius_shift
 from torchpose.camera import Camera
+from torchpose.geometry import least_squares
 from torchpose.pipeline import Method, PoseEstimator
 from torchpose.sim import add_noise, render
 from torchpose.target import Target
@@ -36,11 +37,6 @@ class FrameTrials(Trials, total=False):
     method: Method  # of `PoseEstimator`
 
 
-class _Pose(NamedTuple):
-    R: Tensor
-    t: Tensor
-
-
 def simulate_points(
     camera: Camera, target: Target, R: Tensor, t: Tensor, uncertainty: Uncertainty, **trials: Unpack[Trials]
 ) -> Float[Tensor, "D B 6"]:
@@ -50,8 +46,6 @@ def simulate_points(
     The markers seen are those of `propagate`, in the nominal pose.
 
     Args:
-        camera: as the solver has it.
-        target: as the solver has it.
         R: (B, 3, 3), target to camera.
         t: (B, 3), target to camera, mm.
         uncertainty: as of `propagate` with features "centers".
@@ -73,21 +67,15 @@ def simulate_points(
     ideal = (pixels - nominal[:2, 2]) / nominal.diagonal()[:2]
     pixels = ideal * drawn.focal[:, None, None] + drawn.center[:, None, None]
     noise = torch.randn(pixels.shape, generator=generator, dtype=t.dtype, device=generator.device).to(t)
-    covariances, sigma = None, 1.0
+    exact, mask = replace(camera, covariance=None), markers_seen(camera, target, R, t).repeat(draws, 1)
     if isinstance(uncertainty.image, Tensor):
-        covariances = uncertainty.image.to(t).expand(*points.shape[:-1], 2, 2).flatten(0, 1)
-        noise = (torch.linalg.cholesky(covariances).view(*points.shape[:-1], 2, 2) @ noise[..., None]).squeeze(-1)
+        spread = uncertainty.image.to(t).expand(*points.shape[:-1], 2, 2)
+        pixels = pixels + (torch.linalg.cholesky(spread) @ noise[..., None]).squeeze(-1)
+        found = pnp.solve(target.centers, pixels.flatten(0, 1), exact, covariances=spread.flatten(0, 1), mask=mask)
     else:
-        noise = noise * uncertainty.image
-        sigma = uncertainty.image or sigma  # for the solver's decisions only: equal weights give the same pose
-    found = pnp.solve(
-        target.centers,
-        (pixels + noise).flatten(0, 1),
-        replace(camera, covariance=None),
-        sigma_px=sigma,
-        covariances=covariances,
-        mask=markers_seen(camera, target, R, t).repeat(draws, 1),
-    )
+        pixels = pixels + uncertainty.image * noise
+        sigma = uncertainty.image or 1.0  # for the solver's decisions only: equal weights give the same pose
+        found = pnp.solve(target.centers, pixels.flatten(0, 1), exact, sigma_px=sigma, mask=mask)
     return _errors(found, R, t)
 
 
@@ -97,8 +85,6 @@ def simulate_frames(
     """Errors as of `simulate_points`, of frames rendered with the drawn camera and print, by `PoseEstimator`.
 
     Args:
-        camera: as the estimator has it.
-        target: as the estimator has it.
         R: (B, 3, 3), target to camera.
         t: (B, 3), target to camera, mm.
         uncertainty: its ``image`` is not used: ``noise`` grey levels of every pixel and ``bits`` are.
@@ -166,5 +152,6 @@ def _draw(camera: Camera, target: Target, uncertainty: Uncertainty, draws: int, 
 
 def _errors(found: Pose, R: Tensor, t: Tensor) -> Tensor:
     """(D, B, 6) of poses (D * B)."""
-    each = _Pose(found.R.unflatten(0, (-1, len(t))), found.t.unflatten(0, (-1, len(t))))
-    return pose_difference(each, _Pose(R, t))
+    draws = len(found.t) // len(t)
+    truth = least_squares.Pose(R.repeat(draws, 1, 1), t.repeat(draws, 1))
+    return pose_difference(found, truth).unflatten(0, (draws, len(t)))

@@ -102,8 +102,6 @@ def propagate(
     """Covariances that the sources give the estimated poses, to first order, through the full camera model.
 
     Args:
-        camera: as the estimator has it.
-        target: as the estimator has it.
         R: (B, 3, 3), target to camera.
         t: (B, 3), target to camera, mm.
         uncertainty: of measurement, camera and print.

@@ -56,14 +56,10 @@ def sweep(
     """Errors at the distances (D,), mm, the target's middle on the optical axis.
 
     Args:
-        camera: as the solver has it.
-        target: as the solver has it.
         distance: (D,) mm.
         uncertainty: with one number for ``image``. Its ``focal_length`` is taken as an error of that very size, the
             true lens being the longer one.
         tilt: rad, about the x axis.
-        draws: of measurement, camera and print.
-        seed: of the draws.
     """
     distance = distance.double()
     R = rotations.exp(distance.new_tensor([tilt, 0.0, 0.0])).expand(len(distance), 3, 3)

@@ -90,7 +90,6 @@ def find_corners(names: Sequence[str], frames: Tensor, board: Board) -> Views:
     Args:
         names: of the B frames.
         frames: (B, H, W) uint8 or uint16.
-        board: the one in view.
     """
     find = _chessboard_corners if board.charuco is None else _charuco_corners
     # OpenCV's detectors want 8 bits

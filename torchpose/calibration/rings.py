@@ -30,7 +30,6 @@ def find_rings(names: Sequence[str], frames: Tensor, cameras: Sequence[Camera], 
         names: of the B frames.
         frames: (B, H, W), see `torchpose.PoseEstimator`.
         cameras: to identify the markers with, one after the other; if there are several, all without distortion.
-        target: the one in view.
 
     Returns:
         The views of each camera. Which ring is which depends little on the camera, the centres hardly at all.

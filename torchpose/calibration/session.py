@@ -31,8 +31,6 @@ def calibrate_camera(frames: Frames, shown: Target | Board, start: Camera, *, gu
 
     Args:
         frames: read once for a board, twice for a target.
-        shown: what is in view.
-        start: with the frames' size.
         guess: only the size of ``start`` is known; several focal lengths are tried.
         lens: a name of `torchpose.calibration.LENS_MODELS`.
 
@@ -78,8 +76,6 @@ def calibrate_robot(
     """Hand-eye transform from the poses of views; on which side the camera is mounted follows from the poses.
 
     Args:
-        views: by whose names ``robot`` goes.
-        bundle: their poses.
         intrinsics: covariance of the bundle's first intrinsics (n, n), None for an exact camera.
         robot: base_from_tool by name of the view, x y z in mm, rotation vector in rad.
 

@@ -130,7 +130,7 @@ def _numbers(*values: float) -> str:
     return " ".join(map(_number, values))
 
 
-def _element(name: str, text: str | None = None, **attributes: float | str) -> str:
+def _element(name: str, text: str | None = None, /, **attributes: float | str) -> str:
     values = {key.replace("_", "-"): v if isinstance(v, str) else _number(v) for key, v in attributes.items()}
     start = " ".join([name, *(f'{key}="{value}"' for key, value in values.items())])
     return f"<{start}/>" if text is None else f"<{start}>{escape(text)}</{name}>"
@@ -138,16 +138,14 @@ def _element(name: str, text: str | None = None, **attributes: float | str) -> s
 
 def _svg(shape: Shape) -> str:
     if isinstance(shape, Text):
-        anchor = {"text_anchor": "middle"} if shape.number else {}
-        place = {"x": shape.x, "y": shape.y, "font_size": shape.size}
-        return _element("text", shape.text, **place, font_family="Helvetica, Arial, sans-serif", **anchor)
+        family, anchor = "Helvetica, Arial, sans-serif", {"text_anchor": "middle"} if shape.number else {}
+        return _element("text", shape.text, x=shape.x, y=shape.y, font_size=shape.size, font_family=family, **anchor)
     colour = f"#{round(255 * shape.grey):02x}" + 2 * f"{round(255 * shape.grey):02x}"
     if isinstance(shape, Circle):
         return _element("circle", cx=shape.x, cy=shape.y, r=shape.radius, fill=colour)
     if isinstance(shape, Rectangle):
         return _element("rect", x=shape.x, y=shape.y, width=shape.width, height=shape.height, fill=colour)
-    ends = {"x1": shape.x1, "y1": shape.y1, "x2": shape.x2, "y2": shape.y2}
-    return _element("line", **ends, stroke=colour, stroke_width=shape.width)
+    return _element("line", x1=shape.x1, y1=shape.y1, x2=shape.x2, y2=shape.y2, stroke=colour, stroke_width=shape.width)
 
 
 def _pdf(shape: Shape) -> str:

@@ -89,11 +89,8 @@ def edge_covariance(camera: Camera, target: Target, R: Tensor, t: Tensor, imagin
     but with no derivative besides those by the pose, for searches.
 
     Args:
-        camera: taken for exact.
-        target: taken for exact.
         R: (B, 3, 3), target to camera.
         t: (B, 3), target to camera, mm.
-        imaging: conditions of the frames.
 
     Returns:
         float64, mm and rad, translation first, rotation multiplied from the left.

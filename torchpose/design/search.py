@@ -67,11 +67,7 @@ def design_target(
     `predicted_covariance`.
 
     Args:
-        camera: taken for exact.
-        volume: where the target may be.
         plate: width and height, mm.
-        need: deviations that are acceptable.
-        imaging: conditions of the frames.
         choice: ``name``, ``background`` and ``markers``, see `Choice`.
 
     Raises:
