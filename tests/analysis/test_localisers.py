@@ -101,9 +101,9 @@ def test_codes_are_read_at_a_tilt(name):
             recognition.circles("rings", (recognition.RADIUS_MM, code * recognition.RADIUS_MM), 150),
             recognition.read_rings,
         )
-    camera, R, t = study.view(Condition(tilt=25), 4, 0)
-    frames = study.pictures(mark, Condition(), camera, R, t, 0)
-    outline, _ = study.outlines(mark, camera, R, t)
+    seen = study.view(Condition(tilt=25), 4, 0)
+    frames = study.pictures(mark, Condition(), seen, 0)
+    outline, _ = study.outlines(mark, seen)
     value = read(localisers.edge_points(frames, outline, 0.7), outline)
     assert (value - code).abs().max() < 0.01
 

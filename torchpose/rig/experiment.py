@@ -20,7 +20,7 @@ from torch import Tensor
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.io.manifest import read_manifest, read_records
-from torchpose.io.tables import read_table
+from torchpose.io.writers import read_table
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 _COLUMNS = ("frame", "target", "status", "tx", "ty", "tz", "rx", "ry", "rz", "sx", "sy", "sz", "srx", "sry", "srz")
