@@ -73,7 +73,8 @@ def adjust(views: Views, camera: Camera, R: Tensor, t: Tensor, *, free: bool = T
     residual = views.pixels - moved.project(_placed(views, pose)[1])
     chi2 = (whiten @ residual[..., None]).square().sum((-1, -2))
     gain, converged = -covariance @ part.mixed.mT, int(found.code) == Code.CONVERGED
-    information = normal.solve().information[0]
+    # without the trace of a diagonal that steps are solved with: whether the views tell is decided by this
+    information = normal.information[0] - (part.mixed @ covariance @ part.mixed.mT).sum(0)
     return Bundle(moved, pose.R, pose.t, residual, chi2, information, covariance, gain, converged)
 
 
