@@ -9,7 +9,7 @@ from matplotlib.patches import Rectangle
 from torchpose.report.figures import COLOURS, GREY, subplots
 from torchpose.report.files import save_figures
 from torchpose.rig.plan import CapturePlan
-from torchpose.rig.robot_settings import Workspace
+from torchpose.rig.settings import Workspace
 
 
 def draw_path(plan: CapturePlan, workspace: Workspace, out: Path) -> None:
