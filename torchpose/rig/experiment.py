@@ -23,7 +23,7 @@ from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.geometry.rows import Rows
 from torchpose.io.manifest import read_manifest, read_records
-from torchpose.io.tables import read_table
+from torchpose.io.writers import read_table
 from torchpose.rig.plan import Label
 from torchpose.rig.poses import to_transform
 
