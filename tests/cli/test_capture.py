@@ -251,7 +251,7 @@ def robot_fault(name, at_fraction=None):
 
 
 def kill_driver(cell, controller, cameras):
-    cell.robot._link.kill()
+    cell.robot._child.kill()
 
 
 FAULTS = [

@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from torchpose.analysis.sensitivity import Uncertainty
+from torchpose.analysis.sweep import sweep
 from torchpose.studies import fig04_sensitivity, table01_orientation
-from torchpose.studies.fig04_sensitivity import SIGMAS_PX, exponent, paper_camera, simulate
+from torchpose.studies.fig04_sensitivity import SIGMAS_PX, cases_of, exponent, paper_camera
 from torchpose.target import Target
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is:DeprecationWarning")
@@ -19,8 +20,8 @@ pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is:Deprecatio
 def cases():
     distance = torch.linspace(12, 32, 11, dtype=torch.float64)
     size = Uncertainty(focal_length=fig04_sensitivity.FOCAL_ERROR)
-    found = simulate(paper_camera(), Target.load("quad8"), distance, SIGMAS_PX, size, draws=3000, seed=5)
-    return list(found.values())
+    plans = cases_of(SIGMAS_PX, size).values()
+    return [sweep(paper_camera(), Target.load("quad8"), distance, plan, draws=3000, seed=5) for plan in plans]
 
 
 def test_without_focal_error_x_and_y_are_linear_and_z_is_quadratic(cases):
