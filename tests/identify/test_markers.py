@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import pytest
 import torch
-from exact import F64, exact_ellipses, pinhole, random_poses, rings_of
 from torch import Tensor
 
+from tests.exact import F64, exact_ellipses, pinhole, random_poses, rings_of
 from torchpose.geometry import rotations
 from torchpose.identify import Identified, MarkerTable, crossed_out, identify
 from torchpose.rings import Rings
@@ -23,7 +24,7 @@ def clutter(rings: Rings, extra: Tensor, frame: Tensor) -> Rings:
     other = rings_of(extra, frame)
     both = {f.name: (getattr(rings, f.name), getattr(other, f.name)) for f in dataclasses.fields(Rings)}
 
-    def join(a, b):
+    def join(a: Any, b: Any) -> Any:
         if isinstance(a, Tensor):
             return torch.cat([a, b])
         return type(a)(*(torch.cat([getattr(a, f.name), getattr(b, f.name)]) for f in dataclasses.fields(a)))
@@ -155,7 +156,7 @@ def test_table_pads_shorter_targets() -> None:
     assert table.centers.dtype == F64
 
 
-def test_no_marker_lies_across_a_ring():
+def test_no_marker_lies_across_a_ring() -> None:
     """A pose whose unseen marker would lie half across a measured ring is doubted; one concentric with it is not."""
     r, t = torch.eye(3, dtype=F64)[None], torch.tensor([[0.0, 0.0, 300.0]], dtype=F64)
     truth = exact_ellipses(QUAD, CAMERA, r, t)[0]

@@ -186,7 +186,7 @@ class Lens:
 
 
 def test_arguments_and_results_are_arranged_as_they_are_in_python() -> None:
-    def function(pair: Pair, lens: Lens, missing: Tensor | None) -> dict[str, Pair]:
+    def function(pair: Pair, lens: Lens, missing: Tensor | None) -> dict[str, Any]:
         scale = pair.second[1] * lens.matrix[0, 1]
         return {lens.name: Pair(pair.first * scale, (pair.second[0] + (0 if missing is None else missing), 1.0))[:1]}
 

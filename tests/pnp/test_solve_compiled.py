@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 import torch
-from scenes import CUBOID, F64, FOCAL, GRID, MATRIX, SQUARE, pixels, views
 from torch import Tensor
 
+from tests.pnp.scenes import CUBOID, F64, FOCAL, GRID, MATRIX, SQUARE, pixels, views
 from torchpose import pnp
 from torchpose.camera import Camera
 from torchpose.kernels import has_compiler
@@ -71,7 +71,8 @@ def test_cameras_share_what_was_compiled() -> None:
 def test_options(kind: str) -> None:
     g = torch.Generator().manual_seed(5)
     r, t, xy = views(GRID, 80)
-    points, image, camera, options = GRID, pixels(xy, 0.1), MATRIX, {}
+    options: dict[str, Any] = {}
+    points, image, camera = GRID, pixels(xy, 0.1), MATRIX
     if kind == "own":
         points = GRID.expand(80, -1, -1) * torch.linspace(1, 1.5, 80, dtype=F64)[:, None, None]
         camera_points = points @ r.mT + t[:, None]

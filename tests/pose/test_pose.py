@@ -6,12 +6,12 @@ import dataclasses
 
 import pytest
 import torch
-from exact import F64, exact_ellipses, pinhole, random_poses, rings_of
 from torch import Tensor
 
+from tests.exact import F64, exact_ellipses, pinhole, random_poses, rings_of
 from torchpose.camera import Camera
 from torchpose.geometry import rotations
-from torchpose.pose import Evidence, compensate, gather_evidence, intrinsics_covariance, solve_poses
+from torchpose.pose import Evidence, Solutions, compensate, gather_evidence, intrinsics_covariance, solve_poses
 from torchpose.pose import solve as pose
 from torchpose.results import Reason, Status
 from torchpose.target import Target
@@ -59,7 +59,7 @@ def hide(e: Evidence, marker: int) -> Evidence:
     return e.without(torch.full((len(e.mask),), marker))
 
 
-def errors(s: pose.Solutions, r: Tensor, t: Tensor) -> Tensor:
+def errors(s: Solutions, r: Tensor, t: Tensor) -> Tensor:
     return torch.cat([s.t - t, rotations.log(s.R @ r.mT)], -1)
 
 

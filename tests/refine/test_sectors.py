@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
-from exact import F64, exact_ellipses, pinhole, random_poses
 from torch import Tensor
 
+from tests.exact import F64, exact_ellipses, pinhole, random_poses
 from torchpose.geometry import rotations
 from torchpose.refine import Refined, refine_photometric
 from torchpose.refine.photometric.grey_chi2 import grey_chi2
@@ -18,7 +20,7 @@ CAMERA = pinhole()
 QUAD = Target.load("quad40")
 
 
-def arguments(frames: Tensor, r: Tensor, t: Tensor, off: float = 1e-2) -> tuple[object, ...]:
+def arguments(frames: Tensor, r: Tensor, t: Tensor, off: float = 1e-2) -> tuple[Any, ...]:
     """Of `refine_photometric`, from a start that is off by ``off`` mm."""
     g, count = torch.Generator().manual_seed(5), len(r)
     start = t + off * torch.randn(count, 3, dtype=F64, generator=g)

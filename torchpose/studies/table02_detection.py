@@ -90,7 +90,7 @@ def reference() -> Any:
     return json.loads((files("torchpose.studies") / "data" / "elsdc_table2_scene.json").read_text(encoding="utf-8"))
 
 
-def scene(data: dict) -> tuple[Tensor, Tensor]:
+def scene(data: dict[str, Any]) -> tuple[Tensor, Tensor]:
     """Noise-free frame (H, W) and its circles (C, 3): u, v, radius, outer and inner of each marker in turn."""
     about = data["scene"]
     circles = []
