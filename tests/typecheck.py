@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from types import FunctionType, ModuleType
-from typing import Any, Self, get_args
+from typing import Any, Literal, Self, get_args, get_origin
 
 import torch
 from beartype import BeartypeConf, beartype
@@ -91,7 +91,8 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _resolved(hint: Any, function: Callable[..., Any]) -> Any:
-    """The type that an annotation names; Any where that is for mypy alone: `Self`, a protocol, or not imported here."""
+    """The type that an annotation names. Any for what is not to be checked: `Self`, protocols, what is imported for
+    mypy alone, and choices of words, whose functions themselves say which ones they know."""
 
     def holder() -> None: ...
 
@@ -100,7 +101,9 @@ def _resolved(hint: Any, function: Callable[..., Any]) -> Any:
         hint = typing.get_type_hints(holder, function.__globals__, include_extras=True)["hint"]
     except (NameError, TypeError):
         return Any
-    return Any if any(part is Self or getattr(part, "_is_protocol", False) for part in _parts(hint)) else hint
+    parts = _parts(hint)
+    unchecked = any(p is Self or get_origin(p) is Literal or getattr(p, "_is_protocol", False) for p in parts)
+    return Any if unchecked else hint
 
 
 def _parts(hint: Any) -> list[Any]:

@@ -6,6 +6,8 @@ import errno
 import hashlib
 import json
 import os
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,21 +19,21 @@ from torchpose.rig.session import Session, SessionFault, SessionReason
 IMAGE = np.arange(48 * 64, dtype=np.uint16).reshape(48, 64)
 
 
-def opened(folder, **changes):
+def opened(folder: Path, **changes: Any) -> Session:
     return Session(folder, **{"plan": "p", "images": {"camera": [64, 48, "Mono16"]}, **changes})
 
 
-def begun(folder, **changes):
+def begun(folder: Path, **changes: bool) -> Session:
     session = opened(folder, **changes).__enter__()
     session.begin(emulated=True, record={"plan": "small"})
     return session
 
 
-def records(folder):
+def records(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (folder / "manifest.jsonl").read_text().splitlines()]
 
 
-def test_a_frame_is_an_image_and_a_line(tmp_path):
+def test_a_frame_is_an_image_and_a_line(tmp_path: Path) -> None:
     with begun(tmp_path) as session:
         session.write("0000", IMAGE, {"camera": "camera"})
         session.end("complete")
@@ -52,13 +54,15 @@ def test_a_frame_is_an_image_and_a_line(tmp_path):
         (errno.EIO, SessionReason.NOT_WRITABLE),
     ],
 )
-def test_a_line_that_does_not_fit_leaves_nothing(tmp_path, monkeypatch, number, reason):
+def test_a_line_that_does_not_fit_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, reason: SessionReason
+) -> None:
     session = begun(tmp_path)
     session.write("0000", IMAGE, {})
     before = (tmp_path / "manifest.jsonl").read_bytes()
     write = os.write
 
-    def full(file, data):
+    def full(file: int, data: bytes) -> int:
         if len(data) > 20:
             return write(file, data[:20])  # a part of it still fits
         raise OSError(number, os.strerror(number))
@@ -73,7 +77,7 @@ def test_a_line_that_does_not_fit_leaves_nothing(tmp_path, monkeypatch, number, 
     assert session.done == {"0000"}
 
 
-def test_an_image_that_does_not_fit_leaves_nothing(tmp_path):
+def test_an_image_that_does_not_fit_leaves_nothing(tmp_path: Path) -> None:
     with begun(tmp_path) as session:
         (tmp_path / "images" / ".0000.png.tmp").symlink_to("/dev/full")
         with pytest.raises(SessionFault, match="no space left") as caught:
@@ -84,7 +88,7 @@ def test_an_image_that_does_not_fit_leaves_nothing(tmp_path):
     assert [r["record"] for r in records(tmp_path)] == ["session", "end"]
 
 
-def test_a_resumed_session_knows_what_is_there(tmp_path):
+def test_a_resumed_session_knows_what_is_there(tmp_path: Path) -> None:
     with begun(tmp_path) as session:
         session.write("0000", IMAGE, {})
         session.write("0001", IMAGE, {})
@@ -102,7 +106,7 @@ def test_a_resumed_session_knows_what_is_there(tmp_path):
     assert [r["record"] for r in records(tmp_path)][2:] == ["session", "frame", "session", "end"]
 
 
-def test_what_cannot_be_resumed(tmp_path):
+def test_what_cannot_be_resumed(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="--resume: does not exist"):
         opened(tmp_path, resume=True)
     with begun(tmp_path):
@@ -117,7 +121,7 @@ def test_what_cannot_be_resumed(tmp_path):
         session.begin(emulated=False, record={})
 
 
-def test_a_session_that_cannot_begin(tmp_path):
+def test_a_session_that_cannot_begin(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.touch()
     with pytest.raises(ConfigError, match="--out: cannot be made"):
