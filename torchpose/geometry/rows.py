@@ -7,16 +7,16 @@ moving to a device. A field may be a tensor, other rows, a tuple of these, or No
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import field, fields, replace
+from dataclasses import MISSING, field, fields, replace
 from typing import Any, Self
 
 import torch
 from torch import Tensor
 
 
-def shared() -> Any:
+def shared(default: Any = MISSING) -> Any:
     """A dataclass field that belongs to all rows together: selecting rows leaves it alone, `Rows.to` moves it."""
-    return field(metadata={"shared": True})
+    return field(default=default, metadata={"shared": True})
 
 
 class Rows:
@@ -82,4 +82,6 @@ class Rows:
                 changed[f.name] = tuple(change(*items) for items in zip(*values, strict=True))
             elif isinstance(values[0], (Tensor, Rows)):
                 changed[f.name] = change(*values)
+            elif values[0] is not None and not f.metadata.get("shared"):
+                raise TypeError(f"{type(self).__name__}.{f.name} is no tensor and no rows; mark it as shared")
         return replace(self, **changed)  # type: ignore[type-var]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchpose.geometry.least_squares import solve_scaled
 from torchpose.geometry.segments import segment_sum
 from torchpose.refine.photometric.band import band_width
-from torchpose.refine.photometric.gauss_newton import POSE, QUANTISATION, solve_ridged
 from torchpose.refine.photometric.grey_levels import (
     CUT,
     TILE,
@@ -18,9 +18,10 @@ from torchpose.refine.photometric.grey_levels import (
     noise_spread,
     sum_products,
 )
-from torchpose.refine.photometric.ring_model import Sight, gather_pixels, ring_model
+from torchpose.refine.photometric.light import POSE, QUANTISATION
+from torchpose.refine.photometric.ring_model import gather_pixels, ring_model
 from torchpose.refine.photometric.sectors import clear_sectors, misfit, sum_sectors
-from torchpose.refine.result import Refined
+from torchpose.refine.sight import Refined, Sight
 
 _LEVEL_STEPS = 3  # of the grey levels alone
 
@@ -36,33 +37,33 @@ def grey_chi2(sight: Sight, one: Refined, two: Refined) -> tuple[Tensor, Tensor]
     """
     rows = len(sight.frame)
     band = band_width(torch.maximum(one.blur, two.blur))
-    b = gather_pixels(sight, band, TILE)
+    blocks = gather_pixels(sight, band, TILE)
     squares, weights, variances, misfits, explained = [], [], [], [], []
     for pose in (one, two):
-        model = ring_model(b, pose.R, pose.t, pose.blur, check=True)
-        levels = first_levels(b, pose.R, pose.t, pose.blur)
+        model = ring_model(blocks, pose.R, pose.t, pose.blur, check=True)
+        levels = first_levels(blocks, pose.R, pose.t, pose.blur)
         for _ in range(_LEVEL_STEPS):
-            columns, slope = columns_of(b, model, levels)
+            columns, slope = columns_of(blocks, model, levels)
             residual = columns[:, :, -1].flatten(1)
-            usable, weight = inliers(residual, b, model, levels)
-            sectors = sum_sectors(residual, slope, usable, weight, b, model)
-            clear = clear_sectors(sectors, noise_spread(residual, b), model_misfit(levels))
+            usable, weight = inliers(residual, blocks, model, levels)
+            sectors = sum_sectors(residual, slope, usable, weight, blocks, model)
+            clear = clear_sectors(sectors, noise_spread(residual, blocks), model_misfit(levels))
             weight = weight * sectors.of_pixels(clear.to(weight.dtype))
             sums = sum_products(columns, weight)
-            levels = levels + solve_ridged(sums[:, POSE:-1, POSE:-1], sums[:, POSE:-1, -1:]).squeeze(-1)
-        used = segment_sum(weight.sum(-1).double(), b.row, rows).clamp_min(1)
-        variance = (segment_sum(sums[:, -1, -1], b.row, rows) / used).clamp_min(QUANTISATION)
+            levels = levels + solve_scaled(sums[:, POSE:-1, POSE:-1], sums[:, POSE:-1, -1:]).squeeze(-1)
+        used = segment_sum(weight.sum(-1).double(), blocks.row, rows).clamp_min(1)
+        variance = (segment_sum(sums[:, -1, -1], blocks.row, rows) / used).clamp_min(QUANTISATION)
         squares.append(residual.square())
         weights.append(weight)
         variances.append(variance)
-        misfits.append(misfit(sectors, clear, variance[b.row], b.row, rows))
-        shows = clear.any(-1) & _has_contrast(levels, sums[:, POSE:-1, POSE:-1], variance[b.row])
-        explained.append(segment_sum((~shows).double(), b.row, rows) == 0)
+        misfits.append(misfit(sectors, clear, variance[blocks.row], blocks.row, rows))
+        shows = clear.any(-1) & _has_contrast(levels, sums[:, POSE:-1, POSE:-1], variance[blocks.row])
+        explained.append(segment_sum((~shows).double(), blocks.row, rows) == 0)
     variance = torch.minimum(*variances)
-    most = (CUT**2 * variance[b.row, None]).to(squares[0].dtype)
+    most = (CUT**2 * variance[blocks.row, None]).to(squares[0].dtype)
     of_one, of_two = (torch.minimum(s, most) for s in squares)
     difference = (torch.maximum(*weights) * (of_two - of_one)).sum(-1).double()
-    chi2 = segment_sum(difference, b.row, rows) / variance / torch.minimum(*misfits).clamp_min(1)
+    chi2 = segment_sum(difference, blocks.row, rows) / variance / torch.minimum(*misfits).clamp_min(1)
     return chi2, torch.stack(explained, -1)
 
 
@@ -74,5 +75,5 @@ def _has_contrast(levels: Tensor, information: Tensor, variance: Tensor) -> Tens
     """
     by_level = torch.zeros_like(levels)
     by_level[:, 0], by_level[:, 3] = -1.0, 1.0
-    spread2 = variance * (by_level * solve_ridged(information, by_level[..., None]).squeeze(-1)).sum(-1)
+    spread2 = variance * (by_level * solve_scaled(information, by_level[..., None]).squeeze(-1)).sum(-1)
     return (by_level * levels).sum(-1).square() > CUT**2 * spread2
