@@ -130,7 +130,7 @@ def by_prediction(names: list[str], frames: Tensor, target: tp.Target) -> Calibr
         place = {name: k for k, name in enumerate(result.views.names)}
         known = torch.tensor([place.get(name, -1) for name in views.names])
         kept = known[views.view] >= 0
-        views, radius = views.of_points(kept), radius[kept]
+        views, radius = views[kept], radius[kept]
         shift = predicted_shift(
             replace(views, view=known[views.view]), radius, result.camera, result.bundle.R, result.bundle.t
         )
@@ -175,7 +175,7 @@ def blob_views(views: Views, frames: Tensor, target: tp.Target, holes: Tensor) -
         if len(points):
             nearest, at = torch.cdist(views.pixels[mine], points).min(1)
             pixels[mine], found[mine] = points[at], nearest < 5
-    return replace(views, pixels=pixels).of_points(found)
+    return replace(views, pixels=pixels)[found]
 
 
 def one_set(

@@ -20,7 +20,7 @@ import argparse
 import math
 import sys
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -32,7 +32,7 @@ import torchpose as tp
 from torchpose.analysis import pose_errors
 from torchpose.geometry import conics, rotations
 from torchpose.sim import add_noise, render, shapes
-from torchpose.sim.shapes import Shapes
+from torchpose.sim.shapes import Circles, Shapes, Sides
 
 F64 = torch.float64
 WIDTH, HEIGHT, FOCAL = 1824, 1216, 1111.11
@@ -212,12 +212,9 @@ def _shape(
 
 def _with_hole(shape: Shapes, hole: Shapes) -> Shapes:
     """One shape with the outline of another as its hole."""
-    return Shapes(
-        shape.frame, shape.marker, shape.level, shape.center,
-        torch.cat([shape.circle_of, hole.circle_of]), torch.cat([shape.circle_center, hole.circle_center]),
-        torch.cat([shape.circle_axes, hole.circle_axes]), torch.cat([shape.circle_sign, -hole.circle_sign]),
-        torch.cat([shape.side_of, hole.side_of]), torch.cat([shape.side, hole.side.flip(1)]),
-    )  # fmt: skip
+    circles = Circles.cat([shape.circles, replace(hole.circles, sign=-hole.circles.sign)])
+    sides = Sides.cat([shape.sides, replace(hole.sides, ends=hole.sides.ends.flip(1))])
+    return replace(shape, circles=circles, sides=sides)
 
 
 def _covers(rng: np.random.Generator, target: tp.Target, levels: tuple[float, float]) -> Shapes:

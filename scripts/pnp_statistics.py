@@ -177,7 +177,7 @@ def fall(scenes: Scenes) -> Tensor:
     """(M,): decreases from the start of each second minimum to its end, over that promised by the first step."""
     count = scenes.image_points.shape[1]
     weights = scenes.sigma[:, None].pow(-2).expand(-1, count)
-    inputs = Inputs(scenes.object_points, scenes.image_points, scenes.matrix, 1.0, None, weights, None, math.inf)
+    inputs = Inputs(scenes.object_points, scenes.image_points, scenes.matrix, 1.0, None, weights, None, None)
     problem = prepare(inputs)
     poses = upright(starts(problem).double())
     normal = normal_equations(problem.observed.each(), poses)

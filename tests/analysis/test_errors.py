@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from scipy.stats import chi2, kstest
 from torchpose.analysis import pose_errors, rms
 from torchpose.geometry import rotations
 from torchpose.io.truth import Truth
-from torchpose.results import Poses
+from torchpose.results import Detections, Poses
 
 POSES = 4000
 
@@ -113,7 +112,11 @@ def test_poses_and_truth_are_what_is_compared() -> None:
     eye = torch.eye(3, dtype=torch.float64).repeat(rows, 1, 1)
     t = torch.ones(rows, 3, dtype=torch.float64)
     covariance = torch.eye(6, dtype=torch.float64).repeat(rows, 1, 1)
-    none: Any = None  # no detections, which are not compared
+    none = Detections(
+        **{name: torch.zeros(0, dtype=torch.int64) for name in ("frame", "target", "marker")},
+        **{name: torch.zeros(0, size) for name, size in (("center", 2), ("outer", 5), ("inner", 5))},
+        center_cov=torch.zeros(0, 2, 2),
+    )
     poses = Poses(R=eye, t=t, covariance=covariance, R_alt=eye, t_alt=t, detections=none, **zeros, **whole)
     truth = Truth(["a", "b"], ["x", "x"], torch.zeros_like(t), torch.zeros_like(t))
     assert pose_errors(poses, truth).nees.tolist() == [3.0, 3.0]

@@ -25,7 +25,8 @@ def test_the_diagonals_of_a_square_in_perspective_meet_in_its_centre() -> None:
     corner = torch.tensor([[-4.0, -4, 0], [4, -4, 0], [4, 4, 0], [-4, 4, 0]], dtype=F64)
     x = corner @ rotations.exp(torch.tensor([0.6, 0.3, 0.2], dtype=F64)).T + torch.tensor([1.0, 2, 40], dtype=F64)
     image = 800 * x[:, :2] / x[:, 2:]
-    sides = localisers.through(image, image.roll(-1, 0))
+    points = torch.nn.functional.pad(image, (0, 1), value=1.0)
+    sides = torch.linalg.cross(points, points.roll(-1, 0))
     assert localisers.diagonals(sides[None])[0].tolist() == pytest.approx([800 / 40, 1600 / 40])
     assert (image.mean(0) - localisers.diagonals(sides)).norm() > 0.1
 
@@ -100,9 +101,9 @@ def test_codes_are_read_at_a_tilt(name: str) -> None:
             circles("rings", (recognition.RADIUS_MM, code * recognition.RADIUS_MM), 150),
             recognition.read_rings,
         )
-    camera, R, t = study.view(Condition(tilt=25), 4, 0)
-    frames = study.pictures(mark, Condition(), camera, R, t, 0)
-    outline, _ = study.outlines(mark, camera, R, t)
+    seen = study.view(Condition(tilt=25), 4, 0)
+    frames = study.pictures(mark, Condition(), seen, 0)
+    outline, _ = study.outlines(mark, seen)
     value = read(localisers.edge_points(frames, outline, 0.7), outline)
     assert (value - code).abs().max() < 0.01
 

@@ -46,12 +46,12 @@ def views(
     pixels = pixels + sigma * torch.randn(pixels.shape, dtype=F64, generator=torch.Generator().manual_seed(seed))
     variance = (sigma if said is None else said) ** 2
     return Views(
-        tuple(f"{k}.png" for k in range(n)),
         torch.arange(n).repeat_interleave(m),
         torch.arange(m).repeat(n),
         points.repeat(n, 1),
         pixels,
         variance * torch.eye(2, dtype=F64).expand(n * m, 2, 2),
+        tuple(f"{k}.png" for k in range(n)),
     )
 
 

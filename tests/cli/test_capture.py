@@ -29,8 +29,7 @@ from torchpose.cli.main import main
 from torchpose.geometry import rotations
 from torchpose.io.manifest import read_manifest
 from torchpose.rig.cameras import Cameras, Frame
-from torchpose.rig.robot import Robot
-from torchpose.rig.robot_settings import RobotReading
+from torchpose.rig.robot import Robot, RobotReading
 from torchpose.rig.twin.controller import TwinController
 from torchpose.rig.twin.scene import Scene
 
@@ -261,7 +260,7 @@ def robot_fault(name: str, at_fraction: float | None = None) -> Callable[..., An
 
 
 def kill_driver(cell: Cell, controller: TwinController, cameras: Cameras) -> None:
-    cell.robot._link.kill()
+    cell.robot._child.kill()
 
 
 FAULTS = [

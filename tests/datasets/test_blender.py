@@ -1,6 +1,6 @@
 """Blender against the analytic renderer: the same plan, two independent programs. Runs where bpy is installed.
 
-pip install -e '.[blender,dev]' under Python 3.11, then pytest -m slow tests/sim/test_blender.py
+pip install -e '.[blender,dev]' under Python 3.11, then pytest -m slow tests/datasets/test_blender.py
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def ink_centroids(plan: Plan, frames: torch.Tensor) -> torch.Tensor:
         R, t = plan.R[i], plan.t[i]
         depth = (R[:, 2] @ t) / (ray @ R[:, 2])
         plane = (depth[..., None] * ray - t) @ R[:, :2]
-        dark = (c["light"][i] - frame) / (c["light"][i] - c["dark"][i])
+        dark = (c.light[i] - frame) / (c.light[i] - c.dark[i])
         for center, radius in zip(target.centers, target.radii[:, 0], strict=True):
             mass = dark * ((plane - center[:2]).norm(dim=-1) < 1.2 * radius)
             out.append(torch.stack([(mass * u).sum(), (mass * v).sum()]) / mass.sum())

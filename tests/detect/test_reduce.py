@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from torchpose.detect import reduce
 from torchpose.detect.reduce import REDUCED_PIXELS, area_reduce, reduction_factor
 
 
@@ -21,6 +22,39 @@ def test_block_means(factor: int, dtype: torch.dtype) -> None:
     # 8 and 16 bit stay integers until they are small, rounded once for each factor of 2
     rounding = {1: 0.0, 2: 0.5, 3: 0.5, 4: 1.0}[factor] if dtype in (torch.uint8, torch.uint16) else 1e-4
     assert (reduced.double() - blocks.mean((2, 4))).abs().max() <= rounding
+
+
+@pytest.mark.parametrize("factor", [*range(2, 14), 15, 22, 26])
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.uint16, torch.float16, torch.float32, torch.float64])
+@pytest.mark.parametrize("exact", [False, True])
+def test_every_device_rounds_alike(
+    factor: int, dtype: torch.dtype, exact: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What other devices do, done on the CPU, is what the CPU does in its own way, to the last bit."""
+    generator = torch.Generator().manual_seed(factor)
+    size = (2, 7 * factor + 1, 39 * factor + 2)
+    if dtype.is_floating_point:
+        frames = (255 * torch.rand(size, generator=generator)).to(dtype)
+    else:
+        frames = torch.randint(0, torch.iinfo(dtype).max + 1, size, generator=generator).to(dtype)
+    here = area_reduce(frames, factor, exact=exact)
+    monkeypatch.setattr(reduce, "_in_parts", reduce._at_once)
+    elsewhere = area_reduce(frames, factor, exact=exact)
+    assert here.dtype == elsewhere.dtype
+    assert torch.equal(here, elsewhere)
+
+
+@pytest.mark.parametrize("by", range(3, 10, 2))
+def test_16_bit_sums_round_right_through_opencv(by: int) -> None:
+    """All sums next to a border between two levels."""
+    area = by * by
+    border = area * torch.arange(65535) + area // 2
+    blocks = torch.stack([border, border + 1]).flatten()[:, None] // area + (
+        torch.arange(area) < torch.stack([border, border + 1]).flatten()[:, None] % area
+    )
+    frames = blocks.unflatten(1, (by, by)).transpose(0, 1).flatten(1)[None].to(torch.uint16)
+    expected = torch.stack([torch.arange(65535), torch.arange(1, 65536)]).flatten()
+    assert torch.equal(area_reduce(frames, by).flatten().long(), expected)
 
 
 def test_16_bit_range() -> None:

@@ -53,6 +53,10 @@ def test_a_whole_last_line_counts_without_its_newline(tmp_path: Path) -> None:
         ([SESSION, FRAME | {"robot_pose": [1, 2, 3, 4, 5]}], "line 2: robot_pose"),
         ([SESSION, FRAME | {"robot_pose": [1, 2, 3, 4, 5, float("nan")]}], "line 2: robot_pose"),
         ([SESSION, FRAME | {"robot_pose": "home"}], "line 2: robot_pose"),
+        ([SESSION, FRAME | {"robot_pose": [10**400, 2, 3, 4, 5, 6]}], "line 2: robot_pose"),
+        ([SESSION, FRAME | {"robot_pose": [1, 2, 3, 4, 5, "6"]}], "line 2: robot_pose"),
+        ([SESSION, FRAME | {"id": True}], "line 2: id"),
+        ([SESSION | {"units": ["mm"]}], "line 1: units"),
     ],
 )
 def test_broken_records_are_refused_by_line_and_field(

@@ -1,9 +1,12 @@
 """Rows, tables and the journal: exact round trips, whole files or none, resuming after any cut."""
 
 import csv
+import errno
 import io
 import json
 import math
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -24,7 +27,7 @@ from torchpose.io.rows import (
     pose_rows,
 )
 from torchpose.io.store import ResultStore
-from torchpose.io.writers import read_rows, write_rows
+from torchpose.io.writers import read_rows, read_table, write_rows
 from torchpose.results import Detections, Poses, Reason, Status
 
 CONTRACT = "frame,target,status,tx,ty,tz,rx,ry,rz,sx,sy,sz,srx,sry,srz,rms_px,markers,reason"
@@ -129,6 +132,13 @@ def test_tables_read_back_to_the_same_bits(tmp_path: Path, suffix: str) -> None:
     kept = [c for c, kind in schema.items() if suffix != ".csv" or kind is not list]
     assert list(read_rows(path, schema)) == [{c: row[c] for c in kept} for row in rows]
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize("row", ["a.png", "a.png,quad,3"])
+def test_a_row_with_another_number_of_cells_is_refused(tmp_path: Path, row: str) -> None:
+    (tmp_path / "t.csv").write_text(f"frame,target\n{row}\n")
+    with pytest.raises(ConfigError, match=r"t\.csv: POSES: cannot be read \(a row has another number of cells"):
+        read_table(tmp_path / "t.csv")
 
 
 def test_csv_has_the_columns_of_the_contract(tmp_path: Path) -> None:
@@ -328,6 +338,42 @@ def test_two_runs_cannot_write_one_table(tmp_path: Path) -> None:
     second = store(tmp_path, resume=True)
     assert NAMES[0] in second
     second.close()
+
+
+def test_a_killed_run_holds_no_lock(tmp_path: Path) -> None:
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "from tests.io.test_store import NAMES, Path, record, store\n"
+        "one = store(Path(sys.argv[2])); one.append([record(NAMES[0])]); print('held', flush=True); sys.stdin.read()"
+    )
+    command = [sys.executable, "-c", code, str(Path(__file__).parents[2]), str(tmp_path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "held\n"
+        with pytest.raises(ConfigError, match=r"p\.csv\.partial: --out: another run is writing it; wait for it or"):
+            store(tmp_path, resume=True)
+        other.kill()
+    assert complete(tmp_path, resume=True) == NAMES[:1]
+    assert {p.name for p in tmp_path.iterdir()} == {"p.csv", "d.csv", "p.csv.run.json"}
+
+
+def test_places_without_locks_are_written_unguarded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr("torchpose.io.store.lock_descriptor", missing)
+    assert complete(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    "line", ["[1]", '{"frame": "0.png"}', '{"frame": "0.png", "rows": [], "detections": []}', '{"rows": [{}]}', "3"]
+)
+@pytest.mark.parametrize("first", [True, False])
+def test_a_journal_of_another_program_is_one_clear_line(tmp_path: Path, line: str, first: bool) -> None:
+    head = "" if first else json.dumps({"origin": ORIGIN}) + "\n"
+    (tmp_path / "p.csv.partial").write_text(head + line + "\n")
+    with pytest.raises(ConfigError, match=r"p\.csv\.partial: --resume: not written by torchpose; run without --resume"):
+        store(tmp_path, resume=True)
 
 
 @pytest.mark.parametrize("place", ["p.txt", "p", "gone/p.csv", "folder.csv", "file/p.csv", "/proc/p.csv"])

@@ -10,11 +10,12 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from torchpose.errors import ConfigError
-from torchpose.rig.camera import CameraFault, CameraReason, CameraSettings
 from torchpose.rig.cameras import Cameras
-from torchpose.rig.settings import load_rig
+from torchpose.rig.faults import CameraFault, CameraReason
+from torchpose.rig.settings import CameraSettings, load_rig
 
 pytest.importorskip("pypylon.pylon", reason="pypylon is not installed (extra: rig)")
 
@@ -33,12 +34,10 @@ def _emulators(monkeypatch: pytest.MonkeyPatch) -> None:
 class Pictures:
     """A scene of random pictures, a new one at every look."""
 
-    def __init__(
-        self, folder: Path, shape: tuple[int, int] = (SIZE[1], SIZE[0]), dtype: type[np.uint16 | np.uint8] = np.uint8
-    ) -> None:
+    def __init__(self, folder: Path, shape: tuple[int, int] = (SIZE[1], SIZE[0]), dtype: Any = np.uint8) -> None:
         self.folder, self.shape, self.dtype = folder, shape, dtype
         self.random = np.random.default_rng(0)
-        self.shown: dict[str, np.ndarray] = {}
+        self.shown: dict[str, NDArray[Any]] = {}
 
     def __call__(self, name: str) -> Path:
         image = self.random.integers(0, np.iinfo(self.dtype).max, self.shape, self.dtype, endpoint=True)
@@ -98,7 +97,7 @@ def test_a_camera_is_found_by_its_serial_number() -> None:
         assert [d["serial"] for d in cameras.descriptions] == ["0815-0001", "0815-0000"]
 
 
-def refused(reason: CameraReason, *words: str, action: Callable[..., Any]) -> float:
+def refused(reason: CameraReason, *words: str, action: Callable[[], object]) -> float:
     start = time.monotonic()
     with pytest.raises(CameraFault) as caught:
         action()

@@ -15,19 +15,14 @@ from scipy.spatial.transform import Rotation
 
 from torchpose.errors import ConfigError
 from torchpose.rig.plan import load_plan
-from torchpose.rig.robot_settings import Workspace
+from torchpose.rig.settings import Workspace
 
 ROOT = Path(__file__).parents[2]
 DOWN = [math.pi, 0.0, 0.0]
 AXIS: dict[str | None, int] = {"x": 0, "y": 1, "z": 2, "pitch": 0, "yaw": 1, "roll": 2}
 
 
-def written(
-    folder: Path,
-    steps: list[dict[str, Any]],
-    axes: list[float] | str = "tool",
-    rotation: list[float] = DOWN,
-) -> Path:
+def written(folder: Path, steps: list[Any], axes: str | list[float] = "tool", rotation: list[float] = DOWN) -> Path:
     origin = {"translation": [400.0, 0.0, 300.0], "rotation": rotation}
     path = folder / "plan.yaml"
     path.write_text(yaml.safe_dump({"name": "try", "origin": origin, "axes": axes, "steps": steps}))
@@ -41,15 +36,15 @@ def test_the_paper_plan() -> None:
     assert all(w.origin == (w.value == 0) for w in plan.waypoints)
     for w in plan.waypoints:
         shift = torch.tensor(w.pose[:3]) - torch.tensor(plan.origin[:3])
-        move = torch.zeros(3)
+        expected = torch.zeros(3)
         if w.kind == "translation":
-            move[AXIS[w.axis]] = w.value  # its axes are those of the base
-        torch.testing.assert_close(shift, move, atol=1e-5, rtol=0)
+            expected[AXIS[w.axis]] = w.value  # its axes are those of the base
+        torch.testing.assert_close(shift, expected, atol=1e-5, rtol=0)
         turn = Rotation.from_rotvec(w.pose[3:]) * Rotation.from_rotvec(plan.origin[3:]).inv()
-        expected = [0.0, 0.0, 0.0]
+        turned = [0.0, 0.0, 0.0]
         if w.kind == "rotation":
-            expected[AXIS[w.axis]] = math.radians(w.value)
-        assert turn.as_rotvec() == pytest.approx(expected, abs=1e-9)
+            turned[AXIS[w.axis]] = math.radians(w.value)
+        assert turn.as_rotvec() == pytest.approx(turned, abs=1e-9)
 
 
 vectors = st.lists(st.floats(-2, 2), min_size=3, max_size=3)
@@ -58,12 +53,9 @@ vectors = st.lists(st.floats(-2, 2), min_size=3, max_size=3)
 @given(rotation=vectors, axes=st.one_of(st.just("tool"), vectors), value=st.floats(-20, 20))
 @settings(max_examples=30, deadline=None)
 def test_moves_and_turns_are_about_the_given_axes(
-    tmp_path_factory: pytest.TempPathFactory, rotation: list[float], axes: list[float] | str, value: float
+    tmp_path_factory: pytest.TempPathFactory, rotation: list[float], axes: str | list[float], value: float
 ) -> None:
-    steps: list[dict[str, Any]] = [
-        {"translation": {"axes": ["y"], "values_mm": [value]}},
-        {"rotation": {"values_deg": [value]}},
-    ]
+    steps = [{"translation": {"axes": ["y"], "values_mm": [value]}}, {"rotation": {"values_deg": [value]}}]
     plan = load_plan(written(tmp_path_factory.mktemp("plan"), steps, axes, rotation))
     frame = Rotation.from_rotvec(rotation if axes == "tool" else axes)
     start = Rotation.from_rotvec(rotation)
@@ -126,7 +118,7 @@ def test_a_waypoint_out_of_the_workspace(tmp_path: Path) -> None:
         ([{"poses": [[1, 2, 3]]}], "steps[0].poses[0]: has 3 entries; give 6"),
     ],
 )
-def test_mistakes(tmp_path: Path, steps: list[dict[str, Any]], words: str) -> None:
+def test_mistakes(tmp_path: Path, steps: list[Any], words: str) -> None:
     path = written(tmp_path, steps)
     with pytest.raises(ConfigError) as caught:
         load_plan(path)

@@ -293,8 +293,8 @@ def test_tool_outside_the_workspace_at_the_start(loopback: str) -> None:
 
 @needs_ur_rtde
 def test_driver_process_killed_in_mid_move(robot: Robot, twin: TwinController) -> None:
-    assert robot._link is not None
-    threading.Timer(0.3, os.kill, (robot._link.pid, signal.SIGKILL)).start()
+    assert robot._child is not None
+    threading.Timer(0.3, os.kill, (robot._child.pid, signal.SIGKILL)).start()
     with fault_within(1.5, RobotReason.CHILD_DIED):
         robot.move(FAR)
     assert stands(twin, 0.2)

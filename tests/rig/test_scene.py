@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 import yaml
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from torchpose.camera import Camera
@@ -22,18 +24,13 @@ CAMERA = Camera(
 TOOL = [400.0, 10.0, 300.0, 3.0, 0.2, -0.1]
 
 
-def matrix(pose: dict[str, list[float]]) -> np.ndarray:
+def matrix(pose: dict[str, Any]) -> NDArray[np.float64]:
     m = np.eye(4)
     m[:3, :3], m[:3, 3] = Rotation.from_rotvec(pose["rotation"]).as_matrix(), pose["translation"]
     return m
 
 
-def scene(
-    folder: Path,
-    camera: dict[str, dict[str, list[float]]],
-    target: dict[str, dict[str, list[float]]],
-    **changes: dict[str, float],
-) -> Scene:
+def scene(folder: Path, camera: dict[str, Any], target: dict[str, Any], **changes: Any) -> Scene:
     CAMERA.save(folder / "camera.json")
     given = {"cameras": [{"camera": "camera.json", "focal_scale": 1.01, **camera}], "target": "quad40", **target}
     path = folder / "twin.yaml"

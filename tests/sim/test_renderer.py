@@ -286,6 +286,12 @@ def test_bad_arguments() -> None:
         add_noise(torch.zeros(1, 2, 2), 1.0, bits=17)
 
 
+def test_settings_by_another_name_are_refused() -> None:
+    R, t = pose(0, 0, (0.0, 0.0, 200.0))
+    with pytest.raises(TypeError, match="psf_sigmas"):
+        render(camera(), target(), R, t, psf_sigmas=0.7)
+
+
 def test_no_frames() -> None:
     assert render(camera(), target(), torch.zeros(0, 3, 3), torch.zeros(0, 3), plate=(9, 9)).shape == (0, 120, 128)
     assert add_noise(torch.zeros(0, 3, 4), 1.0).shape == (0, 3, 4)

@@ -16,7 +16,7 @@ import pytest
 from torchpose.errors import ConfigError
 from torchpose.report.figures import subplots
 from torchpose.studies import reproduce as module
-from torchpose.studies.study import Comparison, Picture, StudyResult, Table, Value
+from torchpose.studies.study import Comparison, Picture, StudyResult, Table
 
 
 def small(name: str, calls: list[str], error: Exception | None = None) -> ModuleType:
@@ -29,7 +29,7 @@ def small(name: str, calls: list[str], error: Exception | None = None) -> Module
         progress(0.5)
         figure, ((axis,),) = subplots(1, 1, (3, 2))
         axis.plot([0, 1])
-        rows: list[dict[str, Value]] = [
+        rows: list[dict[str, Any]] = [
             {"noise": n, "error_px": float("nan") if n == 0 else 0.1234567 * n, "kind": "a<b"} for n in range(30)
         ]
         return StudyResult(

@@ -7,11 +7,10 @@ import math
 import pytest
 import torch
 
-from tests.studies.tables import rows
 from torchpose.analysis.sensitivity import Uncertainty
-from torchpose.analysis.sweep import Sweep
+from torchpose.analysis.sweep import Sweep, sweep
 from torchpose.studies import fig04_sensitivity, table01_orientation
-from torchpose.studies.fig04_sensitivity import SIGMAS_PX, exponent, paper_camera, simulate
+from torchpose.studies.fig04_sensitivity import SIGMAS_PX, cases_of, exponent, paper_camera
 from torchpose.target import Target
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is:DeprecationWarning")
@@ -21,8 +20,8 @@ pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is:Deprecatio
 def cases() -> list[Sweep]:
     distance = torch.linspace(12, 32, 11, dtype=torch.float64)
     size = Uncertainty(focal_length=fig04_sensitivity.FOCAL_ERROR)
-    found = simulate(paper_camera(), Target.load("quad8"), distance, SIGMAS_PX, size, draws=3000, seed=5)
-    return list(found.values())
+    plans = cases_of(SIGMAS_PX, size).values()
+    return [sweep(paper_camera(), Target.load("quad8"), distance, plan, draws=3000, seed=5) for plan in plans]
 
 
 def test_without_focal_error_x_and_y_are_linear_and_z_is_quadratic(cases: list[Sweep]) -> None:
@@ -62,13 +61,13 @@ def test_the_study_has_the_papers_figures_beside_ours(cases: list[Sweep]) -> Non
 def test_table_one_yaw_and_pitch_are_worse_than_roll_and_the_papers_numbers_have_their_circumstances() -> None:
     result = table01_orientation.run()
     noise, focal, readings = result.tables
-    for yaw, roll in zip(rows(noise)[::2], rows(noise)[1::2], strict=True):
+    for yaw, roll in zip(noise.rows[::2], noise.rows[1::2], strict=True):
         # of a square: sqrt(2) d / a
         ratio = yaw["predicted_rms_deg"] / roll["predicted_rms_deg"]
         assert ratio == pytest.approx(math.sqrt(2) * yaw["distance_mm"] / 4, rel=1e-3)
         assert roll["rms_deg"] == pytest.approx(roll["predicted_rms_deg"], rel=0.15)
-    for row in rows(readings):
+    for row in readings.rows:
         assert row["yaw_pitch_deg"] == pytest.approx(0.165, rel=0.02)
         assert row["roll_deg"] == pytest.approx(0.051, rel=0.02)
-    assert rows(focal)[0]["yaw_pitch_deg"] < 1e-9
-    assert rows(focal)[-1]["yaw_pitch_deg"] > 0.01
+    assert focal.rows[0]["yaw_pitch_deg"] < 1e-9
+    assert focal.rows[-1]["yaw_pitch_deg"] > 0.01

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.studies.tables import rows
 from torchpose.studies import fig05_shapes
 from torchpose.studies.fig05_shapes import Condition
 
@@ -30,15 +29,15 @@ def test_the_study_says_which_shape_is_best_where(monkeypatch: pytest.MonkeyPatc
     assert done[-1] == 1
     accuracy, bars, found, _codes = result.tables
     assert len(accuracy.rows) == 8 * 5
-    assert {row["mark"] for row in found.rows} == {row["mark"] for row in rows(accuracy)}
+    assert {row["mark"] for row in found.rows} == {row["mark"] for row in accuracy.rows}
     # the paper's reasons for concentric rings
-    tilted = {row["mark"]: row["rms_px"] for row in rows(accuracy) if row["curve"] == "tilt_deg" and row["value"] == 45}
+    tilted = {row["mark"]: row["rms_px"] for row in accuracy.rows if row["curve"] == "tilt_deg" and row["value"] == 45}
     assert min(tilted, key=tilted.__getitem__) == "concentric rings"
     assert tilted["filled circle"] > 20 * tilted["concentric rings"]
-    left = {r["mark"]: r["rms_px"] for r in rows(accuracy) if r["curve"] == "distortion_k1_uncorrected"}
+    left = {r["mark"]: r["rms_px"] for r in accuracy.rows if r["curve"] == "distortion_k1_uncorrected"}
     assert min(left, key=left.__getitem__) == "concentric rings"
     # and its claim about the cross, which holds for the centroid
-    centroid = {row["bar_over_extent"]: row["centroid_rms_px"] for row in rows(bars)}
+    centroid = {row["bar_over_extent"]: row["centroid_rms_px"] for row in bars.rows}
     assert centroid[0.5] < centroid[0.2] < centroid[0.1]
     assert {c.what for c in result.comparisons} >= {"rings: false recognitions a frame"}
     assert len(result.save(tmp_path)) == 4 + 3 + 1

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.studies.tables import rows
 from torchpose.datasets.plan import load_plan
 from torchpose.studies import (
     fig06_regions,
@@ -35,17 +34,17 @@ def check(result: StudyResult, folder: Path) -> None:
 def test_table_ii_finds_all_circles_and_explains_the_papers_error(tmp_path: Path) -> None:
     result = table02_detection.run(seeds=1)
     found, explained = result.tables
-    for row in rows(found):
+    for row in found.rows:
         assert (row["found_of_8"], row["false"]) == (8, 0)
         assert row["rms_px"] < 0.05
-    for row in rows(explained):
+    for row in explained.rows:
         assert row["mean_with_both_mistakes_px"] == pytest.approx(row["paper_mean_px"], abs=0.05)
     check(result, tmp_path)
 
 
 def test_fig_6_finds_every_circle_and_knows_the_markers(tmp_path: Path) -> None:
     result = fig06_regions.run()
-    drawing, phone = rows(result.tables[0])
+    drawing, phone = result.tables[0].rows
     assert (drawing["found"], drawing["other_ellipses"], drawing["rings"]) == (8, 0, 4)
     assert phone["found"] == phone["circles"]
     assert "4 are known as markers; the pose is ok" in result.statements[-1]
@@ -54,7 +53,7 @@ def test_fig_6_finds_every_circle_and_knows_the_markers(tmp_path: Path) -> None:
 
 def test_fig_7_corrected_edges_give_the_true_size(tmp_path: Path) -> None:
     result = fig07_subpixel.run()
-    for row in rows(result.tables[0]):
+    for row in result.tables[0].rows:
         assert row["axes_error_corrected_px"] < 0.02 < row["axes_error_as_read_px"]
         assert row["center_error_corrected_px"] < 0.02
     check(result, tmp_path)
@@ -63,7 +62,7 @@ def test_fig_7_corrected_edges_give_the_true_size(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_table_iii_photometric_is_near_the_bound_and_the_papers_chain_below_its_figures(tmp_path: Path) -> None:
     result = table03_centers.run(seeds=12)
-    for row in rows(result.tables[0]):
+    for row in result.tables[0].rows:
         if row["noise"] > 0:
             assert row["photometric_over_bound"] < 1.35  # 96 errors: 7 % of scatter
         if row["paper_largest_px"] is not None:
@@ -74,7 +73,7 @@ def test_table_iii_photometric_is_near_the_bound_and_the_papers_chain_below_its_
 def test_table_iv_compensates_at_every_tilt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(table04_compensation, "TILTS_DEG", (5, 10, 60))
     result = table04_compensation.run(seeds=3)
-    for row in rows(result.tables[0]):
+    for row in result.tables[0].rows:
         assert row["formula_exact_px"] < 1e-9
         if row["noise"] == 0:
             assert row["measured_exact_px"] < 0.002
@@ -90,7 +89,7 @@ def test_fig_11_has_the_plan_of_the_configs_and_obeys_equation_5(tmp_path: Path)
     assert ours.file.imaging == configured.file.imaging
     assert ours.file.sensor == configured.file.sensor
     result = fig11_simulation.run(frames=6)
-    by = {(row["frames"], row["axis"]): row for row in rows(result.tables[0])}
+    by = {(row["frames"], row["axis"]): row for row in result.tables[0].rows}
     assert by["analytic", "z"]["ok"] == 6
     assert by["analytic", "z"]["rms"] < 4 * by["analytic", "z"]["bound_sigma"]
     assert by["analytic, focal length 0.25 % too long", "z"]["bias"] == pytest.approx(400, abs=30)
