@@ -17,6 +17,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -82,8 +83,8 @@ def problems(batch: int) -> dict[str, tuple[Callable[..., Any], Callable[..., An
     rows = {name: (function, mapped(function), args) for name, (function, args) in table.items()}
     spread = (0.01 * torch.eye(2, dtype=torch.float64)).expand(batch, 4, 2, 2)
     rows["pnp.solve of four centres, two starts"] = (
-        lambda *args: solve_centers(*args, False),
-        lambda *args: solve_centers(*args, True),
+        partial(solve_centers, compile=False),
+        partial(solve_centers, compile=True),
         (image, spread, upright, 40 * t),
     )
     return rows

@@ -21,6 +21,7 @@ import argparse
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -117,13 +118,11 @@ def by_prediction(names: list[str], frames: Tensor, target: tp.Target) -> Calibr
     """Residual: fitted minus predicted centre of every ellipse. The shift is renewed until it stands."""
     both = [ring_views(names, frames, target, which) for which in (0, 1)]
     views = Views.cat([both[0][0]])
-    views = replace(
-        views,
-        **{
-            n: torch.cat([getattr(v, n) for v, _, _ in both])
-            for n in ("view", "point", "points", "pixels", "covariance")
-        },
-    )
+    joined: dict[str, Any] = {
+        name: torch.cat([getattr(part, name) for part, _, _ in both])
+        for name in ("view", "point", "points", "pixels", "covariance")
+    }
+    views = replace(views, **joined)
     radius = torch.cat([size for _, size, _ in both])
     result = calibrate_intrinsics(views, [START], lens=LENS)
     for _ in range(3):
@@ -161,9 +160,9 @@ def blob_views(views: Views, frames: Tensor, target: tp.Target, holes: Tensor) -
 
     It wants full discs: the holes (K, 5), inner ellipses, are painted over up to the middle of the ring.
     """
-    parameters = cv2.SimpleBlobDetector_Params()
+    parameters = cv2.SimpleBlobDetector_Params()  # type: ignore[attr-defined]  # missing in the stubs of OpenCV 5
     parameters.maxArea = 1e5
-    detector = cv2.SimpleBlobDetector_create(parameters)
+    detector = cv2.SimpleBlobDetector_create(parameters)  # type: ignore[attr-defined]  # missing in the stubs of OpenCV 5
     pixels, found = views.pixels.clone(), torch.zeros(len(views.view), dtype=torch.bool)
     wider = 0.5 + 0.5 * target.radii[views.point, 0] / target.radii[views.point, 1]
     for k, frame in enumerate(frames):

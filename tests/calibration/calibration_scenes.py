@@ -9,13 +9,14 @@ from torch import Tensor
 
 import torchpose as tp
 from torchpose.calibration import Views
+from torchpose.camera.model import Model
 from torchpose.geometry import rotations
 
 F64 = torch.float64
 Transform = tuple[Tensor, Tensor]
 
 
-def camera(distortion: list[float] | None = None, *, model: str = "brown_conrady", scale: float = 1.0) -> tp.Camera:
+def camera(distortion: list[float] | None = None, *, model: Model = "brown_conrady", scale: float = 1.0) -> tp.Camera:
     """1824 x 1216 px at scale 1, no symmetry anywhere."""
     d = [-0.08, 0.03, 2e-4, -1.5e-4] if distortion is None else distortion
     k = scale * torch.tensor([[1503.0, 0, 905.3], [0, 1500, 612.8], [0, 0, 1 / scale]], dtype=F64)

@@ -3,11 +3,11 @@
 import math
 from dataclasses import replace
 
-import calibration_scenes as scenes
 import pytest
 import torch
 
 import torchpose as tp
+from tests.calibration import calibration_scenes as scenes
 from torchpose.calibration import LENS_MODELS, calibrate_intrinsics
 from torchpose.calibration.bundle import adjust, moved_camera
 from torchpose.calibration.intrinsics import start_cameras

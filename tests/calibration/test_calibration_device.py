@@ -2,11 +2,11 @@
 
 from dataclasses import replace
 
-import calibration_scenes as scenes
 import torch
-from devices import DeviceNamed
 
 import torchpose as tp
+from tests.calibration import calibration_scenes as scenes
+from tests.devices import DeviceNamed
 from torchpose.calibration import calibrate_hand_eye, calibrate_intrinsics
 from torchpose.calibration.boards import Board, find_corners
 from torchpose.calibration.intrinsics import locate_views, start_cameras

@@ -4,9 +4,9 @@ import math
 
 import pytest
 import torch
-from devices import DeviceNamed
 
 import torchpose as tp
+from tests.devices import DeviceNamed
 from torchpose.analysis import Uncertainty, pose_crlb, propagate, simulate_frames, simulate_points
 from torchpose.analysis.evaluation import Estimates, evaluate
 from torchpose.analysis.localisers import by_centroid, by_corner, centre_bound

@@ -1,6 +1,8 @@
 """Decoding: every format bit by bit, and no file that ends early is ever measured."""
 
 import io
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,17 +16,17 @@ RAMP = (np.add.outer(np.arange(61) * 3, np.arange(83)) % 256).astype(np.uint8)
 RAMP16 = RAMP.astype(np.uint16) * 257 + 3
 
 
-def encoded(suffix, image):
+def encoded(suffix: str, image: np.ndarray) -> bytes:
     return cv2.imencode(suffix, image)[1].tobytes()
 
 
-def from_pil(image, kind, **options):
+def from_pil(image: Image.Image, kind: str, **options: Any) -> bytes:
     buffer = io.BytesIO()
     image.save(buffer, kind, **options)
     return buffer.getvalue()
 
 
-def tiff(image, **options):
+def tiff(image: np.ndarray, **options: Any) -> bytes:
     buffer = io.BytesIO()
     tifffile.imwrite(
         buffer, image, photometric="minisblack", **options
@@ -32,7 +34,7 @@ def tiff(image, **options):
     return buffer.getvalue()
 
 
-LOSSLESS = {
+LOSSLESS: dict[str, tuple[bytes, np.ndarray]] = {
     "png8": (encoded(".png", RAMP), RAMP),
     "png16": (encoded(".png", RAMP16), RAMP16),
     "tiff8": (encoded(".tiff", RAMP), RAMP),
@@ -51,7 +53,7 @@ LOSSLESS = {
 
 
 @pytest.mark.parametrize("kind", LOSSLESS)
-def test_lossless_formats_come_out_bit_by_bit_in_their_own_depth(tmp_path, kind):
+def test_lossless_formats_come_out_bit_by_bit_in_their_own_depth(tmp_path: Path, kind: str) -> None:
     data, expected = LOSSLESS[kind]
     path = tmp_path / "f"
     path.write_bytes(data)
@@ -60,7 +62,7 @@ def test_lossless_formats_come_out_bit_by_bit_in_their_own_depth(tmp_path, kind)
     np.testing.assert_array_equal(image, expected)
 
 
-def test_colour_is_reduced_to_luma(tmp_path):
+def test_colour_is_reduced_to_luma(tmp_path: Path) -> None:
     bgr = np.random.default_rng(0).integers(0, 256, (40, 50, 3)).astype(np.uint8)
     (tmp_path / "f").write_bytes(encoded(".png", bgr))
     luma = bgr @ np.array([0.114, 0.587, 0.299])  # ITU-R BT.601
@@ -68,7 +70,7 @@ def test_colour_is_reduced_to_luma(tmp_path):
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_exif_orientation_does_not_turn_the_sensor(tmp_path, orientation):
+def test_exif_orientation_does_not_turn_the_sensor(tmp_path: Path, orientation: int) -> None:
     exif = Image.Exif()
     exif[0x0112] = orientation
     colour = Image.fromarray(cv2.GaussianBlur(RAMP // 4 + 90, (0, 0), 3)).convert("RGB")
@@ -79,7 +81,7 @@ def test_exif_orientation_does_not_turn_the_sensor(tmp_path, orientation):
     assert np.abs(image.astype(int) - np.asarray(colour)[..., 0]).max() < 12
 
 
-def jpeg_with_preview():
+def jpeg_with_preview() -> bytes:
     """A JPEG whose EXIF segment holds a whole JPEG, end marker included, as cameras write it."""
     data, preview = encoded(".jpg", RAMP), encoded(".jpg", RAMP[:16, :16])
     body = b"Exif\0\0" + preview
@@ -95,7 +97,7 @@ TRUNCATABLE = {kind: data for kind, (data, _) in LOSSLESS.items()} | {
 
 @pytest.mark.parametrize("kind", TRUNCATABLE)
 @pytest.mark.parametrize("share", [0.01, 0.2, 0.5, 0.9, 0.99, "all but one byte"])
-def test_a_file_that_ends_early_is_refused(tmp_path, kind, share):
+def test_a_file_that_ends_early_is_refused(tmp_path: Path, kind: str, share: float | str) -> None:
     data = TRUNCATABLE[kind]
     kept = len(data) - 1 if share == "all but one byte" else int(len(data) * share)
     path = tmp_path / "f"
@@ -107,7 +109,7 @@ def test_a_file_that_ends_early_is_refused(tmp_path, kind, share):
 
 
 @pytest.mark.parametrize("kind", ["png8", "png16"])
-def test_a_flipped_bit_in_a_png_is_refused(tmp_path, kind):
+def test_a_flipped_bit_in_a_png_is_refused(tmp_path: Path, kind: str) -> None:
     data = bytearray(LOSSLESS[kind][0])
     data[len(data) // 2] ^= 4
     (tmp_path / "f").write_bytes(data)
@@ -127,7 +129,7 @@ def test_a_flipped_bit_in_a_png_is_refused(tmp_path, kind):
         (b"BM" + bytes(100), "corrupt"),
     ],
 )
-def test_the_reason_says_what_is_wrong(tmp_path, data, reason):
+def test_the_reason_says_what_is_wrong(tmp_path: Path, data: bytes | None, reason: str) -> None:
     path = tmp_path / "f.png"
     if data is not None:
         path.write_bytes(data)

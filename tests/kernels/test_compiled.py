@@ -20,6 +20,7 @@ from torch import Tensor
 
 from torchpose import ConfigError
 from torchpose.kernels import LEAST, build, compiled, functions, has_compiler, mapped, padded, repeated, tracing
+from torchpose.kernels.build import Kernel
 
 pytestmark = pytest.mark.skipif(not has_compiler(), reason="needs a C++ compiler (apt-get install g++)")
 F32, F64 = torch.float32, torch.float64
@@ -186,7 +187,7 @@ class Lens:
 
 
 def test_arguments_and_results_are_arranged_as_they_are_in_python() -> None:
-    def function(pair: Pair, lens: Lens, missing: Tensor | None) -> dict[str, Pair]:
+    def function(pair: Pair, lens: Lens, missing: Tensor | None) -> dict[str, Any]:
         scale = pair.second[1] * lens.matrix[0, 1]
         return {lens.name: Pair(pair.first * scale, (pair.second[0] + (0 if missing is None else missing), 1.0))[:1]}
 
@@ -203,8 +204,12 @@ def test_arguments_and_results_are_arranged_as_they_are_in_python() -> None:
 
 def test_numbers_are_no_reason_to_compile_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[str] = []
-    make = functions.build
-    monkeypatch.setattr(functions, "build", lambda source: (made.append(source), make(source))[1])
+
+    def counted(source: str) -> Kernel:
+        made.append(source)
+        return build.build(source)
+
+    monkeypatch.setattr(functions, "build", counted)
 
     def function(pair: Pair, scale: float) -> Tensor:
         return torch.where(pair.first > scale, pair.second[1] * pair.first, pair.second[0])

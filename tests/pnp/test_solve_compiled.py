@@ -7,12 +7,13 @@ from typing import Any
 
 import pytest
 import torch
-from scenes import CUBOID, F64, FOCAL, GRID, MATRIX, SQUARE, pixels, views
 from torch import Tensor
 
+from tests.pnp.scenes import CUBOID, F64, FOCAL, GRID, MATRIX, SQUARE, pixels, views
 from torchpose import kernels, pnp
 from torchpose.camera import Camera
 from torchpose.kernels import functions, has_compiler
+from torchpose.kernels.build import Kernel, build
 from torchpose.pnp import PnPCode, PnPResult
 
 pytestmark = pytest.mark.skipif(not has_compiler(), reason="needs a C++ compiler (apt-get install g++)")
@@ -72,7 +73,8 @@ def test_cameras_share_what_was_compiled() -> None:
 def test_options(kind: str) -> None:
     g = torch.Generator().manual_seed(5)
     r, t, xy = views(GRID, 80)
-    points, image, camera, options = GRID, pixels(xy, 0.1), MATRIX, {}
+    options: dict[str, Any] = {}
+    points, image, camera = GRID, pixels(xy, 0.1), MATRIX
     if kind == "own":
         points = GRID.expand(80, -1, -1) * torch.linspace(1, 1.5, 80, dtype=F64)[:, None, None]
         camera_points = points @ r.mT + t[:, None]
@@ -106,8 +108,12 @@ def test_noise_and_the_limit_of_huber_are_no_reason_to_compile_anew(
     robust: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[str] = []
-    make = functions.build
-    monkeypatch.setattr(functions, "build", lambda source: (made.append(source), make(source))[1])
+
+    def counted(source: str) -> Kernel:
+        made.append(source)
+        return build(source)
+
+    monkeypatch.setattr(functions, "build", counted)
     kernels.compiled.cache_clear()
     kernels.repeated.cache_clear()
     image = pixels(views(SQUARE, 80, tilt_deg=(0, 75), far=60)[2], 0.1)

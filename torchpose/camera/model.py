@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -54,6 +55,18 @@ class Camera:
     distortion: Tensor
     model: Model = "brown_conrady"
     covariance: Tensor | None = None
+
+    if TYPE_CHECKING:  # of tensors the fields are made by __post_init__
+
+        def __init__(
+            self,
+            width: int,
+            height: int,
+            matrix: Tensor | np.ndarray | Sequence[Sequence[float]],
+            distortion: Tensor | np.ndarray | Sequence[float],
+            model: Model = "brown_conrady",
+            covariance: Tensor | np.ndarray | Sequence[Sequence[float]] | None = None,
+        ) -> None: ...
 
     @classmethod
     def pinhole(cls, width: int, height: int, focal: float) -> Camera:
