@@ -13,6 +13,7 @@ from torchpose.camera import Camera
 from torchpose.detect import find_candidates
 from torchpose.errors import ConfigError, FrameError
 from torchpose.identify import Identified, MarkerTable, Scene, identify, look_again
+from torchpose.kernels import find_compiler
 from torchpose.pose import (
     MIN_MARKERS,
     Evidence,
@@ -45,9 +46,10 @@ class PoseEstimator(nn.Module):
         float_range: grey value of white in floating-point frames: 1.0 or 255.0.
         srgb: the grey values are sRGB-encoded and are taken back to linear ones first. Edges are half-way in linear
             grey, so encoded frames that are taken as linear ones shift them (docs/precision.md).
+        compile: solve small problems in compiled loops (`torchpose.kernels`), on the CPU; the first call takes seconds.
 
     Raises:
-        ConfigError: no target, or two of one name; an unknown method.
+        ConfigError: no target, or two of one name; an unknown method; ``compile`` without a C++ compiler.
     """
 
     def __init__(
@@ -58,6 +60,7 @@ class PoseEstimator(nn.Module):
         method: Method = "photometric",
         float_range: float = 1.0,
         srgb: bool = False,
+        compile: bool = False,
     ) -> None:
         super().__init__()
         self.camera = camera
@@ -75,6 +78,9 @@ class PoseEstimator(nn.Module):
         self.method = method
         self.float_range = float_range
         self.srgb = srgb
+        self.solves_compiled = compile
+        if compile:
+            find_compiler()
         self.table = MarkerTable.of(self.targets)
         for owner in ("camera", "table"):
             for name, value in _tensors(getattr(self, owner)).items():
@@ -151,7 +157,9 @@ class PoseEstimator(nn.Module):
         evidence = gather_evidence(rings, identified.ring, markers, scene.camera.matrix, self._recipe.locate)
         solvable = (evidence.mask.sum(-1) >= MIN_MARKERS).nonzero()[:, 0]
         rough = identified.R[solvable], identified.t[solvable]
-        return Found(rings, identified, evidence, solvable, solve_poses(evidence[solvable], rough))
+        return Found(
+            rings, identified, evidence, solvable, solve_poses(evidence[solvable], rough, compile=self.solves_compiled)
+        )
 
     def _second_look(self, scene: Scene, found: Found) -> tuple[Rings, Identified]:
         """Looks for missing markers where the solutions put them, or the rough pose where there is none."""
