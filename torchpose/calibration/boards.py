@@ -17,8 +17,9 @@ from torchpose.calibration.views import Views
 from torchpose.errors import ConfigError
 
 _EXAMPLES = "chessboard:9x6:5mm (inner corners, square) or charuco:8x5:10mm:7mm:4X4_50 (squares, square, marker)"
-_CHESSBOARD = re.compile(r"chessboard:(\d+)x(\d+):([\d.]+)mm")
-_CHARUCO = re.compile(r"charuco:(\d+)x(\d+):([\d.]+)mm:([\d.]+)mm:(\w+)")
+_LENGTH = r"(\d+\.?\d*|\.\d+)mm"
+_CHESSBOARD = re.compile(rf"chessboard:(\d+)x(\d+):{_LENGTH}")
+_CHARUCO = re.compile(rf"charuco:(\d+)x(\d+):{_LENGTH}:{_LENGTH}:(\w+)")
 _SUBPIX_WINDOW = 0.3  # of the distance between corners, half width
 _SUBPIX_RANGE = (3, 11)  # px
 _NONE = (np.zeros(0, int), np.zeros((0, 2)))
@@ -49,18 +50,18 @@ class Board:
         """
         problem = f"is no board; write {_EXAMPLES}"
         if found := _CHESSBOARD.fullmatch(text):
-            columns, rows, square = int(found[1]), int(found[2]), _length(found[3], text)
-            if min(columns, rows) >= 3:
+            columns, rows, square = int(found[1]), int(found[2]), float(found[3])
+            if min(columns, rows) >= 3 and square > 0:
                 return cls(columns, rows, square)
-            problem = "a chessboard needs 3 x 3 inner corners at least; take a larger one"
+            problem = "a chessboard needs 3 x 3 inner corners at least and squares above 0 mm; take a larger one"
         elif found := _CHARUCO.fullmatch(text):
-            size, square, marker = (int(found[1]), int(found[2])), _length(found[3], text), _length(found[4], text)
+            size, square, marker = (int(found[1]), int(found[2])), float(found[3]), float(found[4])
             dictionary = getattr(cv2.aruco, f"DICT_{found[5].removeprefix('DICT_')}", None)
             codes = None if dictionary is None else cv2.aruco.getPredefinedDictionary(dictionary)
             if codes is None:
                 problem = f"no dictionary {found[5]} in OpenCV; write for example 4X4_50"
-            elif marker >= square or min(size) < 3:
-                problem = "needs 3 x 3 squares at least and markers smaller than the squares"
+            elif not 0 < marker < square or min(size) < 3:
+                problem = "needs 3 x 3 squares at least and markers above 0 mm, smaller than the squares"
             elif math.prod(size) // 2 > len(codes.bytesList):
                 problem = f"{found[5]} has too few markers for the board; take a larger dictionary"
             else:
@@ -72,16 +73,6 @@ class Board:
         """Row by row, mm."""
         down, across = np.indices((self.rows, self.columns)).reshape(2, -1)
         return self.square * torch.from_numpy(np.stack([across, down, np.zeros_like(down)], -1)).double()
-
-
-def _length(text: str, where: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not value > 0:
-        raise ConfigError(f"--board: {where}: {text!r} is no length; write {_EXAMPLES}")
-    return value
 
 
 def find_corners(names: Sequence[str], frames: Tensor, board: Board) -> Views:

@@ -250,30 +250,30 @@ def _covariance(bundle: Bundle, names: tuple[str, ...]) -> Tensor:
 
 
 def _warnings(views: Views, bundle: Bundle, covariance: Tensor, common: float) -> list[str]:
-    notes = []
-    if common > _LARGE_ERROR:
-        notes.append(
-            f"the points are {common:.2g} px off, more than print and lens explain; check the target file, --model, "
-            "and that all frames are of one camera with one focus"
-        )
-    normal = bundle.R[:, :, 2]
+    normal, reach = bundle.R[:, :, 2], views.pixels.amax(0) - views.pixels.amin(0)
     spread = float((normal @ normal.T).clamp(-1, 1).acos().max().rad2deg())
-    if spread < _LITTLE_TILT_DEG:
-        notes.append(
+    focal = float((covariance.diagonal()[:2].sqrt() / bundle.camera.matrix.diagonal()[:2]).max())
+    covered = reach > _LITTLE_COVER * reach.new_tensor([bundle.camera.width, bundle.camera.height])
+    doubts = [
+        (
+            common > _LARGE_ERROR,
+            f"the points are {common:.2g} px off, more than print and lens explain; check the target file, --model, "
+            "and that all frames are of one camera with one focus",
+        ),
+        (
+            spread < _LITTLE_TILT_DEG,
             f"views too alike: their tilts differ by {spread:.0f} degrees at most, so focal length and distance are "
-            "hard to tell apart; add views tilted by 20 to 45 degrees in different directions"
-        )
-    relative = float((covariance.diagonal()[:2].sqrt() / bundle.camera.matrix.diagonal()[:2]).max())
-    if relative > _WIDE_SIGMA:
-        notes.append(
-            f"the focal length is known to {relative:.2%} only, which is the relative error of every distance; "
-            "add tilted views, or views that fill the frame"
-        )
-    reach = views.pixels.amax(0) - views.pixels.amin(0)
-    size = reach.new_tensor([bundle.camera.width, bundle.camera.height])
-    if len(bundle.camera.distortion) and not bool((reach > _LITTLE_COVER * size).all()):
-        notes.append(
+            "hard to tell apart; add views tilted by 20 to 45 degrees in different directions",
+        ),
+        (
+            focal > _WIDE_SIGMA,
+            f"the focal length is known to {focal:.2%} only, which is the relative error of every distance; "
+            "add tilted views, or views that fill the frame",
+        ),
+        (
+            len(bundle.camera.distortion) > 0 and not bool(covered.all()),
             "the points cover less than half of the frame's width or height, so the distortion beyond them is "
-            "extrapolated; add views with the target near borders and corners"
-        )
-    return notes
+            "extrapolated; add views with the target near borders and corners",
+        ),
+    ]
+    return [text for doubtful, text in doubts if doubtful]

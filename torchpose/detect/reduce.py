@@ -68,24 +68,26 @@ def _in_parts(frames: Tensor, factor: int, exact: bool) -> Tensor:
     tall = frames.reshape(batch * height, width).numpy()  # a view unless rows were cropped
     reduced = np.empty((batch * height // factor, width // factor), np.float32 if exact else tall.dtype)
     rows = max(1, _PART_PIXELS // (width * factor))
+    *steps, last = _steps(factor)
     for start in range(0, len(reduced), rows):
         part = tall[start * factor : (start + rows) * factor].astype(reduced.dtype, copy=False)
-        for by in _steps(factor):
-            part = _by_opencv(part, by)
-        reduced[start : start + rows] = part
+        for by in steps:
+            part = _by_opencv(part, by, np.empty((len(part) // by, part.shape[1] // by), part.dtype))
+        _by_opencv(part, last, reduced[start : start + rows])
     return torch.from_numpy(reduced).view(batch, height // factor, -1)
 
 
-def _by_opencv(levels: np.ndarray, by: int) -> np.ndarray:
-    """`block_means` through cv2.resize(INTER_AREA) where it gives the same.
+def _by_opencv(levels: np.ndarray, by: int, means: np.ndarray) -> np.ndarray:
+    """`block_means`, put into ``means``, through cv2.resize(INTER_AREA) where it gives the same.
 
     Reduction by 2 is the one that OpenCV has vector code for, three times as fast as by 4 at once
     (scripts/bench_pipeline.py). It adds floats in the order of `block_means`, but for the columns left over.
     """
     whole = levels.dtype.kind == "u"
     if by > (_OPENCV_MOST if whole else 2):
-        return block_means(levels.astype(np.int64) if whole else levels, by)
-    means = cv2.resize(levels, (levels.shape[1] // by, len(levels) // by), interpolation=cv2.INTER_AREA)
+        means[:] = block_means(levels.astype(np.int64) if whole else levels, by)
+        return means
+    cv2.resize(levels, means.shape[::-1], means, interpolation=cv2.INTER_AREA)
     rest = 0 if whole else means.shape[1] % _OPENCV_LANES
     if rest:
         means[:, -rest:] = block_means(levels[:, -by * rest :], by)

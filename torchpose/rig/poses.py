@@ -8,15 +8,14 @@ from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float
-from pydantic import BeforeValidator, FiniteFloat
+from pydantic import FiniteFloat
 from torch import Tensor
 
 from torchpose.geometry import rotations
+from torchpose.rig.settings import AS_TUPLE
 
 _F = FiniteFloat
-Pose = Annotated[
-    tuple[_F, _F, _F, _F, _F, _F], BeforeValidator(lambda six: tuple(six) if isinstance(six, list) else six)
-]
+Pose = Annotated[tuple[_F, _F, _F, _F, _F, _F], AS_TUPLE]
 
 
 def as_pose(numbers: Any) -> Pose:

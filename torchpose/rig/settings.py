@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, field_validator, model_validator
 
 from torchpose.config import read_yaml, validate
 from torchpose.target import Vector
@@ -16,6 +16,7 @@ MAX_SPEED_MM_S = 250.0  # the reduced speed of ISO 10218-1, for work beside peop
 MAX_ACCELERATION_MM_S2 = 1200.0  # the default of the controller's own moves
 
 Positive = Annotated[FiniteFloat, Field(gt=0)]
+AS_TUPLE = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)  # files have lists
 SixNumbers = Annotated[list[FiniteFloat], Field(min_length=6, max_length=6)]
 
 

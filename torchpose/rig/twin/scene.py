@@ -26,7 +26,7 @@ from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.rig.child import ChildEnded
 from torchpose.rig.poses import from_transform, to_transform
-from torchpose.rig.settings import Positive, Rig, Strict
+from torchpose.rig.settings import AS_TUPLE, Positive, Rig, Strict
 from torchpose.rig.twin.controller import TwinController, TwinErrors
 from torchpose.sim import add_noise, render
 from torchpose.target import RigidTransformFile, Target
@@ -57,7 +57,7 @@ class TwinImaging(Strict):
     dark: _Grey = 30.0
     light: _Grey = 220.0
     surround: _Grey = 90.0
-    plate: list[Positive] | None = Field(default=None, min_length=2, max_length=2)
+    plate: Annotated[tuple[Positive, Positive], AS_TUPLE] | None = None
     noise: FiniteFloat = Field(default=1.0, ge=0)
     full_well: Positive | None = None
 
