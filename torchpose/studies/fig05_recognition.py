@@ -63,7 +63,7 @@ def recognition(frames: int, seed: int) -> list[dict[str, Any]]:
 
 def frame_camera() -> Camera:
     """Camera of the frames with clutter."""
-    return Camera.pinhole(WIDTH, HEIGHT, FOCAL_PX)
+    return Camera.ideal(WIDTH, HEIGHT, FOCAL_PX)
 
 
 def clutter(target: Target, frames: int, seed: int) -> Shapes:
@@ -170,7 +170,7 @@ def capacities(count: int, seed: int) -> list[dict[str, Any]]:
         "cross": (lambda code: cross(AREA_MM2, code, 150), read_cross),
         "rectangle": (lambda code: square(math.sqrt(AREA_MM2), 150), read_rectangle),
     }
-    camera = Camera.pinhole(161, 161, 2 * FOCAL_PX)
+    camera = Camera.ideal(161, 161, 2 * FOCAL_PX)
     rows: list[dict[str, Any]] = []
     for noise in CODE_NOISE:
         for name, (build, read) in readers.items():

@@ -127,7 +127,7 @@ def run(
 def paper_plan() -> Plan:
     """The 875 frames of the paper."""
     with TemporaryDirectory() as folder:
-        Camera.pinhole(*CAMERA).save(Path(folder) / "camera.yaml")
+        Camera.ideal(*CAMERA).save(Path(folder) / "camera.yaml")
         (Path(folder) / "plan.yaml").write_text(PLAN, encoding="utf-8")
         return load_plan(Path(folder) / "plan.yaml")
 

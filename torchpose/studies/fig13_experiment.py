@@ -88,7 +88,7 @@ def run(*, full: bool = False, seed: int = 0, progress: Progress = ignore_progre
     degrees = [-5, -4, -3, -2, -1, 1, 2, 3, 4, 5] if full else [-5, -2.5, 2.5, 5]
     with TemporaryDirectory(prefix="torchpose-experiment-") as place:
         folder = Path(place)
-        camera = Camera.pinhole(*CAMERA)
+        camera = Camera.ideal(*CAMERA)
         camera.save(folder / "camera.yaml")
         for name, text in (
             ("rig.yaml", RIG),
