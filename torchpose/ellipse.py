@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchpose.geometry import conics
+from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import Tiles
 
 _SOLVABLE_POINTS = 6  # five parameters and one point to spare
@@ -25,7 +26,7 @@ Method = Literal["halir-flusser", "taubin"]
 
 
 @dataclass(frozen=True, eq=False)
-class EllipseFit:
+class EllipseFit(Rows):
     """Fitted ellipses with their uncertainty.
 
     Attributes:
@@ -41,9 +42,6 @@ class EllipseFit:
     covariance: Tensor
     sigma: Tensor
     points: Tensor
-
-    def __getitem__(self, index: Tensor) -> EllipseFit:
-        return EllipseFit(self.params[index], self.covariance[index], self.sigma[index], self.points[index])
 
     @property
     def center_covariance(self) -> Tensor:

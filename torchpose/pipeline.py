@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import Literal, get_args
+from collections.abc import Callable, Sequence
+from dataclasses import fields, replace
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor, nn
@@ -12,27 +12,25 @@ from torch import Tensor, nn
 from torchpose.camera import Camera
 from torchpose.detect import find_candidates
 from torchpose.errors import ConfigError, FrameError
-from torchpose.identify import Identified, MarkerTable, crossed_out, identify, look_again
+from torchpose.identify import Identified, MarkerTable, Scene, identify, look_again
 from torchpose.pose import (
     MIN_MARKERS,
     Evidence,
+    Found,
     Solutions,
-    center_rms,
-    common_center,
-    compensate,
+    crossed_out,
     gather_evidence,
     intrinsics_covariance,
     outcome,
     solve_poses,
 )
-from torchpose.refine import decide, decide_on_grey, refine_centers, refine_edges, refine_photometric
+from torchpose.refine import METHODS, Sight
 from torchpose.results import Poses, Reason, Status
 from torchpose.rings import Rings, measure_rings
 from torchpose.target import Target
 
 _FRAME_TYPES = (torch.uint8, torch.uint16, torch.float16, torch.bfloat16, torch.float32, torch.float64)
 Method = Literal["photometric", "edges", "centers", "paper"]
-_LEAST_KEPT = 0.5  # of the pixels around the edges that must follow the model for a refinement to count
 
 
 class PoseEstimator(nn.Module):
@@ -77,7 +75,27 @@ class PoseEstimator(nn.Module):
         self.method = method
         self.float_range = float_range
         self.srgb = srgb
-        self._table = MarkerTable.of(self.targets)
+        self._recipe = METHODS[method]
+        self.table = MarkerTable.of(self.targets)
+        for owner in ("camera", "table"):
+            for name, value in _tensors(getattr(self, owner)).items():
+                self.register_buffer(f"{owner}_{name}", value)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> PoseEstimator:
+        """Moves to a device, as any module; geometry stays float64."""
+        super()._apply(lambda value: value.to(fn(value[:0]).device), recurse)
+        self._from_buffers()
+        return self
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        super()._load_from_state_dict(*args, **kwargs)
+        self._from_buffers()
+
+    def _from_buffers(self) -> None:
+        """Camera and table with the tensors that the buffers have."""
+        for owner in ("camera", "table"):
+            old = getattr(self, owner)
+            setattr(self, owner, replace(old, **{n: getattr(self, f"{owner}_{n}") for n in _tensors(old)}))
 
     def extra_repr(self) -> str:
         names = ", ".join(t.name for t in self.targets)
@@ -97,43 +115,17 @@ class PoseEstimator(nn.Module):
             FrameError: wrong shape, size or dtype.
         """
         frames = self._checked(frames)
-        table = self._table.to(frames.device)
-        camera = self.camera.to(frames.device)
-        batch, count = frames.shape[0], len(self.targets)
+        scene = Scene(frames, self.camera.to(frames.device), self.table.to(frames.device))
         candidates = find_candidates(frames)
-        candidates = candidates[torch.isin(candidates.polarity, table.polarity)]
-        rings = measure_rings(frames, candidates, camera, correct=self.method != "paper")
-        identified = identify(rings, table, camera, batch)
-        target = torch.arange(batch * count, device=frames.device) % count
-        evidence, solvable, solutions = self._solved(rings, identified, table, target, camera)
-        before = len(rings)
-        rings, identified = self._second_look(frames, rings, identified, table, camera, solvable, solutions)
-        if len(rings) > before:
-            evidence, solvable, solutions = self._solved(rings, identified, table, target, camera)
-        solutions = self._doubted(solutions, evidence[solvable], solvable // count, rings, table, target[solvable])
-        if self.method != "paper":
-            solutions = decide(solutions, evidence[solvable])
-        shapes = _raw_ellipses(rings, identified.ring[solvable])
-        if self.method == "photometric":
-            solutions = decide_on_grey(solutions, evidence[solvable], frames, camera, solvable // count, shapes)
-        refined = self.method in ("photometric", "edges")
-        if refined:
-            solutions = self._refined(
-                frames,
-                solutions,
-                evidence[solvable],
-                solvable // count,
-                rings,
-                identified.ring[solvable],
-                shapes,
-                camera,
-            )
-        elif self.method == "centers":
-            solutions = _on_centers(solutions, evidence[solvable])
-        if camera.covariance is not None:
-            wider = intrinsics_covariance(evidence[solvable], solutions, camera, refined=refined)
-            solutions = replace(solutions, covariance=solutions.covariance + wider)
-        return outcome(target, solvable, solutions, evidence, identified, rings, table, camera)
+        candidates = candidates[torch.isin(candidates.polarity, scene.table.polarity)]
+        rings = measure_rings(frames, candidates, scene.camera, correct=self._recipe.correct)
+        found = self._solved(scene, rings, identify(rings, scene.table, scene.camera, len(frames)))
+        again = self._second_look(scene, found)
+        if len(again[0]) > len(rings):
+            found = self._solved(scene, *again)
+        if found.solvable.numel():
+            found = found._replace(solutions=self._refined(scene, found))
+        return outcome(scene, found)
 
     def _checked(self, frames: Tensor) -> Tensor:
         if frames.ndim == 4 and frames.shape[1] == 1:
@@ -153,120 +145,69 @@ class PoseEstimator(nn.Module):
             frames = frames.float() * (255.0 / self.float_range)
         return frames.contiguous()
 
-    def _solved(
-        self, rings: Rings, identified: Identified, table: MarkerTable, target: Tensor, camera: Camera
-    ) -> tuple[Evidence, Tensor, Solutions]:
-        """Evidence of every row, which rows (S,) have enough of it, and the solutions of these."""
-        evidence = self._evidence(rings, identified, table, target, camera)
+    def _solved(self, scene: Scene, rings: Rings, identified: Identified) -> Found:
+        """The evidence of every row, and the solutions of those rows that have enough of it."""
+        markers = scene.table[scene.target]
+        evidence = gather_evidence(rings, identified.ring, markers, scene.camera.matrix, self._recipe.locate)
         solvable = (evidence.mask.sum(-1) >= MIN_MARKERS).nonzero()[:, 0]
         rough = identified.R[solvable], identified.t[solvable]
-        return evidence, solvable, solve_poses(evidence[solvable], rough)
+        return Found(rings, identified, evidence, solvable, solve_poses(evidence[solvable], rough))
 
-    def _second_look(
-        self,
-        frames: Tensor,
-        rings: Rings,
-        identified: Identified,
-        table: MarkerTable,
-        camera: Camera,
-        solvable: Tensor,
-        s: Solutions,
-    ) -> tuple[Rings, Identified]:
+    def _second_look(self, scene: Scene, found: Found) -> tuple[Rings, Identified]:
         """Looks for missing markers where the solutions put them, or the rough pose where there is none."""
-        solved = s.status != Status.REJECTED
-        index = solvable[solved]
-        seen = (identified.ring >= 0).index_copy(0, index, s.mask[solved])
+        identified, some = found.identified, found.solutions[found.solutions.solved]
+        index = found.solvable[found.solutions.solved]
+        seen = (identified.ring >= 0).index_copy(0, index, some.mask)
         nowhere = torch.full_like(identified.R, torch.nan), torch.full_like(identified.t, torch.nan)
         R, t = (torch.stack(v, 1) for v in zip((identified.R, identified.t), nowhere, strict=True))
-        twofold = (s.status[solved] == Status.AMBIGUOUS)[:, None]
-        alternative = torch.where(twofold[..., None], s.R_alt[solved], torch.nan)
-        R = R.index_copy(0, index, torch.stack([s.R[solved], alternative], 1))
-        t = t.index_copy(0, index, torch.stack([s.t[solved], s.t_alt[solved]], 1))
-        return look_again(frames, rings, identified, table, camera, seen, R, t, correct=self.method != "paper")
+        twofold = (some.status == Status.AMBIGUOUS)[:, None, None]
+        R = R.index_copy(0, index, torch.stack([some.R, torch.where(twofold, some.R_alt, torch.nan)], 1))
+        t = t.index_copy(0, index, torch.stack([some.t, some.t_alt], 1))
+        return look_again(scene, found.rings, identified, seen, R, t, correct=self._recipe.correct)
 
-    def _evidence(
-        self, rings: Rings, identified: Identified, table: MarkerTable, target: Tensor, camera: Camera
-    ) -> Evidence:
-        ring, mask = identified.ring, identified.ring >= 0
-        row, marker = mask.nonzero().unbind(-1)
-        radii = table.radii[target]
-        index = ring[row, marker]
-        locate = compensate if self.method == "paper" else common_center
-        center, covariance = locate(rings.outer[index], rings.inner[index], radii[row, marker])
-        centers = torch.full((*ring.shape, 2), torch.nan, dtype=torch.float64, device=ring.device)
-        covariances = torch.full((*ring.shape, 2, 2), torch.nan, dtype=torch.float64, device=ring.device)
-        centers[row, marker], covariances[row, marker] = center, covariance
-        return gather_evidence(
-            rings,
-            ring,
-            centers,
-            covariances,
-            table.centers[target],
-            table.normals[target],
-            radii,
-            table.coplanar[target],
-            camera.matrix,
-        )
-
-    def _doubted(
-        self, s: Solutions, e: Evidence, frame: Tensor, rings: Rings, table: MarkerTable, target: Tensor
-    ) -> Solutions:
-        """Rejects poses from three markers that put a fourth across a ring: three centres fit many a mix-up."""
-        seen = s.mask | ~table.valid[target]
-        across = crossed_out(rings, frame, s.R, s.t, e.points, e.radii, seen, self.camera)
-        bad = across & (s.mask.sum(-1) == MIN_MARKERS) & (s.status != Status.REJECTED)
-        status = torch.where(bad, int(Status.REJECTED), s.status)
-        return replace(s, status=status, reason=torch.where(bad, int(Reason.RESIDUAL), s.reason))
-
-    def _refined(
-        self,
-        frames: Tensor,
-        s: Solutions,
-        e: Evidence,
-        frame: Tensor,
-        rings: Rings,
-        ring: Tensor,
-        shapes: Tensor,
-        camera: Camera,
-    ) -> Solutions:
-        """Solutions whose poses are refined on the frames themselves, where the refinement holds."""
-        solved = (s.status != Status.REJECTED).nonzero()[:, 0]
-        index = ring[solved].clamp_min(0)
-        some = replace(e[solved], mask=s.mask[solved])
-        start = (frames, camera, frame[solved], s.R[solved], s.t[solved], some.mask, shapes[solved])
-        model = (some.points, some.normals, some.radii)
-        if self.method == "edges":
-            refined = refine_edges(*start, rings.polarity[index], *model)
-        else:
-            refined = refine_photometric(*start, *model)
-        good = refined.good & (refined.kept > _LEAST_KEPT)
-        index = solved[good]
-        rms = center_rms(some, refined.R, refined.t)
-        return replace(
-            s,
-            R=s.R.index_copy(0, index, refined.R[good]),
-            t=s.t.index_copy(0, index, refined.t[good]),
-            covariance=s.covariance.index_copy(0, index, refined.covariance[good]),
-            rms=s.rms.index_copy(0, index, rms[good]),
-        )
+    def _refined(self, scene: Scene, found: Found) -> Solutions:
+        """The solutions after the steps of the method, with the covariance that the camera adds."""
+        evidence, solutions = found.evidence[found.solvable], _doubted(scene, found)
+        sight = _sight(scene, found, evidence)
+        for step in self._recipe.steps:
+            solutions = step(solutions, evidence, sight)
+        if scene.camera.covariance is None:
+            return solutions
+        used = replace(evidence, mask=solutions.mask)
+        more = intrinsics_covariance(used, solutions.R, solutions.t, scene.camera, refined=self._recipe.on_rims)
+        return replace(solutions, covariance=solutions.covariance + more)
 
 
-def _on_centers(s: Solutions, e: Evidence) -> Solutions:
-    """Solutions refined on the ellipses' own centres, where that holds."""
-    r, t, covariance, _, good = refine_centers(replace(e, mask=s.mask), s.R, s.t)
-    better = good & (s.status != Status.REJECTED)
-    return replace(
-        s,
-        R=torch.where(better[:, None, None], r, s.R),
-        t=torch.where(better[:, None], t, s.t),
-        covariance=torch.where(better[:, None, None], covariance, s.covariance),
+def _doubted(scene: Scene, found: Found) -> Solutions:
+    """Rejects poses from three markers that put a fourth across a ring."""
+    solutions, row = found.solutions, found.solvable
+    markers, matrix = scene.table[scene.target[row]], scene.camera.matrix
+    across = crossed_out(found.rings, scene.frame[row], solutions.R, solutions.t, markers, solutions.mask, matrix)
+    bad = across & (solutions.mask.sum(-1) == MIN_MARKERS) & solutions.solved
+    return solutions.marked(bad, Status.REJECTED, Reason.RESIDUAL)
+
+
+def _sight(scene: Scene, found: Found, evidence: Evidence) -> Sight:
+    """The solvable rows in their frames."""
+    ring = found.rings[found.identified.ring[found.solvable].clamp_min(0).flatten()]
+    raw = torch.stack([ring.outer_raw, ring.inner_raw], 1).view(*evidence.mask.shape, 2, 5)
+    return Sight(
+        scene.frame[found.solvable],
+        evidence.mask,
+        raw,
+        ring.polarity.view_as(evidence.mask),
+        evidence.points,
+        evidence.normals,
+        evidence.radii,
+        scene.frames,
+        scene.camera,
     )
 
 
-def _raw_ellipses(rings: Rings, ring: Tensor) -> Tensor:
-    """Ellipses (N, M, 2, 5) in raw pixels, outer and inner, of the rings (N, M); anything where it is -1."""
-    both = torch.stack([rings.outer_raw, rings.inner_raw], 1)
-    return both[ring.clamp_min(0)] if len(rings) else both.new_ones(*ring.shape, 2, 5)
+def _tensors(owner: Camera | MarkerTable) -> dict[str, Tensor]:
+    """The tensors of a dataclass by name."""
+    values = {f.name: getattr(owner, f.name) for f in fields(owner)}
+    return {name: value for name, value in values.items() if isinstance(value, Tensor)}
 
 
 def _linear(frames: Tensor, white: float) -> Tensor:

@@ -13,7 +13,7 @@ from torchpose.detect import find_candidates
 from torchpose.identify import MarkerTable, identify
 from torchpose.pipeline import PoseEstimator
 from torchpose.pose import common_center, raw_centers
-from torchpose.refine import refine_photometric
+from torchpose.refine import Sight, refine_photometric
 from torchpose.results import Status
 from torchpose.rings import measure_rings
 from torchpose.target import Target
@@ -67,19 +67,19 @@ def measure_centers(names: Sequence[str], frames: Tensor, camera: Camera, target
     points, rotation = target.centers[marker], poses.R[found.frame]
     arm = (rotation @ points[..., None])[..., 0]
     held = torch.diag(torch.tensor([0.0, 0, 0, _HELD, _HELD, _HELD], dtype=torch.float64)).expand(len(marker), 6, 6)
-    refined = refine_photometric(
-        _grey(frames),
-        camera,
+    one = torch.ones(len(marker), 1, dtype=torch.float64, device=rotation.device)
+    sight = Sight(
         found.frame,
-        rotation,
-        arm + poses.t[found.frame],
-        torch.ones(len(marker), 1, dtype=torch.bool),
+        one > 0,
         torch.stack([found.outer, found.inner], 1)[:, None],
-        torch.zeros(len(marker), 1, 3, dtype=torch.float64),
+        one if target.background == "light" else -one,
+        torch.zeros_like(points)[:, None],
         target.normals[marker][:, None],
         target.radii[marker][:, None],
-        prior=held,
+        _grey(frames),
+        camera,
     )
+    refined = refine_photometric(sight, rotation, arm + poses.t[found.frame], prior=held)
     x = refined.t
     xy = x[:, :2] / x[:, 2:]
     eye = torch.eye(2, dtype=torch.float64).expand(len(x), 2, 2)

@@ -13,7 +13,7 @@ from torchpose import ellipse
 from torchpose.camera import Camera
 from torchpose.errors import ConfigError
 from torchpose.geometry.rotations import plane_axes
-from torchpose.refine import refine_photometric
+from torchpose.refine import Sight, refine_photometric
 from torchpose.sim import Defocus, add_noise, render
 from torchpose.target import Target
 
@@ -139,17 +139,9 @@ def predicted_covariance(camera: Camera, target: Target, R: Tensor, t: Tensor, i
         )
         index = torch.arange(len(pixel)).repeat_interleave(_SAMPLES)
         seen = ellipse.fit((pixel - low).flatten(0, 1), index, len(pixel)).view(1, len(target), 2, 5)
-        refined = refine_photometric(
-            add_noise(frame, imaging.noise, index=torch.tensor([i])),
-            crop,
-            torch.zeros(1, dtype=torch.int64),
-            *pose,
-            torch.ones(1, len(target), dtype=torch.bool),
-            seen,
-            target.centers[None],
-            target.normals[None],
-            target.radii[None],
-        )
+        noisy = add_noise(frame, imaging.noise, index=torch.tensor([i]))
+        sight = Sight.of(noisy, crop, target, torch.zeros(1, dtype=torch.int64), seen)
+        refined = refine_photometric(sight, *pose)
         out.append(torch.where(refined.good[:, None, None], refined.covariance, torch.nan))
     return torch.cat(out) if out else t.new_zeros(0, 6, 6)
 

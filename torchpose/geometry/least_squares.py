@@ -43,7 +43,7 @@ class Block(Protocol):
 
     def moved(self, step: Tensor) -> Self: ...
 
-    def where(self, condition: Tensor, other: Self) -> Self: ...
+    def where(self, condition: Tensor, other: Self, /) -> Self: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +82,20 @@ class Vector(Rows):
 
 
 @dataclass(frozen=True, eq=False)
+class PosePrior(Rows):
+    """What is known of poses beside the data: the information about them, and where it has them."""
+
+    information: Float[Tensor, "N 6 6"]
+    pose: Pose
+
+    def at(self, pose: Pose, size: int = 6) -> tuple[Tensor, Tensor]:
+        """For `Normal.with_prior`: information (N, size, size) about a pose and more unknowns, and how far it moved."""
+        moved = torch.cat([pose.t - self.pose.t, rotations.log(pose.R @ self.pose.R.mT)], -1)
+        more = (0, size - 6)
+        return torch.nn.functional.pad(self.information, 2 * more), torch.nn.functional.pad(moved, more)
+
+
+@dataclass(frozen=True, eq=False)
 class Unknowns:
     """Named blocks of unknowns, in the order of their columns.
 
@@ -105,7 +119,7 @@ class Unknowns:
         return cast(Vector, self.own[name] if name in self.own else self.eliminated[name]).values
 
     def moved(self, step: Step) -> Unknowns:
-        """Every block moved by its columns of the step."""
+        """Every block moved by its columns of the step; what the step does not tell (NaN) stays."""
         own = _moved(self.own, step.own)
         return replace(self, own=own, eliminated=_moved(self.eliminated, step.eliminated))
 
@@ -119,10 +133,10 @@ class Unknowns:
         return replace(self, own=own, eliminated=rest)
 
 
-def _moved(blocks: Mapping[str, Block], step: Tensor | None) -> dict[str, Block]:
-    if step is None or not blocks:
-        return dict(blocks)
-    parts = step.split([block.size for block in blocks.values()], -1)
+def _moved(blocks: Mapping[str, Block], step: Tensor) -> dict[str, Block]:
+    if not blocks:
+        return {}
+    parts = step.nan_to_num(nan=0.0).split([block.size for block in blocks.values()], -1)
     return {name: block.moved(part) for (name, block), part in zip(blocks.items(), parts, strict=True)}
 
 
@@ -144,17 +158,18 @@ class Eliminated(Rows):
 
 
 class Step(NamedTuple):
-    """A step (N, n) of the problems' own unknowns and (K, m) of the eliminated ones.
+    """What normal equations give.
 
-    And what it was made of: the information (N, n, n) about the own unknowns, the others being unknown; the decrease
-    (N,) of chi-squared that it promises, and the part of it (N,) that the own unknowns make.
+    own: (N, n), step of the problems' own unknowns. eliminated: (K, m), of the others, empty where there are none.
+    information: (N, n, n), about the own unknowns, the others being unknown. own_chi2: (N,), what the own step takes
+    off chi-squared. variances: (K, m), of the eliminated unknowns; empty if not asked for.
     """
 
     own: Tensor
-    eliminated: Tensor | None
+    eliminated: Tensor
     information: Tensor
-    promised: Tensor
     own_chi2: Tensor
+    variances: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,37 +201,52 @@ class Normal(Rows):
         cost = self.cost + (pull * moved).sum(-1)
         return replace(self, information=self.information + information, right=self.right - pull, cost=cost)
 
-    def solve(self, damping: Tensor | None = None) -> Step:
-        """The step to the least cost; ``damping`` (N,) raises every unknown's own information by that share of it."""
-        part, size = self.eliminated, self.information.diagonal(dim1=-2, dim2=-1)
-        information = self.information if damping is None else _damped(self.information, damping)
-        if part is None:
-            own = solve_scaled(information, self.right)
-            promised = own_chi2 = (own * self.right).sum(-1)
-            rest = None
-        else:
-            inner = part.information if damping is None else _damped(part.information, damping[part.owner])
-            by_own, alone = eliminate(inner, part)
-            information = information - segment_sum(part.mixed @ by_own, part.owner, len(self))
-            right = self.right - segment_sum((part.mixed @ alone[..., None]).squeeze(-1), part.owner, len(self))
-            own = solve_scaled(information, right)
-            rest = alone - (by_own @ own[part.owner][..., None]).squeeze(-1)
-            own_chi2 = (own * right).sum(-1)
-            promised = (own * self.right).sum(-1) + segment_sum((rest * part.right).sum(-1), part.owner, len(self))
+    def solve(self, damping: Tensor | None = None, *, variances: bool = False) -> Step:
+        """The step to the least cost.
+
+        Args:
+            damping: (N,) share of its own information by which that about every unknown is raised.
+            variances: find those of the eliminated unknowns, too.
+        """
+        part, information, right = self.eliminated, self.information, self.right
         if damping is not None:
-            extra = (own.square() * size).sum(-1)
-            if part is not None and rest is not None:
-                of_items = (rest.square() * part.information.diagonal(dim1=-2, dim2=-1)).sum(-1)
-                extra = extra + segment_sum(of_items, part.owner, len(self))
-            promised = promised + damping * extra
-        return Step(own, rest, information, promised, own_chi2)
+            information = _damped(information, damping)
+        if part is None:
+            own = solve_scaled(information, right)
+            return Step(own, own[:0], information, (own * right).sum(-1), own[:0])
+        n, owner = right.shape[1], part.owner
+        inner = part.information if damping is None else _damped(part.information, damping[owner])
+        columns = [part.mixed.mT, part.right[..., None], *([_eye_like(inner)] if variances else [])]
+        by_own, alone, inverse = solve_scaled(inner, torch.cat(columns, -1)).tensor_split([n, n + 1], -1)
+        information = information - segment_sum(part.mixed @ by_own, owner, len(self))
+        right = right - segment_sum((part.mixed @ alone).squeeze(-1), owner, len(self))
+        columns = [right[..., None], *([_eye_like(information)] if variances else [])]
+        own, covariance = solve_scaled(information, torch.cat(columns, -1)).tensor_split([1], -1)
+        rest = (alone - by_own @ own[owner]).squeeze(-1)
+        own = own.squeeze(-1)
+        if variances:
+            variance = inverse.diagonal(dim1=-2, dim2=-1) + ((by_own @ covariance[owner]) * by_own).sum(-1)
+        return Step(own, rest, information, (own * right).sum(-1), variance if variances else rest[:0])
+
+    def promised(self, step: Step, damping: Tensor | None = None) -> Tensor:
+        """Decrease (N,) of the cost that a step promises, made with that damping."""
+        own, part = step.own * self.right, self.eliminated
+        if damping is not None:
+            own = own + damping[:, None] * step.own.square() * self.information.diagonal(dim1=-2, dim2=-1)
+        if part is None:
+            return own.sum(-1)
+        rest = step.eliminated * part.right
+        if damping is not None:
+            size = part.information.diagonal(dim1=-2, dim2=-1)
+            rest = rest + damping[part.owner, None] * step.eliminated.square() * size
+        return own.sum(-1) + segment_sum(rest.sum(-1), part.owner, len(self))
 
 
 class Minimum(NamedTuple):
     """Where a minimisation ended.
 
     The unknowns; the normal equations formed last and the step they gave; the information (N, n, n) that they hold
-    about the own unknowns, the eliminated ones being unknown; and the `Code` (N,).
+    about the own unknowns, the eliminated ones being unknown; the `Code` (N,); and the cost (N,) at the start.
     """
 
     unknowns: Unknowns
@@ -224,6 +254,7 @@ class Minimum(NamedTuple):
     step: Step
     information: Tensor
     code: Tensor
+    first_cost: Tensor
 
     def covariance(self) -> tuple[Tensor, Tensor]:
         """Covariance (N, n, n) of the own unknowns, and whether the data determine them all (N,) bool."""
@@ -252,12 +283,13 @@ def minimise(
         settle: form the normal equations after the last step, too; without, the result has those before it.
     """
     now = problem(unknowns)
+    first_cost = now.cost
     share = None if damping is None else torch.full_like(now.cost, damping)
     code = torch.full_like(now.cost, int(Code.STEPS), dtype=torch.int64)
     for number in range(steps):
         step = now.solve(share)
         if tolerance is not None:
-            done = step.promised < tolerance * now.cost + _PROMISED
+            done = now.promised(step, share) < tolerance * now.cost + _PROMISED
             if share is not None:
                 done |= share > _MOST_DAMPING
             code = torch.where(done, int(Code.CONVERGED), int(Code.STEPS))
@@ -275,13 +307,7 @@ def minimise(
         else:
             unknowns, now = trial, there
     information = now.solve().information if settle or share is not None else step.information
-    return Minimum(unknowns, now, step, information, code)
-
-
-def eliminate(information: Tensor, part: Eliminated) -> tuple[Tensor, Tensor]:
-    """How the eliminated unknowns follow the others (K, m, n), and their step (K, m) where these stand still."""
-    both = solve_scaled(information, torch.cat([part.mixed.mT, part.right[..., None]], -1))
-    return both[..., :-1], both[..., -1]
+    return Minimum(unknowns, now, step, information, code, first_cost)
 
 
 def solve_scaled(matrix: Tensor, right: Tensor) -> Tensor:
@@ -310,6 +336,10 @@ def scaled_inverse(information: Tensor) -> tuple[Tensor, Tensor]:
 def geman_mcclure(deviation: Tensor) -> Tensor:
     """Robust weights of residuals in units of the scale: (1 + d^2)^-2 (Geman and McClure 1987)."""
     return (1 + deviation.square()).reciprocal().square()
+
+
+def _eye_like(matrix: Tensor) -> Tensor:
+    return torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device).expand_as(matrix)
 
 
 def _damped(information: Tensor, share: Tensor) -> Tensor:

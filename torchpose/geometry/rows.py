@@ -82,4 +82,6 @@ class Rows:
                 changed[f.name] = tuple(change(*items) for items in zip(*values, strict=True))
             elif isinstance(values[0], (Tensor, Rows)):
                 changed[f.name] = change(*values)
+            elif values[0] is not None and not f.metadata.get("shared"):
+                raise TypeError(f"{type(self).__name__}.{f.name} is no tensor and no rows; mark it as shared")
         return replace(self, **changed)  # type: ignore[type-var]

@@ -15,72 +15,67 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.detect import Candidates, Verdict
 from torchpose.geometry import conics
-from torchpose.identify.markers import Identified, MarkerTable, ratio_tolerance
-from torchpose.rings import Rings, measure_predicted
-from torchpose.rings.measure import mapped
+from torchpose.identify.markers import Identified, ratio_tolerance
+from torchpose.identify.scene import MarkerTable, Scene
+from torchpose.rings import Rings, mapped, measure_predicted
 
 _LEAST_FOUND = 2  # markers whose rings give a pose
 _PLACE_TOLERANCE = (1.5, 0.15)  # px, and of the semi-major axis
 
 
 def look_again(
-    frames: Tensor,
-    rings: Rings,
-    identified: Identified,
-    table: MarkerTable,
-    camera: Camera,
-    seen: Tensor,
-    R: Tensor,
-    t: Tensor,
-    *,
-    correct: bool = True,
+    scene: Scene, rings: Rings, identified: Identified, seen: Tensor, R: Tensor, t: Tensor, *, correct: bool = True
 ) -> tuple[Rings, Identified]:
     """The rings and their markers, with those that were found at the predicted places.
 
     Args:
-        frames: (B, H, W) grey. rings, identified: of N rows (frames times targets).
-        seen: (N, M) bool, the markers that fit the poses. R, t: (N, S, 3, 3), (N, S, 3), S possible poses of each row;
-            NaN where there are fewer. correct: as for `rings.measure_rings`.
+        scene: frames, camera and targets.
+        rings: found so far.
+        identified: the same, of N rows.
+        seen: (N, M) bool, the markers that fit the poses.
+        R: (N, S, 3, 3), S possible poses of each row; NaN where there are fewer.
+        t: (N, S, 3), the same.
+        correct: as for `rings.measure_rings`.
     """
-    rows = R.shape[0]
-    target = torch.arange(rows, device=R.device) % table.ids.shape[0]
-    wanted = table.valid[target] & ~seen & (seen.sum(-1) >= _LEAST_FOUND)[:, None]
+    markers, camera = scene.table[scene.target], scene.camera
+    wanted = markers.valid & ~seen & (seen.sum(-1) >= _LEAST_FOUND)[:, None]
     row, option, marker = (wanted[:, None] & R.isfinite().all(-1).all(-1)[..., None]).nonzero().unbind(-1)
-    of = target[row]
-    rotation = R[row, option]
-    center = (rotation @ table.centers[of, marker][..., None]).squeeze(-1) + t[row, option]
-    normal, radii = table.normals[of, marker], table.radii[of, marker]
-    ideal, inner = (conics.circle_ellipse(camera.matrix, rotation, center, normal, r) for r in radii.unbind(-1))
-    k = camera.matrix
-
-    def raw(ellipses: Tensor) -> Tensor:
-        return mapped(ellipses, lambda points: camera.distort((points - k[:2, 2]) / k.diagonal()[:2]))
-
-    outer = raw(ideal)
-    limit = torch.tensor([camera.width - 1, camera.height - 1], device=R.device)
+    if row.numel() == 0:
+        return rings, identified
+    ideal, raw, depth = _predicted(markers, camera, R[row, option], t[row, option], (row, marker))
+    outer, limit = raw[:, 0], torch.tensor([camera.width - 1, camera.height - 1], device=R.device)
     # a circle that reaches behind the camera, or a plane seen edge-on, has no ellipse
-    in_view = ((outer[:, :2] > 0) & (outer[:, :2] < limit)).all(-1) & (outer[:, 2] < limit.amin()) & (center[:, 2] > 0)
+    in_view = ((outer[:, :2] > 0) & (outer[:, :2] < limit)).all(-1) & (outer[:, 2] < limit.amin()) & (depth > 0)
     kept = in_view.nonzero()[:, 0]
     if kept.numel() == 0:
         return rings, identified
-    frame = row[kept] // table.ids.shape[0]
-    unknown = torch.full_like(outer[kept, 0], torch.nan)
-    verdict = torch.full_like(frame, int(Verdict.ACCEPTED))
-    candidates = Candidates(frame, outer[kept], table.polarity[of[kept]], unknown, unknown, verdict)
-    found, which = measure_predicted(frames, candidates, raw(inner[kept]), camera, correct=correct)
-    where = kept[which]
+    unknown, verdict = torch.full_like(depth[kept], torch.nan), torch.full_like(kept, int(Verdict.ACCEPTED))
+    candidates = Candidates(scene.frame[row[kept]], outer[kept], markers.polarity[row[kept]], unknown, unknown, verdict)
+    found, which = measure_predicted(scene.frames, candidates, raw[kept, 1], camera, correct=correct)
+    row, marker, ideal = row[kept[which]], marker[kept[which]], ideal[kept[which], 0]
     measured = found.outer.params
-    miss = torch.linalg.vector_norm(measured[:, :2] - ideal[where, :2], dim=-1)
-    off = (found.ratio - radii[where, 1] / radii[where, 0]).abs()
+    miss = torch.linalg.vector_norm(measured[:, :2] - ideal[:, :2], dim=-1)
+    off = (found.ratio - markers.radii[row, marker, 1] / markers.radii[row, marker, 0]).abs()
     px, of_size = _PLACE_TOLERANCE
     good = (miss < px + of_size * measured[:, 2]) & (off < ratio_tolerance(measured[:, 3]))
     # of several poses of a row, the one that was nearest
-    slot = row[where] * table.ids.shape[1] + marker[where]
+    slot = row * identified.ring.shape[1] + marker
     nearest = torch.full((identified.ring.numel(),), torch.inf, dtype=miss.dtype, device=miss.device)
     nearest.scatter_reduce_(0, slot[good], miss[good], "amin")
     index = (good & (miss == nearest[slot])).nonzero()[:, 0]
     ring = len(rings) + torch.arange(index.numel(), device=index.device)
-    place = torch.stack([row[where[index]], marker[where[index]], ring], -1)
+    place = torch.stack([row[index], marker[index], ring], -1)
     assigned = identified.ring.index_put((place[:, 0], place[:, 1]), ring)
     more = replace(identified, ring=assigned, proposal=torch.cat([identified.proposal, place]))
     return Rings.cat([rings, found[index]]), more
+
+
+def _predicted(
+    markers: MarkerTable, camera: Camera, R: Tensor, t: Tensor, at: tuple[Tensor, Tensor]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Ellipses (P, 2, 5) of both circles, ideal and raw pixels, and depths (P,), of markers ``at`` (row, number)."""
+    center, k = (R @ markers.centers[at][..., None]).squeeze(-1) + t, camera.matrix
+    normal = markers.normals[at][:, None]
+    ideal = conics.circle_ellipse(k, R[:, None], center[:, None], normal, markers.radii[at])
+    raw = mapped(ideal.flatten(0, 1), lambda points: camera.distort((points - k[:2, 2]) / k.diagonal()[:2]))
+    return ideal, raw.view_as(ideal), center[:, 2]

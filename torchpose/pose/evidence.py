@@ -2,44 +2,49 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.geometry import conics
+from torchpose.geometry.rows import Rows, shared
+from torchpose.identify import MarkerTable
+from torchpose.pose.centers import common_center
 from torchpose.rings import Rings
 
 _SHAPE_FLOOR = (0.03, 0.5)  # px, and times the curvature a / b^2: what blur and mask do to an ellipse's shape
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class Evidence(Rows):
     """What was measured of the M markers of N rows; padded, see ``mask``.
 
     Attributes:
-        points, normals: (N, M, 3) float64 in the target frame. radii: (N, M, 2).
-        center, covariance: (N, M, 2) ideal px and (N, M, 2, 2): compensated centres.
-        shape: (N, M, 2, 5) fitted ellipses, outer and inner, ideal px. shape_covariance: (N, M, 2, 5, 5), see
-            `ellipse.EllipseFit`.
-        mask: (N, M) bool, marker seen. coplanar: (N,) bool.
-        matrix: (3, 3) camera matrix.
+        points: target frame, mm.
+        normals: the same.
+        radii: outer and inner.
+        center: compensated centres, ideal px.
+        covariance: of these.
+        shape: fitted ellipses, outer and inner, ideal px.
+        shape_covariance: see `ellipse.EllipseFit`.
+        mask: marker seen.
+        coplanar: whether all markers of the target lie in one plane.
+        matrix: of the camera.
     """
 
-    points: Tensor
-    normals: Tensor
-    radii: Tensor
-    center: Tensor
-    covariance: Tensor
-    shape: Tensor
-    shape_covariance: Tensor
-    mask: Tensor
-    coplanar: Tensor
-    matrix: Tensor
-
-    def __getitem__(self, index: Tensor) -> Evidence:
-        rows = {n: getattr(self, n)[index] for n in self.__dataclass_fields__ if n != "matrix"}
-        return Evidence(**rows, matrix=self.matrix)
+    points: Float[Tensor, "N M 3"]
+    normals: Float[Tensor, "N M 3"]
+    radii: Float[Tensor, "N M 2"]
+    center: Float[Tensor, "N M 2"]
+    covariance: Float[Tensor, "N M 2 2"]
+    shape: Float[Tensor, "N M 2 5"]
+    shape_covariance: Float[Tensor, "N M 2 5 5"]
+    mask: Bool[Tensor, "N M"]
+    coplanar: Bool[Tensor, " N"]
+    matrix: Float[Tensor, "3 3"] = shared()
 
     def without(self, marker: Tensor) -> Evidence:
         """The same rows with one marker each, (N,) int64, taken as not seen."""
@@ -50,58 +55,75 @@ class Evidence:
 
 def gather_evidence(
     rings: Rings,
-    ring: Tensor,
-    centers: Tensor,
-    covariances: Tensor,
-    points: Tensor,
-    normals: Tensor,
-    radii: Tensor,
-    coplanar: Tensor,
-    matrix: Tensor,
+    ring: Int[Tensor, "N M"],
+    markers: MarkerTable,
+    matrix: Float[Tensor, "3 3"],
+    locate: Callable[..., tuple[Tensor, Tensor]] = common_center,
 ) -> Evidence:
     """Lays the measurements of flat rings out by row and marker.
 
     Args:
-        rings: K rings. ring: (N, M) int64, -1 where not seen. centers, covariances: (N, M, 2), (N, M, 2, 2).
-        points, normals, radii, coplanar: of the target of each row, (N, M, ...) and (N,). matrix: (3, 3).
+        rings: of all frames.
+        ring: which one each marker is, -1 where not seen.
+        markers: of the target of each row.
+        matrix: of the camera.
+        locate: centres from both ellipses of a ring, as `centers.common_center`.
     """
     mask = ring >= 0
-    at = ring.clamp_min(0)
-    shape = torch.stack([rings.outer.params, rings.inner.params], 1)
-    covariance = torch.stack([rings.outer.covariance, rings.inner.covariance], 1)
-    if len(rings) == 0:  # nothing to index: any row will do, the mask hides it
-        shape, covariance = shape.new_ones(1, 2, 5), covariance.new_ones(1, 2, 5, 5)
-    return Evidence(points, normals, radii, centers, covariances, shape[at], covariance[at], mask, coplanar, matrix)
+    row, marker = mask.nonzero().unbind(-1)
+    seen = rings[ring[row, marker]]
+    center, covariance = locate(seen.outer, seen.inner, markers.radii[row, marker])
+
+    def laid_out(values: Tensor, fill: float) -> Tensor:
+        empty = torch.full((*ring.shape, *values.shape[1:]), fill, dtype=torch.float64, device=ring.device)
+        return empty.index_put((row, marker), values)
+
+    return Evidence(
+        markers.centers,
+        markers.normals,
+        markers.radii,
+        laid_out(center, torch.nan),
+        laid_out(covariance, torch.nan),
+        laid_out(torch.stack([seen.outer.params, seen.inner.params], 1), 1.0),
+        laid_out(torch.stack([seen.outer.covariance, seen.inner.covariance], 1), 1.0),
+        mask,
+        markers.coplanar,
+        matrix,
+    )
 
 
-def shape_chi2(e: Evidence, r: Tensor, t: Tensor) -> Tensor:
+def shape_chi2(evidence: Evidence, R: Tensor, t: Tensor) -> Tensor:
     """Chi-squared (N, S) of the rings' shapes: elongation and its direction, which blur and threshold hardly touch."""
-    x = (r[:, :, None] @ e.points[:, None, ..., None]).squeeze(-1) + t[:, :, None]  # (N, S, M, 3)
+    x = (R[:, :, None] @ evidence.points[:, None, ..., None]).squeeze(-1) + t[:, :, None]  # (N, S, M, 3)
     predicted = conics.circle_ellipse(
-        e.matrix, r[:, :, None, None], x[..., None, :], e.normals[:, None, :, None], e.radii[:, None]
+        evidence.matrix,
+        R[:, :, None, None],
+        x[..., None, :],
+        evidence.normals[:, None, :, None],
+        evidence.radii[:, None],
     )  # (N, S, M, 2, 5)
-    difference = conics.shape_matrix(e.shape)[:, None] - conics.shape_matrix(predicted)
-    theta = e.shape[..., 4]
+    difference = conics.shape_matrix(evidence.shape)[:, None] - conics.shape_matrix(predicted)
+    theta = evidence.shape[..., 4]
     cos, sin = theta.cos(), theta.sin()
     axes = torch.stack([cos, -sin, sin, cos], -1).unflatten(-1, (2, 2))[:, None]
-    d = axes.mT @ difference @ axes
-    v = torch.stack([d[..., 0, 0] - d[..., 1, 1], 2 * d[..., 0, 1]], -1)
+    change = axes.mT @ difference @ axes
+    v = torch.stack([change[..., 0, 0] - change[..., 1, 1], 2 * change[..., 0, 1]], -1)
     pick = torch.tensor([[0, 0, 1, 0, -1], [0, 0, 0, 2, 0]], dtype=v.dtype, device=v.device)
-    floor = _SHAPE_FLOOR[0] + _SHAPE_FLOOR[1] * e.shape[..., 2] / e.shape[..., 3].square()
+    floor = _SHAPE_FLOOR[0] + _SHAPE_FLOOR[1] * evidence.shape[..., 2] / evidence.shape[..., 3].square()
     eye = torch.eye(2, dtype=v.dtype, device=v.device)
-    covariance = pick @ e.shape_covariance @ pick.T + floor.square()[..., None, None] * eye
-    seen = e.mask[..., None, None, None]
+    covariance = pick @ evidence.shape_covariance @ pick.T + floor.square()[..., None, None] * eye
+    seen = evidence.mask[..., None, None, None]
     weight = torch.linalg.inv(torch.where(seen, covariance, eye))[:, None]
     chi2 = (v[..., None, :] @ weight @ v[..., None]).squeeze(-1).squeeze(-1)
-    return torch.where(e.mask[:, None, :, None], chi2, 0.0).sum((-1, -2))
+    return torch.where(evidence.mask[:, None, :, None], chi2, 0.0).sum((-1, -2))
 
 
-def center_rms(e: Evidence, r: Tensor, t: Tensor) -> Tensor:
+def center_rms(evidence: Evidence, R: Tensor, t: Tensor) -> Tensor:
     """RMS distance (N,) in px of the compensated centres from the projected ones."""
-    x = (r[:, None] @ e.points[..., None]).squeeze(-1) + t[:, None]
-    d = (x @ e.matrix.T)[..., :2] / x[..., 2:] - e.center
-    square = torch.where(e.mask, d.square().sum(-1), 0.0)
-    return (square.sum(-1) / e.mask.sum(-1)).sqrt()
+    x = (R[:, None] @ evidence.points[..., None]).squeeze(-1) + t[:, None]
+    d = (x @ evidence.matrix.T)[..., :2] / x[..., 2:] - evidence.center
+    square = torch.where(evidence.mask, d.square().sum(-1), 0.0)
+    return (square.sum(-1) / evidence.mask.sum(-1)).sqrt()
 
 
 def visible(covariance: Tensor, mask: Tensor) -> Tensor:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
-from torchpose.camera import Camera
-from torchpose.identify import Identified, MarkerTable
+from torchpose.identify import Identified, Scene
 from torchpose.pose.centers import raw_centers
 from torchpose.pose.evidence import Evidence
 from torchpose.pose.solutions import MIN_MARKERS, Solutions
@@ -14,68 +15,60 @@ from torchpose.results import Detections, Poses, Reason, Status
 from torchpose.rings import Rings
 
 
-def outcome(
-    target: Tensor,
-    solvable: Tensor,
-    s: Solutions,
-    e: Evidence,
-    identified: Identified,
-    rings: Rings,
-    table: MarkerTable,
-    camera: Camera,
-) -> Poses:
-    """Rows of every frame and target, N = B * T.
+class Found(NamedTuple):
+    """What the stages found in a scene of N rows: rings of all frames, which markers they are, and what these tell.
 
-    Args:
-        target: (N,) int64. solvable: (S,) int64, the rows with solutions. s: these S. e, identified: of the N rows.
-        rings: of all frames.
+    solvable: (S,) int64, the rows with enough of it. solutions: of these.
     """
-    rows, device = target.numel(), target.device
-    frame = torch.arange(rows, device=device) // len(table.ids)
-    mask = e.mask.clone()
-    mask[solvable] = s.mask
-    status = torch.full((rows,), int(Status.REJECTED), device=device)
-    reason = torch.full((rows,), int(Reason.RESIDUAL), device=device)
-    status[solvable], reason[solvable] = s.status, s.reason
 
+    rings: Rings
+    identified: Identified
+    evidence: Evidence
+    solvable: Tensor
+    solutions: Solutions
+
+
+def outcome(scene: Scene, found: Found) -> Poses:
+    """Rows of every frame and target."""
+    rows, solvable, solutions = len(found.evidence), found.solvable, found.solutions
+    device = solvable.device
+    mask = found.evidence.mask.index_copy(0, solvable, solutions.mask)
+    status = torch.full((rows,), int(Status.REJECTED), device=device).index_copy(0, solvable, solutions.status)
+    reason = torch.full((rows,), int(Reason.RESIDUAL), device=device).index_copy(0, solvable, solutions.reason)
     support = torch.where(status == Status.REJECTED, 0, mask.sum(-1))
-    found, claimed = _awarded(support, mask, identified.ring, len(rings))
+    awarded, claimed = _awarded(support, mask, found.identified.ring, len(found.rings))
 
     # without a pose: the rings that nobody else explains tell why
-    proposed = identified.proposed(~claimed)
-    mask &= found[:, None] | ~torch.cat([claimed, claimed.new_ones(1)])[identified.ring]
-    few = ~found & (proposed < MIN_MARKERS)
+    proposed = found.identified.proposed(~claimed)
+    mask &= awarded[:, None] | ~torch.cat([claimed, claimed.new_ones(1)])[found.identified.ring]
+    few = ~awarded & (proposed < MIN_MARKERS)
     few_status = torch.where(proposed == 0, int(Status.NO_TARGET), int(Status.TOO_FEW_MARKERS))
-    status = torch.where(few, few_status, status)
-    reason = torch.where(few, int(Reason.NONE), reason)
 
     def spread(values: Tensor) -> Tensor:
         out = torch.full((rows, *values.shape[1:]), torch.nan, dtype=values.dtype, device=device)
-        out[solvable] = values
-        return torch.where(found.view(-1, *[1] * (values.ndim - 1)), out, torch.nan)
+        kept = awarded.view(-1, *[1] * (values.ndim - 1))
+        return torch.where(kept, out.index_copy(0, solvable, values), torch.nan)
 
-    row, marker = mask.nonzero().unbind(-1)
-    ring = identified.ring[row, marker]
-    center, center_cov = raw_centers(camera, e.center[row, marker], e.covariance[row, marker])
-    detections = Detections(
-        frame[row],
-        target[row],
-        table.ids[target[row], marker],
-        center,
-        center_cov,
-        rings.outer_raw[ring],
-        rings.inner_raw[ring],
-    )
     names = ("R", "t", "covariance", "rms", "chi2", "R_alt", "t_alt", "rms_alt", "chi2_alt")
     return Poses(
-        frame=frame,
-        target=target,
-        status=status,
-        reason=reason,
+        frame=scene.frame,
+        target=scene.target,
+        status=torch.where(few, few_status, status),
+        reason=torch.where(few, int(Reason.NONE), reason),
         markers=torch.where(few, proposed, mask.sum(-1)),
-        detections=detections,
-        **{n: spread(getattr(s, n)) for n in names},
+        detections=_detections(scene, found, mask),
+        **{name: spread(getattr(solutions, name)) for name in names},
     )
+
+
+def _detections(scene: Scene, found: Found, mask: Tensor) -> Detections:
+    """The markers of the rows that the mask (N, M) has."""
+    row, marker = mask.nonzero().unbind(-1)
+    ring, target = found.rings[found.identified.ring[row, marker]], scene.target[row]
+    evidence = found.evidence
+    center, covariance = raw_centers(scene.camera, evidence.center[row, marker], evidence.covariance[row, marker])
+    ids = scene.table.ids[target, marker]
+    return Detections(scene.frame[row], target, ids, center, covariance, ring.outer_raw, ring.inner_raw)
 
 
 def _awarded(support: Tensor, mask: Tensor, ring: Tensor, rings: int) -> tuple[Tensor, Tensor]:
@@ -84,8 +77,10 @@ def _awarded(support: Tensor, mask: Tensor, ring: Tensor, rings: int) -> tuple[T
     A ring belongs to one target: where two claim it, to the one that explains more rings.
 
     Args:
-        support: (N,) int64, number of rings the pose explains, 0 without one. mask: (N, M) bool, which markers' rings.
+        support: (N,) int64, number of rings the pose explains, 0 without one.
+        mask: (N, M) bool, which markers' rings.
         ring: (N, M) int64, index into the ``rings`` K.
+        rings: their number.
     """
     row, marker = (mask & (support > 0)[:, None]).nonzero().unbind(-1)
     of = ring[row, marker]

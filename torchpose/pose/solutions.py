@@ -2,34 +2,51 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
+
+from torchpose.geometry.rows import Rows
+from torchpose.results import Status
 
 AMBIGUOUS_CHI2 = 20.0  # contract: two poses are ambiguous where their chi-squared differs by less
 MIN_MARKERS = 3  # seen, that a pose needs
 
 
 @dataclass(frozen=True, eq=False)
-class Solutions:
-    """Chosen pose of N rows; the fields as in `results.Poses`."""
+class Solutions(Rows):
+    """Chosen pose of N rows; the fields as in `results.Poses`, and the markers (N, M) that it explains."""
 
-    R: Tensor
-    t: Tensor
-    covariance: Tensor
-    rms: Tensor
-    chi2: Tensor
-    R_alt: Tensor
-    t_alt: Tensor
-    rms_alt: Tensor
-    chi2_alt: Tensor
-    status: Tensor
-    reason: Tensor
-    mask: Tensor
+    R: Float[Tensor, "N 3 3"]
+    t: Float[Tensor, "N 3"]
+    covariance: Float[Tensor, "N 6 6"]
+    rms: Float[Tensor, " N"]
+    chi2: Float[Tensor, " N"]
+    R_alt: Float[Tensor, "N 3 3"]
+    t_alt: Float[Tensor, "N 3"]
+    rms_alt: Float[Tensor, " N"]
+    chi2_alt: Float[Tensor, " N"]
+    status: Int[Tensor, " N"]
+    reason: Int[Tensor, " N"]
+    mask: Bool[Tensor, "N M"]
 
-    def __getitem__(self, index: Tensor) -> Solutions:
-        return Solutions(*(getattr(self, n)[index] for n in self.__dataclass_fields__))
+    @property
+    def solved(self) -> Tensor:
+        """(N,) bool, rows that have a pose."""
+        return self.status != Status.REJECTED
 
-    def replaced(self, index: Tensor, other: Solutions) -> Solutions:
-        """These rows, with the rows ``index`` taken from ``other``."""
-        return Solutions(*(getattr(self, n).index_copy(0, index, getattr(other, n)) for n in self.__dataclass_fields__))
+    def swapped(self, condition: Tensor) -> Solutions:
+        """With both minima exchanged where the condition (N,) bool holds; the covariance is left as it is."""
+        other = {name: getattr(self, f"{name}_alt") for name in ("R", "t", "rms", "chi2")}
+        other |= {f"{name}_alt": getattr(self, name) for name in ("R", "t", "rms", "chi2")}
+        return replace(self, **other).where(condition, self)
+
+    def marked(self, condition: Tensor, status: int, reason: int) -> Solutions:
+        """With this status and reason where the condition (N,) bool holds."""
+        return replace(
+            self,
+            status=torch.where(condition, status, self.status),
+            reason=torch.where(condition, reason, self.reason),
+        )

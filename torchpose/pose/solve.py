@@ -48,77 +48,61 @@ def solve_poses(evidence: Evidence, rough: tuple[Tensor, Tensor]) -> Solutions:
     return solved.replaced(row[winner], retry[winner])
 
 
-def _solve(e: Evidence, rough: tuple[Tensor, Tensor], iterations: int) -> Solutions:
-    seen = e.mask.sum(-1)
-    center = torch.where(e.mask[..., None], e.center, 0.0)
+def _solve(evidence: Evidence, rough: tuple[Tensor, Tensor], iterations: int) -> Solutions:
     result = pnp.solve(
-        e.points,
-        center,
-        e.matrix,
-        covariances=visible(e.covariance, e.mask),
-        mask=e.mask,
-        initial=_starts(e, rough),
+        evidence.points,
+        torch.where(evidence.mask[..., None], evidence.center, 0.0),
+        evidence.matrix,
+        covariances=visible(evidence.covariance, evidence.mask),
+        mask=evidence.mask,
+        initial=_starts(evidence, rough),
         max_iterations=iterations,
     )
     # both minima of the centres, weighed again with the rings' shapes
-    both_r, both_t = torch.stack([result.R, result.R_alt], 1), torch.stack([result.t, result.t_alt], 1)
-    center_chi2 = torch.stack([result.chi2, result.chi2_alt], 1)
-    of_shapes = shape_chi2(e, both_r, both_t)
-    total = (center_chi2 + of_shapes).nan_to_num(nan=torch.inf)  # NaN: no such minimum
-    chi2, best = total.min(1)
-    row = torch.arange(best.numel(), device=best.device)
-    r, t, rms = both_r[row, best], both_t[row, best], torch.stack([result.rms, result.rms_alt], 1)
-    covariance, determined = pose_covariance(e, r, t)
-    chi2_alt = total[row, 1 - best]
-    chi2_alt = torch.where(chi2_alt.isfinite(), chi2_alt, torch.nan)
-
-    chi2_center, rms_best = center_chi2[row, best], rms[row, best]
-    contradicts = (chi2_center > _CENTER_LIMIT[0] + _CENTER_LIMIT[1] * (2 * seen - 6)) & (rms_best > _CENTER_RMS)
+    R, t = torch.stack([result.R, result.R_alt], 1), torch.stack([result.t, result.t_alt], 1)
+    rms, of_centers = torch.stack([result.rms, result.rms_alt], 1), torch.stack([result.chi2, result.chi2_alt], 1)
+    of_shapes = shape_chi2(evidence, R, t)
+    chi2, best = (of_centers + of_shapes).nan_to_num(nan=torch.inf).sort(1)  # NaN: no such minimum
+    row = torch.arange(len(best), device=best.device)[:, None]
+    R, t, rms, of_centers, of_shapes = (x[row, best] for x in (R, t, rms, of_centers, of_shapes))
+    covariance, determined = pose_covariance(evidence, R[:, 0], t[:, 0])
+    chi2_alt = torch.where(chi2[:, 1].isfinite(), chi2[:, 1], torch.nan)
+    seen = evidence.mask.sum(-1)
+    contradicts = (of_centers[:, 0] > _CENTER_LIMIT[0] + _CENTER_LIMIT[1] * (2 * seen - 6)) & (rms[:, 0] > _CENTER_RMS)
+    solvable = chi2[:, 0].isfinite()
     reason = torch.full_like(seen, Reason.NONE)
     for condition, why in (
-        (chi2_alt - chi2 < AMBIGUOUS_CHI2, Reason.TWO_SOLUTIONS),
-        (of_shapes[row, best] > 4 * _SHAPE_LIMIT * seen, Reason.RING_SHAPE),
+        (chi2_alt - chi2[:, 0] < AMBIGUOUS_CHI2, Reason.TWO_SOLUTIONS),
+        (of_shapes[:, 0] > 4 * _SHAPE_LIMIT * seen, Reason.RING_SHAPE),
         (contradicts, Reason.RESIDUAL),
-        (~chi2.isfinite(), Reason.NOT_CONVERGED),
+        (~solvable, Reason.NOT_CONVERGED),
         (result.code == pnp.PnPCode.BEHIND_CAMERA, Reason.BEHIND_CAMERA),
-        ((result.code == pnp.PnPCode.DEGENERATE) | (chi2.isfinite() & ~determined), Reason.DEGENERATE),
+        ((result.code == pnp.PnPCode.DEGENERATE) | (solvable & ~determined), Reason.DEGENERATE),
     ):
         reason = torch.where(condition, int(why), reason)  # the last that holds
     status = torch.where(reason == Reason.NONE, int(Status.OK), int(Status.REJECTED))
     status = torch.where(reason == Reason.TWO_SOLUTIONS, int(Status.AMBIGUOUS), status)
-    return Solutions(
-        r,
-        t,
-        covariance,
-        rms_best,
-        chi2,
-        both_r[row, 1 - best],
-        both_t[row, 1 - best],
-        rms[row, 1 - best],
-        chi2_alt,
-        status,
-        reason,
-        e.mask,
-    )
+    one, two = ((R[:, k], t[:, k], rms[:, k]) for k in range(2))
+    return Solutions(one[0], one[1], covariance, one[2], chi2[:, 0], *two, chi2_alt, status, reason, evidence.mask)
 
 
-def _starts(e: Evidence, rough: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+def _starts(evidence: Evidence, rough: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     """Two poses (N, 2, 3, 3), (N, 2, 3) to start from: both planar solutions, or the rough pose and its mirror."""
-    r, t = rough
+    R, t = rough
     # depth mirrored along the line of sight, the plane turned back on itself: the same weak-perspective image
-    weight = e.mask.double() / e.mask.sum(-1, keepdim=True)
-    middle = (e.points * weight[..., None]).sum(1)
-    at = (r @ middle[..., None]).squeeze(-1) + t
-    first = e.mask.int().argmax(-1)
-    normal = e.normals[torch.arange(first.numel(), device=first.device), first]
-    mirrored = _reflection(at) @ r @ _reflection(normal)
+    weight = evidence.mask.double() / evidence.mask.sum(-1, keepdim=True)
+    middle = (evidence.points * weight[..., None]).sum(1)
+    at = (R @ middle[..., None]).squeeze(-1) + t
+    first = evidence.mask.int().argmax(-1)
+    normal = evidence.normals[torch.arange(first.numel(), device=first.device), first]
+    mirrored = _reflection(at) @ R @ _reflection(normal)
     mirrored_t = at - (mirrored @ middle[..., None]).squeeze(-1)
-    focal, principal = e.matrix.diagonal()[:2], e.matrix[:2, 2]
-    xy = torch.where(e.mask[..., None], (e.center - principal) / focal, 0.0)
-    flat = pnp.planar(e.points, xy, mask=e.mask)
+    focal, principal = evidence.matrix.diagonal()[:2], evidence.matrix[:2, 2]
+    xy = torch.where(evidence.mask[..., None], (evidence.center - principal) / focal, 0.0)
+    flat = pnp.planar(evidence.points, xy, mask=evidence.mask)
     both = flat.R.isfinite().all(-1).all(-1).all(-1)  # else a marker behind the camera, or no plane
-    planar = (e.coplanar & (e.mask.sum(-1) >= 4) & both)[:, None]
-    start_r = torch.where(planar[..., None, None], flat.R, torch.stack([r, mirrored], 1))
+    planar = (evidence.coplanar & (evidence.mask.sum(-1) >= 4) & both)[:, None]
+    start_r = torch.where(planar[..., None, None], flat.R, torch.stack([R, mirrored], 1))
     start_t = torch.where(planar[..., None], flat.t, torch.stack([t, mirrored_t], 1))
     return start_r, start_t
 

@@ -7,65 +7,72 @@ nothing, and their eccentricity tells of the tilt besides.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.geometry import rotations
+from torchpose.geometry.least_squares import Normal, Pose, Unknowns, minimise
+from torchpose.geometry.rows import Rows
 from torchpose.pose import Evidence
-from torchpose.refine.photometric.gauss_newton import solve_scaled
 
 _STEPS = 4  # from within a few standard deviations: the last one changes no digit that counts
 
 
-class OnCenters(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class OnCenters(Rows):
     """Poses of N rows refined on centres.
 
-    R: (N, 3, 3). t: (N, 3). covariance: (N, 6, 6). chi2: (N,), of the centres. good: (N,) bool; where False no better
-    pose than the start was found, and R, t and chi2 are those of the start.
+    Attributes:
+        R: target to camera.
+        t: mm.
+        covariance: as in `results.Poses`.
+        chi2: of the centres.
+        good: where False no better pose than the start was found, and R, t and chi2 are those of the start.
     """
 
-    R: Tensor
-    t: Tensor
-    covariance: Tensor
-    chi2: Tensor
-    good: Tensor
+    R: Float[Tensor, "N 3 3"]
+    t: Float[Tensor, "N 3"]
+    covariance: Float[Tensor, "N 6 6"]
+    chi2: Float[Tensor, " N"]
+    good: Bool[Tensor, " N"]
 
 
-def refine_centers(e: Evidence, rotation: Tensor, translation: Tensor) -> OnCenters:
+def refine_centers(evidence: Evidence, rotation: Tensor, translation: Tensor) -> OnCenters:
     """Refines N poses on the centres of the ellipses of both circles of every marker seen.
 
     The ellipses are those of ideal pixels, so that distortion is off already. Markers that contradict each other are
     for `solve_poses` to find; here all that it kept count, by their covariances.
 
     Args:
-        e: what was measured. rotation, translation: (N, 3, 3), (N, 3) to start from.
+        evidence: what was measured.
+        rotation: (N, 3, 3) to start from.
+        translation: (N, 3), the same.
     """
-    seen = e.mask[:, :, None].expand(-1, -1, 2)
-    eye = torch.eye(2, dtype=e.shape.dtype, device=e.shape.device)
-    covariance = torch.where(seen[..., None, None], e.shape_covariance[..., :2, :2], eye)
+    seen = evidence.mask[:, :, None].expand(-1, -1, 2)
+    eye = torch.eye(2, dtype=evidence.shape.dtype, device=evidence.shape.device)
+    covariance = torch.where(seen[..., None, None], evidence.shape_covariance[..., :2, :2], eye)
     weight = torch.linalg.inv(covariance) * seen[..., None, None]
-    measured = torch.where(seen[..., None], e.shape[..., :2], 0.0)
-    focal, principal = e.matrix.diagonal()[:2], e.matrix[:2, 2]
+    measured = torch.where(seen[..., None], evidence.shape[..., :2], 0.0)
+    focal, principal = evidence.matrix.diagonal()[:2], evidence.matrix[:2, 2]
 
-    r, t = rotation, translation
-    first = last = information = torch.empty(0)
-    for step in range(_STEPS + 1):
-        center, by_pose = ellipse_centers(r, t, e.points, e.normals, e.radii)
+    def problem(unknowns: Unknowns) -> Normal:
+        pose = unknowns.pose
+        center, by_pose = ellipse_centers(pose.R, pose.t, evidence.points, evidence.normals, evidence.radii)
         error = torch.where(seen[..., None], measured - (focal * center + principal), 0.0)[..., None]
         jacobian = focal[:, None] * by_pose
         weighted = jacobian.mT @ weight
-        information = (weighted @ jacobian).sum((1, 2))
-        last = (error.mT @ weight @ error).sum((1, 2, 3, 4))
-        first = last if step == 0 else first
-        if step < _STEPS:
-            change = solve_scaled(information, (weighted @ error).sum((1, 2))).squeeze(-1)
-            r, t = rotations.exp(change[:, 3:]) @ r, t + change[:, :3]
-    inverse, info = torch.linalg.inv_ex(information)
-    good = (info == 0) & (last <= first) & (inverse.diagonal(dim1=-2, dim2=-1) > 0).all(-1)
-    r, t = torch.where(good[:, None, None], r, rotation), torch.where(good[:, None], t, translation)
-    return OnCenters(r, t, inverse, torch.where(good, last, first), good)
+        cost = (error.mT @ weight @ error).sum((1, 2, 3, 4))
+        return Normal((weighted @ jacobian).sum((1, 2)), (weighted @ error).sum((1, 2)).squeeze(-1), cost)
+
+    start = Pose(rotation, translation)
+    found = minimise(problem, Unknowns({"pose": start}), _STEPS)
+    covariance, determined = found.covariance()
+    good = determined & (found.normal.cost <= found.first_cost)
+    pose = found.unknowns.pose.where(good, start)
+    return OnCenters(pose.R, pose.t, covariance, torch.where(good, found.normal.cost, found.first_cost), good)
 
 
 def ellipse_centers(

@@ -10,9 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchpose.geometry import conics
+from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import positions, ragged_arange, segment_mean, values_at
 from torchpose.rings import zernike
 
@@ -23,24 +25,22 @@ _LEAST_STEP = 0.35  # of the mean step of the ring
 
 
 @dataclass(frozen=True, eq=False)
-class RingEdges:
+class RingEdges(Rows):
     """Edge points of M rings, flat, sorted by ring.
 
     Attributes:
-        ring: (E,) int64. points: (E, 2) float64, px.
-        normal: (E, 2) float64, unit, towards increasing grey.
-        offset: (E,) float64, px along the normal from the centre of the edge's pixel, as measured.
-        step: (E,) float64, grey step across the edge.
+        ring: of each point.
+        points: px.
+        normal: unit, towards increasing grey.
+        offset: px along the normal from the centre of the edge's pixel, as measured.
+        step: grey step across the edge.
     """
 
-    ring: Tensor
-    points: Tensor
-    normal: Tensor
-    offset: Tensor
-    step: Tensor
-
-    def __getitem__(self, index: Tensor) -> RingEdges:
-        return RingEdges(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+    ring: Int[Tensor, " E"]
+    points: Float[Tensor, "E 2"]
+    normal: Float[Tensor, "E 2"]
+    offset: Float[Tensor, " E"]
+    step: Float[Tensor, " E"]
 
 
 def edge_pixels(

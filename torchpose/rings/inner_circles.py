@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.detect import Candidates
 from torchpose.geometry import conics
+from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import values_at
 
 ANGLES = 64
@@ -22,19 +24,21 @@ _PARTED = 0.02  # of the semi-minor axis: from which shift of the centres on per
 
 
 @dataclass(frozen=True, eq=False)
-class InnerCircles:
+class InnerCircles(Rows):
     """What is inside each of M candidates.
 
     Attributes:
-        ratio: (M,) float64, of the radii. found: (M,) bool. ellipse: (M, 5), the inner circle, about.
-        seen: (M, 64) bool, the directions, evenly spaced in eccentric anomaly from +u on the circle that the candidate
-            is the image of, in which its own edge shows.
+        ratio: of the radii.
+        found: whether there is a circle.
+        ellipse: the inner circle, about.
+        seen: the directions, evenly spaced in eccentric anomaly from +u on the circle that the candidate is the image
+            of, in which its own edge shows.
     """
 
-    ratio: Tensor
-    found: Tensor
-    ellipse: Tensor
-    seen: Tensor
+    ratio: Float[Tensor, " M"]
+    found: Bool[Tensor, " M"]
+    ellipse: Float[Tensor, "M 5"]
+    seen: Bool[Tensor, "M A"]
 
 
 def find_inner(frames: Tensor, candidates: Candidates, camera: Camera | None = None) -> InnerCircles:

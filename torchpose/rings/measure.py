@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Self
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchpose import ellipse
@@ -14,10 +13,12 @@ from torchpose.camera import Camera
 from torchpose.detect import Candidates
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import conics
+from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import segment_mean, segment_sum
 from torchpose.rings import zernike
 from torchpose.rings.edges import REACH, RingEdges, ring_edges
 from torchpose.rings.inner_circles import ANGLES, clear_directions, find_inner
+from torchpose.rings.lens import ideal_pixels, mapped
 from torchpose.rings.small_rings import fit_small_rings
 
 _LEAST_COVER = (0.4, 0.33)  # of the perimeter with edge points, outer and inner circle
@@ -31,42 +32,24 @@ _STEP_RANGE = (0.4, 2.5)  # inner to outer grey step
 
 
 @dataclass(frozen=True, eq=False)
-class Rings:
+class Rings(Rows):
     """K rings with both circles measured, flat.
 
     Attributes:
-        frame: (K,) int64. polarity: (K,) float64, +1 dark ring on light, -1 light on dark.
-        outer_raw, inner_raw: (K, 5) float64, ellipses in the pixels of the frame.
-        outer, inner: fits in ideal pixels, that is of the same camera without lens distortion.
+        frame: of each ring.
+        polarity: +1 dark ring on light, -1 light on dark.
+        outer_raw: ellipses in the pixels of the frame.
+        inner_raw: the same.
+        outer: fits in ideal pixels, that is of the same camera without lens distortion.
+        inner: the same.
     """
 
-    frame: Tensor
-    polarity: Tensor
-    outer_raw: Tensor
-    inner_raw: Tensor
+    frame: Int[Tensor, " K"]
+    polarity: Float[Tensor, " K"]
+    outer_raw: Float[Tensor, "K 5"]
+    inner_raw: Float[Tensor, "K 5"]
     outer: EllipseFit
     inner: EllipseFit
-
-    def __len__(self) -> int:
-        return self.frame.shape[0]
-
-    def __getitem__(self, index: Tensor) -> Rings:
-        return Rings(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
-
-    @classmethod
-    def cat(cls, parts: Sequence[Self]) -> Self:
-        """The rings of all parts."""
-
-        def fits(name: str) -> EllipseFit:
-            some = [getattr(part, name) for part in parts]
-            return EllipseFit(*(torch.cat([getattr(f, n) for f in some]) for n in EllipseFit.__dataclass_fields__))
-
-        def tensor(name: str) -> Tensor:
-            return torch.cat([getattr(part, name) for part in parts])
-
-        return cls(
-            tensor("frame"), tensor("polarity"), tensor("outer_raw"), tensor("inner_raw"), fits("outer"), fits("inner")
-        )
 
     @property
     def ratio(self) -> Tensor:
@@ -175,28 +158,19 @@ def _measure_small(
     large = (found.outer.params[:, 3] > least_outer) & (found.inner.params[:, 3] > least_inner)
     index = (found.good & large).nonzero()[:, 0]
     outer, inner = found.outer[index], found.inner[index]
+
+    def to_ideal(points: Tensor) -> Tensor:
+        return ideal_pixels(camera, points)
+
     rings = Rings(
         candidates.frame[index],
         candidates.polarity[index],
         outer.params,
         inner.params,
-        replace(outer, params=_ideal(camera, outer.params)),
-        replace(inner, params=_ideal(camera, inner.params)),
+        replace(outer, params=mapped(outer.params, to_ideal)),
+        replace(inner, params=mapped(inner.params, to_ideal)),
     )
     return rings, index
-
-
-def _ideal(camera: Camera, ellipses: Tensor) -> Tensor:
-    """Ellipses (K, 5) of raw pixels in ideal ones."""
-    return mapped(ellipses, lambda points: ideal_pixels(camera, points))
-
-
-def mapped(ellipses: Tensor, mapping: Callable[[Tensor], Tensor]) -> Tensor:
-    """Images (K, 5) of ellipses under a mapping of points (P, 2) that is nearly affine across each of them."""
-    angle = torch.arange(ANGLES, dtype=torch.float64, device=ellipses.device) * (2 * torch.pi / ANGLES)
-    points = conics.points_on(ellipses[:, None], angle.expand(ellipses.shape[0], -1)).flatten(0, 1)
-    ring = torch.arange(ellipses.shape[0], device=ellipses.device).repeat_interleave(ANGLES)
-    return ellipse.fit(mapping(points), ring, ellipses.shape[0])
 
 
 def _unbiased(
@@ -208,9 +182,3 @@ def _unbiased(
     pushed = zernike.curvature_shift(slope) * ellipse.curvature(edges.points, edges.ring, fitted)
     change = zernike.deblur(edges.offset, slope) - edges.offset - pushed * outward[edges.ring]
     return edges.points + change[:, None] * edges.normal
-
-
-def ideal_pixels(camera: Camera, points: Tensor) -> Tensor:
-    """Pixels (..., 2) that a camera with the same matrix and no distortion would see; float64."""
-    k = camera.matrix.to(points.device)
-    return camera.undistort_points(points.double()) * k.diagonal()[:2] + k[:2, 2]

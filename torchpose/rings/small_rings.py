@@ -21,10 +21,21 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import conics
+from torchpose.geometry.least_squares import (
+    Eliminated,
+    Normal,
+    Unknowns,
+    Vector,
+    geman_mcclure,
+    minimise,
+    solve_scaled,
+)
+from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import ragged_arange, segment_mean, segment_sum
 from torchpose.rings.small_ring_model import MOST_NODES, depth, exact, first_order, outer_ellipses
 
@@ -32,7 +43,7 @@ _MARGIN = 3.0  # px around the outer ellipse
 _SOFT, _CUT = 2.5, 4.0  # standard deviations: scale of the soft weights, and from where on a pixel is dropped
 _SECTORS, _SECTOR_CUT = 16, 4.0  # and standard deviations of the mean square of a sector
 _LEAST_KEPT = 0.5  # of the pixels
-_MOST_MOVE = 0.7  # px of an iteration
+_MOST_MOVE = (*[0.7] * 5, 0.1, *[0.7] * 3)  # of an iteration: px, and the ratio
 _START_SIGMA = 0.8  # px
 _BLURRED = 0.2  # blur over inner semi-minor axis above which edges are no edges any more
 _BLURRED_MARGIN = 2.5  # blurs around the outer ellipse
@@ -41,45 +52,86 @@ _PROMISING = 0.5  # of it, from the first fit, for a second one
 _PART = 400_000  # pixels times nodes at a time
 _RATIO_RANGE = (0.12, 0.93)  # beyond it, a plain disc or its rim
 _RATIO_SIGMA = 0.1  # of the ratio: an inner circle that is not sure is none
-_NONLINEAR = 9  # centre 2, shape 3, ratio, blur, inner from outer centre 2; then the four grey ones
+_NONLINEAR = 9  # centre 2, shape 3, ratio, blur, inner from outer centre 2
+_LEVELS = 4  # paper, its slope 2, contrast
+_LEAST = (*[-math.inf] * 5, 0.05, 0.3, *[-math.inf] * 2)  # of the unknowns, and the most
+_MOST = (*[math.inf] * 5, 0.97, 6.0, *[math.inf] * 2)
 _LEAST_PARTED = 1e-3  # px, standard deviation of the prior of the smallest rings
 
 
 @dataclass(frozen=True, eq=False)
-class SmallRings:
-    """K fitted rings: both circles in raw pixels, and whether the model explains what is seen (K,) bool."""
+class SmallRings(Rows):
+    """K fitted rings.
+
+    Attributes:
+        outer: ellipses in raw pixels.
+        inner: the same.
+        good: whether the model explains what is seen.
+    """
 
     outer: EllipseFit
     inner: EllipseFit
-    good: Tensor
+    good: Bool[Tensor, " K"]
+
+
+class _Stage(NamedTuple):
+    """Some steps, and how they weigh the pixels.
+
+    held: the ring stays where it is. sectors: those that contradict the model do not count. hard: every pixel counts
+    or not, instead of by a smooth weight.
+    """
+
+    steps: int
+    held: bool = False
+    sectors: bool = True
+    hard: bool = False
+
+
+class _Scheme(NamedTuple):
+    """How the rings are modelled and solved."""
+
+    coverage: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+    damping: float
+    stages: tuple[_Stage, ...]
+
+
+# grey levels and weights alone at first, so that a cover does not pull from the start
+_ROUGH = _Scheme(first_order, 1e-3, (_Stage(3, held=True, sectors=False), _Stage(7), _Stage(4, hard=True)))
+# blur, width and contrast of a ring much blurred are hard to tell apart: no step is to be shortened
+_PRECISE = _Scheme(exact, 1e-5, (_Stage(6), _Stage(4, hard=True)))
 
 
 def fit_small_rings(
-    frames: Tensor, frame: Tensor, outer: Tensor, ratio: Tensor, seen: Tensor, polarity: Tensor, focal: Tensor
+    frames: Shaped[Tensor, "B H W"],
+    frame: Int[Tensor, " K"],
+    outer: Float[Tensor, "K 5"],
+    ratio: Float[Tensor, " K"],
+    seen: Bool[Tensor, "K A"],
+    polarity: Float[Tensor, " K"],
+    focal: Float[Tensor, ""],
 ) -> SmallRings:
     """Fits the model above by damped Gauss-Newton from rough rings.
 
     Args:
-        frames: (B, H, W) grey, any real dtype. frame: (K,) int64. outer: (K, 5) rough outer ellipses, px.
-        ratio: (K,) rough ratio of the radii. seen: (K, A) bool, the directions in which the outer edge shows, see
-            `inner_circles.find_inner`; the others do not count. polarity: (K,) +1 for a dark ring. focal: () px.
+        frames: grey, any real dtype.
+        frame: of each ring.
+        outer: rough outer ellipses, px.
+        ratio: rough, of the radii.
+        seen: the directions in which the outer edge shows, see `inner_circles.find_inner`; the others do not count.
+        polarity: +1 for a dark ring.
+        focal: px.
     """
     shape = conics.shape_matrix(outer)
     start = [outer[:, :2], shape[:, 0, :1], shape[:, 0, 1:], shape[:, 1, 1:], ratio[:, None]]
     theta = torch.cat([*start, torch.full_like(ratio, _START_SIGMA)[:, None], torch.zeros_like(outer[:, :2])], -1)
     parted = (outer[:, 2].square() * (1 - ratio.square()) / focal).clamp_min(_LEAST_PARTED)
-    known = torch.nn.functional.pad(parted.pow(-2)[:, None].expand(-1, 2), (_NONLINEAR - 2, 4))
+    known = torch.nn.functional.pad(parted.pow(-2)[:, None].expand(-1, 2), (_NONLINEAR - 2, 0))
     margin = torch.full_like(ratio, _MARGIN)
-    # grey levels and weights alone at first, so that a cover does not pull from the start
-    rough = _Scheme(first_order, damping=1e-3, hold=3, soft=10, hard=4)
-    # blur, width and contrast of a ring much blurred are hard to tell apart: no step is to be shortened
-    precise = _Scheme(exact, damping=1e-5, hold=0, soft=6, hard=4)
-    fit = _gauss_newton(_windows(frames, frame, outer, margin), theta, seen, known, rough)
+    fit = _fitted(_windows(frames, frame, outer, margin), theta, seen, known, _ROUGH)
     for part in _blurred(fit, outer, polarity):
         reach = (_BLURRED_MARGIN * fit.theta[part, 6]).clamp_min(_MARGIN)
         window = _windows(frames, frame[part], outer[part], reach)
-        again = _gauss_newton(window, fit.theta[part], seen[part], known[part], precise)
-        fit = _Fit(*(every.index_copy(0, part, some) for every, some in zip(fit, again, strict=True)))
+        fit = fit.replaced(part, _fitted(window, fit.theta[part], seen[part], known[part], _PRECISE))
     return _judged(fit, outer, polarity)
 
 
@@ -94,86 +146,89 @@ def _blurred(fit: _Fit, outer: Tensor, polarity: Tensor) -> Sequence[Tensor]:
     return which[order].split(part.unique_consecutive(return_counts=True)[1].tolist())
 
 
-class _Fit(NamedTuple):
-    """K fits: parameters (K, 9), their covariance (K, 9, 9), contrast, residual variance, pixels kept, all as (K,).
+@dataclass(frozen=True, eq=False)
+class _Fit(Rows):
+    """K fits: parameters and their covariance, contrast, residual variance, number of pixels kept and their share, the
+    share of the grey values' variance that is explained, and whether the window is on the frame and the data determine
+    all parameters."""
 
-    And the share of the pixels that is kept, of the grey values' variance that is explained, and (K,) bool, whether the
-    window is on the frame and the normal equations could be solved.
-    """
-
-    theta: Tensor
-    covariance: Tensor
-    contrast: Tensor
-    variance: Tensor
-    pixels: Tensor
-    kept: Tensor
-    explained: Tensor
-    sound: Tensor
-
-
-class _Scheme(NamedTuple):
-    """How the rings are modelled and solved: model, damping, and numbers of iterations.
-
-    The first ``hold`` of them keep the ring where it is; ``soft`` ones weigh the pixels smoothly, then ``hard`` ones
-    keep or drop each.
-    """
-
-    coverage: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
-    damping: float
-    hold: int
-    soft: int
-    hard: int
+    theta: Float[Tensor, "K 9"]
+    covariance: Float[Tensor, "K 9 9"]
+    contrast: Float[Tensor, " K"]
+    variance: Float[Tensor, " K"]
+    pixels: Float[Tensor, " K"]
+    kept: Float[Tensor, " K"]
+    explained: Float[Tensor, " K"]
+    sound: Bool[Tensor, " K"]
 
 
-def _gauss_newton(window: _Window, theta: Tensor, seen: Tensor, known: Tensor, scheme: _Scheme) -> _Fit:
-    """Damped Gauss-Newton from parameters (K, 9), with ``known`` (K, 13) the information that is there before."""
-    index, xy, grey, whole = window
-    count = theta.shape[0]
-    origin = theta[:, :2]
-    semi_major = outer_ellipses(theta)[0][:, 2]
-    local = (xy - origin[index]) / semi_major[index, None]
-    linear = theta.new_zeros(count, 4)
-    normal = torch.eye(_NONLINEAR + 4, dtype=theta.dtype, device=theta.device).expand(count, -1, -1)
-    residual = grey
-    at = depth(theta, index, xy)
-    direction = (torch.atan2(at.v, at.u) * (seen.shape[1] / (2 * math.pi))).round().long() % seen.shape[1]
-    clear = seen[index, direction].to(grey)
-    sector = direction * _SECTORS // seen.shape[1]
-    weight = clear
-    spread = torch.ones_like(theta[:, 0])
-    for step_number in range(scheme.soft + scheme.hard):
-        value, derivative = scheme.coverage(theta, index, xy)
-        basis = torch.cat([torch.ones_like(local[:, :1]), local, value[:, None]], -1)
-        # grey levels first, so that the derivatives have their contrast
-        linear = _solve(basis, grey, index, count, weight)
-        residual = grey - (basis * linear[index]).sum(-1)
-        if step_number < scheme.soft:  # later it would grow with what it lets in
-            spread = segment_mean(residual.square(), index, count, weight).sqrt()
-        agrees = _agreeing(residual, clear, index * _SECTORS + sector, count) if step_number >= scheme.hold else clear
-        weight = clear * agrees * _weights(residual / spread[index], keep=step_number >= scheme.soft)
-        jacobian = torch.cat([derivative * linear[index, 3:], basis], -1)
-        weighted = jacobian * weight[:, None]
-        normal = segment_sum((weighted[:, :, None] * jacobian[:, None]).flatten(1), index, count)
-        normal = normal.view(count, _NONLINEAR + 4, -1) + torch.diag_embed(known * spread.square()[:, None])
-        gradient = segment_sum(weighted * residual[:, None], index, count)
-        gradient[:, 7:9] -= (known[:, 7:9] * spread.square()[:, None]) * theta[:, 7:9]
-        damped = normal + torch.diag_embed(scheme.damping * normal.diagonal(dim1=-2, dim2=-1) + 1e-12)
-        step = torch.linalg.solve_ex(damped, gradient[..., None]).result.squeeze(-1)[:, :_NONLINEAR]
-        step = step.nan_to_num(nan=0.0).clamp(-_MOST_MOVE, _MOST_MOVE) * (step_number >= scheme.hold)
-        step[:, 5] = step[:, 5].clamp(-0.1, 0.1)
-        theta = theta + step
-        ratio, sigma = theta[:, 5:6].clamp(0.05, 0.97), theta[:, 6:7].clamp(0.3, 6.0)
-        theta = torch.cat([theta[:, :5], ratio, sigma, theta[:, 7:]], -1)
-
-    pixels = segment_sum(weight, index, count)  # the last weights are 0 or 1
-    variance = segment_sum(weight * residual.square(), index, count) / (pixels - _NONLINEAR - 4).clamp_min(1)
+def _fitted(window: _Window, theta: Tensor, seen: Tensor, known: Tensor, scheme: _Scheme) -> _Fit:
+    """Fits from parameters (K, 9), with ``known`` (K, 9) the information about each that is there before."""
+    pixels, limits = (
+        _Pixels(window, theta, seen, known, scheme),
+        [theta.new_tensor(x) for x in (_LEAST, _MOST, _MOST_MOVE)],
+    )
+    unknowns = Unknowns({"ring": Vector(theta, *limits)})
+    for stage in scheme.stages:
+        pixels.stage = stage
+        if stage.held:
+            for _ in range(stage.steps):
+                pixels(unknowns)
+            continue
+        found = minimise(pixels, unknowns, stage.steps, damping=scheme.damping, settle=False)
+        unknowns = found.unknowns
+    index, weight, grey, count = window.ring, pixels.weight, window.grey, len(theta)
+    number = segment_sum(weight, index, count)  # the last weights are 0 or 1
+    residual = segment_sum(weight * pixels.residual.square(), index, count)
+    variance = residual / (number - _NONLINEAR - _LEVELS).clamp_min(1)
     mean = segment_mean(grey, index, count, weight)
-    total = segment_sum(weight * (grey - mean[index]).square(), index, count) / pixels
-    inverse, info = torch.linalg.inv_ex(normal)
-    covariance = inverse[:, :_NONLINEAR, :_NONLINEAR] * variance[:, None, None]
-    kept = pixels / torch.bincount(index, minlength=count)
-    sound = whole & (info == 0) & covariance.isfinite().all(-1).all(-1)
-    return _Fit(theta, covariance, linear[:, 3], variance, pixels, kept, 1 - variance / total, sound)
+    total = segment_sum(weight * (grey - mean[index]).square(), index, count) / number
+    covariance, determined = found.covariance()
+    covariance = covariance * (variance / pixels.spread.square())[:, None, None]
+    sound = window.whole & determined & covariance.isfinite().all(-1).all(-1)
+    kept = number / torch.bincount(index, minlength=count)
+    theta = unknowns.values("ring")
+    return _Fit(theta, covariance, pixels.levels[:, 3], variance, number, kept, 1 - variance / total, sound)
+
+
+class _Pixels:
+    """The normal equations of K rings by the pixels of their windows, and what these last showed."""
+
+    def __init__(self, window: _Window, theta: Tensor, seen: Tensor, known: Tensor, scheme: _Scheme) -> None:
+        self.window, self.scheme, self.known, self.stage = window, scheme, known, scheme.stages[0]
+        semi_major = outer_ellipses(theta)[0][:, 2]
+        local = (window.xy - theta[window.ring, :2]) / semi_major[window.ring, None]
+        self.plane = torch.cat([torch.ones_like(local[:, :1]), local], -1)
+        at, directions = depth(theta, window.ring, window.xy), seen.shape[1]
+        direction = (torch.atan2(at.v, at.u) * (directions / (2 * math.pi))).round().long() % directions
+        self.clear = self.weight = seen[window.ring, direction].to(window.grey)
+        self.sector = window.ring * _SECTORS + direction * _SECTORS // directions
+        self.spread = torch.ones_like(theta[:, 0])
+        self.residual, self.levels = window.grey, theta.new_zeros(len(theta), _LEVELS)
+
+    def __call__(self, unknowns: Unknowns) -> Normal:
+        theta, (index, xy, grey, _) = unknowns.values("ring"), self.window
+        count, stage = len(theta), self.stage
+        value, derivative = self.scheme.coverage(theta, index, xy)
+        basis = torch.cat([self.plane, value[:, None]], -1)
+        # grey levels first, so that the derivatives have their contrast
+        self.levels = _levels(basis, grey, index, count, self.weight)
+        self.residual = residual = grey - (basis * self.levels[index]).sum(-1)
+        if not stage.hard:  # later it would grow with what it lets in
+            self.spread = segment_mean(residual.square(), index, count, self.weight).sqrt()
+        agrees = _agreeing(residual, self.clear, self.sector, count) if stage.sectors else 1.0
+        self.weight = self.clear * agrees * _weights(residual / self.spread[index], keep=stage.hard)
+        jacobian = torch.cat([derivative * self.levels[index, 3:], basis], -1)
+        weighted = jacobian * (self.weight / self.spread.square()[index])[:, None]
+        products = segment_sum((weighted[:, :, None] * jacobian[:, None]).flatten(1), index, count)
+        products = products.unflatten(1, (_NONLINEAR + _LEVELS, -1))
+        right = segment_sum(weighted * residual[:, None], index, count)
+        n = _NONLINEAR
+        owner = torch.arange(count, device=theta.device)
+        part = Eliminated(products[:, :n, n:], products[:, n:, n:], right[:, n:], owner)
+        # the prior of the shift between the centres is at zero
+        information = products[:, :n, :n] + torch.diag_embed(self.known)
+        return Normal(information, right[:, :n] - self.known * theta, torch.zeros_like(right[:, 0]), part)
 
 
 def _judged(fit: _Fit, outer: Tensor, polarity: Tensor) -> SmallRings:
@@ -244,7 +299,7 @@ def _weights(deviation: Tensor, keep: bool) -> Tensor:
     """Weights (P,) of residuals in standard deviations: Geman-McClure's, or with ``keep`` 1 within the cut, else 0."""
     if keep:
         return (deviation.abs() < _CUT).to(deviation)
-    return (1 + (deviation / _SOFT).square()).reciprocal().square().nan_to_num(nan=0.0)
+    return geman_mcclure(deviation / _SOFT).nan_to_num(nan=0.0)
 
 
 def _agreeing(residual: Tensor, clear: Tensor, sector: Tensor, count: int) -> Tensor:
@@ -261,13 +316,13 @@ def _agreeing(residual: Tensor, clear: Tensor, sector: Tensor, count: int) -> Te
     return (square <= limit).flatten()[sector].to(residual)
 
 
-def _solve(basis: Tensor, grey: Tensor, index: Tensor, count: int, weight: Tensor) -> Tensor:
+def _levels(basis: Tensor, grey: Tensor, index: Tensor, count: int, weight: Tensor) -> Tensor:
     """Weighted least-squares coefficients (count, C) of grey values on a basis (P, C)."""
     c = basis.shape[1]
     weighted = basis * weight[:, None]
     gram = segment_sum((weighted[:, :, None] * basis[:, None]).flatten(1), index, count).unflatten(1, (c, c))
     right = segment_sum(weighted * grey[:, None], index, count)
-    return torch.linalg.solve_ex(gram, right[..., None]).result.squeeze(-1).nan_to_num(nan=0.0)
+    return solve_scaled(gram, right).nan_to_num(nan=0.0)
 
 
 def _to_axes(ellipses: Tensor) -> Tensor:

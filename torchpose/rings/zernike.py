@@ -15,8 +15,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import segment_sum, values_at
 
 ORDERS = ((0, 0), (1, 1), (2, 0), (2, 2), (3, 1), (3, 3), (4, 0), (4, 2), (4, 4))
@@ -27,23 +29,23 @@ _LEAST_SLOPE = 0.4  # sigma = 0.22 N; a wider blur is out of the mask's reach an
 
 
 @dataclass(frozen=True, eq=False)
-class Edges:
+class Edges(Rows):
     """Sub-pixel edges, flat.
 
     Attributes:
-        points: (E, 2) float64, u, v of the edge point, px.
-        normal: (E, 2) float64, unit direction of increasing grey.
-        offset: (E,) float64, signed distance of the edge from the pixel's centre along the normal, px.
-        step: (E,) float64, height of the grey step.
-        inside: (E,) bool, the edge runs through its own pixel: |du| and |dv| at most 0.5 px. Where it is False the
-            window saw an edge of a neighbouring pixel, or none.
+        points: u, v of the edge point, px.
+        normal: unit direction of increasing grey.
+        offset: signed distance of the edge from the pixel's centre along the normal, px.
+        step: height of the grey step.
+        inside: the edge runs through its own pixel: |du| and |dv| at most 0.5 px. Where it is False the window saw an
+            edge of a neighbouring pixel, or none.
     """
 
-    points: Tensor
-    normal: Tensor
-    offset: Tensor
-    step: Tensor
-    inside: Tensor
+    points: Float[Tensor, "E 2"]
+    normal: Float[Tensor, "E 2"]
+    offset: Float[Tensor, " E"]
+    step: Float[Tensor, " E"]
+    inside: Bool[Tensor, " E"]
 
 
 @lru_cache(maxsize=8)

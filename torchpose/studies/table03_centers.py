@@ -18,7 +18,7 @@ from torch import Tensor
 
 import torchpose as tp
 from torchpose.detect import find_candidates
-from torchpose.refine import refine_edges, refine_photometric
+from torchpose.refine import Sight, refine_edges, refine_photometric
 from torchpose.rings import Rings, measure_rings
 from torchpose.sim import add_noise, render
 from torchpose.studies.study import Comparison, Progress, StudyResult, Table, Value, ignore_progress
@@ -122,16 +122,14 @@ def errors(noise: float, seed: int, cam: tp.Camera) -> dict[str, Tensor]:
     one = torch.zeros(4, dtype=torch.int64)
     scale = 1000.0 / FOCAL
     start = torch.nn.functional.pad((better.outer.params[at, :2] - cam.matrix[:2, 2]) * scale, (0, 1), value=1000.0)
-    mask = torch.ones(4, 1, dtype=torch.bool)
     shapes = torch.stack([better.outer_raw[at], better.inner_raw[at]], 1)[:, None]
+    mask, polarity = torch.ones(4, 1, dtype=torch.bool), torch.ones(4, 1, dtype=F64)
     model = (torch.zeros(4, 1, 3, dtype=F64), target.normals[:, None], target.radii[:, None])
+    sight = Sight(one, mask, shapes, polarity, *model, frame, cam)
     prior = torch.diag(torch.tensor([0.0, 0, HELD, HELD, HELD, HELD], dtype=F64)).expand(4, 6, 6)
     rotation = torch.eye(3, dtype=F64).expand(4, 3, 3)
-    polarity = torch.ones(4, 1, dtype=F64)
-    for name, refined in (
-        ("edges", refine_edges(frame, cam, one, rotation, start, mask, shapes, polarity, *model, prior=prior)),
-        ("photometric", refine_photometric(frame, cam, one, rotation, start, mask, shapes, *model, prior=prior)),
-    ):
+    for name, refine in (("edges", refine_edges), ("photometric", refine_photometric)):
+        refined = refine(sight, rotation, start, prior=prior)
         out[name] = FOCAL * refined.t[:, :2] / refined.t[:, 2:] + cam.matrix[:2, 2] - truth
     return out
 

@@ -19,11 +19,10 @@ import torch
 from torch import Tensor
 
 from torchpose.camera import Camera
-from torchpose.geometry import rotations
+from torchpose.geometry.least_squares import Normal, Pose, PosePrior, Unknowns, geman_mcclure, minimise
 from torchpose.geometry.segments import segment_mean, segment_sum
 from torchpose.refine.edges.step_filter import StepOffsets, step_offsets, window_correlation
-from torchpose.refine.photometric.gauss_newton import solve_scaled
-from torchpose.refine.result import Refined
+from torchpose.refine.sight import Refined, Sight
 from torchpose.rings import zernike
 from torchpose.rings.edges import RingEdges, ring_edges
 
@@ -41,76 +40,100 @@ _CUT = 4.0  # robust standard deviations beyond which an edge point is left out
 _CUT_FLOOR = 0.02  # px, added to the cut: what pixels alias to
 
 
-def refine_edges(
-    frames: Tensor,
-    camera: Camera,
-    frame: Tensor,
-    rotation: Tensor,
-    translation: Tensor,
-    mask: Tensor,
-    rings: Tensor,
-    polarity: Tensor,
-    centers: Tensor,
-    normals: Tensor,
-    radii: Tensor,
-    *,
-    prior: Tensor | None = None,
-) -> Refined:
-    """Refines N poses on the edge points of their rings.
+def refine_edges(sight: Sight, rotation: Tensor, translation: Tensor, *, prior: Tensor | None = None) -> Refined:
+    """Refines N poses on the edge points of their rings; arguments as in `refine_photometric`."""
+    start = Pose(rotation, translation)
+    fit = _Fit(sight, None if prior is None else PosePrior(prior, start))
+    unknowns = Unknowns({"pose": start})
+    for steps, look in ((_SOFT_STEPS, fit.soft), (_STEPS - _SOFT_STEPS, fit.hard), (_FILTER_STEPS, fit.filtered)):
+        found = minimise(look, unknowns, steps, settle=False)
+        unknowns = found.unknowns
+    covariance, determined = found.covariance()
+    good = determined & covariance.isfinite().all(-1).all(-1)
+    kept = segment_mean(fit.keep, fit.seen.of, len(sight), fit.seen.sound)
+    noise = (fit.variance / fit.correlation).sqrt()
+    return Refined(unknowns.pose.R, unknowns.pose.t, covariance, fit.blur, noise, kept, good)
 
-    Args:
-        frames: (B, H, W) grey, any real dtype, in grey levels. frame: (N,) int64.
-        rotation, translation: (N, 3, 3), (N, 3) to start from, within about a pixel.
-        mask: (N, M) bool, markers seen. rings: (N, M, 2, 5) their fitted ellipses in raw pixels, outer and inner.
-        polarity: (N, M), +1 dark ring on light, -1 light on dark.
-        centers, normals: (N, M, 3) in the target frame. radii: (N, M, 2), mm.
-        prior: (N, 6, 6), as in `refine_photometric`.
-    """
-    rows = rotation.shape[0]
-    row, marker = mask.nonzero().unbind(-1)
-    both = rings[row, marker]  # (K, 2, 5)
-    gap = 0.5 * (both[:, 0, 3] - both[:, 1, 3])
-    reach = torch.minimum(gap, 0.6 * both[:, 1, 3]).clamp(1.0, _REACH).repeat_interleave(2)
-    side = torch.tensor([1.0, -1.0], dtype=torch.float64, device=both.device)
-    outward = (polarity[row, marker, None] * side).flatten()
-    edges = ring_edges(frames, frame[row].repeat_interleave(2), both.flatten(0, 1), outward, reach)
 
-    block = edges.ring // 2
-    circles = (centers[row, marker][block], normals[row, marker][block], radii[row, marker].flatten()[edges.ring])
-    seen = _seen(edges, camera, outward, row[block], *circles)
-    of, sound = seen.of, seen.sound
-    # the error of an edge point falls with the height of its step, taken from the whole circle: a high one by chance
-    # must not count more
-    step = segment_mean(edges.step, edges.ring, 2 * row.numel())[edges.ring]
-    trust = sound * (step / segment_mean(step, of, rows)[of]).square()
+class _Fit:
+    """The normal equations of N rows in three ways, and the blur, spread and choice of points that the last left."""
 
-    r, t = rotation, translation
-    known = torch.zeros(rows, 6, 6, dtype=torch.float64, device=r.device) if prior is None else prior
-    moved = torch.zeros(rows, 6, dtype=torch.float64, device=r.device)
-    spread = torch.full((rows,), _START_SPREAD, dtype=torch.float64, device=r.device)
-    blur, keep = torch.zeros_like(spread), sound
-    for i in range(_STEPS + _FILTER_STEPS):
-        if i < _STEPS:
-            error, by_pose, blur = _zernike_errors(seen, r, t, keep, rows)
-            soft, keep, spread = _robust(error, spread, sound, of, rows)
-            weight, correlation = trust * (soft if i < _SOFT_STEPS else keep), _CHAIN * zernike.edge_correlation()
-        else:
-            by_pose, found = _filter_errors(seen, frames, frame, r, t, blur)
-            error = found.error
-            _, keep, spread = _robust(error, spread, sound, of, rows)
-            weight, correlation = keep * found.information * step.square(), window_correlation()
-            blur_weight = keep * found.blur_information * step.square()
-            blur = blur + segment_mean(found.widening, of, rows, blur_weight).clamp(-_MOST_CHANGE, _MOST_CHANGE)
-            blur = blur.clamp_min(_LEAST_BLUR)
-        step_pose, information, variance = _step(error, by_pose, weight, of, rows, known, moved, correlation)
-        moved = moved + step_pose
-        r, t = rotations.exp(step_pose[:, 3:]) @ r, t + step_pose[:, :3]
+    def __init__(self, sight: Sight, prior: PosePrior | None) -> None:
+        self.sight, self.prior = sight, prior
+        row, marker = sight.mask.nonzero().unbind(-1)
+        both = sight.rings[row, marker]  # (K, 2, 5)
+        gap = 0.5 * (both[:, 0, 3] - both[:, 1, 3])
+        reach = torch.minimum(gap, 0.6 * both[:, 1, 3]).clamp(1.0, _REACH).repeat_interleave(2)
+        side = torch.tensor([1.0, -1.0], dtype=torch.float64, device=both.device)
+        outward = (sight.polarity[row, marker, None] * side).flatten()
+        edges = ring_edges(sight.frames, sight.frame[row].repeat_interleave(2), both.flatten(0, 1), outward, reach)
+        block = edges.ring // 2
+        radius = sight.radii[row, marker].flatten()[edges.ring]
+        circles = (sight.centers[row, marker][block], sight.normals[row, marker][block], radius)
+        self.seen = _seen(edges, sight.camera, outward, row[block], *circles)
+        # the error of an edge point falls with the height of its step, taken from the whole circle: a high one by
+        # chance must not count more
+        self.step = segment_mean(edges.step, edges.ring, 2 * row.numel())[edges.ring]
+        sound, of, rows = self.seen.sound, self.seen.of, len(sight)
+        self.trust = sound * (self.step / segment_mean(self.step, of, rows)[of]).square()
+        self.spread = torch.full((rows,), _START_SPREAD, dtype=torch.float64, device=both.device)
+        self.blur, self.variance, self.keep, self.correlation = self.spread, self.spread, sound, 1.0
 
-    inverse, info = torch.linalg.inv_ex(information)
-    covariance = inverse * variance[:, None, None]
-    kept = segment_mean(keep, of, rows, sound)
-    good = (info == 0) & covariance.isfinite().all(-1).all(-1) & (covariance.diagonal(dim1=-2, dim2=-1) > 0).all(-1)
-    return Refined(r, t, covariance, blur, (variance / correlation).sqrt(), kept, good)
+    def soft(self, unknowns: Unknowns) -> Normal:
+        """Zernike edges, all of them, by weight."""
+        error, by_pose = self._zernike(unknowns.pose)
+        soft = self._robust(error)
+        return self._normal(unknowns.pose, error, by_pose, self.trust * soft)
+
+    def hard(self, unknowns: Unknowns) -> Normal:
+        """Zernike edges that agree."""
+        error, by_pose = self._zernike(unknowns.pose)
+        self._robust(error)
+        return self._normal(unknowns.pose, error, by_pose, self.trust * self.keep)
+
+    def filtered(self, unknowns: Unknowns) -> Normal:
+        """The same edges by matched filters; the blur follows."""
+        by_pose, found = _filter_errors(self.seen, self.sight, unknowns.pose, self.blur)
+        self._robust(found.error)
+        square = self.keep * self.step.square()
+        change = segment_mean(found.widening, self.seen.of, len(self.sight), square * found.blur_information)
+        self.blur = (self.blur + change.clamp(-_MOST_CHANGE, _MOST_CHANGE)).clamp_min(_LEAST_BLUR)
+        self.correlation = window_correlation()
+        return self._normal(unknowns.pose, found.error, by_pose, square * found.information)
+
+    def _zernike(self, pose: Pose) -> tuple[Tensor, Tensor]:
+        """How far Zernike edges lie outside the circles (E,), px, and derivatives (E, 6) of the distance."""
+        edges, of, sign, rows = self.seen.edges, self.seen.of, self.seen.sign, len(self.sight)
+        distance, bend, _, by_pose = self.seen.circles(pose)
+        true = edges.offset - sign * distance  # of the projected circle from the pixel's centre
+        slope = zernike.blur_slope(edges.offset * self.keep, true * self.keep, of, rows)
+        read = zernike.deblur(edges.offset, slope[of]) - zernike.curvature_shift(slope[of]) * bend * sign
+        # the slope tells of two pixels: the image's and the kernel's
+        self.blur = (((1 - slope) * zernike.MASK**2 - 1) / 12).clamp_min(_LEAST_BLUR**2).sqrt()
+        self.correlation = _CHAIN * zernike.edge_correlation()
+        return (sign * (read - true)).nan_to_num(nan=0.0), by_pose
+
+    def _robust(self, error: Tensor) -> Tensor:
+        """Weights (E,) of errors; by their spread, which points agree."""
+        of, sound = self.seen.of, self.seen.sound
+        soft = sound * geman_mcclure(error / (_SOFT * self.spread)[of])
+        self.spread = _SOFT_BIAS * segment_mean(error.square(), of, len(self.sight), soft).sqrt()
+        self.keep = sound * (error.abs() < (_CUT * self.spread + _CUT_FLOOR)[of])
+        return soft
+
+    def _normal(self, pose: Pose, error: Tensor, by_pose: Tensor, weight: Tensor) -> Normal:
+        """In units of the points' variance; of neighbours ``correlation`` tell as much as one that is independent."""
+        products = by_pose[:, :, None] * torch.cat([by_pose, error[:, None]], -1)[:, None, :]
+        extra = torch.stack([weight * error.square(), (weight > 0).double()], -1)
+        columns = torch.cat([weight[:, None] * products.flatten(1), extra], -1)
+        sums = segment_sum(columns, self.seen.of, len(self.sight))
+        information, right = sums[:, :42].unflatten(1, (6, 7)).split([6, 1], -1)
+        chi2, count = sums[:, 42:].unbind(-1)
+        variance = self.correlation * chi2 / (count - 7 * self.correlation).clamp_min(1)
+        self.variance = variance
+        scale = 1 / variance[:, None, None]
+        normal = Normal(information * scale, -(right * scale).squeeze(-1), chi2 / variance)
+        return normal if self.prior is None else normal.with_prior(*self.prior.at(pose))
 
 
 class _Seen(NamedTuple):
@@ -130,9 +153,10 @@ class _Seen(NamedTuple):
     sign: Tensor
     sound: Tensor
 
-    def circles(self, r: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """`circle_distance` of the poses (N, 3, 3), (N, 3)."""
-        return circle_distance(self.ray, self.warp, r[self.of], t[self.of], self.center, self.normal, self.radius)
+    def circles(self, pose: Pose) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """`circle_distance` of the poses of N rows."""
+        of = self.of
+        return circle_distance(self.ray, self.warp, pose.R[of], pose.t[of], self.center, self.normal, self.radius)
 
 
 def _seen(
@@ -145,60 +169,15 @@ def _seen(
     return _Seen(edges, of, ray.nan_to_num(nan=0.0), warp, center, normal, radius, outward[edges.ring], sound)
 
 
-def _zernike_errors(seen: _Seen, r: Tensor, t: Tensor, keep: Tensor, rows: int) -> tuple[Tensor, Tensor, Tensor]:
-    """How far Zernike edges lie outside the circles (E,), px, derivatives (E, 6) of the distance, and blur (N,)."""
-    edges, of, sign = seen.edges, seen.of, seen.sign
-    distance, bend, _, by_pose = seen.circles(r, t)
-    true = edges.offset - sign * distance  # of the projected circle from the pixel's centre
-    slope = zernike.blur_slope(edges.offset * keep, true * keep, of, rows)
-    read = zernike.deblur(edges.offset, slope[of]) - zernike.curvature_shift(slope[of]) * bend * sign
-    # the slope tells of two pixels: the image's and the kernel's
-    blur = (((1 - slope) * zernike.MASK**2 - 1) / 12).clamp_min(_LEAST_BLUR**2).sqrt()
-    return (sign * (read - true)).nan_to_num(nan=0.0), by_pose, blur
-
-
-def _filter_errors(
-    seen: _Seen, frames: Tensor, frame: Tensor, r: Tensor, t: Tensor, blur: Tensor
-) -> tuple[Tensor, StepOffsets]:
+def _filter_errors(seen: _Seen, sight: Sight, pose: Pose, blur: Tensor) -> tuple[Tensor, StepOffsets]:
     """Derivatives (E, 6) of the distance, and what the matched filters see in the windows of the same pixels."""
     edges = seen.edges
     pixel = (edges.points - edges.offset[:, None] * edges.normal).round()
-    distance, bend, across, by_pose = seen.circles(r, t)
+    distance, bend, across, by_pose = seen.circles(pose)
     middle = distance + (across * (pixel - edges.points)).sum(-1)
-    found = step_offsets(frames, frame[seen.of], pixel.long(), across, middle, bend, blur[seen.of])
+    frame = sight.frame[seen.of]
+    found = step_offsets(sight.frames, frame, pixel.long(), across, middle, bend, blur[seen.of])
     return by_pose, StepOffsets(*(x.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0) for x in found))
-
-
-def _robust(error: Tensor, spread: Tensor, sound: Tensor, of: Tensor, rows: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Geman-McClure weights (E,) of errors, the hard choice (E,) by their spread, and that spread (N,)."""
-    soft = sound * (1 + (error / (_SOFT * spread)[of]).square()).reciprocal().square()
-    spread = _SOFT_BIAS * segment_mean(error.square(), of, rows, soft).sqrt()
-    return soft, sound * (error.abs() < (_CUT * spread + _CUT_FLOOR)[of]), spread
-
-
-def _step(
-    error: Tensor,
-    by_pose: Tensor,
-    weight: Tensor,
-    of: Tensor,
-    rows: int,
-    known: Tensor,
-    moved: Tensor,
-    correlation: float,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Gauss-Newton step (N, 6), information (N, 6, 6) at unit variance, and the variance (N,).
-
-    Errors of neighbouring points are correlated: ``correlation`` of them tell as much as one that is independent.
-    """
-    products = by_pose[:, :, None] * torch.cat([by_pose, error[:, None]], -1)[:, None, :]
-    extra = torch.stack([weight * error.square(), (weight > 0).double()], -1)
-    sums = segment_sum(torch.cat([weight[:, None] * products.flatten(1), extra], -1), of, rows)
-    information, right = sums[:, :42].unflatten(1, (6, 7)).split([6, 1], -1)
-    chi2, count = sums[:, 42:].unbind(-1)
-    variance = correlation * chi2 / (count - 7 * correlation).clamp_min(1)
-    information = information + known * variance[:, None, None]
-    pull = variance[:, None, None] * (known @ moved[..., None])
-    return solve_scaled(information, -right - pull).squeeze(-1), information, variance
 
 
 def circle_distance(

@@ -4,21 +4,22 @@ Every pixel in a band around the edges of a frame's rings is predicted as
 
     grey = ring + (paper - ring) F
 
-with the fraction of paper F of `ring_model`. Pose and blur (one for each frame) are found by Gauss-Newton; the two grey
-levels of each marker, with linear gradients over the plane, are linear unknowns (`grey_levels`, `gauss_newton`).
-Frames and markers are padded blocks of pixels: one sequence of tensor operations for the whole batch.
+with the fraction of paper F of `ring_model`. Pose and blur (one for each frame) are the unknowns; the two grey levels
+of each marker, with linear gradients over the plane, are eliminated (`grey_levels`, `light`). Frames and markers are
+padded blocks of pixels: one sequence of tensor operations for the whole batch.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
-from torchpose.camera import Camera
-from torchpose.geometry import rotations
+from torchpose.geometry.least_squares import Block, Minimum, Normal, Pose, PosePrior, Unknowns, Vector, minimise
 from torchpose.geometry.segments import segment_sum
 from torchpose.refine.photometric.band import BAND, band_width
-from torchpose.refine.photometric.gauss_newton import LEVELS, gauss_newton_step
 from torchpose.refine.photometric.grey_levels import (
     TILE,
     columns_of,
@@ -28,49 +29,48 @@ from torchpose.refine.photometric.grey_levels import (
     noise_spread,
     sum_products,
 )
-from torchpose.refine.photometric.ring_model import Sight, gather_pixels, ring_model
-from torchpose.refine.photometric.sectors import away_from_unclear, clear_sectors, doubtful, sum_sectors, trust
-from torchpose.refine.result import Refined
+from torchpose.refine.photometric.light import LEVELS, POSE, normal_equations
+from torchpose.refine.photometric.ring_model import gather_pixels, ring_model
+from torchpose.refine.photometric.sectors import Sectors, away_from_unclear, clear_sectors, doubtful, sum_sectors, trust
+from torchpose.refine.sight import Refined, Sight
 
 _COARSE = 6  # the first steps take one pixel of so many; both are whole numbers of tiles
 _MOST_COARSE = 512  # of a marker whose edges are sharp: the last step, on all pixels, mends what they leave
-_STEPS = (3, 1)  # of Gauss-Newton, on some of the pixels and on all
-_THOROUGH_STEPS = (3, 4)
 _START_BLUR = 0.8  # px
 _BLUR_RANGE = (0.3, 4.0)
 
 
-def refine_photometric(
-    frames: Tensor,
-    camera: Camera,
-    frame: Tensor,
-    rotation: Tensor,
-    translation: Tensor,
-    mask: Tensor,
-    rings: Tensor,
-    centers: Tensor,
-    normals: Tensor,
-    radii: Tensor,
-    *,
-    prior: Tensor | None = None,
-) -> Refined:
+class _Stage(NamedTuple):
+    """Some Gauss-Newton steps, and how they see the pixels.
+
+    coarse: some pixels only. wary: those where the model is sound, and in sectors clear of what stands beside them.
+    tempered: light may be curved, and sectors that pull at the pose count for less.
+    """
+
+    steps: int
+    coarse: bool = False
+    wary: bool = False
+    tempered: bool = False
+
+
+_QUICK = (_Stage(3, coarse=True), _Stage(1))
+_THOROUGH = (_Stage(3, coarse=True, wary=True), _Stage(2, wary=True), _Stage(2, wary=True, tempered=True))
+
+
+def refine_photometric(sight: Sight, rotation: Tensor, translation: Tensor, *, prior: Tensor | None = None) -> Refined:
     """Refines N poses on the grey values around the rings of their markers.
 
     Args:
-        frames: (B, H, W) grey, any real dtype, in grey levels. frame: (N,) int64.
-        rotation, translation: (N, 3, 3), (N, 3) to start from, within about a pixel.
-        mask: (N, M) bool, markers seen. rings: (N, M, 2, 5) their fitted ellipses in raw pixels, outer and inner.
-        centers, normals: (N, M, 3) in the target frame. radii: (N, M, 2), mm.
+        sight: the rows, frames in grey levels.
+        rotation: (N, 3, 3) to start from, within about a pixel.
+        translation: (N, 3), the same.
         prior: (N, 6, 6), information about the pose besides the frames, that is the inverse covariance of the start:
             from the robot, or to hold what is known.
     """
-    rows = rotation.shape[0]
-    start = torch.full((rows,), _START_BLUR, dtype=torch.float64, device=rotation.device)
-    none = torch.zeros(rows, 6, 6, dtype=torch.float64, device=rotation.device)
-    known = none if prior is None else prior
-    narrow = torch.full_like(start, BAND)
-    sight = Sight(frames, camera, frame, mask, rings, centers, normals, radii)
-    first, doubt = _refine(sight, rotation, translation, start, narrow, known, most_coarse=_MOST_COARSE)
+    narrow = torch.full_like(translation[:, 0], BAND)
+    start, blur = Pose(rotation, translation), torch.full_like(narrow, _START_BLUR)
+    known = None if prior is None else PosePrior(prior, start)
+    first, doubt = _refined(_Fit(sight, narrow, known, _MOST_COARSE), start, blur, _QUICK)
     # a wide blur needs a wider band, or it takes the levels on both sides of the edge for its own
     wide = band_width(first.blur) > BAND + 1
     for thorough in (False, True):
@@ -78,73 +78,86 @@ def refine_photometric(
         if w.numel() == 0:
             continue
         band = torch.where(wide, band_width(first.blur), BAND)[w]
-        begin = (rotation[w], translation[w], first.blur[w], band, known[w])
-        again, still = _refine(sight.rows(w), *begin, thorough=thorough)
+        fit = _Fit(sight[w], band, None if known is None else known[w])
+        again, still = _refined(fit, start[w], first.blur[w], _THOROUGH if thorough else _QUICK)
         good = again.good.nonzero()[:, 0]
-        first = first.replaced(w[good], again[good])
-        doubt = doubt.index_copy(0, w[good], still[good])
+        first, doubt = first.replaced(w[good], again[good]), doubt.index_copy(0, w[good], still[good])
     return first
 
 
-def _refine(
-    sight: Sight,
-    r: Tensor,
-    t: Tensor,
-    blur: Tensor,
-    band: Tensor,
-    prior: Tensor,
-    thorough: bool = False,
-    most_coarse: int | None = None,
-) -> tuple[Refined, Tensor]:
-    """`refine_photometric` by the pixels within ``band`` (N,) px of an edge, from a blur (N,) px.
-
-    Also says which rows (N,) are `doubtful`. ``thorough`` is for these: light may be curved, sectors that pull at the
-    pose count for less, and there are more steps. ``most_coarse``: pixels of a marker in the coarse steps.
-    """
-    rows = r.shape[0]
-    blocks = gather_pixels(sight, band, TILE * _COARSE)
-    coarse = blocks.every(_COARSE, most_coarse)
-    levels = first_levels(coarse, r, t, blur)
-    seen, of_them = (segment_sum(b.valid.sum(-1).double(), b.row, rows) for b in (blocks, coarse))
+def _refined(fit: _Fit, start: Pose, blur: Tensor, stages: tuple[_Stage, ...]) -> tuple[Refined, Tensor]:
+    """Rows refined in stages from a pose and a blur (N,) px, and which of them are `doubtful`."""
+    found = _minimised(fit, start, blur, stages)
+    pose, owner, rows = found.unknowns.pose, fit.blocks.row, len(blur)
+    covariance, determined = found.covariance()
+    covariance = covariance[:, :6, :6]
+    kept, usable = (segment_sum((x > 0).sum(-1), owner, rows) for x in (fit.weight, fit.usable))
+    good = determined & covariance.isfinite().all(-1).all(-1)
+    refined = Refined(
+        pose.R, pose.t, covariance, found.unknowns.values("blur")[:, 0], fit.variance.sqrt(), kept / usable, good
+    )
+    seen, of_them = (segment_sum(b.valid.sum(-1).double(), owner, rows) for b in (fit.blocks, fit.coarse))
     more = (seen / of_them.clamp_min(1)).clamp_min(1)
-    usable = weight = blocks.valid
-    information = torch.zeros(rows, 7, 7, dtype=torch.float64, device=r.device)
-    variance = torch.ones(rows, dtype=torch.float64, device=r.device)
-    known = torch.nn.functional.pad(prior, (0, 1, 0, 1))
-    moved = torch.zeros(rows, 7, dtype=torch.float64, device=r.device)
-    doubt = torch.zeros(rows, dtype=torch.bool, device=r.device)
-    earlier = doubt[:, None]
-    steps = _THOROUGH_STEPS if thorough else _STEPS
-    for number, part in enumerate((*[coarse] * steps[0], *[blocks] * steps[1])):
-        tempered = thorough and number > steps[0] + 1
-        if tempered and levels.shape[1] == LEVELS:
-            levels = torch.nn.functional.pad(levels, (0, LEVELS))
-        model = ring_model(part, r, t, blur, check=thorough)
+    doubt = doubtful(fit.sectors, fit.clear, fit.variance[owner], owner, found.step.own_chi2, more)
+    return refined, doubt
+
+
+def _minimised(fit: _Fit, start: Pose, blur: Tensor, stages: tuple[_Stage, ...]) -> Minimum:
+    low, high = blur.new_tensor(_BLUR_RANGE).unbind()
+    own: dict[str, Block] = {"pose": start, "blur": Vector(blur[:, None], low, high)}
+    levels = first_levels(fit.coarse, start.R, start.t, blur)
+    unknowns = Unknowns(own, {"levels": Vector(levels)}, fit.blocks.row)
+    for stage in stages:
+        if stage.tempered:
+            levels = torch.nn.functional.pad(unknowns.values("levels"), (0, LEVELS))
+            unknowns = replace(unknowns, eliminated={"levels": Vector(levels)})
+        fit.stage = stage
+        found = minimise(fit, unknowns, stage.steps, settle=False)
+        unknowns = found.unknowns
+    return found
+
+
+class _Fit:
+    """The normal equations of N rows by their pixels within ``band`` (N,) px of an edge, and what they last saw.
+
+    ``most_coarse``: pixels of a marker in the coarse stages.
+    """
+
+    sectors: Sectors
+    clear: Tensor
+
+    def __init__(self, sight: Sight, band: Tensor, prior: PosePrior | None, most_coarse: int | None = None) -> None:
+        self.blocks = gather_pixels(sight, band, TILE * _COARSE)
+        self.coarse = self.blocks.every(_COARSE, most_coarse)
+        self.prior = prior
+        self.stage = _QUICK[0]
+        self.variance = torch.ones_like(band)
+        self.usable = self.weight = self.blocks.valid
+
+    def __call__(self, unknowns: Unknowns) -> Normal:
+        stage, part, pose = self.stage, self.coarse if self.stage.coarse else self.blocks, unknowns.pose
+        levels = unknowns.values("levels")
+        model = ring_model(part, pose.R, pose.t, unknowns.values("blur")[:, 0], check=stage.wary)
         columns, slope = columns_of(part, model, levels)
         residual = columns[:, :, -1].flatten(1)
-        usable, weight = inliers(residual, part, model, levels)
-        if part is blocks:
-            sectors = sum_sectors(residual, slope, usable, weight, part, model)
-            clear = clear_sectors(sectors, noise_spread(residual, part), model_misfit(levels))
-            if thorough:  # what levels without curvature could not explain stays out: curved ones bend into covers
-                clear = away_from_unclear(sectors, clear) & (earlier if tempered else True)
-                earlier = clear
-            factor = trust(sectors, clear, variance[blocks.row]) if tempered else clear.to(weight.dtype)
-            weight = weight * sectors.of_pixels(factor)
-        sums = sum_products(columns, weight)
-        step, level_step, information, variance = gauss_newton_step(
-            sums, weight.sum(-1), levels, blocks.row, rows, known, moved
-        )
-        if part is blocks:
-            step_chi2 = (step * (information @ step[..., None]).squeeze(-1)).sum(-1) / variance
-            doubt = doubtful(sectors, clear, variance[blocks.row], blocks.row, step_chi2, more)
-        moved = moved + step
-        r = rotations.exp(step[:, 3:6]) @ r
-        t = t + step[:, :3]
-        blur = (blur + step[:, 6]).clamp(*_BLUR_RANGE)
-        levels = levels + level_step
-    inverse, info = torch.linalg.inv_ex(information)
-    covariance = inverse[:, :6, :6] * variance[:, None, None]
-    kept = segment_sum((weight > 0).sum(-1), blocks.row, rows) / segment_sum(usable.sum(-1), blocks.row, rows)
-    good = (info == 0) & covariance.isfinite().all(-1).all(-1) & (covariance.diagonal(dim1=-2, dim2=-1) > 0).all(-1)
-    return Refined(r, t, covariance, blur, variance.sqrt(), kept, good), doubt
+        self.usable, self.weight = inliers(residual, part, model, levels)
+        if not stage.coarse:
+            self.sectors = sum_sectors(residual, slope, self.usable, self.weight, part, model)
+            factor = self._trusted(noise_spread(residual, part), model_misfit(levels))
+            self.weight = self.weight * self.sectors.of_pixels(factor.to(self.weight.dtype))
+        sums = sum_products(columns, self.weight)
+        prior = None if self.prior is None else self.prior.at(pose, POSE)
+        normal, self.variance = normal_equations(sums, self.weight.sum(-1), levels, part.row, len(pose), prior)
+        return normal
+
+    def _trusted(self, spread: Tensor, misfit: Tensor) -> Tensor:
+        """Weights (K, 96) of the sectors."""
+        clear = clear_sectors(self.sectors, spread, misfit)
+        if self.stage.wary:
+            clear = away_from_unclear(self.sectors, clear)
+        if not self.stage.tempered:
+            self.clear = clear
+            return clear
+        # what levels without curvature could not explain stays out: curved ones bend into covers
+        self.clear = clear & self.clear
+        return trust(self.sectors, self.clear, self.variance[self.blocks.row])

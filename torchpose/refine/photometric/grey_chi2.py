@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchpose.geometry.least_squares import solve_scaled
 from torchpose.geometry.segments import segment_sum
 from torchpose.refine.photometric.band import band_width
-from torchpose.refine.photometric.gauss_newton import POSE, QUANTISATION, solve_ridged
 from torchpose.refine.photometric.grey_levels import (
     CUT,
     TILE,
@@ -18,9 +18,10 @@ from torchpose.refine.photometric.grey_levels import (
     noise_spread,
     sum_products,
 )
-from torchpose.refine.photometric.ring_model import Sight, gather_pixels, ring_model
+from torchpose.refine.photometric.light import POSE, QUANTISATION
+from torchpose.refine.photometric.ring_model import gather_pixels, ring_model
 from torchpose.refine.photometric.sectors import clear_sectors, misfit, sum_sectors
-from torchpose.refine.result import Refined
+from torchpose.refine.sight import Refined, Sight
 
 _LEVEL_STEPS = 3  # of the grey levels alone
 
@@ -49,7 +50,7 @@ def grey_chi2(sight: Sight, one: Refined, two: Refined) -> tuple[Tensor, Tensor]
             clear = clear_sectors(sectors, noise_spread(residual, b), model_misfit(levels))
             weight = weight * sectors.of_pixels(clear.to(weight.dtype))
             sums = sum_products(columns, weight)
-            levels = levels + solve_ridged(sums[:, POSE:-1, POSE:-1], sums[:, POSE:-1, -1:]).squeeze(-1)
+            levels = levels + solve_scaled(sums[:, POSE:-1, POSE:-1], sums[:, POSE:-1, -1:]).squeeze(-1)
         used = segment_sum(weight.sum(-1).double(), b.row, rows).clamp_min(1)
         variance = (segment_sum(sums[:, -1, -1], b.row, rows) / used).clamp_min(QUANTISATION)
         squares.append(residual.square())
@@ -74,5 +75,5 @@ def _has_contrast(levels: Tensor, information: Tensor, variance: Tensor) -> Tens
     """
     by_level = torch.zeros_like(levels)
     by_level[:, 0], by_level[:, 3] = -1.0, 1.0
-    spread2 = variance * (by_level * solve_ridged(information, by_level[..., None]).squeeze(-1)).sum(-1)
+    spread2 = variance * (by_level * solve_scaled(information, by_level[..., None]).squeeze(-1)).sum(-1)
     return (by_level * levels).sum(-1).square() > CUT**2 * spread2

@@ -11,7 +11,8 @@ import math
 import torch
 from torch import Tensor
 
-from torchpose.refine.photometric.gauss_newton import LEVELS, QUANTISATION, solve_ridged
+from torchpose.geometry.least_squares import solve_scaled
+from torchpose.refine.photometric.light import LEVELS, QUANTISATION
 from torchpose.refine.photometric.ring_model import PixelBlocks, RingModel, ring_model
 
 TILE = 256  # pixels summed in float32 at a time; sums of tiles are float64, so padding changes no digit that counts
@@ -38,7 +39,7 @@ def first_levels(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor) -> Tensor:
         residual = b.grey - predicted
         weight = b.valid / (1 + (residual / (2 * noise_spread(residual, b)[:, None])).square()).square()
         sums = sum_products(columns, weight)
-        levels = solve_ridged(sums[:, :LEVELS, :LEVELS], sums[:, :LEVELS, LEVELS:]).squeeze(-1)
+        levels = solve_scaled(sums[:, :LEVELS, :LEVELS], sums[:, :LEVELS, LEVELS:]).squeeze(-1)
     return levels
 
 

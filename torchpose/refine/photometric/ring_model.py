@@ -14,12 +14,14 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose.camera import Camera
 from torchpose.geometry.rotations import plane_axes
+from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import values_at
 from torchpose.refine.photometric.band import band_pixels
+from torchpose.refine.sight import Sight
 
 _FULL_SCALES = (255.0, 1023.0, 4095.0, 16383.0, 65520.0, 65535.0)  # of 8 to 16 bits; 12 bits in the upper ones of 16
 _DEEP = 0.7  # of the radius of curvature: nearer to its centre a pixel sees edges on all sides
@@ -27,45 +29,37 @@ _BENT = 0.4  # of a distance from an edge: the most that its second-order term m
 _FAR = 3.5  # standard deviations of the blur from an edge, from where on neither matters
 
 
-class Sight(NamedTuple):
-    """N rows of markers seen in frames, and where; arguments as in `refine_photometric`."""
-
-    frames: Tensor
-    camera: Camera
-    frame: Tensor
-    mask: Tensor
-    rings: Tensor
-    centers: Tensor
-    normals: Tensor
-    radii: Tensor
-
-    def rows(self, index: Tensor) -> Sight:
-        """Some of the rows, in the same frames."""
-        return Sight(self.frames, self.camera, *(v[index] for v in self[2:]))
-
-
 @dataclass(frozen=True, eq=False)
-class PixelBlocks:
-    """Pixels of K markers, padded to P; one plane of numbers (K, P) for every component.
+class PixelBlocks(Rows):
+    """Pixels of K markers, padded to P; one plane of numbers for every component.
 
-    row: (K,) int64. origin: (K, 2), a ray near each marker, on the plane z = 1. ray_x, ray_y: the pixels', from there.
-    warp: 4 planes, d(ray)/d(pixel) row by row. grey, valid. size: (K,) int64, pixels of each marker; what follows in
-    its row repeats the last one and is not valid. center, normal: (K, 3), target frame. radii: (K, 2). limits: (K, 2),
-    the grey levels at which the frame's noise is clipped, -inf and inf where it is not.
+    Attributes:
+        row: whose marker it is.
+        origin: a ray near each marker, on the plane z = 1.
+        ray_x: the pixels' rays from there.
+        ray_y: the same.
+        warp: d(ray)/d(pixel), row by row.
+        grey: values of the pixels.
+        valid: 1 or 0.
+        size: pixels of each marker; what follows in its row repeats the last one and is not valid.
+        center: of the marker, target frame.
+        normal: the same.
+        radii: outer and inner.
+        limits: the grey levels at which the frame's noise is clipped, -inf and inf where it is not.
     """
 
-    row: Tensor
-    origin: Tensor
-    ray_x: Tensor
-    ray_y: Tensor
-    warp: tuple[Tensor, ...]
-    grey: Tensor
-    valid: Tensor
-    size: Tensor
-    center: Tensor
-    normal: Tensor
-    radii: Tensor
-    limits: Tensor
+    row: Int[Tensor, " K"]
+    origin: Float[Tensor, "K 2"]
+    ray_x: Float[Tensor, "K P"]
+    ray_y: Float[Tensor, "K P"]
+    warp: tuple[Tensor, Tensor, Tensor, Tensor]
+    grey: Float[Tensor, "K P"]
+    valid: Float[Tensor, "K P"]
+    size: Int[Tensor, " K"]
+    center: Float[Tensor, "K 3"]
+    normal: Float[Tensor, "K 3"]
+    radii: Float[Tensor, "K 2"]
+    limits: Float[Tensor, "K 2"]
 
     def every(self, nth: int, most: int | None = None) -> PixelBlocks:
         """The same with one pixel of ``nth``, or as many fewer as leave ``most`` of each marker."""
@@ -77,7 +71,8 @@ class PixelBlocks:
         index = index.minimum((self.size[:, None] - 1).clamp_min(0))
         planes = {n: getattr(self, n).gather(1, index) for n in ("ray_x", "ray_y", "grey", "valid")}
         planes["valid"] *= inside
-        return replace(self, **planes, warp=tuple(w.gather(1, index) for w in self.warp))
+        w00, w01, w10, w11 = (w.gather(1, index) for w in self.warp)
+        return replace(self, **planes, warp=(w00, w01, w10, w11))
 
 
 class RingModel(NamedTuple):
@@ -102,10 +97,10 @@ def gather_pixels(sight: Sight, band: Tensor, grain: int) -> PixelBlocks:
 
     ``grain``: the padded length P is a multiple of it.
     """
-    frames, camera, frame, mask, rings, centers, normals, radii = sight
+    frames, camera, frame = sight.frames, sight.camera, sight.frame
     height, width = frames.shape[-2:]
-    row, marker = mask.nonzero().unbind(-1)
-    both = rings[row, marker]  # (K, 2, 5)
+    row, marker = sight.mask.nonzero().unbind(-1)
+    both = sight.rings[row, marker]  # (K, 2, 5)
     block, u, v = band_pixels(both[:, 0], both[:, 1], band[row], height, width)
     if block.numel() == 0:  # of rings beyond the frame: one pixel that does not count
         block, u, v = (torch.zeros(min(1, row.numel()), dtype=torch.int64, device=frames.device) for _ in range(3))
@@ -140,13 +135,13 @@ def gather_pixels(sight: Sight, band: Tensor, grain: int) -> PixelBlocks:
         origin,
         padded(x),
         padded(y),
-        tuple(padded(w / det) for w in (j11, -j01, -j10, j00)),
+        (padded(j11 / det), padded(-j01 / det), padded(-j10 / det), padded(j00 / det)),
         padded(torch.where(sound, grey, 0.0)),
         padded(sound) * inside,
         size,
-        centers[row, marker],
-        normals[row, marker],
-        radii[row, marker],
+        sight.centers[row, marker],
+        sight.normals[row, marker],
+        sight.radii[row, marker],
         limits,
     )
 
@@ -161,84 +156,116 @@ def _clipping(grey: Tensor, row: Tensor, rows: int) -> Tensor:
     return torch.stack([low, torch.where(full, brightest, torch.inf)], -1)
 
 
-def ring_model(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor, *, check: bool = False) -> RingModel:
-    """Predicts every pixel, and with ``check`` says where that is sound.
+class _Foot(NamedTuple):
+    """Where the ray of every pixel meets the marker's plane; planes (K, P) or (K, 1), float32.
 
-    The radius in the plane is formed in float64, what is small beside it in float32.
+    x, y: mm, about the circles' centre. radius: their length. outer, inner: less that of the circle. toward: growth of
+    the depth with the ray's angle, 1 / (n . ray). depth: of the point over that of the plane's foot.
+    axes: of the plane, its normal and the arm of the marker, (x, y, z) each, camera axes. one_c, two_c: the circles'
+    centre along the axes. away: distance of the plane, over which it is 1 / away.
     """
-    rk = r[b.row]
-    normal = (rk @ b.normal[..., None]).squeeze(-1)
-    arm = (rk @ b.center[..., None]).squeeze(-1)  # marker's centre about the target's origin, camera axes
-    center = arm + t[b.row]
+
+    x: Tensor
+    y: Tensor
+    radius: Tensor
+    outer: Tensor
+    inner: Tensor
+    toward: Tensor
+    depth: Tensor
+    axes: tuple[tuple[Tensor, ...], ...]
+    one_c: Tensor
+    two_c: Tensor
+    over_away: Tensor
+
+
+def _feet(blocks: PixelBlocks, R: Tensor, t: Tensor) -> _Foot:
+    """The radius in the plane is formed in float64, what is small beside it in float32."""
+    rk = R[blocks.row]
+    normal = (rk @ blocks.normal[..., None]).squeeze(-1)
+    arm = (rk @ blocks.center[..., None]).squeeze(-1)  # marker's centre about the target's origin, camera axes
+    center = arm + t[blocks.row]
     one, two = plane_axes(normal)
-
-    def scalar(value: Tensor) -> Tensor:
-        return value[:, None]
-
     # the ray of the pixel meets the plane at depth * ray; coordinates there, about the circle's centre, are quotients
     # of linear functions of the ray, which counts from a ray near the marker, so that float32 holds it
     away = (normal * center).sum(-1, keepdim=True)
-    near = torch.nn.functional.pad(b.origin, (0, 1), value=1.0)
+    near = torch.nn.functional.pad(blocks.origin, (0, 1), value=1.0)
     over = (normal * near).sum(-1, keepdim=True)
 
     def linear(vector: Tensor) -> Tensor:
-        at_x, at_y, _ = (scalar(c) for c in (vector / over).unbind(-1))
-        return (vector * near).sum(-1, keepdim=True) / over + at_x * b.ray_x + at_y * b.ray_y
+        at_x, at_y, _ = (vector / over).split(1, -1)
+        return (vector * near).sum(-1, keepdim=True) / over + at_x * blocks.ray_x + at_y * blocks.ray_y
 
     one_c, two_c = (one * center).sum(-1, keepdim=True), (two * center).sum(-1, keepdim=True)
     toward = 1 / linear(normal)
     x, y = linear(away * one - one_c * normal) * toward, linear(away * two - two_c * normal) * toward
     radius = (x * x + y * y).sqrt().clamp_min(1e-9)
-    outer, inner = ((radius - scalar(size)).float() for size in b.radii.unbind(-1))
-
+    outer, inner = ((radius - size).float() for size in blocks.radii.split(1, -1))
     x, y, radius, toward = (v.float() for v in (x, y, radius, toward / over))
+    axes = tuple(v.float().split(1, -1) for v in (one, two, normal, arm))
     depth, over_away = away.float() * toward, 1 / away.float()
-    one_c, two_c, q = one_c.float(), two_c.float(), scalar(blur[b.row]).float()
-    axes = [[scalar(c).float() for c in v.unbind(-1)] for v in (one, two, normal, arm)]
-    (ax, ay, az), (bx, by, bz), (nx, ny, nz), (cx, cy, cz) = axes
+    return _Foot(x, y, radius, outer, inner, toward, depth, axes, one_c.float(), two_c.float(), over_away)
+
+
+class _Rim(NamedTuple):
+    """Image of the circles through every pixel; planes (K, P) float32.
+
+    per_mm: px for a mm of radius. bend: curvature of the circle's image, 1/px. second: to second order in the distance,
+    half the second over the first derivative of the radius, 1/px. normal: (nu, nv) of the image. by_pose: derivatives
+    of the distance, 6 planes.
+    """
+
+    per_mm: Tensor
+    bend: Tensor
+    second: Tensor
+    normal: tuple[Tensor, Tensor]
+    by_pose: tuple[Tensor, ...]
+
+
+def _rims(blocks: PixelBlocks, foot: _Foot) -> _Rim:
+    x, y, radius, toward, depth = foot.x, foot.y, foot.radius, foot.toward, foot.depth
+    (ax, ay, az), (bx, by, bz), (nx, ny, nz), (cx, cy, cz) = foot.axes
     ex, ey = x / radius, y / radius
     # a displacement w of the ray's foot, or of the plane against it, changes the radius by m . w
-    s = (radius + ex * one_c + ey * two_c) * over_away
+    s = (radius + ex * foot.one_c + ey * foot.two_c) * foot.over_away
     mx, my, mz = ex * ax + ey * bx - s * nx, ex * ay + ey * by - s * ny, ex * az + ey * bz - s * nz
-    w00, w01, w10, w11 = b.warp
+    w00, w01, w10, w11 = blocks.warp
     gu, gv = mx * w00 + my * w10, mx * w01 + my * w11  # gradient of the radius in the image, over the depth
     flat = (gu.square() + gv.square()).clamp_min(1e-30).rsqrt()
-    per_mm = flat / depth  # px for a mm of radius
-    # area of a pixel in the plane, mm^2; curvature of the circle's image, 1/px
-    area = depth.square() * (w00 * w11 - w01 * w10).abs() * toward.abs()
+    per_mm = flat / depth
+    area = depth.square() * (w00 * w11 - w01 * w10).abs() * toward.abs()  # of a pixel in the plane, mm^2
     bend = area.square() * per_mm.pow(3) / radius
-    # to second order in the distance: along the image's normal the radius bends where that normal is oblique in the
-    # plane, and by perspective; both as second over first derivative, 1/px, halved
+    # along the image's normal the radius bends where that normal is oblique in the plane, and by perspective
     nu, nv = gu * flat, gv * flat
-    side = (ex * two_c - ey * one_c) * over_away
+    side = (ex * foot.two_c - ey * foot.one_c) * foot.over_away
     hx, hy = ex * bx - ey * ax - side * nx, ex * by - ey * ay - side * ny  # as m, but across the radius
     oblique = (hx * w00 + hy * w10) * nu + (hx * w01 + hy * w11) * nv
     recede = ((nx * w00 + ny * w10) * nu + (nx * w01 + ny * w11) * nv) * toward
     second = 0.5 * oblique.square() * depth * flat / radius - recede
-    d_outer, d_inner = outer * per_mm, inner * per_mm
-    straight = d_inner
-    d_outer, d_inner = d_outer + second * d_outer.square(), d_inner + second * d_inner.square()
-    sound = None
-    if check:
-        near = (-bend * straight < _DEEP) & ((second * straight).abs() < _BENT)
-        sound = near | (d_inner.abs() > _FAR * q)
-    pull = 0.5 * q * bend
-    z_outer, z_inner = d_outer / q + pull, d_inner / q + pull
-    square = square_cumulant(nu, nv, q)
-    f_outer, p_outer = blurred_step(z_outer, square)
-    f_inner, p_inner = blurred_step(z_inner, square)
     px, py, pz = x * ax + y * bx + cx, x * ay + y * by + cy, x * az + y * bz + cz
     by_pose = tuple(-per_mm * v for v in (mx, my, mz, py * mz - pz * my, pz * mx - px * mz, px * my - py * mx))
-    size = scalar(b.radii[:, 0]).float()
-    return RingModel(
-        f_outer + 1 - f_inner,
-        (p_outer - p_inner) / q,
-        p_outer * (bend - z_outer / q) - p_inner * (bend - z_inner / q),
-        by_pose,
-        x / size,
-        y / size,
-        sound,
-    )
+    return _Rim(per_mm, bend, second, (nu, nv), by_pose)
+
+
+def ring_model(blocks: PixelBlocks, R: Tensor, t: Tensor, blur: Tensor, *, check: bool = False) -> RingModel:
+    """Predicts every pixel at poses (N, 3, 3), (N, 3) and blurs (N,), and with ``check`` says where that is sound."""
+    foot = _feet(blocks, R, t)
+    rim = _rims(blocks, foot)
+    q = blur[blocks.row, None].float()
+    straight = foot.inner * rim.per_mm
+    d_outer, d_inner = (d + rim.second * d.square() for d in (foot.outer * rim.per_mm, straight))
+    sound = None
+    if check:
+        near = (-rim.bend * straight < _DEEP) & ((rim.second * straight).abs() < _BENT)
+        sound = near | (d_inner.abs() > _FAR * q)
+    pull = 0.5 * q * rim.bend
+    z_outer, z_inner = d_outer / q + pull, d_inner / q + pull
+    square = square_cumulant(*rim.normal, q)
+    f_outer, p_outer = blurred_step(z_outer, square)
+    f_inner, p_inner = blurred_step(z_inner, square)
+    by_q = p_outer * (rim.bend - z_outer / q) - p_inner * (rim.bend - z_inner / q)
+    size = blocks.radii[:, :1].float()
+    by_d = (p_outer - p_inner) / q
+    return RingModel(f_outer + 1 - f_inner, by_d, by_q, rim.by_pose, foot.x / size, foot.y / size, sound)
 
 
 def square_cumulant(nu: Tensor, nv: Tensor, blur: Tensor) -> Tensor:

@@ -1,0 +1,74 @@
+"""What is known of a batch before anything in it is measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Self
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchpose.camera import Camera
+from torchpose.geometry.rows import Rows
+from torchpose.target import Target
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerTable(Rows):
+    """T targets as padded tensors of M markers.
+
+    Attributes:
+        ids: of the markers.
+        centers: target frame, mm.
+        normals: the same.
+        radii: outer and inner, mm.
+        valid: False where padded.
+        polarity: +1 dark rings, -1 light ones.
+        coplanar: whether all markers lie in one plane.
+    """
+
+    ids: Int[Tensor, "T M"]
+    centers: Float[Tensor, "T M 3"]
+    normals: Float[Tensor, "T M 3"]
+    radii: Float[Tensor, "T M 2"]
+    valid: Bool[Tensor, "T M"]
+    polarity: Float[Tensor, " T"]
+    coplanar: Bool[Tensor, " T"]
+
+    @classmethod
+    def of(cls, targets: Sequence[Target]) -> Self:
+        def padded(rows: Sequence[Tensor], fill: float) -> Tensor:
+            return torch.nn.utils.rnn.pad_sequence(list(rows), batch_first=True, padding_value=fill)
+
+        return cls(
+            padded([t.ids for t in targets], -1),
+            padded([t.centers for t in targets], 0.0),
+            padded([t.normals for t in targets], 0.0),
+            padded([t.radii for t in targets], 1.0),
+            padded([torch.ones(len(t), dtype=torch.bool) for t in targets], False),
+            torch.tensor([1.0 if t.background == "light" else -1.0 for t in targets], dtype=torch.float64),
+            torch.tensor([t.coplanar for t in targets]),
+        )
+
+
+class Scene(NamedTuple):
+    """B frames (B, H, W) in grey levels, the camera that took them, and the targets looked for.
+
+    Every frame and target is a row, N = B * T, frame-major.
+    """
+
+    frames: Tensor
+    camera: Camera
+    table: MarkerTable
+
+    @property
+    def frame(self) -> Tensor:
+        """(N,) int64, of each row."""
+        return torch.arange(len(self.frames), device=self.frames.device).repeat_interleave(len(self.table))
+
+    @property
+    def target(self) -> Tensor:
+        """(N,) int64, of each row."""
+        return torch.arange(len(self.table), device=self.frames.device).repeat(len(self.frames))

@@ -1,0 +1,71 @@
+"""The normal equations of the photometric fit: pose and blur, with the grey levels of every marker to be eliminated.
+
+A marker has six levels: ring and paper, each with a constant and a gradient over the plane. Gradients left free cost a
+tenth of the precision of a frame whose light is even, and gradients left out would be a bias of many deviations where
+it is not. So they have a normal prior about 0 whose width is found in the frame itself (empirical Bayes; Morris 1983):
+the mean square of its gradients beyond what their noise explains.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchpose.geometry.least_squares import Eliminated, Normal
+from torchpose.geometry.segments import segment_mean, segment_sum
+
+POSE, LEVELS = 7, 6  # unknowns of a frame (translation, rotation, blur) and of a marker, at least
+QUANTISATION = 1 / 12  # variance of rounding, in grey levels^2, below which no noise estimate falls
+_GRADIENTS = (1, 2, 4, 5)  # among the levels
+_CURVATURES = (6, 7, 8, 9, 10, 11)  # where there are any
+_LEAST_WIDTH = 0.01  # variance of the prior over that of a gradient's noise: as good as none
+_RIDGE = 1e-9  # of a marker's information: sums in float32 make up as much
+
+
+def normal_equations(
+    sums: Tensor, used: Tensor, levels: Tensor, owner: Tensor, rows: int, prior: tuple[Tensor, Tensor] | None = None
+) -> tuple[Normal, Tensor]:
+    """Normal equations of N frames in units of the noise, with the prior about the levels, and the noise's variance.
+
+    Args:
+        sums: (K, 8 + L, 8 + L), of every marker, weight times products of the derivatives by pose (7) and levels (L)
+            and the residual.
+        used: (K,) sum of weights.
+        levels: (K, L) so far, L = 6, or 12 with the light's curvature.
+        owner: (K,) int64, frame of every marker.
+        rows: number N of frames.
+        prior: information (N, 7, 7) about the pose, and how far the pose is from the prior's (N, 7).
+    """
+    count = torch.bincount(owner, minlength=rows)
+    chi2 = segment_sum(sums[:, -1, -1], owner, rows)
+    freedom = segment_sum(used, owner, rows) - POSE - levels.shape[1] * count
+    variance = (chi2 / freedom.clamp_min(1)).clamp_min(QUANTISATION)
+    sums = sums / variance[owner, None, None]
+    own, mixed, of_levels = sums[:, :POSE, :POSE], sums[:, :POSE, POSE:-1], sums[:, POSE:-1, POSE:-1]
+    ridge = (_RIDGE * of_levels.diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)).expand(levels.shape)
+    part = Eliminated(mixed, of_levels + torch.diag_embed(ridge), sums[:, POSE:-1, -1], owner)
+    normal = Normal(segment_sum(own, owner, rows), segment_sum(sums[:, :POSE, -1], owner, rows), chi2 / variance, part)
+    normal = normal if prior is None else normal.with_prior(*prior)
+    precision = _precision(normal, part, levels)
+    held = replace(
+        part,
+        information=part.information + torch.diag_embed(precision),
+        right=part.right - precision * levels,
+    )
+    return replace(normal, eliminated=held), variance
+
+
+def _precision(normal: Normal, part: Eliminated, levels: Tensor) -> Tensor:
+    """Information (K, L) of the prior about the levels, from those that the data alone give."""
+    rows, owner = len(normal), part.owner
+    free = normal.solve(variances=True)
+    precision = torch.zeros_like(levels)
+    for group in (_GRADIENTS, _CURVATURES) if levels.shape[1] > LEVELS else (_GRADIENTS,):
+        gradients = (levels + free.eliminated)[:, group]
+        mean_noise = segment_mean(free.variances[:, group].mean(-1), owner, rows)
+        excess = segment_mean(gradients.square().mean(-1), owner, rows) - mean_noise
+        width2 = excess.clamp_min(_LEAST_WIDTH * mean_noise).clamp_min(1e-12)
+        precision[:, group] = width2.reciprocal()[owner, None]
+    return precision
