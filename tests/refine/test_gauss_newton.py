@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-
 from torchpose.refine.photometric.gauss_newton import LEVELS, POSE, Step, gauss_newton_step
 
 F64 = torch.float64

@@ -33,6 +33,7 @@ from torchpose.datasets.plan import Plan, in_depth_range
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.io.truth import Truth, write_truth
+from torchpose.sim import faults_of, with_faults
 from torchpose.sim.clutter import random_clutter, random_covers
 from torchpose.sim.renderer import Defocus, render
 from torchpose.sim.sensor import Lighting, add_noise
@@ -136,9 +137,11 @@ def analytic(plan: Plan) -> Renderer:
 
 def simulated_frames(plan: Plan, renderer: Renderer, which: Tensor) -> Tensor:
     """(B, H, W) uint8 or uint16, frames of the numbers ``which`` (B,) as the plan's sensor delivers them."""
-    sensor = plan.file.sensor
+    sensor, clean = plan.file.sensor, renderer(which)
+    if plan.file.faults:
+        clean = with_faults(clean, faults_of(plan.file.faults), plan.file.seed, index=which)
     return add_noise(
-        renderer(which),
+        clean,
         plan.conditions["noise"][which],
         plan.file.seed,
         index=which,

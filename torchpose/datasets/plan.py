@@ -14,11 +14,12 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat,
 from torch import Tensor
 
 from torchpose.camera import Camera
-from torchpose.config import beside, read_yaml, validate
+from torchpose.config import beside, read_yaml, validate, within
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.geometry.rotations import plane_axes
 from torchpose.io.truth import Truth, read_truth
+from torchpose.sim import faults_of
 from torchpose.target import Target
 
 _FROZEN = ConfigDict(extra="forbid", frozen=True)
@@ -185,6 +186,7 @@ class PlanFile(BaseModel):
     poses: Poses
     imaging: Imaging = Imaging()
     sensor: Sensor = Sensor()
+    faults: dict[str, dict[str, Any]] = {}
     depth_range: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)] | None = None
     out_of_view: Literal["error", "mark"] = "error"
     bounds: bool = True
@@ -247,6 +249,9 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
     camera = Camera.load(beside(path, file.camera))
     target = Target.load(beside(path, file.target))
     generator = torch.Generator().manual_seed(file.seed % 2**63)
+    if file.faults:
+        with within(f"{path}: "):
+            faults_of(file.faults)
     if file.depth_range is not None and not 0 < file.depth_range[0] < file.depth_range[1]:
         raise ConfigError(f"{path}: depth_range: {file.depth_range} is not 0 < near < far; correct it")
     R, t = _poses(path, file, camera, target)

@@ -24,6 +24,8 @@ _FLAGS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTAT
 # Chunks of a PNG file that leave its grey values as they are in both decoders. Of others (animation, transparency,
 # background) OpenCV has a view of its own.
 _NEUTRAL = frozenset(b"IHDR IDAT IEND tEXt zTXt iTXt tIME pHYs gAMA cHRM sRGB iCCP sBIT".split())
+# kornia_rs holds the interpreter while it decodes, OpenCV does not: more threads than these decode sooner with OpenCV
+_HOLDERS = 2
 _MOST_PIXELS = 1 << 28  # that kornia_rs is asked for; OpenCV has limits of its own
 _DEFLATE = 1032  # largest ratio of deflate: a header that promises more pixels is wrong, no memory is taken for it
 
@@ -39,15 +41,14 @@ class UnreadableImageError(Exception):
         self.reason = reason
 
 
-def decode(path: Path, *, hold: bool = True) -> np.ndarray:
+def decode(path: Path, *, threads: int = 1) -> np.ndarray:
     """Grey values (H, W) of an image file, uint8 or uint16 as stored. Colour is reduced to luma, alpha is ignored.
 
     Of a file with several pages the first is read.
 
     Args:
         path: of the file.
-        hold: whether the interpreter may be held, which kornia_rs does while it decodes. OpenCV lets other threads run:
-            many of them decode sooner with it.
+        threads: that decode side by side.
 
     Raises:
         UnreadableImageError: with the reason. A file that ends early is refused, never filled up.
@@ -64,7 +65,7 @@ def decode(path: Path, *, hold: bool = True) -> np.ndarray:
         raise UnreadableImageError("not_an_image")
     if not next((ends(data) for start, ends in _ENDS if data.startswith(start)), True):
         raise UnreadableImageError("truncated")
-    image = _plain_png(data) if hold and data.startswith(_PNG) else None
+    image = _plain_png(data) if threads <= _HOLDERS and data.startswith(_PNG) else None
     if image is not None:
         return image
     try:

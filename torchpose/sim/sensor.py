@@ -90,8 +90,10 @@ def add_noise(
     SplitMix64 of Steele, Lea and Flood 2014 and the Box-Muller transform in float32), so it is the same in any batch.
 
     Args:
-        frames: (B, H, W), grey levels 0..255. sigma: read noise in grey levels of 0..255; a number or (B,).
-        seed: any integer. index: (B,) int64, the frames' numbers; 0 to B - 1 by default.
+        frames: (B, H, W), grey levels 0..255.
+        sigma: read noise in grey levels of 0..255; a number or (B,).
+        seed: any integer.
+        index: (B,) int64, the frames' numbers; 0 to B - 1 by default.
         bits: 1 to 16; white (255) becomes 2^bits - 1.
         full_well: electrons of a white pixel; None for a sensor without shot noise.
         gamma: stored = 255 (grey / 255)^(1 / gamma), after the noise.
@@ -112,8 +114,7 @@ def add_noise(
     if not bool((amplitude >= 0).all()):
         raise ConfigError("sigma: the noise is negative; give 0 or more grey levels")
     top, dtype = 2**bits - 1, torch.uint8 if bits <= 8 else torch.uint16
-    number = torch.arange(count, device=frames.device) if index is None else index.to(frames.device)
-    key = _mix64(_mix64(torch.full_like(number, seed % 2**62)) + number)
+    key = frame_keys(count, seed, None if index is None else index.to(frames.device)).to(frames.device)
     steps = torch.arange(1, min(_CHUNK, (height * width + 1) // 2) + 1, device=frames.device) * _GOLDEN
     flat = frames.reshape(count, height * width)
     out = torch.empty(flat.shape, dtype=dtype, device=frames.device)
@@ -134,6 +135,12 @@ def add_noise(
                 level.div_(GREY_MAX).clamp_min_(0).pow_(1 / gamma).mul_(GREY_MAX)
             out[rows, b : b + 2 * _CHUNK] = level.mul_(top / GREY_MAX).round_().clamp_(0, top).to(dtype)
     return out.view(count, height, width)
+
+
+def frame_keys(count: int, seed: int, index: Tensor | None = None) -> Tensor:
+    """(B,) int64 keys of the chance in each frame, from its number ``index`` (B,), 0 to ``count`` - 1 by default."""
+    number = torch.arange(count) if index is None else index
+    return _mix64(_mix64(torch.full_like(number, seed % 2**62)) + number)
 
 
 def _normal(start: Tensor, steps: Tensor, count: int) -> Tensor:
