@@ -11,7 +11,7 @@ from torchpose.errors import ConfigError
 from torchpose.sim import faults_of, with_faults
 
 FRAMES = torch.linspace(20, 220, 3 * 40 * 50).view(3, 40, 50)
-WANTED = {
+WANTED: dict[str, dict[str, object]] = {
     "RandomGaussianIllumination": {"gain": [0.1, 0.2]},
     "RandomErasing": {"scale": [0.01, 0.03], "value": 0.2},
     "RandomSaltAndPepperNoise": {"amount": [0.01, 0.02]},
