@@ -273,8 +273,8 @@ def _yaml(entries: Mapping[str, Any], tag: str = "") -> str:
     return text
 
 
-def _opencv_text(camera: Camera) -> str:
-    entries = {
+def _entries(camera: Camera) -> dict[str, Any]:
+    return {
         "image_width": camera.width,
         "image_height": camera.height,
         "camera_matrix": camera.matrix,
@@ -282,45 +282,37 @@ def _opencv_text(camera: Camera) -> str:
         "distortion_coefficients": camera.distortion,
         "camera_matrix_covariance": camera.covariance,
     }
-    return "%YAML:1.0\n---\n" + _yaml(entries, " !!opencv-matrix")
 
 
-def _ros_text(camera: Camera) -> str:
-    coefficients = camera.distortion
-    if camera.model == "kannala_brandt":
-        model = "equidistant"
-    else:  # plumb_bob has five coefficients, rational_polynomial eight
-        model = "rational_polynomial" if len(coefficients) == 8 else "plumb_bob"
-        coefficients = pad(coefficients, (0, (8 if len(coefficients) == 8 else 5) - len(coefficients)))
-    return _yaml(
-        {
-            "image_width": camera.width,
-            "image_height": camera.height,
-            "camera_name": "camera",
-            "camera_matrix": camera.matrix,
-            "distortion_model": model,
-            "distortion_coefficients": coefficients,
-            "rectification_matrix": torch.eye(3),
-            "projection_matrix": pad(camera.matrix, (0, 1)),
-            "camera_matrix_covariance": camera.covariance,
-        }
-    )
+def _opencv_text(camera: Camera) -> str:
+    return "%YAML:1.0\n---\n" + _yaml(_entries(camera), " !!opencv-matrix")
 
 
 def _json_text(camera: Camera) -> str:
-    def table(values: torch.Tensor) -> str:
-        return "[" + ", ".join(map(_row, values)) + "]"
+    def written(value: Any) -> str:
+        if not isinstance(value, torch.Tensor):
+            return f'"{value}"' if isinstance(value, str) else f"{value}"
+        return _row(value) if value.ndim == 1 else "[" + ", ".join(map(_row, value)) + "]"
 
-    fields = [
-        f'"image_width": {camera.width}',
-        f'"image_height": {camera.height}',
-        f'"camera_matrix": {table(camera.matrix)}',
-        f'"distortion_model": "{camera.model}"',
-        f'"distortion_coefficients": {_row(camera.distortion)}',
-    ]
-    if camera.covariance is not None:
-        fields.append(f'"camera_matrix_covariance": {table(camera.covariance)}')
-    return "{\n  " + ",\n  ".join(fields) + "\n}\n"
+    fields = [f'  "{name}": {written(value)}' for name, value in _entries(camera).items() if value is not None]
+    return "{\n" + ",\n".join(fields) + "\n}\n"
+
+
+def _ros_text(camera: Camera) -> str:
+    entries, model = _entries(camera), "equidistant"
+    coefficients, covariance = camera.distortion, entries.pop("camera_matrix_covariance")
+    if camera.model == "brown_conrady":  # plumb_bob has five coefficients, rational_polynomial eight
+        model = "rational_polynomial" if len(coefficients) == 8 else "plumb_bob"
+        coefficients = pad(coefficients, (0, (8 if len(coefficients) == 8 else 5) - len(coefficients)))
+    entries |= {
+        "distortion_model": model,
+        "distortion_coefficients": coefficients,
+        "camera_name": "camera",
+        "rectification_matrix": torch.eye(3),
+        "projection_matrix": pad(camera.matrix, (0, 1)),
+        "camera_matrix_covariance": covariance,
+    }
+    return _yaml(entries)
 
 
 def _focal_center(camera: Camera) -> tuple[float, float, float, float]:

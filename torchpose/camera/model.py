@@ -121,11 +121,7 @@ class Camera:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Camera:
-        """Reads a camera file in any of the formats of `torchpose.camera.formats`; ``FILE#cam1`` picks one of several.
-
-        Raises:
-            ConfigError: one line ``FILE: FIELD: what is wrong; the fix``.
-        """
+        """Reads a camera file, see `torchpose.camera.formats.load`; ``FILE#cam1`` picks one of several."""
         from torchpose.camera import formats
 
         return formats.load(path)
@@ -133,11 +129,7 @@ class Camera:
     def save(
         self, path: str | os.PathLike[str], format: Literal["opencv", "json", "ros", "kalibr", "colmap"] | None = None
     ) -> None:
-        """Writes the camera file in one piece; see `torchpose.camera.formats.save`.
-
-        Raises:
-            ConfigError: the format cannot hold this camera, or the file cannot be written.
-        """
+        """Writes the camera file in one piece, see `torchpose.camera.formats.save`."""
         from torchpose.camera import formats
 
         formats.save(self, path, format)
@@ -270,10 +262,8 @@ class Camera:
             ex_trial, ey_trial = x_distorted - u, y_distorted - v
             trial_error = torch.hypot(ex_trial, ey_trial)
             better = (trial_error < error) & (torch.hypot(x_trial, y_trial) < limit)
-            old, new = (
-                (x, y, ex, ey, error, *jacobian),
-                (x_trial, y_trial, ex_trial, ey_trial, trial_error, *trial_jacobian),
-            )
+            old = x, y, ex, ey, error, *jacobian
+            new = x_trial, y_trial, ex_trial, ey_trial, trial_error, *trial_jacobian
             x, y, ex, ey, error, *jacobian = (torch.where(better, b, a) for a, b in zip(old, new, strict=True))
             fraction = torch.where(better, 1.0, 0.5 * fraction)
         j_xx, j_xy, j_yy = jacobian
