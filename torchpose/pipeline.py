@@ -24,7 +24,7 @@ from torchpose.pose import (
     outcome,
     solve_poses,
 )
-from torchpose.refine import METHODS, Sight
+from torchpose.refine import METHODS, Recipe, Sight
 from torchpose.results import Poses, Reason, Status
 from torchpose.rings import Rings, measure_rings
 from torchpose.target import Target
@@ -75,7 +75,6 @@ class PoseEstimator(nn.Module):
         self.method = method
         self.float_range = float_range
         self.srgb = srgb
-        self._recipe = METHODS[method]
         self.table = MarkerTable.of(self.targets)
         for owner in ("camera", "table"):
             for name, value in _tensors(getattr(self, owner)).items():
@@ -83,19 +82,20 @@ class PoseEstimator(nn.Module):
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> PoseEstimator:
         """Moves to a device, as any module; geometry stays float64."""
-        super()._apply(lambda value: value.to(fn(value[:0]).device), recurse)
-        self._from_buffers()
+        device = fn(self.camera.matrix[:0]).device
+        super()._apply(lambda value: value.to(device), recurse)
+        self.camera, self.table = self.camera.to(device), self.table.to(device)
         return self
 
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
         super()._load_from_state_dict(*args, **kwargs)
-        self._from_buffers()
-
-    def _from_buffers(self) -> None:
-        """Camera and table with the tensors that the buffers have."""
         for owner in ("camera", "table"):
             old = getattr(self, owner)
-            setattr(self, owner, replace(old, **{n: getattr(self, f"{owner}_{n}") for n in _tensors(old)}))
+            setattr(self, owner, replace(old, **{name: getattr(self, f"{owner}_{name}") for name in _tensors(old)}))
+
+    @property
+    def _recipe(self) -> Recipe:
+        return METHODS[self.method]
 
     def extra_repr(self) -> str:
         names = ", ".join(t.name for t in self.targets)

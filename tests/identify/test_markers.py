@@ -10,7 +10,8 @@ from exact import F64, exact_ellipses, pinhole, random_poses, rings_of
 from torch import Tensor
 
 from torchpose.geometry import rotations
-from torchpose.identify import Identified, MarkerTable, crossed_out, identify
+from torchpose.identify import Identified, MarkerTable, identify
+from torchpose.pose import crossed_out
 from torchpose.rings import Rings
 from torchpose.target import Target
 
@@ -20,15 +21,7 @@ QUAD = Target.load("quad40")
 
 def clutter(rings: Rings, extra: Tensor, frame: Tensor) -> Rings:
     """``rings`` followed by rings with ellipses ``extra`` (C, 2, 5)."""
-    other = rings_of(extra, frame)
-    both = {f.name: (getattr(rings, f.name), getattr(other, f.name)) for f in dataclasses.fields(Rings)}
-
-    def join(a, b):
-        if isinstance(a, Tensor):
-            return torch.cat([a, b])
-        return type(a)(*(torch.cat([getattr(a, f.name), getattr(b, f.name)]) for f in dataclasses.fields(a)))
-
-    return Rings(**{name: join(*pair) for name, pair in both.items()})
+    return Rings.cat([rings, rings_of(extra, frame)])
 
 
 def scene(target: Target, count: int, tilt_deg: float = 60.0, seed: int = 0) -> tuple[Rings, Tensor, Tensor]:
@@ -55,14 +48,7 @@ def test_every_marker_in_any_pose(name: str) -> None:
 def test_order_of_the_rings_does_not_matter() -> None:
     rings, _, _ = scene(QUAD, 20)
     shuffle = torch.randperm(80, generator=torch.Generator().manual_seed(1))
-    shuffled = Rings(
-        rings.frame[shuffle],
-        rings.polarity[shuffle],
-        rings.outer_raw[shuffle],
-        rings.inner_raw[shuffle],
-        rings.outer[shuffle],
-        rings.inner[shuffle],
-    )
+    shuffled = rings[shuffle]
     result = found(shuffled, [QUAD], 20)
     assert torch.equal(shuffle[result.ring], torch.arange(80).view(20, 4))
 
@@ -94,14 +80,7 @@ def test_hidden_markers() -> None:
     keep = torch.ones(40, 4, dtype=torch.bool)
     keep[torch.arange(40), torch.arange(40) % 4] = False
     index = keep.flatten().nonzero()[:, 0]
-    some = Rings(
-        rings.frame[index],
-        rings.polarity[index],
-        rings.outer_raw[index],
-        rings.inner_raw[index],
-        rings.outer[index],
-        rings.inner[index],
-    )
+    some = rings[index]
     result = found(some, [QUAD], 40)
     assert torch.equal(result.ring >= 0, keep)
     assert torch.equal(index[result.ring[keep]], index)
@@ -125,26 +104,12 @@ def test_polarity_separates_targets_of_one_code() -> None:
 def test_one_ring_alone_and_none() -> None:
     rings, _, _ = scene(QUAD, 2)
     one = torch.tensor([2])
-    single = Rings(
-        rings.frame[one],
-        rings.polarity[one],
-        rings.outer_raw[one],
-        rings.inner_raw[one],
-        rings.outer[one],
-        rings.inner[one],
-    )
+    single = rings[one]
     result = found(single, [QUAD], 2)
     assert result.ring.tolist() == [[-1, -1, 0, -1], [-1, -1, -1, -1]]
     assert result.R.isnan().all()
     nothing = torch.zeros(0, dtype=torch.int64)
-    none = Rings(
-        rings.frame[nothing],
-        rings.polarity[nothing],
-        rings.outer_raw[nothing],
-        rings.inner_raw[nothing],
-        rings.outer[nothing],
-        rings.inner[nothing],
-    )
+    none = rings[nothing]
     assert (found(none, [QUAD], 2).ring == -1).all()
 
 
@@ -155,7 +120,7 @@ def test_table_pads_shorter_targets() -> None:
     assert table.centers.dtype == F64
 
 
-def test_no_marker_lies_across_a_ring():
+def test_no_marker_lies_across_a_ring() -> None:
     """A pose whose unseen marker would lie half across a measured ring is doubted; one concentric with it is not."""
     r, t = torch.eye(3, dtype=F64)[None], torch.tensor([[0.0, 0.0, 300.0]], dtype=F64)
     truth = exact_ellipses(QUAD, CAMERA, r, t)[0]
@@ -164,5 +129,5 @@ def test_no_marker_lies_across_a_ring():
         ring = truth[3:].clone()
         ring[..., 0] += shift * ring[:, 0, 2]
         rings = rings_of(ring, frame)
-        across = crossed_out(rings, frame, r, t, QUAD.centers[None], QUAD.radii[None], seen, CAMERA)
+        across = crossed_out(rings, frame, r, t, MarkerTable.of([QUAD]), seen, CAMERA.matrix)
         assert across.tolist() == [expected]

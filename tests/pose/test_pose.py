@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.geometry import rotations
+from torchpose.identify import MarkerTable
 from torchpose.pose import Evidence, compensate, gather_evidence, intrinsics_covariance, solve_poses
 from torchpose.pose import solve as pose
 from torchpose.results import Reason, Status
@@ -36,23 +37,9 @@ def evidence(
     if shift is not None:
         ellipses[..., :2] += shift[:, :, None]
     rings = rings_of(ellipses.flatten(0, 1), torch.arange(count).repeat_interleave(markers), sigma, seed=seed)
-    radii = target.radii.repeat(count, 1)
-    center, covariance = compensate(rings.outer, rings.inner, radii)
-
-    def rows(x: Tensor) -> Tensor:
-        return x.expand(count, *x.shape)
-
-    return gather_evidence(
-        rings,
-        torch.arange(count * markers).view(count, markers),
-        center.view(count, markers, 2),
-        covariance.view(count, markers, 2, 2),
-        rows(target.centers),
-        rows(target.normals),
-        rows(target.radii),
-        torch.full((count,), target.coplanar),
-        camera.matrix,
-    )
+    markers = MarkerTable.of([target])[torch.zeros(count, dtype=torch.int64)]
+    ring = torch.arange(count * len(target)).view(count, len(target))
+    return gather_evidence(rings, ring, markers, camera.matrix, compensate)
 
 
 def hide(e: Evidence, marker: int) -> Evidence:
@@ -153,7 +140,7 @@ def test_intrinsics_covariance_is_the_pose_s_own_response() -> None:
         one = torch.zeros(4, 4, dtype=F64)
         one[k, k] = 1
         known = dataclasses.replace(pinhole(), matrix=e.matrix, covariance=one)
-        predicted = intrinsics_covariance(e, s, known, refined=False).diagonal(dim1=-2, dim2=-1).sqrt()
+        predicted = intrinsics_covariance(e, s.R, s.t, known, refined=False).diagonal(dim1=-2, dim2=-1).sqrt()
         torch.testing.assert_close(change.abs(), predicted, rtol=0.02, atol=2e-5)
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchpose.analysis import pose_crlb
 from torchpose.camera import Camera
 from torchpose.geometry import rotations
-from torchpose.refine import Refined, refine_photometric
+from torchpose.refine import Refined, Sight, refine_photometric
 from torchpose.sim import add_noise, render
 from torchpose.target import Target
 
@@ -28,13 +28,8 @@ def refined(frames: Tensor, r: Tensor, t: Tensor, camera: Camera = CAMERA, targe
     off = rotations.exp(1e-3 * torch.randn(count, 3, dtype=F64, generator=g))
     start = t + 1e-2 * torch.randn(count, 3, dtype=F64, generator=g)
 
-    def rows(x: Tensor) -> Tensor:
-        return x.expand(count, *x.shape)
-
-    return refine_photometric(
-        frames, camera, torch.arange(count), off @ r, start, torch.ones(count, len(target), dtype=torch.bool),
-        exact_ellipses(target, camera, r, t), rows(target.centers), rows(target.normals), rows(target.radii),
-    )  # fmt: skip
+    sight = Sight.of(frames, camera, target, torch.arange(count), exact_ellipses(target, camera, r, t))
+    return refine_photometric(sight, off @ r, start)
 
 
 def errors(result: Refined, r: Tensor, t: Tensor) -> Tensor:
@@ -185,10 +180,7 @@ def test_rows_do_not_depend_on_each_other() -> None:
     rings = exact_ellipses(QUAD, CAMERA, r, t)
 
     def run(rows: Tensor) -> Refined:
-        count = len(rows)
-        table = (x.expand(count, *x.shape) for x in (QUAD.centers, QUAD.normals, QUAD.radii))
-        mask = torch.ones(count, len(QUAD), dtype=torch.bool)
-        return refine_photometric(frames, CAMERA, rows, r[rows], t[rows], mask, rings[rows], *table)
+        return refine_photometric(Sight.of(frames, CAMERA, QUAD, rows, rings[rows]), r[rows], t[rows])
 
     together = run(torch.arange(6))
     for k in range(6):

@@ -9,7 +9,8 @@ from exact import F64, exact_ellipses, pinhole, random_poses, rings_of
 
 import torchpose as tp
 from torchpose.geometry import rotations
-from torchpose.pose import Evidence, common_center, gather_evidence, solve_poses
+from torchpose.identify import MarkerTable
+from torchpose.pose import Evidence, gather_evidence, solve_poses
 from torchpose.refine import decide, refine_centers
 from torchpose.refine.centers import ellipse_centers
 from torchpose.results import Status
@@ -22,18 +23,8 @@ def evidence(r: torch.Tensor, t: torch.Tensor, sigma: float) -> Evidence:
     count, markers = len(r), len(QUAD)
     ellipses = exact_ellipses(QUAD, CAMERA, r, t).flatten(0, 1)
     rings = rings_of(ellipses, torch.arange(count).repeat_interleave(markers), sigma, seed=3)
-    center, covariance = common_center(rings.outer, rings.inner, QUAD.radii.repeat(count, 1))
-    return gather_evidence(
-        rings,
-        torch.arange(count * markers).view(count, markers),
-        center.view(count, markers, 2),
-        covariance.view(count, markers, 2, 2),
-        QUAD.centers.expand(count, -1, -1),
-        QUAD.normals.expand(count, -1, -1),
-        QUAD.radii.expand(count, -1, -1),
-        torch.ones(count, dtype=torch.bool),
-        CAMERA.matrix,
-    )
+    every = MarkerTable.of([QUAD])[torch.zeros(count, dtype=torch.int64)]
+    return gather_evidence(rings, torch.arange(count * markers).view(count, markers), every, CAMERA.matrix)
 
 
 def errors(found_r: torch.Tensor, found_t: torch.Tensor, r: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
@@ -59,21 +50,21 @@ def test_derivatives() -> None:
 def test_exact_centers_give_the_exact_pose() -> None:
     r, t = random_poses(20, 60, (120, 300))
     off = rotations.exp(torch.full((3,), 2e-3, dtype=F64))
-    found_r, found_t, _, _, good = refine_centers(evidence(r, t, 1e-9), off @ r, t + 0.1)
-    assert good.all()
-    assert errors(found_r, found_t, r, t).abs().max() < 1e-6
+    found = refine_centers(evidence(r, t, 1e-9), off @ r, t + 0.1)
+    assert found.good.all()
+    assert errors(found.R, found.t, r, t).abs().max() < 1e-6
 
 
 def test_better_than_compensated_centers_and_says_so() -> None:
     r, t = random_poses(400, 60, (130, 200))
     e = evidence(r, t, 0.02)
     s = solve_poses(e, (r, t))
-    found_r, found_t, covariance, _, good = refine_centers(e, s.R, s.t)
-    assert good.all()
-    error = errors(found_r, found_t, r, t)
+    found = refine_centers(e, s.R, s.t)
+    assert found.good.all()
+    error = errors(found.R, found.t, r, t)
     before = errors(s.R, s.t, r, t).square().mean(0).sqrt()
     assert (error.square().mean(0).sqrt() < 0.7 * before).all()
-    nees = (error[:, None] @ torch.linalg.inv(covariance) @ error[..., None]).flatten()
+    nees = (error[:, None] @ torch.linalg.inv(found.covariance) @ error[..., None]).flatten()
     assert 5.5 < nees.mean() < 6.5  # 400 poses: 6, deviation 0.17
 
 
@@ -84,8 +75,8 @@ def test_markers_not_seen_do_not_count() -> None:
     wrong = dataclasses.replace(hidden, shape=hidden.shape.clone())
     wrong.shape[:, 0] += 50.0
     a, b = refine_centers(hidden, r, t), refine_centers(wrong, r, t)
-    assert torch.equal(a[0], b[0])
-    assert torch.equal(a[1], b[1])
+    assert torch.equal(a.R, b.R)
+    assert torch.equal(a.t, b.t)
 
 
 def far_and_noisy(count: int) -> tuple[torch.Tensor, torch.Tensor, Evidence]:

@@ -13,7 +13,7 @@ from torch import Tensor
 import torchpose as tp
 from torchpose import ellipse
 from torchpose.geometry import conics, rotations
-from torchpose.refine import Refined, refine_edges
+from torchpose.refine import Refined, Sight, refine_edges
 from torchpose.refine.edges.fit import circle_distance
 from torchpose.sim import add_noise, render
 
@@ -93,22 +93,9 @@ def refined(noise: float, count: int = 8, prior: Tensor | None = None) -> tuple[
     )
     to_px = torch.linalg.inv(camera.matrix)
     shapes = conics.ellipse_from_conic(conics.from_matrix(to_px.T @ conic @ to_px))
-    every = torch.ones(count, len(QUAD), dtype=torch.bool)
     off = rotations.exp(torch.full((3,), 1.0e-4, dtype=F64))
-    out = refine_edges(
-        frames,
-        camera,
-        torch.arange(count),
-        off @ r,
-        t + 0.02,
-        every,
-        shapes,
-        every.double(),
-        QUAD.centers.expand(count, -1, -1),
-        QUAD.normals.expand(count, -1, -1),
-        QUAD.radii.expand(count, -1, -1),
-        prior=prior,
-    )
+    sight = Sight.of(frames, camera, QUAD, torch.arange(count), shapes)
+    out = refine_edges(sight, off @ r, t + 0.02, prior=prior)
     return out, r, t
 
 

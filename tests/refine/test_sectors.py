@@ -7,9 +7,8 @@ from exact import F64, exact_ellipses, pinhole, random_poses
 from torch import Tensor
 
 from torchpose.geometry import rotations
-from torchpose.refine import Refined, refine_photometric
+from torchpose.refine import Refined, Sight, refine_photometric
 from torchpose.refine.photometric.grey_chi2 import grey_chi2
-from torchpose.refine.photometric.ring_model import Sight
 from torchpose.refine.photometric.sectors import SECTORS, Sectors, away_from_unclear, doubtful, trust
 from torchpose.sim import add_noise, render, shapes
 from torchpose.target import Target
@@ -18,13 +17,12 @@ CAMERA = pinhole()
 QUAD = Target.load("quad40")
 
 
-def arguments(frames: Tensor, r: Tensor, t: Tensor, off: float = 1e-2) -> tuple[object, ...]:
+def arguments(frames: Tensor, r: Tensor, t: Tensor, off: float = 1e-2) -> tuple[Sight, Tensor, Tensor]:
     """Of `refine_photometric`, from a start that is off by ``off`` mm."""
     g, count = torch.Generator().manual_seed(5), len(r)
     start = t + off * torch.randn(count, 3, dtype=F64, generator=g)
-    model = (x.expand(count, *x.shape) for x in (QUAD.centers, QUAD.normals, QUAD.radii))
-    mask = torch.ones(count, len(QUAD), dtype=torch.bool)
-    return (frames, CAMERA, torch.arange(count), r, start, mask, exact_ellipses(QUAD, CAMERA, r, t), *model)
+    sight = Sight.of(frames, CAMERA, QUAD, torch.arange(count), exact_ellipses(QUAD, CAMERA, r, t))
+    return sight, r, start
 
 
 def nees(result: Refined, r: Tensor, t: Tensor) -> Tensor:
@@ -116,8 +114,7 @@ def test_grey_values_tell_a_tilt_from_its_mirror_image() -> None:
     flip = torch.eye(3, dtype=F64) - 2 * line[:, :, None] * line[:, None]
     normal = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=F64))
     mirrored = Refined(flip @ r @ normal, t, right.covariance, right.blur, right.noise, right.kept, right.good)
-    judged = (*given[:3], *given[5:])
-    chi2, explained = grey_chi2(Sight(*judged), right, mirrored)
+    chi2, explained = grey_chi2(given[0], right, mirrored)
     assert (chi2 > 20).all()
     assert explained[:, 0].all()
-    torch.testing.assert_close(grey_chi2(Sight(*judged), mirrored, right)[0], -chi2)
+    torch.testing.assert_close(grey_chi2(given[0], mirrored, right)[0], -chi2)

@@ -9,7 +9,7 @@ from exact import F64, exact_ellipses, pinhole, random_poses
 from torch import Tensor
 
 from torchpose.pose import Evidence, Solutions
-from torchpose.refine import decide_on_grey
+from torchpose.refine import Sight, decide_on_grey
 from torchpose.results import Reason, Status
 from torchpose.sim import add_noise, render
 from torchpose.target import Target
@@ -47,7 +47,8 @@ def solutions(r: Tensor, t: Tensor, r_alt: Tensor, t_alt: Tensor, status: Status
 
 def decided(s: Solutions, frames: Tensor, r: Tensor, t: Tensor) -> Solutions:
     """By the frames of the poses ``r``, ``t``."""
-    return decide_on_grey(s, evidence(r, t), frames, CAMERA, torch.arange(len(r)), exact_ellipses(QUAD, CAMERA, r, t))
+    sight = Sight.of(frames, CAMERA, QUAD, torch.arange(len(r)), exact_ellipses(QUAD, CAMERA, r, t))
+    return decide_on_grey(s, evidence(r, t), sight)
 
 
 def unchanged(found: Solutions, s: Solutions) -> bool:

@@ -30,8 +30,11 @@ def solve_poses(evidence: Evidence, rough: tuple[Tensor, Tensor]) -> Solutions:
     that marker is left out.
 
     Args:
-        evidence: N rows. rough: R (N, 3, 3), t (N, 3) to start from.
+        evidence: N rows.
+        rough: R (N, 3, 3), t (N, 3) to start from.
     """
+    if len(evidence) == 0:
+        return _no_solutions(evidence, *rough)
     solved = _solve(evidence, rough, _ITERATIONS[0])
     slow = (solved.reason == Reason.NOT_CONVERGED).nonzero()[:, 0]
     if slow.numel():
@@ -84,6 +87,12 @@ def _solve(evidence: Evidence, rough: tuple[Tensor, Tensor], iterations: int) ->
     status = torch.where(reason == Reason.TWO_SOLUTIONS, int(Status.AMBIGUOUS), status)
     one, two = ((R[:, k], t[:, k], rms[:, k]) for k in range(2))
     return Solutions(one[0], one[1], covariance, one[2], chi2[:, 0], *two, chi2_alt, status, reason, evidence.mask)
+
+
+def _no_solutions(evidence: Evidence, R: Tensor, t: Tensor) -> Solutions:
+    """Of no rows: frames without a target cost nothing here."""
+    one, code = t.new_empty(0), evidence.mask.new_empty(0, dtype=torch.int64)
+    return Solutions(R, t, t.new_empty(0, 6, 6), one, one, R, t, one, one, code, code, evidence.mask)
 
 
 def _starts(evidence: Evidence, rough: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:

@@ -66,9 +66,18 @@ def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera, *, cor
         camera: its distortion is taken off the sub-pixel points before the final fit.
         correct: free the edges from what blur and curvature do to them; False leaves them as the moments read them.
     """
+    if len(candidates) == 0:
+        return _no_rings(candidates)
     inside = find_inner(frames, candidates, camera)
     found = inside.found
     return _measure(frames, candidates[found], inside.ellipse[found], inside.seen[found], camera, correct)[0]
+
+
+def _no_rings(candidates: Candidates) -> Rings:
+    """Of no candidates: frames without any cost nothing here."""
+    frame, polarity, none = candidates.frame, candidates.polarity, candidates.ellipse
+    fit = EllipseFit(none, none.new_empty(0, 5, 5), polarity, polarity)
+    return Rings(frame, polarity, none, none, fit, fit)
 
 
 def measure_predicted(

@@ -11,7 +11,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchpose.geometry.least_squares import solve_scaled
+from torchpose.geometry.least_squares import geman_mcclure, solve_scaled
 from torchpose.refine.photometric.light import LEVELS, QUANTISATION
 from torchpose.refine.photometric.ring_model import PixelBlocks, RingModel, ring_model
 
@@ -24,66 +24,66 @@ _NEAR_PURE = 0.05  # of paper in a pixel, beside the most and the least of its m
 _FIRST_STEPS = 3  # reweighted fits of the levels before the pose is moved
 
 
-def first_levels(b: PixelBlocks, r: Tensor, t: Tensor, blur: Tensor) -> Tensor:
+def first_levels(blocks: PixelBlocks, R: Tensor, t: Tensor, blur: Tensor) -> Tensor:
     """Grey levels (K, 6) for the poses that come in: medians, then reweighted linear fits.
 
     A third of a ring may be covered: a least-squares fit of gradients would bend towards the cover and stay there.
     """
-    model = ring_model(b, r, t, blur)
-    columns = _tiled((*_basis(model), b.grey))
+    model = ring_model(blocks, R, t, blur)
+    columns = _tiled((*_basis(model), blocks.grey))
     none = torch.zeros_like(model.fraction[:, 0])
-    ring, paper = _pure_levels(b, model.fraction)
+    ring, paper = _pure_levels(blocks, model.fraction)
     levels = torch.stack([ring, none, none, paper, none, none], -1).nan_to_num(0.0, 0.0, 0.0).double()
     for _ in range(_FIRST_STEPS):
         predicted = (levels.float()[:, None, None] @ columns[:, :, :LEVELS]).flatten(1)
-        residual = b.grey - predicted
-        weight = b.valid / (1 + (residual / (2 * noise_spread(residual, b)[:, None])).square()).square()
+        residual = blocks.grey - predicted
+        weight = blocks.valid * geman_mcclure(residual / (2 * noise_spread(residual, blocks)[:, None]))
         sums = sum_products(columns, weight)
         levels = solve_scaled(sums[:, :LEVELS, :LEVELS], sums[:, :LEVELS, LEVELS:]).squeeze(-1)
     return levels
 
 
-def _pure_levels(b: PixelBlocks, fraction: Tensor) -> tuple[Tensor, Tensor]:
+def _pure_levels(blocks: PixelBlocks, fraction: Tensor) -> tuple[Tensor, Tensor]:
     """Grey of ring and of paper (K,) by the medians of the pixels that show most of either.
 
     A blurred ring has no pixel without paper, so the line through both medians is followed to the ends. A level beyond
     the range of grey values shows no pixel at all.
     """
     fraction = fraction.clamp(0, 1)  # beyond: deep in a flat hole, where the expansions fail
-    known = fraction.masked_fill(b.valid == 0, torch.nan)
+    known = fraction.masked_fill(blocks.valid == 0, torch.nan)
     least = known.nan_to_num(nan=2.0).amin(-1, keepdim=True)
     most = known.nan_to_num(nan=-1.0).amax(-1, keepdim=True)
-    ends = [b.valid * where for where in (fraction < least + _NEAR_PURE, fraction > most - _NEAR_PURE)]
-    (ring, paper), (at_ring, at_paper) = ([_median(v, w) for w in ends] for v in (b.grey, fraction))
+    ends = [blocks.valid * where for where in (fraction < least + _NEAR_PURE, fraction > most - _NEAR_PURE)]
+    (ring, paper), (at_ring, at_paper) = ([_median(v, w) for w in ends] for v in (blocks.grey, fraction))
     slope = (paper - ring) / (at_paper - at_ring)
     return ring - at_ring * slope, paper + (1 - at_paper) * slope
 
 
-def columns_of(b: PixelBlocks, m: RingModel, levels: Tensor) -> tuple[Tensor, Tensor]:
+def columns_of(blocks: PixelBlocks, model: RingModel, levels: Tensor) -> tuple[Tensor, Tensor]:
     """Derivatives by pose (6), blur (1) and levels (L), and the residual, by tiles: (K, P / 256, 8 + L, 256) float32.
 
     Also the derivative by the distance from the edges (K, P).
     """
     a0, ax, ay, p0, px, py, *curved = (v[:, None].float() for v in levels.unbind(-1))
-    ring, paper = a0 + ax * m.x + ay * m.y, p0 + px * m.x + py * m.y
+    ring, paper = a0 + ax * model.x + ay * model.y, p0 + px * model.x + py * model.y
     if curved:
         axx, axy, ayy, pxx, pxy, pyy = curved
-        ring = ring + axx * m.x.square() + axy * m.x * m.y + ayy * m.y.square()
-        paper = paper + pxx * m.x.square() + pxy * m.x * m.y + pyy * m.y.square()
+        ring = ring + axx * model.x.square() + axy * model.x * model.y + ayy * model.y.square()
+        paper = paper + pxx * model.x.square() + pxy * model.x * model.y + pyy * model.y.square()
     contrast = paper - ring
-    by_d = contrast * m.by_d
-    residual = b.grey - (ring + contrast * m.fraction)
-    basis = _basis(m, bool(curved))
-    return _tiled((*(by_d * v for v in m.by_pose), contrast * m.by_q, *basis, residual)), by_d
+    by_d = contrast * model.by_d
+    residual = blocks.grey - (ring + contrast * model.fraction)
+    basis = _basis(model, bool(curved))
+    return _tiled((*(by_d * v for v in model.by_pose), contrast * model.by_q, *basis, residual)), by_d
 
 
-def _basis(m: RingModel, curved: bool = False) -> tuple[Tensor, ...]:
+def _basis(model: RingModel, curved: bool = False) -> tuple[Tensor, ...]:
     """Planes of the linear unknowns: ring (1, x, y), paper (1, x, y); if ``curved`` also (xx, xy, yy) of both."""
-    ring, paper = 1 - m.fraction, m.fraction
-    flat = (ring, ring * m.x, ring * m.y, paper, paper * m.x, paper * m.y)
+    ring, paper = 1 - model.fraction, model.fraction
+    flat = (ring, ring * model.x, ring * model.y, paper, paper * model.x, paper * model.y)
     if not curved:
         return flat
-    squares = (m.x.square(), m.x * m.y, m.y.square())
+    squares = (model.x.square(), model.x * model.y, model.y.square())
     return (*flat, *(ring * p for p in squares), *(paper * p for p in squares))
 
 
@@ -98,27 +98,27 @@ def sum_products(columns: Tensor, weight: Tensor) -> Tensor:
     return (weighted @ columns.mT).double().sum(1)
 
 
-def inliers(residual: Tensor, b: PixelBlocks, m: RingModel, levels: Tensor) -> tuple[Tensor, Tensor]:
+def inliers(residual: Tensor, blocks: PixelBlocks, model: RingModel, levels: Tensor) -> tuple[Tensor, Tensor]:
     """Pixels (K, P) whose noise is not clipped, by what they should show, and of these the ones that do show it."""
-    spread = noise_spread(residual, b)[:, None]
-    predicted = b.grey - residual
+    spread = noise_spread(residual, blocks)[:, None]
+    predicted = blocks.grey - residual
     margin = _CLEAR_OF_LIMITS * spread
-    low, high = b.limits[:, :1], b.limits[:, 1:]
-    usable = b.valid * ((predicted > low + margin) & (predicted < high - margin))
-    if m.sound is not None:
-        usable = usable * m.sound
+    low, high = blocks.limits[:, :1], blocks.limits[:, 1:]
+    usable = blocks.valid * ((predicted > low + margin) & (predicted < high - margin))
+    if model.sound is not None:
+        usable = usable * model.sound
     return usable, usable * (residual.abs() < CUT * spread + model_misfit(levels)[:, None])
 
 
-def noise_spread(residual: Tensor, b: PixelBlocks) -> Tensor:
+def noise_spread(residual: Tensor, blocks: PixelBlocks) -> Tensor:
     """Robust standard deviation (K,) from the median absolute residual.
 
     All markers of a frame share its noise, so none may claim much more than the best of them: cover would.
     """
-    own = (1.4826 * _median(residual.abs(), b.valid)).nan_to_num(nan=1.0).clamp_min(math.sqrt(QUANTISATION))
-    least = torch.full((int(b.row.max()) + 1 if len(own) else 0,), torch.inf, dtype=own.dtype, device=own.device)
-    least = least.scatter_reduce(0, b.row, own, "amin")
-    return torch.minimum(own, _MOST_SPREAD * least[b.row])
+    own = (1.4826 * _median(residual.abs(), blocks.valid)).nan_to_num(nan=1.0).clamp_min(math.sqrt(QUANTISATION))
+    least = torch.full((int(blocks.row.max()) + 1 if len(own) else 0,), torch.inf, dtype=own.dtype, device=own.device)
+    least = least.scatter_reduce(0, blocks.row, own, "amin")
+    return torch.minimum(own, _MOST_SPREAD * least[blocks.row])
 
 
 def _median(values: Tensor, where: Tensor) -> Tensor:

@@ -12,11 +12,13 @@ and these displacements are independent and of zero mean where the model holds (
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import segment_sum
 from torchpose.refine.photometric.ring_model import PixelBlocks, RingModel
 
@@ -32,19 +34,25 @@ _DISPLACED = 0.005  # px, displacement that a camera or print slightly off may c
 _TINY = 1e-12
 
 
-class Sectors(NamedTuple):
-    """Sums over the pixels of the 2 x 48 sectors of K markers, inner circle first: (K, 96).
+@dataclass(frozen=True, eq=False)
+class Sectors(Rows):
+    """Sums over the pixels of the 2 x 48 sectors of K markers, inner circle first.
 
-    total: usable pixels. used: sum of weights. square: of weighted squared residuals. pull, hold: sum(w j r) and
-    sum(w j^2). cell: (K, P) int64, flat sector of every pixel.
+    Attributes:
+        total: usable pixels.
+        used: sum of weights.
+        square: of weighted squared residuals.
+        pull: sum(w j r).
+        hold: sum(w j^2).
+        cell: flat sector of every pixel.
     """
 
-    total: Tensor
-    used: Tensor
-    square: Tensor
-    pull: Tensor
-    hold: Tensor
-    cell: Tensor
+    total: Float[Tensor, "K 96"]
+    used: Float[Tensor, "K 96"]
+    square: Float[Tensor, "K 96"]
+    pull: Float[Tensor, "K 96"]
+    hold: Float[Tensor, "K 96"]
+    cell: Int[Tensor, "K P"]
 
     def of_pixels(self, values: Tensor) -> Tensor:
         """Values (K, 96) of the sectors as those of their pixels (K, P)."""
@@ -52,18 +60,18 @@ class Sectors(NamedTuple):
 
     def scaled(self, factor: Tensor) -> Sectors:
         """With the weights of every sector multiplied by ``factor`` (K, 96)."""
-        return self._replace(**{n: getattr(self, n) * factor for n in ("used", "square", "pull", "hold")})
+        return replace(self, **{n: getattr(self, n) * factor for n in ("used", "square", "pull", "hold")})
 
 
 def sum_sectors(
-    residual: Tensor, slope: Tensor, usable: Tensor, weight: Tensor, b: PixelBlocks, m: RingModel
+    residual: Tensor, slope: Tensor, usable: Tensor, weight: Tensor, blocks: PixelBlocks, model: RingModel
 ) -> Sectors:
     """Sums of residuals (K, P) with derivatives by the edge ``slope``, and weights, of which ``usable`` is the most."""
-    middle = 0.5 * (1 + b.radii[:, 1] / b.radii[:, 0])
-    outer = torch.hypot(m.x, m.y) > middle[:, None].float()
-    turn = (torch.atan2(m.y, m.x) / (2 * math.pi) + 0.5) * SECTORS
-    count = len(b.row)
-    block = torch.arange(count, device=b.row.device)[:, None]
+    middle = 0.5 * (1 + blocks.radii[:, 1] / blocks.radii[:, 0])
+    outer = torch.hypot(model.x, model.y) > middle[:, None].float()
+    turn = (torch.atan2(model.y, model.x) / (2 * math.pi) + 0.5) * SECTORS
+    count = len(blocks.row)
+    block = torch.arange(count, device=blocks.row.device)[:, None]
     cell = (2 * block + outer) * SECTORS + turn.long().clamp(0, SECTORS - 1)
     flat = cell.flatten()
     weighted = weight * residual
@@ -72,12 +80,13 @@ def sum_sectors(
     planes = (usable, weight, weighted * residual, pull * residual, pull * slope)
     sums = [torch.zeros(2 * SECTORS * count, dtype=weight.dtype, device=weight.device) for _ in planes]
     total, used, square, pulls, hold = (
-        s.scatter_add_(0, flat, p.flatten()).view(count, 2 * SECTORS) for s, p in zip(sums, planes, strict=True)
+        total.scatter_add_(0, flat, plane.flatten()).view(count, 2 * SECTORS)
+        for total, plane in zip(sums, planes, strict=True)
     )
     return Sectors(total, used, square, pulls, hold, cell)
 
 
-def clear_sectors(s: Sectors, spread: Tensor, misfit: Tensor) -> Tensor:
+def clear_sectors(sectors: Sectors, spread: Tensor, misfit: Tensor) -> Tensor:
     """(K, 96) bool, False for sectors where many usable pixels do not follow the model.
 
     What covers an edge agrees with it by chance wherever the edge passes through the cover's own grey, and where both
@@ -86,21 +95,21 @@ def clear_sectors(s: Sectors, spread: Tensor, misfit: Tensor) -> Tensor:
     Args:
         spread: (K,) standard deviation of noise. misfit: (K,) what the model itself may be off by; grey levels.
     """
-    limit = spread[:, None].square() * (1 + _CUT * (2 / s.used.clamp_min(1)).sqrt()) + misfit[:, None].square()
-    clear = (s.used > _KEPT * s.total) & (s.square < s.used * limit)
+    limit = spread[:, None].square() * (1 + _CUT * (2 / sectors.used.clamp_min(1)).sqrt()) + misfit[:, None].square()
+    clear = (sectors.used > _KEPT * sectors.total) & (sectors.square < sectors.used * limit)
     # where half of a ring is gone, the rest of the marker is not to be trusted either
-    seen = (s.total > 0).sum(-1, keepdim=True)
+    seen = (sectors.total > 0).sum(-1, keepdim=True)
     return clear & (clear.sum(-1, keepdim=True) > _LEAST_CLEAR * seen)
 
 
-def away_from_unclear(s: Sectors, clear: Tensor) -> Tensor:
+def away_from_unclear(sectors: Sectors, clear: Tensor) -> Tensor:
     """Clear sectors (K, 96) that touch no run of two unclear ones: what lies over these ends in a blurred edge."""
-    unclear = (~clear & (s.total > 0)).unflatten(1, (2, SECTORS))
+    unclear = (~clear & (sectors.total > 0)).unflatten(1, (2, SECTORS))
     run = unclear & (unclear.roll(1, -1) | unclear.roll(-1, -1))
     return clear & ~(run.roll(1, -1) | run.roll(-1, -1)).flatten(1)
 
 
-def trust(s: Sectors, clear: Tensor, variance: Tensor) -> Tensor:
+def trust(sectors: Sectors, clear: Tensor, variance: Tensor) -> Tensor:
     """Weights (K, 96) of the sectors beside those of their pixels: 0 where they are not clear or pull too hard.
 
     What is left of a circle may still pull more than noise does. The excess of the chi-squared of cells of four sectors
@@ -110,29 +119,29 @@ def trust(s: Sectors, clear: Tensor, variance: Tensor) -> Tensor:
     Args:
         variance: (K,) of noise.
     """
-    noise = variance[:, None].to(s.pull.dtype)
-    good = clear & (s.pull.square() < _SIGNIFICANT**2 * noise * s.hold.clamp_min(_TINY))
-    chi2, hold = _cells(s.scaled(good.to(s.pull.dtype)), noise)
+    noise = variance[:, None].to(sectors.pull.dtype)
+    good = clear & (sectors.pull.square() < _SIGNIFICANT**2 * noise * sectors.hold.clamp_min(_TINY))
+    chi2, hold = _cells(sectors.scaled(good.to(sectors.pull.dtype)), noise)
     excess = (chi2 - (hold > 0).to(chi2.dtype)).sum(-1).clamp_min(0)
     spread = (excess / hold.sum(-1).clamp_min(_TINY))[:, None] * hold  # tau^2 over the variance of each cell
     return good / (1 + spread.repeat_interleave(_CELL, 1))
 
 
-def _cells(s: Sectors, noise: Tensor, allowed: float = 0.0) -> tuple[Tensor, Tensor]:
+def _cells(sectors: Sectors, noise: Tensor, allowed: float = 0.0) -> tuple[Tensor, Tensor]:
     """Chi-squared of the displacement of every cell, given ``allowed`` px besides noise, and its hold: (K, 24)."""
-    pull, hold = (v.unflatten(1, (-1, _CELL)).sum(-1) for v in (s.pull, s.hold))
+    pull, hold = (v.unflatten(1, (-1, _CELL)).sum(-1) for v in (sectors.pull, sectors.hold))
     variance = noise * hold + (allowed * hold).square()
     return torch.where(hold > 0, pull.square() / variance.clamp_min(_TINY), 0.0), hold
 
 
-def misfit(s: Sectors, clear: Tensor, variance: Tensor, row: Tensor, rows: int) -> Tensor:
+def misfit(sectors: Sectors, clear: Tensor, variance: Tensor, row: Tensor, rows: int) -> Tensor:
     """Chi-squared of the displacements of a row's cells per cell (N,): 1 where the model holds."""
-    chi2, hold = _cells(s.scaled(clear.to(s.pull.dtype)), variance[:, None].to(s.pull.dtype))
+    chi2, hold = _cells(sectors.scaled(clear.to(sectors.pull.dtype)), variance[:, None].to(sectors.pull.dtype))
     count = segment_sum((hold > 0).double().sum(-1), row, rows).clamp_min(1)
     return segment_sum(chi2.double().sum(-1), row, rows) / count
 
 
-def doubtful(s: Sectors, clear: Tensor, variance: Tensor, row: Tensor, step_chi2: Tensor, more: Tensor) -> Tensor:
+def doubtful(sectors: Sectors, clear: Tensor, variance: Tensor, row: Tensor, step_chi2: Tensor, more: Tensor) -> Tensor:
     """Rows (N,) bool whose grey values contradict the model, or that have not come to rest.
 
     Args:
@@ -141,8 +150,10 @@ def doubtful(s: Sectors, clear: Tensor, variance: Tensor, row: Tensor, step_chi2
             noise alone makes a step of more - 1 times its usual chi-squared.
     """
     rows = step_chi2.numel()
-    unclear = (~clear & (s.total > 0))[:, SECTORS:].sum(-1) > _UNCLEAR
-    chi2, hold = _cells(s.scaled(clear.to(s.pull.dtype)), variance[:, None].to(s.pull.dtype), _DISPLACED)
+    unclear = (~clear & (sectors.total > 0))[:, SECTORS:].sum(-1) > _UNCLEAR
+    chi2, hold = _cells(
+        sectors.scaled(clear.to(sectors.pull.dtype)), variance[:, None].to(sectors.pull.dtype), _DISPLACED
+    )
     total = segment_sum(chi2.double().sum(-1), row, rows) - step_chi2
     freedom = segment_sum((hold > 0).double().sum(-1), row, rows).clamp_min(1)
     pulled = total > freedom + _SIGNIFICANT * (2 * freedom).sqrt()

@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
-from torchpose.refine.photometric.gauss_newton import LEVELS, POSE, Step, gauss_newton_step
+
+from torchpose.refine.photometric.light import LEVELS, POSE, normal_equations
 
 F64 = torch.float64
 MARKERS, PIXELS, TRIALS = 4, 300, 400
 GRADIENTS = (1, 2, 4, 5)
+
+
+class Step(NamedTuple):
+    """pose: (N, 7). levels: (K, L). information: (N, 7, 7) at unit noise, levels eliminated. variance: (N,)."""
+
+    pose: Tensor
+    levels: Tensor
+    information: Tensor
+    variance: Tensor
 
 
 def problem() -> Tensor:
@@ -25,8 +37,9 @@ def step(columns: Tensor, levels: Tensor, noise: Tensor) -> Step:
     every = torch.cat([columns.expand(trials, -1, -1, -1), noise[..., None]], -1).flatten(0, 1)
     row = torch.arange(trials).repeat_interleave(MARKERS)
     used = torch.full((trials * MARKERS,), float(PIXELS), dtype=F64)
-    known = torch.zeros(trials, POSE, POSE, dtype=F64)
-    return gauss_newton_step(every.mT @ every, used, levels.repeat(trials, 1), row, trials, known, known[:, 0])
+    normal, variance = normal_equations(every.mT @ every, used, levels.repeat(trials, 1), row, trials)
+    found = normal.solve()
+    return Step(found.own, found.eliminated, found.information * variance[:, None, None], variance)
 
 
 def noises(trials: int) -> Tensor:
