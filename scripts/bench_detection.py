@@ -199,7 +199,7 @@ def ringgrid_detector() -> Detector:
 
 
 def detectors() -> dict[str, Detector]:
-    peers = {
+    peers: dict[str, Detector] = {
         "torchpose": ours,
         "SimpleBlobDetector": blobs,
         "findCirclesGrid": grid,
@@ -230,7 +230,8 @@ def sweep(name: str, frames: int, seed: int, peers: dict[str, Detector]) -> None
         made = list(scenes(lens, target, condition, frames, seed))
         own = math.nan
         for peer, detect in peers.items():
-            hits, false, errors, start = 0, 0, [], time.process_time()
+            errors: list[float] = []
+            hits, false, start = 0, 0, time.process_time()
             results = [detect(frame.numpy()) for frame, _ in made]
             cpu = 1e3 * (time.process_time() - start) / len(made)
             for found, (_, truth) in zip(results, made, strict=True):

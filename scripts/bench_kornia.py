@@ -225,7 +225,7 @@ def turning(bench: Bench) -> Iterator[Row]:
 
 def geometry(bench: Bench) -> Iterator[Row]:
     """Projection, undistortion, rigid transforms and PnP."""
-    camera = tp.Camera(1824, 1216, camera_of("2 MP").matrix, [-0.3, 0.12, 1e-3, -2e-3])  # type: ignore[arg-type]
+    camera = tp.Camera(1824, 1216, camera_of("2 MP").matrix, [-0.3, 0.12, 1e-3, -2e-3])
     generator = torch.Generator().manual_seed(1)
     pixels = torch.rand(10_000, 2, generator=generator, dtype=F64) * torch.tensor([1823.0, 1215.0], dtype=F64)
     eye = torch.eye(3, dtype=F64)[None]
@@ -327,11 +327,9 @@ def pictures(bench: Bench) -> Iterator[Row]:
         ("GaussianBlur2d 5", kornia.filters.GaussianBlur2d((5, 5), (0.7, 0.7))),
     ):
         plain = value[0, 0].numpy()
-        ours = (
-            (lambda plain=plain: cv2.medianBlur(plain, 3))
-            if "Median" in name
-            else (lambda plain=plain: cv2.GaussianBlur(plain, (5, 5), 0.7, borderType=cv2.BORDER_REFLECT_101))
-        )
+        ours: Work = partial(cv2.medianBlur, plain, 3)
+        if "Gaussian" in name:
+            ours = partial(cv2.GaussianBlur, plain, (5, 5), 0.7, borderType=cv2.BORDER_REFLECT_101)
         difference = worst(ours()[1:-1, 1:-1], module(value)[0, 0, 1:-1, 1:-1])
         yield bench.row(
             f"filters.{name}",

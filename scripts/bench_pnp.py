@@ -225,7 +225,7 @@ class Traffic(TorchDispatchMode):
     """Counts the operations, and the bytes of the tensors that they read and write, of views none."""
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__()  # type: ignore[no-untyped-call]  # of torch
         self.calls = self.bytes = 0
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:

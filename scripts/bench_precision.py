@@ -28,18 +28,20 @@ from torch import Tensor
 import torchpose as tp
 from torchpose.analysis import pose_crlb
 from torchpose.geometry import rotations
+from torchpose.pipeline import Method
 from torchpose.sim import add_noise, render
 
-METHODS = ("paper", "centers", "edges", "photometric")
+METHODS: tuple[Method, ...] = ("paper", "centers", "edges", "photometric")
 NEAR = 0.3  # of the outer radius within which a centre counts as the marker's
 
 
 def blobs(frame: np.ndarray) -> np.ndarray:
     """Centres (K, 2) of dark blobs, of OpenCV's detector as findCirclesGrid uses it."""
-    options = cv2.SimpleBlobDetector_Params()
+    options = cv2.SimpleBlobDetector_Params()  # type: ignore[attr-defined]  # missing in the stubs of OpenCV 5
     options.minArea, options.maxArea = 50.0, 1e5
     options.filterByColor = options.filterByInertia = options.filterByConvexity = False  # the middle of a ring is light
-    found = cv2.SimpleBlobDetector_create(options).detect(frame)
+    detector = cv2.SimpleBlobDetector_create(options)  # type: ignore[attr-defined]  # missing in the stubs of OpenCV 5
+    found = detector.detect(frame)
     return np.array([k.pt for k in found], dtype=np.float64).reshape(-1, 2)
 
 
@@ -60,7 +62,9 @@ def poses_from_centers(centers: list[np.ndarray], uv: Tensor, reach: Tensor, cam
     points, matrix = TARGET.centers.numpy(), camera.matrix.numpy()
     out_r, out_t, ok = [], [], []
     for found, truth, near in zip(centers, uv.numpy(), reach.tolist(), strict=True):
-        r, t, good = np.eye(3), np.full(3, math.nan), False
+        r: np.ndarray = np.eye(3)
+        t: np.ndarray = np.full(3, math.nan)
+        good = False
         if len(found):
             distance = np.linalg.norm(truth[:, None] - found, axis=-1)
             pick = distance.argmin(1)
@@ -96,7 +100,7 @@ def main() -> None:
     reach = NEAR * camera.matrix[0, 0] * TARGET.radii[0, 0] / t[:, 2]
 
     estimators = {m: tp.PoseEstimator(camera, TARGET, method=m) for m in METHODS}
-    cost = dict.fromkeys(METHODS, math.inf)
+    cost: dict[str, float] = dict.fromkeys(METHODS, math.inf)
     found: dict[str, tuple[Tensor, ...]] = {}
     for _ in range(options.rounds + 1):  # the first warms up
         for m, estimator in estimators.items():

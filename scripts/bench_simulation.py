@@ -70,21 +70,14 @@ def main() -> int:
     cv2.setNumThreads(1)
     try:
         plan = load_plan(options.plan)
-        sensor, clean = plan.file.sensor, analytic(plan)
+        sensor, clean = plan.file.sensor.model_dump(exclude={"noise"}), analytic(plan)
         batches = max(2, min(options.frames, len(plan)) // BATCH)
         which = [(torch.arange(BATCH) + BATCH * i) % len(plan) for i in range(batches + 1)]
         pictures = [clean(w) for w in which[:2]]
 
         def noise(number: int) -> torch.Tensor:
-            return add_noise(
-                pictures[number % 2],
-                plan.conditions["noise"][which[number]],
-                plan.file.seed,
-                index=which[number],
-                bits=sensor.bits,
-                full_well=sensor.full_well,
-                gamma=sensor.gamma,
-            )
+            level = plan.conditions.noise[which[number]]
+            return add_noise(pictures[number % 2], level, plan.file.seed, index=which[number], **sensor)
 
         noisy = [noise(i).numpy() for i in range(2)]
         print(f"{plan.camera.width} x {plan.camera.height}, {batches} batches of {BATCH} frames, one thread")

@@ -21,6 +21,7 @@ import argparse
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -117,13 +118,11 @@ def by_prediction(names: list[str], frames: Tensor, target: tp.Target) -> Calibr
     """Residual: fitted minus predicted centre of every ellipse. The shift is renewed until it stands."""
     both = [ring_views(names, frames, target, which) for which in (0, 1)]
     views = Views.cat([both[0][0]])
-    views = replace(
-        views,
-        **{
-            n: torch.cat([getattr(v, n) for v, _, _ in both])
-            for n in ("view", "point", "points", "pixels", "covariance")
-        },
-    )
+    joined: dict[str, Any] = {
+        name: torch.cat([getattr(part, name) for part, _, _ in both])
+        for name in ("view", "point", "points", "pixels", "covariance")
+    }
+    views = replace(views, **joined)
     radius = torch.cat([size for _, size, _ in both])
     result = calibrate_intrinsics(views, [START], lens=LENS)
     for _ in range(3):
@@ -131,7 +130,7 @@ def by_prediction(names: list[str], frames: Tensor, target: tp.Target) -> Calibr
         place = {name: k for k, name in enumerate(result.views.names)}
         known = torch.tensor([place.get(name, -1) for name in views.names])
         kept = known[views.view] >= 0
-        views, radius = views.of_points(kept), radius[kept]
+        views, radius = views[kept], radius[kept]
         shift = predicted_shift(
             replace(views, view=known[views.view]), radius, result.camera, result.bundle.R, result.bundle.t
         )
@@ -161,9 +160,9 @@ def blob_views(views: Views, frames: Tensor, target: tp.Target, holes: Tensor) -
 
     It wants full discs: the holes (K, 5), inner ellipses, are painted over up to the middle of the ring.
     """
-    parameters = cv2.SimpleBlobDetector_Params()
+    parameters = cv2.SimpleBlobDetector_Params()  # type: ignore[attr-defined]  # missing in the stubs of OpenCV 5
     parameters.maxArea = 1e5
-    detector = cv2.SimpleBlobDetector_create(parameters)
+    detector = cv2.SimpleBlobDetector_create(parameters)  # type: ignore[attr-defined]  # missing in the stubs of OpenCV 5
     pixels, found = views.pixels.clone(), torch.zeros(len(views.view), dtype=torch.bool)
     wider = 0.5 + 0.5 * target.radii[views.point, 0] / target.radii[views.point, 1]
     for k, frame in enumerate(frames):
@@ -176,7 +175,7 @@ def blob_views(views: Views, frames: Tensor, target: tp.Target, holes: Tensor) -
         if len(points):
             nearest, at = torch.cdist(views.pixels[mine], points).min(1)
             pixels[mine], found[mine] = points[at], nearest < 5
-    return replace(views, pixels=pixels).of_points(found)
+    return replace(views, pixels=pixels)[found]
 
 
 def one_set(

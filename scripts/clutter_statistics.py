@@ -20,7 +20,7 @@ import argparse
 import math
 import sys
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -32,7 +32,7 @@ import torchpose as tp
 from torchpose.analysis import pose_errors
 from torchpose.geometry import conics, rotations
 from torchpose.sim import add_noise, render, shapes
-from torchpose.sim.shapes import Shapes
+from torchpose.sim.shapes import Circles, Shapes, Sides
 
 F64 = torch.float64
 WIDTH, HEIGHT, FOCAL = 1824, 1216, 1111.11
@@ -89,7 +89,8 @@ def scene(number: int, seed: int, camera: tp.Camera, choice: list[tp.Target], mo
     noise = float(rng.uniform(0.5, max(0.8, min(6.0, light * depth * dimmest / 12))))
     dark = light * (1 - depth)
     levels = (dark, light)
-    plate, surround = None, 0.5 * light
+    plate: tuple[float, float] | None = None
+    surround: float | Tensor = 0.5 * light
     extent = 2.2 * float(target.centers[:, :2].abs().max() + target.radii.max())
     if rng.random() < 0.2:
         plate, surround = (extent, extent), _picture(rng) * (light / 250)
@@ -177,46 +178,43 @@ def _shape(
     kind, turn, scale = rng.integers(10), rng.uniform(0, 2 * math.pi), size * rng.uniform(0.4, 1.0)
     dark, light = levels
     level = float(rng.uniform(0.8 * dark, light)) if rng.random() < 0.5 else float(rng.choice(levels))
-    way = np.array([math.cos(turn), math.sin(turn)])
+    way, place = np.array([math.cos(turn), math.sin(turn)]), at.tolist()
     if kind == 0:
-        return shapes.rectangle(at, 1.5 * scale, scale, turn, level)
+        return shapes.rectangle(place, 1.5 * scale, scale, turn, level)
     if kind == 1:
-        return shapes.cross(at, 1.5 * scale, 0.4 * scale, turn, level)
+        return shapes.cross(place, 1.5 * scale, 0.4 * scale, turn, level)
     if kind == 2:
-        return shapes.ring(at, scale, 0.0, level)
+        return shapes.ring(place, scale, 0.0, level)
     if kind == 3:  # a washer
-        return shapes.ring(at, scale, rng.uniform(0.5, 0.8) * scale, level)
+        return shapes.ring(place, scale, rng.uniform(0.5, 0.8) * scale, level)
     if kind == 4:  # a ring of other proportions
         own = (target.radii[:, 1] / target.radii[:, 0]).numpy()
         ratios = np.linspace(0.15, 0.9, 76)
         return shapes.ring(
-            at, scale, float(rng.choice(ratios[abs(ratios[:, None] - own).min(1) > 0.04])) * scale, level
+            place, scale, float(rng.choice(ratios[abs(ratios[:, None] - own).min(1) > 0.04])) * scale, level
         )
     if kind == 5:  # a disc with its hole off centre
-        disc = shapes.ring(at, scale, 0.0, level)
+        disc = shapes.ring(place, scale, 0.0, level)
         inner = rng.uniform(0.2, 0.5)
-        hole = shapes.ring(at + way * scale * rng.uniform(0.15, 0.95 - inner), inner * scale, 0.0, level)
+        hole = shapes.ring((at + way * scale * rng.uniform(0.15, 0.95 - inner)).tolist(), inner * scale, 0.0, level)
         return _with_hole(disc, hole)
     if kind == 6:  # a screw head: a disc with a slot
-        slot = shapes.rectangle(at, 1.4 * scale, 0.25 * scale, turn, level)
-        return _with_hole(shapes.ring(at, scale, 0.0, level), slot)
+        slot = shapes.rectangle(place, 1.4 * scale, 0.25 * scale, turn, level)
+        return _with_hole(shapes.ring(place, scale, 0.0, level), slot)
     if kind == 7:
         sides = rng.integers(3, 9)
         angle = turn + 2 * math.pi * np.arange(sides) / sides
         return shapes.polygon([at + scale * np.stack([np.cos(angle), np.sin(angle)], 1)], level)
     if kind == 8:  # a figure as large as a marker
-        return shapes.text(str(rng.choice(["O", "0", "8", "Q", "6"])), at, 1.1 * scale, turn, level)
-    return shapes.text(str(rng.choice(WORDS)), at, 0.3 * scale, turn, level)
+        return shapes.text(str(rng.choice(["O", "0", "8", "Q", "6"])), place, 1.1 * scale, turn, level)
+    return shapes.text(str(rng.choice(WORDS)), place, 0.3 * scale, turn, level)
 
 
 def _with_hole(shape: Shapes, hole: Shapes) -> Shapes:
     """One shape with the outline of another as its hole."""
-    return Shapes(
-        shape.frame, shape.marker, shape.level, shape.center,
-        torch.cat([shape.circle_of, hole.circle_of]), torch.cat([shape.circle_center, hole.circle_center]),
-        torch.cat([shape.circle_axes, hole.circle_axes]), torch.cat([shape.circle_sign, -hole.circle_sign]),
-        torch.cat([shape.side_of, hole.side_of]), torch.cat([shape.side, hole.side.flip(1)]),
-    )  # fmt: skip
+    circles = Circles.cat([shape.circles, replace(hole.circles, sign=-hole.circles.sign)])
+    sides = Sides.cat([shape.sides, replace(hole.sides, ends=hole.sides.ends.flip(1))])
+    return replace(shape, circles=circles, sides=sides)
 
 
 def _covers(rng: np.random.Generator, target: tp.Target, levels: tuple[float, float]) -> Shapes:

@@ -14,6 +14,7 @@ import math
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -81,7 +82,7 @@ class Truth:
     t: torch.Tensor
 
 
-def run(name: str, case: Case, frames: int, seed: int) -> list[dict[str, object]]:
+def run(name: str, case: Case, frames: int, seed: int) -> list[dict[str, Any]]:
     camera = tp.Camera.load(CAMERAS / f"{case.camera}.yaml")
     made = design_target(
         camera,
@@ -120,7 +121,7 @@ def run(name: str, case: Case, frames: int, seed: int) -> list[dict[str, object]
     found = torch.cat(ok)
     error = torch.cat(errors)[found]
     predicted = deviations(predicted_covariance(camera, made.target, R[found], t[found], imaging))
-    rows: list[dict[str, object]] = []
+    rows: list[dict[str, Any]] = []
     for i, axis in enumerate(AXES):
         rows.append({
             "design": name,
@@ -139,7 +140,7 @@ def run(name: str, case: Case, frames: int, seed: int) -> list[dict[str, object]
     return rows
 
 
-def markdown(rows: list[dict[str, object]]) -> list[str]:
+def markdown(rows: list[dict[str, Any]]) -> list[str]:
     """One line a design: ratios by axis."""
     lines = [f"| design | rings | ok | {' | '.join(AXES)} | NEES |", "| --- " * (len(AXES) + 4) + "|"]
     for name in dict.fromkeys(str(row["design"]) for row in rows):
@@ -159,7 +160,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="CSV file of the rows")
     parser.add_argument("--markdown", action="store_true", help="print a table for the documentation")
     options = parser.parse_args()
-    rows: list[dict[str, object]] = []
+    rows: list[dict[str, Any]] = []
     for name in list(CASES) if "all" in options.case else options.case:
         found = run(name, CASES[name], options.frames, options.seed)
         rows += found

@@ -23,6 +23,7 @@ import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -122,7 +123,7 @@ def evaluate(scenes: Scenes, compile: bool) -> Statistics:
     )
 
 
-def summarise(name: str, runs: list[Statistics], select: list[Tensor]) -> dict[str, object]:
+def summarise(name: str, runs: list[Statistics], select: list[Tensor]) -> dict[str, Any]:
     """One row of the table, over the scenes selected in every run."""
 
     def gather(attribute: str) -> Tensor:
@@ -157,7 +158,7 @@ def summarise(name: str, runs: list[Statistics], select: list[Tensor]) -> dict[s
     }
 
 
-def table(runs: list[Statistics]) -> list[dict[str, object]]:
+def table(runs: list[Statistics]) -> list[dict[str, Any]]:
     """All scenes, then slices by tilt, noise and number of points."""
     rows = [summarise("all", runs, [torch.ones_like(run.code, dtype=torch.bool) for run in runs])]
     for low, high in ((0, 5), (5, 15), (15, 30), (30, 60), (60, 80)):
@@ -176,7 +177,7 @@ def fall(scenes: Scenes) -> Tensor:
     """(M,): decreases from the start of each second minimum to its end, over that promised by the first step."""
     count = scenes.image_points.shape[1]
     weights = scenes.sigma[:, None].pow(-2).expand(-1, count)
-    inputs = Inputs(scenes.object_points, scenes.image_points, scenes.matrix, 1.0, None, weights, None, math.inf)
+    inputs = Inputs(scenes.object_points, scenes.image_points, scenes.matrix, 1.0, None, weights, None, None)
     problem = prepare(inputs)
     poses = upright(starts(problem).double())
     normal = normal_equations(problem.observed.each(), poses)

@@ -19,7 +19,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import torch
 from scipy.stats import chi2
@@ -173,7 +173,13 @@ def covered(case: Case, camera: tp.Camera, frames: Tensor, r: Tensor, t: Tensor,
 
 def bound_of(case: Case, camera: tp.Camera, r: Tensor, t: Tensor) -> Tensor:
     variance = case.blur**2 + spread(case.psf).square().sum(-1).mean() / 2
-    options = {"psf_sigma": variance.sqrt(), "dark": DARK, "light": LIGHT, "noise_sigma": case.noise, "bits": case.bits}
+    options: dict[str, Any] = {
+        "psf_sigma": variance.sqrt(),
+        "dark": DARK,
+        "light": LIGHT,
+        "noise_sigma": case.noise,
+        "bits": case.bits,
+    }
     full = pose_crlb(camera, TARGET, r, t, **options)
     if not case.cover and not case.missing:
         return full
@@ -188,7 +194,7 @@ def without_first(target: tp.Target) -> tp.Target:
     )
 
 
-def run(name: str, case: Case, methods: list[Method], frames: int, seed: int) -> list[dict[str, object]]:
+def run(name: str, case: Case, methods: list[Method], frames: int, seed: int) -> list[dict[str, Any]]:
     g = torch.Generator().manual_seed(seed)
     camera = camera_of(case.k1)
     r, t = case.poses(frames, g)
@@ -255,7 +261,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="CSV file of the rows")
     options = parser.parse_args()
     names = list(CASES) if "all" in options.case else options.case
-    rows: list[dict[str, object]] = []
+    rows: list[dict[str, Any]] = []
     for name in names:
         for row in run(name, CASES[name], options.method, options.frames, options.seed):
             rows.append(row)

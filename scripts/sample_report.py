@@ -95,8 +95,8 @@ def main() -> int:
             fault = f"{absent[0]}: column is missing" if absent else "frame: no row"
             raise ConfigError(f"{options.truth}: {fault}; use what scripts/make_sample.py wrote")
         estimated = read_poses(options.poses, truth)
-    except ConfigError as error:
-        print(f"sample_report: error: {error}", file=sys.stderr)
+    except ConfigError as refused:
+        print(f"sample_report: error: {refused}", file=sys.stderr)
         return 2
     tilt, noise = (truth.extra[name] for name in CONDITIONS)
     bound = grouped(torch.stack([truth.extra[name] for name in BOUND], 1))

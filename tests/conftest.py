@@ -1,13 +1,13 @@
-"""Test modules import the shared witnesses (tests/exact.py) by name; property tests draw the same examples in CI."""
+"""Types and shapes are checked while the tests run; property tests draw the same examples in CI."""
 
 import os
 import signal
-import sys
-from pathlib import Path
 
 from hypothesis import settings
 
-sys.path.insert(0, str(Path(__file__).parent))
+from tests import typecheck
+
+typecheck.install()  # before anything imports the package
 
 # a red run of CI is then of the change, not of the draw; everywhere else every run draws anew
 settings.register_profile("ci", derandomize=True)

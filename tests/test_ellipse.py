@@ -20,7 +20,7 @@ from torchpose.geometry import conics
 no_deadline = settings(deadline=None)
 
 
-def random_ellipses(count, generator, least_ratio=0.2):
+def random_ellipses(count: int, generator: torch.Generator, least_ratio: float = 0.2) -> torch.Tensor:
     u = torch.rand(count, 5, generator=generator, dtype=torch.float64)
     a = 5 + 200 * u[:, 2]
     return torch.stack(
@@ -28,7 +28,9 @@ def random_ellipses(count, generator, least_ratio=0.2):
     )
 
 
-def sample(truth, points, generator, arc=2 * math.pi, noise=0.0):
+def sample(
+    truth: torch.Tensor, points: int, generator: torch.Generator, arc: float = 2 * math.pi, noise: float = 0.0
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Flat points on an arc of each ellipse, with normal noise in u and v, and their index."""
     count = truth.shape[0]
     start = 2 * math.pi * torch.rand(count, 1, generator=generator, dtype=torch.float64)
@@ -38,19 +40,19 @@ def sample(truth, points, generator, arc=2 * math.pi, noise=0.0):
     return xy, torch.arange(count).repeat_interleave(points)
 
 
-def assert_same_ellipses(actual, expected, atol, rtol=0.0):
+def assert_same_ellipses(actual: torch.Tensor, expected: torch.Tensor, atol: float, rtol: float = 0.0) -> None:
     """Compares centre and shape matrix, which are smooth where theta is not."""
     torch.testing.assert_close(actual[:, :2], expected[:, :2], rtol=rtol, atol=atol)
     torch.testing.assert_close(conics.shape_matrix(actual), conics.shape_matrix(expected), rtol=rtol, atol=atol)
 
 
 @pytest.fixture
-def generator():
+def generator() -> torch.Generator:
     return torch.Generator().manual_seed(7)
 
 
 @pytest.mark.parametrize(("arc", "atol"), [(2 * math.pi, 1e-9), (math.pi, 1e-8), (math.pi / 2, 1e-5)])
-def test_exact_points(generator, arc, atol):
+def test_exact_points(generator: torch.Generator, arc: float, atol: float) -> None:
     truth = random_ellipses(500, generator)
     xy, index = sample(truth, 60, generator, arc)
     order = torch.randperm(index.numel(), generator=generator)
@@ -61,7 +63,7 @@ def test_exact_points(generator, arc, atol):
 
 
 @pytest.mark.parametrize("arc", [2 * math.pi, math.pi, 2.0])
-def test_equals_halir_flusser(generator, arc):
+def test_equals_halir_flusser(generator: torch.Generator, arc: float) -> None:
     """The textbook algorithm in NumPy: normalised points, eigenvectors of C^-1 (S1 - S2 S3^-1 S2^T)."""
     truth = random_ellipses(60, generator)
     xy, index = sample(truth, 80, generator, arc, noise=0.3)
@@ -82,7 +84,7 @@ def test_equals_halir_flusser(generator, arc):
 
 
 @pytest.mark.parametrize("arc", [2 * math.pi, math.pi])
-def test_equals_opencv_direct(generator, arc):
+def test_equals_opencv_direct(generator: torch.Generator, arc: float) -> None:
     truth = random_ellipses(100, generator, least_ratio=0.4)
     # OpenCV takes float32 points: near the origin they lose nothing that matters here
     truth[:, :2] = 0
@@ -94,7 +96,7 @@ def test_equals_opencv_direct(generator, arc):
         assert_same_ellipses(found[k, None], expected, atol=5e-3)
 
 
-def test_equals_scikit_image(generator):
+def test_equals_scikit_image(generator: torch.Generator) -> None:
     truth = random_ellipses(25, generator)
     xy, index = sample(truth, 60, generator, noise=0.1)
     found = ellipse.fit(xy, index, 25)
@@ -113,7 +115,7 @@ def test_equals_scikit_image(generator):
     st.floats(0, 2 * math.pi),
     st.floats(0.05, 50),
 )
-def test_equivariance(seed, du, dv, angle, scale):
+def test_equivariance(seed: int, du: float, dv: float, angle: float, scale: float) -> None:
     generator = torch.Generator().manual_seed(seed)
     truth = random_ellipses(3, generator)
     xy, index = sample(truth, 40, generator, arc=5.0, noise=0.3)
@@ -127,7 +129,7 @@ def test_equivariance(seed, du, dv, angle, scale):
     torch.testing.assert_close(conics.shape_matrix(moved), shape, rtol=0, atol=tolerance)
 
 
-def test_float32_raw_pixels(generator):
+def test_float32_raw_pixels(generator: torch.Generator) -> None:
     truth = random_ellipses(50, generator)
     truth[:, :2] += torch.tensor([4000.0, 3000.0])
     xy, index = sample(truth, 100, generator)
@@ -148,7 +150,7 @@ DEGENERATE = {
 
 
 @pytest.mark.parametrize("name", DEGENERATE)
-def test_degenerate_points_are_nan_and_leave_the_neighbours_alone(generator, name):
+def test_degenerate_points_are_nan_and_leave_the_neighbours_alone(generator: torch.Generator, name: str) -> None:
     truth = random_ellipses(2, generator)
     xy, index = sample(truth, 30, generator, noise=0.1)
     bad = DEGENERATE[name].double()
@@ -161,7 +163,7 @@ def test_degenerate_points_are_nan_and_leave_the_neighbours_alone(generator, nam
     assert measured.covariance[[0, 2]].isfinite().all()
 
 
-def test_no_ellipses():
+def test_no_ellipses() -> None:
     nothing, index = torch.zeros(0, 2), torch.zeros(0, dtype=torch.int64)
     params = ellipse.fit(nothing, index, 0)
     assert params.shape == (0, 5)
@@ -170,7 +172,7 @@ def test_no_ellipses():
     assert ellipse.with_covariance(nothing, index, params).covariance.shape == (0, 5, 5)
 
 
-def test_weights_repeat_points(generator):
+def test_weights_repeat_points(generator: torch.Generator) -> None:
     truth = random_ellipses(4, generator)
     xy, index = sample(truth, 30, generator, noise=0.5)
     weights = torch.randint(0, 4, index.shape, generator=generator)
@@ -181,20 +183,20 @@ def test_weights_repeat_points(generator):
     assert_same_ellipses(ellipse.fit(xy, index, 4, weights), expected, atol=1e-8)
 
 
-def test_gradient(generator):
+def test_gradient(generator: torch.Generator) -> None:
     truth = torch.tensor([[10.0, 20, 9, 6, 0.5], [-5, 3, 12, 4, 2.0]], dtype=torch.float64)
     xy, index = sample(truth, 12, generator, noise=0.2)
     assert torch.autograd.gradcheck(lambda p: ellipse.fit(p, index, 2), xy.requires_grad_())
 
 
-def test_distance_of_circles(generator):
+def test_distance_of_circles(generator: torch.Generator) -> None:
     circle = torch.tensor([[3.0, 4, 10, 10, 0.0]], dtype=torch.float64)
     xy = 30 * torch.randn(50, 2, generator=generator, dtype=torch.float64)
     expected = (xy - circle[0, :2]).norm(dim=-1) - 10
     torch.testing.assert_close(ellipse.distance(xy, torch.zeros(50, dtype=torch.int64), circle), expected)
 
 
-def test_distance_near_ellipses(generator):
+def test_distance_near_ellipses(generator: torch.Generator) -> None:
     truth = random_ellipses(200, generator, least_ratio=0.3)
     xy, index = sample(truth, 1, generator)
     s = conics.shape_matrix(truth)
@@ -207,7 +209,7 @@ def test_distance_near_ellipses(generator):
     assert (error < bound + 1e-12).all()
 
 
-def test_curvature(generator):
+def test_curvature(generator: torch.Generator) -> None:
     """Against the parametric formula a b / (a^2 sin^2 + b^2 cos^2)^(3/2), also from points off the ellipse."""
     truth = random_ellipses(100, generator, least_ratio=0.3)
     angle = 2 * math.pi * torch.rand(100, generator=generator, dtype=torch.float64)
@@ -220,7 +222,7 @@ def test_curvature(generator):
     torch.testing.assert_close(ellipse.curvature(away, index, truth), expected)
 
 
-def test_robust_fit(generator):
+def test_robust_fit(generator: torch.Generator) -> None:
     """35 % of the points elsewhere: a covering straight edge, or a neighbouring concentric ring."""
     truth = random_ellipses(60, generator, least_ratio=0.4)
     truth[:, 2:4] += 20
@@ -240,7 +242,7 @@ def test_robust_fit(generator):
     assert_same_ellipses(found, clean, atol=0.02)
 
 
-def test_robust_fit_of_clean_points_is_the_plain_fit(generator):
+def test_robust_fit_of_clean_points_is_the_plain_fit(generator: torch.Generator) -> None:
     truth = random_ellipses(20, generator)
     xy, index = sample(truth, 100, generator, noise=0.03)
     found, keep = ellipse.fit_robust(xy, index, 20, start=truth + 0.5)
@@ -252,7 +254,7 @@ def test_robust_fit_of_clean_points_is_the_plain_fit(generator):
 @pytest.mark.parametrize(
     ("shape", "arc"), [((60.0, 60.0, 0.0), 2 * math.pi), ((60.0, 25.0, 0.7), 2 * math.pi), ((80.0, 60.0, 2.5), 4.5)]
 )
-def test_covariance_against_monte_carlo(shape, arc):
+def test_covariance_against_monte_carlo(shape: tuple[float, float, float], arc: float) -> None:
     generator = torch.Generator().manual_seed(11)
     trials, points = 3000, 150
     truth = torch.tensor([200.0, 150.0, *shape], dtype=torch.float64).expand(trials, 5)
@@ -275,7 +277,7 @@ def test_covariance_against_monte_carlo(shape, arc):
     torch.testing.assert_close(fitted.points, torch.full((trials,), float(points), dtype=torch.float64))
 
 
-def _turned(covariance, angle):
+def _turned(covariance: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
     """Covariances of (c, e11, e12, e22) with E turned from axes at ``angle`` to axes at 0: E' = T E T^T."""
     c, s = angle.cos(), angle.sin()
     zero, one = torch.zeros_like(c), torch.ones_like(c)
@@ -290,14 +292,14 @@ def _turned(covariance, angle):
     return m @ covariance @ m.mT
 
 
-def test_correlation_scales_the_covariance(generator):
+def test_correlation_scales_the_covariance(generator: torch.Generator) -> None:
     xy, index = sample(random_ellipses(3, generator), 50, generator, noise=0.1)
     params = ellipse.fit(xy, index, 3)
     one, two = (ellipse.with_covariance(xy, index, params, correlation=c).covariance for c in (1.0, 2.0))
     torch.testing.assert_close(two, 2 * one)
 
 
-def test_batch_invariance(generator):
+def test_batch_invariance(generator: torch.Generator) -> None:
     truth = random_ellipses(5, generator)
     xy, index = sample(truth, 40, generator, noise=0.2)
     together = ellipse.fit(xy, index, 5)
@@ -306,7 +308,7 @@ def test_batch_invariance(generator):
         torch.testing.assert_close(alone[0], together[k], rtol=1e-12, atol=0)
 
 
-def test_taubin_on_arcs(generator):
+def test_taubin_on_arcs(generator: torch.Generator) -> None:
     """Bias of the major axis on short arcs: the direct fit shrinks, Taubin's hardly."""
     trials, arc, noise = 600, math.pi / 2, 0.1
     truth = torch.tensor([50.0, 40, 60, 50, 0.3], dtype=torch.float64).expand(trials, 5)
@@ -319,7 +321,7 @@ def test_taubin_on_arcs(generator):
     assert abs(truth[0, 2] - better[2]) < 0.3
 
 
-def test_taubin_on_whole_ellipses(generator):
+def test_taubin_on_whole_ellipses(generator: torch.Generator) -> None:
     truth = random_ellipses(50, generator, least_ratio=0.4)
     xy, index = sample(truth, 200, generator)
     assert_same_ellipses(ellipse.fit(xy, index, 50, method="taubin"), truth, atol=1e-8)
@@ -328,7 +330,7 @@ def test_taubin_on_whole_ellipses(generator):
     assert_same_ellipses(both[1], both[0], atol=0.01)
 
 
-def test_taubin_is_the_generalised_eigenvector(generator):
+def test_taubin_is_the_generalised_eigenvector(generator: torch.Generator) -> None:
     """Against scipy on the raw coordinates: scatter of (x^2, xy, y^2, x, y, 1) against that of its gradients."""
     truth = torch.tensor([[3.0, -2, 9, 5, 0.7]], dtype=torch.float64)
     xy, index = sample(truth, 60, generator, arc=3.0, noise=0.1)
@@ -345,7 +347,7 @@ def test_taubin_is_the_generalised_eigenvector(generator):
 
 
 @pytest.mark.parametrize("method", ["halir-flusser", "taubin"])
-def test_every_layout_gives_the_same_fit(generator, method):
+def test_every_layout_gives_the_same_fit(generator: torch.Generator, method: ellipse.Method) -> None:
     """Equal counts, unequal counts, unsorted points, blocks."""
     truth = random_ellipses(9, generator, least_ratio=0.4)
     xy, index = sample(truth, 40, generator, noise=0.1)

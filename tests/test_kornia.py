@@ -93,7 +93,7 @@ def poses_of(count: int) -> tuple[Tensor, Tensor]:
 
 def test_pinhole_projects_as_ours_from_target_to_pixels() -> None:
     """Integer pixel centres, extrinsics that map target to camera, pixels as x, y: kornia's conventions are ours."""
-    camera = tp.Camera(1824, 1216, [[1100.0, 0, 911.5], [0, 1110, 600], [0, 0, 1]], [])  # type: ignore[arg-type]
+    camera = tp.Camera(1824, 1216, [[1100.0, 0, 911.5], [0, 1110, 600], [0, 0, 1]], [])
     R, t = poses_of(5)
     points = torch.tensor([[-20.0, -20, 0], [20, -20, 1], [20, 20, 0]], dtype=F64)
     theirs = camera.pinhole(R, t)
@@ -127,7 +127,7 @@ def test_se3_is_the_pose(plain: tp.Poses) -> None:
 def test_undistortion_of_kornia_stops_short_where_ours_does_not() -> None:
     """Why `Camera.undistort_points` stays: kornia's fixed-point iteration leaves pixels at the corners."""
     camera = tp.Camera.load(SAMPLE / "camera.yaml")
-    strong = tp.Camera(camera.width, camera.height, camera.matrix, [-0.3, 0.12, 1e-3, -2e-3])  # type: ignore[arg-type]
+    strong = tp.Camera(camera.width, camera.height, camera.matrix, [-0.3, 0.12, 1e-3, -2e-3])
     corner = torch.tensor([[0.0, 0.0], [1823, 1215], [900, 600]], dtype=F64)
     undistort = kornia.geometry.calibration.undistort_points
     theirs = undistort(corner[None], strong.matrix[None], strong.distortion[None], torch.eye(3, dtype=F64)[None])[0]

@@ -8,10 +8,10 @@ import pickle
 
 import pytest
 import torch
-from exact import F64, pinhole, random_poses
 from torch import Tensor
 
 import torchpose as tp
+from tests.exact import F64, pinhole, random_poses
 from torchpose.pipeline import Method
 from torchpose.refine import METHODS
 from torchpose.sim import add_noise, render
@@ -74,7 +74,7 @@ def test_no_frame_is_no_row(method: Method) -> None:
 
 def test_frames_without_rings_cost_little() -> None:
     """Nothing is solved or refined where nothing was identified."""
-    from test_pipeline import OpCount
+    from tests.test_pipeline import OpCount
 
     estimator = tp.PoseEstimator(CAMERA, QUAD)
     counts = {}

@@ -5,15 +5,16 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import pytest
 import torch
-from exact import F64, pinhole, random_poses
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import torchpose as tp
+from tests.exact import F64, pinhole, random_poses
 from torchpose.geometry import rotations
 from torchpose.io.truth import read_truth
 from torchpose.sim import add_noise, render
@@ -66,7 +67,7 @@ class OpCount(TorchDispatchMode):
     """Counts dispatched tensor operations."""
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__()  # type: ignore[no-untyped-call]  # of torch
         self.count = 0
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):  # type: ignore[no-untyped-def]
@@ -246,7 +247,7 @@ def test_detections_in_raw_pixels(sample: tuple[tp.PoseEstimator, Tensor], poses
 
 
 @pytest.mark.parametrize("method", ["photometric", "edges"])
-def test_refined_poses_follow_the_intrinsics_as_predicted(method: str) -> None:
+def test_refined_poses_follow_the_intrinsics_as_predicted(method: Literal["photometric", "edges"]) -> None:
     """The gain of uncertain intrinsics, column by column: the whole chain again with fx, fy, cx or cy changed."""
     camera, target = tp.Camera.load(SAMPLE / "camera.yaml"), QUAD
     r = rotations.exp(torch.tensor([[0.4, 0.3, 0.5], [0.6, -0.1, 1.0]], dtype=F64))

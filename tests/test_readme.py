@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer
@@ -15,7 +16,7 @@ from torchpose.cli.main import app
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def blocks(language: str) -> list[str]:
@@ -23,7 +24,7 @@ def blocks(language: str) -> list[str]:
     return [re.sub(rf"^{indent}", "", body, flags=re.MULTILINE) for indent, body in found]
 
 
-def test_python_runs():
+def test_python_runs() -> None:
     (code,) = blocks("python")
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -31,46 +32,52 @@ def test_python_runs():
 
 
 @pytest.fixture
-def files(tmp_path):
+def files(tmp_path: Path) -> Path:
     for body in blocks("yaml"):
         (tmp_path / body.split()[1]).write_text(body, encoding="utf-8")
     return tmp_path
 
 
-def test_files_load(files):
+def test_files_load(files: Path) -> None:
     camera = tp.Camera.load(files / "camera.yaml")
     assert (camera.width, camera.height) == (1824, 1216)
     assert camera.distortion.tolist() == [-0.08, 0.02, 0.0002, -0.00015]
     target = tp.Target.load(files / "target.yaml")
     assert (target.name, target.ids.tolist()) == ("plate", [0, 1, 2, 3])
+    assert target.part_translation is not None
     assert target.part_translation.tolist() == [0, 0, 4.2]
     assert tp.HandEye.load(files / "handeye.yaml").mount == "base"
 
 
-def test_built_in_targets_are_all_named():
+def test_built_in_targets_are_all_named() -> None:
     for path in (ROOT / "torchpose" / "targets").glob("*.yaml"):
         assert f"`{path.stem}`" in README
 
 
-def test_options_exist():
-    estimate = typer.main.get_command(app).commands["estimate"]
+def commands() -> dict[str, Any]:
+    group: Any = typer.main.get_command(app)
+    return dict(group.commands)
+
+
+def test_options_exist() -> None:
+    estimate = commands()["estimate"]
     options = {name for parameter in estimate.params for name in parameter.opts}
     section = README[README.index("## Your own images") : README.index("### Other commands")]
     named = set(re.findall(r"(?<![\w-])--[a-z-]+", section)) - {"--help"}
     assert {"--camera", "--resume", "--hand-eye"} <= named <= options
 
 
-def test_other_commands_exist_with_their_options():
-    commands = typer.main.get_command(app).commands
+def test_other_commands_exist_with_their_options() -> None:
+    found = commands()
     section = README[README.index("### Other commands") : README.index("### How a pose")]
     lines = re.findall(r"`torchpose (\w+)([^`]*)`", section)
-    assert {name for name, _ in lines} == set(commands) - {"estimate"}
+    assert {name for name, _ in lines} == set(found) - {"estimate"}
     for name, usage in lines:
-        options = {option for parameter in commands[name].params for option in parameter.opts}
+        options = {option for parameter in found[name].params for option in parameter.opts}
         assert set(re.findall(r"--[a-z-]+", usage)) <= options
 
 
-def test_statuses_and_reasons_are_all_explained():
+def test_statuses_and_reasons_are_all_explained() -> None:
     table = README[README.index("### How a pose") : README.index("## Library")]
     assert set(re.findall(r"`(\w+)`", table)) >= {status.name.lower() for status in tp.Status}
     reasons = {reason.name.lower() for reason in tp.Reason} - {"none", "two_solutions"}  # the latter is `ambiguous`
@@ -78,12 +85,12 @@ def test_statuses_and_reasons_are_all_explained():
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_links_lead_somewhere(page):
+def test_links_lead_somewhere(page: Path) -> None:
     for link in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text(encoding="utf-8")):
         assert "://" in link or (page.parent / link).exists(), link
 
 
-def test_layout_names_every_part():
+def test_layout_names_every_part() -> None:
     layout = README[README.index("## Layout") : README.index("Imports point one way")]
     parts = [path for path in (ROOT / "torchpose").iterdir() if not path.name.startswith("_")]
     stages = {f"{path.name}/" for path in parts if (path / "__init__.py").exists()}

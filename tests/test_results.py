@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields
+from typing import Any
 
 import pytest
 import torch
@@ -11,10 +13,10 @@ from torchpose.geometry import rotations
 from torchpose.results import Detections, Poses, Status
 
 
-def detections(count=3):
+def detections(count: int = 3) -> Detections:
     generator = torch.Generator().manual_seed(3)
 
-    def floats(*shape):
+    def floats(*shape: int) -> torch.Tensor:
         return torch.randn(count, *shape, generator=generator, dtype=torch.float64)
 
     index = torch.arange(count)
@@ -22,10 +24,10 @@ def detections(count=3):
 
 
 @pytest.fixture
-def poses():
+def poses() -> Poses:
     generator = torch.Generator().manual_seed(8)
 
-    def floats(*shape):
+    def floats(*shape: int) -> torch.Tensor:
         return torch.randn(4, *shape, generator=generator, dtype=torch.float64)
 
     root = floats(6, 6)
@@ -55,7 +57,7 @@ def poses():
 TRANSFORM = rotations.exp(torch.tensor([0.3, -1.1, 0.4]).double()), torch.tensor([5.0, -20, 70]).double()
 
 
-def numeric_covariance(poses, change):
+def numeric_covariance(poses: Poses, change: Callable[..., Any]) -> torch.Tensor:
     """Covariance of the changed pose from central differences of the left-multiplied state (t, w)."""
     step, columns = 1e-6, []
     base = change(poses)
@@ -72,7 +74,7 @@ def numeric_covariance(poses, change):
     return jacobian @ poses.covariance @ jacobian.mT
 
 
-def test_moved(poses):
+def test_moved(poses: Poses) -> None:
     r, t = TRANSFORM
     x_target = torch.randn(3, dtype=torch.float64)
     x_part = r @ x_target + t
@@ -85,7 +87,7 @@ def test_moved(poses):
 
 
 @pytest.mark.parametrize("batched", [False, True])
-def test_seen_from(poses, batched):
+def test_seen_from(poses: Poses, batched: bool) -> None:
     r, t = TRANSFORM
     if batched:
         r, t = r.expand(4, 3, 3), t.expand(4, 3)
@@ -97,14 +99,14 @@ def test_seen_from(poses, batched):
     torch.testing.assert_close(seen.covariance[:3], expected, rtol=1e-6, atol=1e-6)
 
 
-def test_moving_back(poses):
+def test_moving_back(poses: Poses) -> None:
     r, t = TRANSFORM
     back = poses.moved(r, t).moved(*rotations.inverse(r, t))
     for name in ("R", "t", "covariance", "R_alt", "t_alt"):
         torch.testing.assert_close(getattr(back, name), getattr(poses, name), equal_nan=True, rtol=1e-9, atol=1e-9)
 
 
-def test_columns(poses):
+def test_columns(poses: Poses) -> None:
     assert len(poses) == 4
     assert poses.ok.tolist() == [True, False, True, False]
     torch.testing.assert_close(rotations.exp(poses.rotation_vector[:3]), poses.R[:3])
@@ -113,7 +115,7 @@ def test_columns(poses):
     assert poses.std[3].isnan().all()
 
 
-def test_selection_keeps_the_detections(poses):
+def test_selection_keeps_the_detections(poses: Poses) -> None:
     picked = poses[poses.ok]
     assert picked.frame.tolist() == [0, 2]
     assert torch.equal(picked.t, poses.t[[0, 2]])
@@ -123,7 +125,7 @@ def test_selection_keeps_the_detections(poses):
 
 
 @pytest.mark.parametrize("target", [torch.float32, "meta"])
-def test_to_reaches_everything(poses, target):
+def test_to_reaches_everything(poses: Poses, target: str | torch.dtype) -> None:
     moved = poses.to(target)
     for bundle, original in ((moved, poses), (moved.detections, poses.detections)):
         for f in fields(bundle):

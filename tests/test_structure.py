@@ -1,6 +1,8 @@
 """The house: what may import what, and how large a function may grow."""
 
 import ast
+from ast import Module
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -32,7 +34,7 @@ MODULES = sorted(ROOT.rglob("*.py"))
 LOOSE = 8  # files beside __init__.py
 
 
-def imported(tree):
+def imported(tree: Module) -> Iterator[tuple[str, int]]:
     """Rooms of the package that a module imports, with their lines."""
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "torchpose":
@@ -44,7 +46,7 @@ def imported(tree):
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_imports_follow_the_flow(path):
+def test_imports_follow_the_flow(path: Path) -> None:
     room = path.relative_to(ROOT).parts[0].removesuffix(".py")
     if room == "__init__":
         return  # hands on the public names of all rooms
@@ -53,10 +55,10 @@ def test_imports_follow_the_flow(path):
             assert LEVEL[other] < LEVEL[room], f"line {line}: {room} imports {other}"
 
 
-def test_every_room_has_its_place():
+def test_every_room_has_its_place() -> None:
     found = {path.stem for path in ROOT.glob("*.py")} | {path.parent.name for path in ROOT.glob("*/__init__.py")}
     assert found - {"__init__"} == set(LEVEL)
 
 
-def test_few_loose_files():
+def test_few_loose_files() -> None:
     assert len([path for path in ROOT.glob("*.py") if path.name != "__init__.py"]) <= LOOSE

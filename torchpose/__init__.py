@@ -29,7 +29,7 @@ __all__ = [
     "ellipse",
     "pnp",
 ]
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 
 _HOME = {
     "Camera": "camera",

@@ -44,9 +44,8 @@ class _Loader(yaml.SafeLoader):
             return self.construct_mapping(node, deep=True)
         if isinstance(node, yaml.SequenceNode):
             return self.construct_sequence(node, deep=True)
-        return self.construct_object(
-            yaml.ScalarNode(self.resolve(yaml.ScalarNode, node.value, (True, False)), node.value)
-        )
+        tag = self.resolve(yaml.ScalarNode, node.value, (True, False))  # type: ignore[no-untyped-call]  # of yaml
+        return self.construct_object(yaml.ScalarNode(tag, node.value))
 
 
 _Loader.add_multi_constructor("", _Loader.construct_untagged)

@@ -11,9 +11,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
+from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
 from torchpose.geometry import conics
+from torchpose.geometry.least_squares import geman_mcclure
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import Tiles
 
@@ -23,6 +25,11 @@ _MOST_PADDING = 4  # places a point: beyond, points are summed one by one
 _FLAT = 1e-12  # squared ratio of the extents of a point set across and along, below which it is a line
 
 Method = Literal["halir-flusser", "taubin"]
+Points = Real[Tensor, "E 2"]
+Index = Int[Tensor, " E"]
+Weights = Real[Tensor, " E"] | None
+Ellipses = Float[Tensor, "M 5"]
+Vector = tuple[Tensor, Tensor, Tensor]
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,29 +37,29 @@ class EllipseFit(Rows):
     """Fitted ellipses with their uncertainty.
 
     Attributes:
-        params: (M, 5) float64, cx, cy, a, b (px), theta (rad); NaN where the points define no ellipse.
-        covariance: (M, 5, 5), of (cx, cy, e11, e12, e22): the centre, and the symmetric change E of the shape matrix
-            diag(a, b) in the ellipse's own axes. var(a) = var(e11), var(b) = var(e22), var(theta) =
-            var(e12) / (a - b)^2. Unlike theta, e12 stays defined for a circle.
-        sigma: (M,), RMS distance of the points (weighted), px.
-        points: (M,), sum of the weights: number of points that count.
+        params: cx, cy, a, b (px), theta (rad); NaN where the points define no ellipse.
+        covariance: of (cx, cy, e11, e12, e22): the centre, and the symmetric change E of the shape matrix diag(a, b) in
+            the ellipse's own axes. var(a) = var(e11), var(b) = var(e22), var(theta) = var(e12) / (a - b)^2. Unlike
+            theta, e12 stays defined for a circle.
+        sigma: RMS distance of the points (weighted), px.
+        points: sum of the weights: number of points that count.
     """
 
-    params: Tensor
-    covariance: Tensor
-    sigma: Tensor
-    points: Tensor
+    params: Float[Tensor, "M 5"]
+    covariance: Float[Tensor, "M 5 5"]
+    sigma: Float[Tensor, " M"]
+    points: Float[Tensor, " M"]
 
     @property
-    def center_covariance(self) -> Tensor:
-        """(M, 2, 2) covariance of the centre, px^2."""
+    def center_covariance(self) -> Float[Tensor, "M 2 2"]:
+        """Covariance of the centre, px^2."""
         return self.covariance[:, :2, :2]
 
 
 def fit(
-    points: Tensor, index: Tensor, count: int, weights: Tensor | None = None, *, method: Method = "halir-flusser"
-) -> Tensor:
-    """Direct least-squares ellipses.
+    points: Points, index: Index, count: int, weights: Weights = None, *, method: Method = "halir-flusser"
+) -> Ellipses:
+    """Direct least-squares ellipses in float64.
 
     "halir-flusser" minimises the weighted sum of squared algebraic distances subject to 4AC - B^2 = 1 (Fitzgibbon 1999
     in the stable form of Halir and Flusser 1998): always an ellipse, but too small on short noisy arcs. "taubin" takes
@@ -61,12 +68,15 @@ def fit(
     follow each other, but are fitted faster where the index is sorted.
 
     Args:
-        points: (E, 2) px, any float dtype; computed in float64. index: (E,) int64, ellipse of each point.
-        count: number M of ellipses. weights: (E,) not negative, or None; points of weight 0 may be NaN.
+        points: px; those of weight 0 may be NaN.
+        index: ellipse of each point.
+        count: number of ellipses.
+        weights: not negative; 1 by default.
+        method: see above.
 
     Returns:
-        (M, 5) float64; rows with fewer than 6 points of weight above 0, whose points lie on a line, or with a NaN among
-        them are NaN.
+        NaN for ellipses with fewer than 6 points of weight above 0, whose points lie on a line, or with a NaN among
+        them.
     """
     if count == 0:
         return torch.zeros(0, 5, dtype=torch.float64, device=points.device)
@@ -74,7 +84,7 @@ def fit(
         blocks = points.view(count, -1, 2).split(max(1, _CHUNK * count // index.numel()))
         parts = [_moments(block) for block in blocks]
     elif count * int(torch.bincount(index).max() if index.numel() else 0) > _MOST_PADDING * index.numel():
-        return _from_moments(*_flat_moments(points, index, count, weights), method=method)
+        parts = [_tile_moments(*_tiled(points, index, count, weights))]
     else:
         parts = [_moments(block, weight) for block, weight in _padded(points, index, count, weights)]
     return _from_moments(*(torch.cat(part) for part in zip(*parts, strict=True)), method=method)
@@ -95,20 +105,21 @@ def _padded(points: Tensor, index: Tensor, count: int, weights: Tensor | None) -
     sizes = torch.bincount(index, minlength=count)
     ends = sizes.cumsum(0)
     slot = torch.arange(index.numel(), device=index.device) - (ends - sizes)[index]
-    for a in range(0, count, step := max(1, _CHUNK * count // max(1, index.numel()))):
-        b = min(a + step, count)
-        first, last = int(ends[a] - sizes[a]), int(ends[b - 1])
-        at = (index[first:last] - a, slot[first:last])
-        width = int(sizes[a:b].max())
-        block = torch.zeros(b - a, width, 2, dtype=torch.float64, device=points.device)
-        weight = torch.zeros(b - a, width, dtype=torch.float64, device=points.device)
+    for low in range(0, count, step := max(1, _CHUNK * count // max(1, index.numel()))):
+        some = sizes[low : low + step]
+        first, last = int(ends[low] - sizes[low]), int(ends[low : low + step][-1])
+        at = (index[first:last] - low, slot[first:last])
+        weight = torch.zeros(len(some), int(some.max()), dtype=torch.float64, device=points.device)
+        block = weight.new_zeros(*weight.shape, 2)
         block[at] = points[first:last].double()
         weight[at] = 1.0 if weights is None else weights[first:last].double()
         yield block, weight
 
 
-def fit_blocks(points: Tensor, weights: Tensor | None = None, *, method: Method = "halir-flusser") -> Tensor:
-    """As `fit`, of ellipses with the same number of points: (M, P, 2), weights (M, P), result (M, 5).
+def fit_blocks(
+    points: Float[Tensor, "M P 2"], weights: Real[Tensor, "M P"] | None = None, *, method: Method = "halir-flusser"
+) -> Ellipses:
+    """As `fit`, of ellipses with the same number of points.
 
     Free of data-dependent control flow: ``torch.compile(fit_blocks)`` fuses it, at half the cost or less.
     """
@@ -136,22 +147,22 @@ def _moments(points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Ten
     return center, sums(xy, center[..., None], w) / total, enough
 
 
-def _flat_moments(points: Tensor, index: Tensor, count: int, weights: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """As `_moments`, for ellipses whose numbers of points differ too much for one block: summed by tiles of points."""
-    w = torch.ones_like(index, dtype=torch.float64) if weights is None else weights.double()
+def _tiled(points: Tensor, index: Tensor, count: int, weights: Tensor | None = None) -> tuple[Tiles, Tensor, Tensor]:
+    """Points (K, 2, T) and their weights (K, 1, T) laid out in tiles."""
     tiles = Tiles.of(index, count)
-    xy, w = tiles.planes(*points.double().unbind(-1), w).split([2, 1], 1)
-    return _tile_moments(tiles, xy, w)
+    weights = torch.ones_like(index, dtype=torch.float64) if weights is None else weights.double()
+    xy, w = tiles.planes(*points.double().unbind(-1), weights).split([2, 1], 1)
+    return tiles, xy, w
 
 
-def _tile_moments(tiles: Tiles, xy: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The same of points (K, 2, T) and weights (K, 1, T) laid out in tiles."""
-    counts = w > 0
+def _tile_moments(tiles: Tiles, xy: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """As `_moments`, for ellipses whose numbers of points differ too much for one block."""
+    counts = weights > 0
     xy = torch.where(counts, xy, 0.0)
-    total, used = tiles.sums(w.sum(-1)), tiles.sums(counts.sum(-1))
-    center = tiles.sums((xy * w).sum(-1)) / total
+    total, used = tiles.sums(weights.sum(-1)), tiles.sums(counts.sum(-1))
+    center = tiles.sums((xy * weights).sum(-1)) / total
     sums = _fused_sums if xy.requires_grad else _gram_sums
-    moments = tiles.sums(sums(xy, center[tiles.group][..., None], w)) / total
+    moments = tiles.sums(sums(xy, center[tiles.group][..., None], weights)) / total
     return center, moments, used.squeeze(-1) >= _SOLVABLE_POINTS
 
 
@@ -180,7 +191,7 @@ def _from_moments(center: Tensor, moments: Tensor, enough: Tensor, *, method: Me
     square = (rows[0] + rows[2]).reciprocal()
     scale = square.rsqrt()
     scaled = torch.cat([rows[:3] * square, rows[3:7] * (square / scale), rows[7:] * square.square()]).unbind(0)
-    conic = _taubin(*scaled) if method == "taubin" else _halir_flusser(*scaled)
+    conic = (_taubin if method == "taubin" else _halir_flusser)(scaled)
     ellipse = conics.ellipse_from_conic(conic)
     one = torch.ones_like(scale)
     ellipse = ellipse * torch.stack([scale, scale, scale, scale, one], -1) + torch.nn.functional.pad(center, (0, 3))
@@ -188,24 +199,20 @@ def _from_moments(center: Tensor, moments: Tensor, enough: Tensor, *, method: Me
     return torch.where((enough & (m20 * m02 - m11 * m11 > _FLAT))[:, None], ellipse, torch.nan)
 
 
-def _halir_flusser(
-    m20: Tensor, m11: Tensor, m02: Tensor, m30: Tensor, m21: Tensor, m12: Tensor, m03: Tensor,
-    m40: Tensor, m31: Tensor, m22: Tensor, m13: Tensor, m04: Tensor,
-) -> Tensor:  # fmt: skip
-    """Conics (M, 6) of central moments; the 3x3 eigenproblem in closed form."""
+def _halir_flusser(moments: tuple[Tensor, ...]) -> Tensor:
+    """Conics (M, 6) of central moments, as `_moments` orders them; the 3x3 eigenproblem in closed form."""
+    m20, m11, m02, m30, m21, m12, m03, m40, m31, m22, m13, m04 = moments
     # scatter matrix of (x^2, xy, y^2) after eliminating the linear part (x, y, 1)
     det = m20 * m02 - m11 * m11
     i11, i12, i22 = m02 / det, -m11 / det, m20 / det
+    first, second, third = (m30, m21, m20), (m21, m12, m11), (m12, m03, m02)
 
-    def reduced(mab: Tensor, pa: Tensor, qa: Tensor, na: Tensor, pb: Tensor, qb: Tensor, nb: Tensor) -> Tensor:
-        return mab - (pa * (i11 * pb + i12 * qb) + qa * (i12 * pb + i22 * qb)) - na * nb
+    def reduced(moment: Tensor, one: Vector, other: Vector) -> Tensor:
+        (p, q, mean), (u, v, other_mean) = one, other
+        return moment - (p * (i11 * u + i12 * v) + q * (i12 * u + i22 * v)) - mean * other_mean
 
-    s11 = reduced(m40, m30, m21, m20, m30, m21, m20)
-    s12 = reduced(m31, m30, m21, m20, m21, m12, m11)
-    s13 = reduced(m22, m30, m21, m20, m12, m03, m02)
-    s22 = reduced(m22, m21, m12, m11, m21, m12, m11)
-    s23 = reduced(m13, m21, m12, m11, m12, m03, m02)
-    s33 = reduced(m04, m12, m03, m02, m12, m03, m02)
+    s11, s12, s13 = reduced(m40, first, first), reduced(m31, first, second), reduced(m22, first, third)
+    s22, s23, s33 = reduced(m22, second, second), reduced(m13, second, third), reduced(m04, third, third)
     # rows of M = C^-1 S with the constraint matrix C of 4AC - B^2
     a, b, c = _positive_eigenvector(
         (0.5 * s13, 0.5 * s23, 0.5 * s33), (-s12, -s22, -s23), (0.5 * s11, 0.5 * s12, 0.5 * s13)
@@ -216,29 +223,29 @@ def _halir_flusser(
     return torch.stack([a, b, c, d, e, -(a * m20 + b * m11 + c * m02)], -1)
 
 
-def _taubin(
-    m20: Tensor, m11: Tensor, m02: Tensor, m30: Tensor, m21: Tensor, m12: Tensor, m03: Tensor,
-    m40: Tensor, m31: Tensor, m22: Tensor, m13: Tensor, m04: Tensor,
-) -> Tensor:  # fmt: skip
+def _taubin(moments: tuple[Tensor, ...]) -> Tensor:
     """Conics (M, 6) of central moments: smallest eigenvector of the scatter against the mean squared gradient."""
-    # (A, B, C, D, E) after eliminating F = -(A m20 + B m11 + C m02)
-    scatter = torch.stack([
-        m40 - m20 * m20, m31 - m20 * m11, m22 - m20 * m02, m30, m21,
-        m31 - m20 * m11, m22 - m11 * m11, m13 - m11 * m02, m21, m12,
-        m22 - m20 * m02, m13 - m11 * m02, m04 - m02 * m02, m12, m03,
-        m30, m21, m12, m20, m11,
-        m21, m12, m03, m11, m02,
-    ], -1).unflatten(-1, (5, 5))  # fmt: skip
+    m20, m11, m02, m30, m21, m12, m03, m40, m31, m22, m13, m04 = moments
     zero, one = torch.zeros_like(m20), torch.ones_like(m20)
+    # (A, B, C, D, E) after eliminating F = -(A m20 + B m11 + C m02)
+    mean = torch.stack([m20, m11, m02, zero, zero], -1)
+    products = [
+        [m40, m31, m22, m30, m21],
+        [m31, m22, m13, m21, m12],
+        [m22, m13, m04, m12, m03],
+        [m30, m21, m12, m20, m11],
+        [m21, m12, m03, m11, m02],
+    ]
+    scatter = torch.stack([torch.stack(row, -1) for row in products], -2) - mean[:, :, None] * mean[:, None]
     # mean of (2 A x + B y + D)^2 + (B x + 2 C y + E)^2, m20 + m02 = 1
-    gradient = torch.stack([
-        4 * m20, 2 * m11, zero, zero, zero,
-        2 * m11, m20 + m02, 2 * m11, zero, zero,
-        zero, 2 * m11, 4 * m02, zero, zero,
-        zero, zero, zero, one, zero,
-        zero, zero, zero, zero, one,
-    ], -1).unflatten(-1, (5, 5))  # fmt: skip
-    factor, failed = torch.linalg.cholesky_ex(gradient)
+    squares = [
+        [4 * m20, 2 * m11, zero, zero, zero],
+        [2 * m11, m20 + m02, 2 * m11, zero, zero],
+        [zero, 2 * m11, 4 * m02, zero, zero],
+        [zero, zero, zero, one, zero],
+        [zero, zero, zero, zero, one],
+    ]
+    factor, failed = torch.linalg.cholesky_ex(torch.stack([torch.stack(row, -1) for row in squares], -2))
     sound = ((failed == 0) & scatter.isfinite().all(-1).all(-1))[:, None, None]
     eye = torch.eye(5, dtype=scatter.dtype, device=scatter.device)
     factor, scatter = torch.where(sound, factor, eye), torch.where(sound, scatter, eye)
@@ -246,12 +253,8 @@ def _taubin(
     white = torch.linalg.solve_triangular(factor, half.mT, upper=False)
     _, vectors = torch.linalg.eigh(white)
     best = torch.linalg.solve_triangular(factor.mT, vectors[:, :, :1], upper=True).squeeze(-1)
-    a, b, c, d, e = best.unbind(-1)
-    conic = torch.stack([a, b, c, d, e, -(a * m20 + b * m11 + c * m02)], -1)
+    conic = torch.cat([best, -(best * mean).sum(-1, keepdim=True)], -1)
     return torch.where(sound[:, 0], conic, torch.nan)
-
-
-Vector = tuple[Tensor, Tensor, Tensor]
 
 
 def _positive_eigenvector(first: Vector, second: Vector, third: Vector) -> Vector:
@@ -270,12 +273,8 @@ def _positive_eigenvector(first: Vector, second: Vector, third: Vector) -> Vecto
     for rows in ((two, three), (three, one)):
         other, length = _cross(*rows)
         better = length > longest
-        best = (
-            torch.where(better, other[0], best[0]),
-            torch.where(better, other[1], best[1]),
-            torch.where(better, other[2], best[2]),
-        )
-        longest = torch.where(better, length, longest)
+        x, y, z = (torch.where(better, new, old) for new, old in zip(other, best, strict=True))
+        best, longest = (x, y, z), torch.where(better, length, longest)
     return best
 
 
@@ -285,21 +284,21 @@ def _cross(u: Vector, v: Vector) -> tuple[Vector, Tensor]:
     return (x, y, z), x * x + y * y + z * z
 
 
-def distance(points: Tensor, index: Tensor, ellipses: Tensor) -> Tensor:
-    """Signed first-order distances (E,) in px of points to their ellipses, positive outside (Sampson)."""
+def distance(points: Points, index: Index, ellipses: Ellipses) -> Float[Tensor, " E"]:
+    """Signed first-order distances in px of points to their ellipses, positive outside (Sampson)."""
     value, gx, gy = _radial(points, index, ellipses)
     return value / torch.sqrt(gx * gx + gy * gy)
 
 
-def curvature(points: Tensor, index: Tensor, ellipses: Tensor) -> Tensor:
-    """Curvature (E,) in 1/px of the ellipses where the rays from their centres through the points meet them."""
+def curvature(points: Points, index: Index, ellipses: Ellipses) -> Float[Tensor, " E"]:
+    """Curvature in 1/px of the ellipses where the rays from their centres through the points meet them."""
     _, gx, gy = _radial(points, index, ellipses)
     steep = gx * gx + gy * gy
     # p^3 / (a b)^2 with p = 1 / |grad rho| the distance of the tangent from the centre
     return 1 / (steep * steep.sqrt() * (ellipses[:, 2] * ellipses[:, 3]).square().index_select(0, index))
 
 
-def _radial(points: Tensor, index: Tensor, ellipses: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _radial(points: Tensor, index: Tensor, ellipses: Tensor) -> Vector:
     """rho - 1 (E,) and its gradient, two of (E,); rho = |S^-1 (x - c)| the elliptic radius."""
     of = (v.contiguous().index_select(0, index) for v in _inverse_shape(ellipses).unbind(-1))
     return _radius(*points.double().unbind(-1), *of)
@@ -313,9 +312,7 @@ def _inverse_shape(ellipses: Tensor) -> Tensor:
     return torch.stack([ellipses[:, 0], ellipses[:, 1], s22 / det, -s12 / det, s11 / det], -1)
 
 
-def _radius(
-    x: Tensor, y: Tensor, cx: Tensor, cy: Tensor, i11: Tensor, i12: Tensor, i22: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+def _radius(x: Tensor, y: Tensor, cx: Tensor, cy: Tensor, i11: Tensor, i12: Tensor, i22: Tensor) -> Vector:
     dx, dy = x - cx, y - cy
     u, v = i11 * dx + i12 * dy, i12 * dx + i22 * dy
     rho = torch.sqrt(u * u + v * v)
@@ -323,40 +320,37 @@ def _radius(
 
 
 def fit_robust(
-    points: Tensor,
-    index: Tensor,
+    points: Points,
+    index: Index,
     count: int,
     *,
-    start: Tensor,
+    start: Ellipses,
     scales: tuple[float, ...] = (2.0, 1.0, 0.5),
     cut: float = 4.0,
-) -> tuple[Tensor, Tensor]:
-    """Ellipses from points of which some lie elsewhere (cover, glare, neighbouring edges).
+) -> tuple[Ellipses, Bool[Tensor, " E"]]:
+    """Ellipses from points of which some lie elsewhere (cover, glare, neighbouring edges), and which were kept.
 
     Iteratively reweighted direct fits from ``start``: first with Geman-McClure weights of falling scale, then with the
     points within ``cut`` robust standard deviations only, unweighted, so that the result is a plain least-squares fit.
 
-    Args:
-        points, index, count: as in `fit`. start: (M, 5), a rough ellipse to start from.
-        scales: px, scales of the weights, from the error of ``start`` down to a few times the edge noise.
+    Points, their index and the count are given as in `fit`.
 
-    Returns:
-        (M, 5) ellipses and (E,) bool, the points kept.
+    Args:
+        start: rough ellipses to start from.
+        scales: px, scales of the weights, from the error of ``start`` down to a few times the edge noise.
+        cut: in standard deviations.
     """
-    tiles = Tiles.of(index, count)
-    planes = tiles.planes(*points.double().unbind(-1), torch.ones_like(points[:, 0], dtype=torch.float64))
-    xy, there = planes.split([2, 1], 1)
+    tiles, xy, there = _tiled(points, index, count)
 
     def distances(ellipses: Tensor) -> Tensor:
-        of = _inverse_shape(ellipses)[tiles.group, :, None].unbind(1)
-        value, gx, gy = _radius(*xy.unbind(1), *of)
+        value, gx, gy = _radius(*xy.unbind(1), *_inverse_shape(ellipses)[tiles.group, :, None].unbind(1))
         return value / torch.sqrt(gx * gx + gy * gy)
 
     def refit(weights: Tensor) -> Tensor:
         return _from_moments(*_tile_moments(tiles, xy, weights[:, None]), method="halir-flusser")
 
-    def trust(r: Tensor, scale: float) -> Tensor:
-        return there[:, 0] * (1 + (r / scale).square()).reciprocal().square().nan_to_num(nan=0.0)
+    def trust(off: Tensor, scale: float) -> Tensor:
+        return there[:, 0] * geman_mcclure(off / scale).nan_to_num(nan=0.0)
 
     ellipses = start.double()
     for scale in scales:
@@ -375,7 +369,7 @@ def fit_robust(
 
 
 def with_covariance(
-    points: Tensor, index: Tensor, ellipses: Tensor, weights: Tensor | None = None, *, correlation: float = 1.0
+    points: Points, index: Index, ellipses: Ellipses, weights: Weights = None, *, correlation: float = 1.0
 ) -> EllipseFit:
     """First-order covariance of fitted ellipses from the scatter of their own points.
 
@@ -383,10 +377,11 @@ def with_covariance(
     elliptic radius: algebraic distances count points near the ends of the major axis less. So the covariance is
     sigma^2 (J^T W J)^-1 J^T W^2 J (J^T W J)^-1, sigma from the distances with E - 5 degrees of freedom.
 
+    Points, their index and their weights are given as in `fit`.
+
     Args:
-        points, index, weights: as in `fit`. ellipses: (M, 5) as fitted.
-        correlation: variance inflation for points whose errors are correlated along the edge
-            (`zernike.edge_correlation`).
+        ellipses: as fitted.
+        correlation: variance inflation where errors are correlated along the edge (`zernike.edge_correlation`).
     """
     count = ellipses.shape[0]
     w = torch.ones_like(points[:, 0], dtype=torch.float64) if weights is None else weights.double()

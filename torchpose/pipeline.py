@@ -83,7 +83,7 @@ class PoseEstimator(nn.Module):
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> PoseEstimator:
         """Moves to a device, as any module; geometry stays float64."""
         device = fn(self.camera.matrix[:0]).device
-        super()._apply(lambda value: value.to(device), recurse)
+        super()._apply(lambda value: value.to(device), recurse)  # type: ignore[no-untyped-call]  # of torch
         self.camera, self.table = self.camera.to(device), self.table.to(device)
         return self
 

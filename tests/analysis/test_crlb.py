@@ -25,7 +25,7 @@ def tilted() -> tuple[Tensor, Tensor]:
     return rotations.exp(torch.tensor([[0.5, -0.3, 0.7]], dtype=F64)), torch.tensor([[2.0, -3.0, 190.0]], dtype=F64)
 
 
-def test_is_the_inverse_fisher_information_of_whole_frames():
+def test_is_the_inverse_fisher_information_of_whole_frames() -> None:
     cam, target = camera((-0.2, 0.05, 1e-3, -1e-3)), Target.load("quad40")
     R, t = tilted()
     psf, dark, light, noise = 0.8, 40.0, 200.0, 2.0
@@ -64,7 +64,7 @@ def test_is_the_inverse_fisher_information_of_whole_frames():
     )
 
 
-def test_lateral_information_is_that_of_straight_edges():
+def test_lateral_information_is_that_of_straight_edges() -> None:
     # derived: a blurred edge of contrast h and length L fixes its offset with information
     # h^2 L / (2 sqrt(pi) s noise^2); a circle of radius r px seen frontally has pi r px of it along each axis
     cam, target = camera(), Target.load("quad40")
@@ -80,7 +80,7 @@ def test_lateral_information_is_that_of_straight_edges():
     assert information[1, 1].item() == pytest.approx(expected, rel=0.01)
 
 
-def test_turns_with_the_camera():
+def test_turns_with_the_camera() -> None:
     # a quarter turn of the whole scene about the optical axis maps pixels onto pixels and rotates the covariance
     cam, target = camera(), Target.load("quad40")
     R, t = tilted()
@@ -93,7 +93,7 @@ def test_turns_with_the_camera():
     assert difference.abs().max() < 1e-6
 
 
-def test_scales_with_noise_and_contrast():
+def test_scales_with_noise_and_contrast() -> None:
     cam, target = camera(), Target.load("quad40")
     R, t = tilted()
     R, t = R.expand(4, 3, 3), t.expand(4, 3)
@@ -106,7 +106,7 @@ def test_scales_with_noise_and_contrast():
     torch.testing.assert_close(eight[0], bound[0] / 12, rtol=1e-5, atol=0)
 
 
-def test_batch_equals_single_poses_beyond_one_chunk():
+def test_batch_equals_single_poses_beyond_one_chunk() -> None:
     cam, target = camera(), Target.load("quad40")
     w = torch.linspace(-0.5, 0.5, 18, dtype=F64)
     R = rotations.exp(torch.stack([w, -w, 2 * w], 1))
@@ -118,7 +118,7 @@ def test_batch_equals_single_poses_beyond_one_chunk():
         )
 
 
-def test_no_pose_without_markers_in_view():
+def test_no_pose_without_markers_in_view() -> None:
     target = Target.load("quad40")
     R = torch.eye(3, dtype=F64).expand(2, 3, 3)
     t = torch.tensor([[0.0, 0.0, 150.0], [0.0, 0.0, -150.0]], dtype=F64)
@@ -128,7 +128,7 @@ def test_no_pose_without_markers_in_view():
     assert pose_crlb(camera(), target, R[1:], t[1:]).isnan().all()
 
 
-def test_no_pose_from_one_ring():
+def test_no_pose_from_one_ring() -> None:
     # a ring looks the same after a turn about its axis
     target = Target.load("quad40")
     R, _ = tilted()
@@ -139,7 +139,7 @@ def test_no_pose_from_one_ring():
     assert pose_crlb(camera(), target, R, one + torch.tensor([0.0, 0.0, 200.0])).isfinite().all()
 
 
-def test_blur_must_be_positive():
+def test_blur_must_be_positive() -> None:
     R, t = tilted()
     with pytest.raises(ConfigError, match="psf_sigma"):
         pose_crlb(camera(), Target.load("quad40"), R, t, psf_sigma=-1.0)

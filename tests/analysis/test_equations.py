@@ -27,7 +27,7 @@ def extent(f: float, length: float, distance: float) -> float:
 
 
 @given(st.floats(4, 50), st.floats(1, 40), st.floats(30, 500))
-def test_distance_and_its_derivative_are_those_of_the_camera(f, length, distance):
+def test_distance_and_its_derivative_are_those_of_the_camera(f: float, length: float, distance: float) -> None:
     n = extent(f, length, distance)
     assert equations.distance(length, f, n, MU) == pytest.approx(distance)
     h = 1e-5 * distance
@@ -38,12 +38,12 @@ def test_distance_and_its_derivative_are_those_of_the_camera(f, length, distance
 
 
 @given(st.floats(4, 50), st.floats(30, 500))
-def test_a_pixel_covers_what_the_camera_says(f, distance):
+def test_a_pixel_covers_what_the_camera_says(f: float, distance: float) -> None:
     slope = (extent(f, 8.001, distance) - extent(f, 7.999, distance)) / 0.002
     assert equations.lateral_per_pixel(f, distance, MU) == pytest.approx(1 / slope, rel=1e-6)
 
 
-def test_a_wrong_focal_length_shifts_the_depth_by_its_share():
+def test_a_wrong_focal_length_shifts_the_depth_by_its_share() -> None:
     n = extent(TRUE_FOCAL, LENGTH, DISTANCE)
     assert equations.true_distance(LENGTH, TRUE_FOCAL, n, MU) == pytest.approx(DISTANCE)
     assumed = equations.distance(LENGTH, FOCAL, n, MU)
@@ -55,14 +55,14 @@ def lateral_difference(dn: float) -> float:
     return dn * LENGTH / extent(TRUE_FOCAL, LENGTH, DISTANCE) - dn * LENGTH / extent(FOCAL, LENGTH, DISTANCE)
 
 
-def test_the_sixth_equation_holds_with_the_sign_of_its_middle():
+def test_the_sixth_equation_holds_with_the_sign_of_its_middle() -> None:
     value = equations.lateral_focal_error(DISTANCE, 0.2, FOCAL, TRUE_FOCAL, MU)
     assert value == pytest.approx(lateral_difference(0.2), rel=1e-9)
     printed = DISTANCE * MU * 0.2 * (TRUE_FOCAL - FOCAL) / (FOCAL * TRUE_FOCAL)
     assert value == pytest.approx(-printed)
 
 
-def test_the_term_that_the_paper_neglects_is_negligible_for_an_error_of_extraction_only():
+def test_the_term_that_the_paper_neglects_is_negligible_for_an_error_of_extraction_only() -> None:
     pixel = 0.2 * equations.lateral_per_pixel(FOCAL, DISTANCE, MU)
     noise = equations.lateral_focal_error(DISTANCE, 0.2, FOCAL, TRUE_FOCAL, MU)
     assert abs(noise) / pixel == pytest.approx(0.02 / 8.02)
@@ -74,6 +74,6 @@ def test_the_term_that_the_paper_neglects_is_negligible_for_an_error_of_extracti
     assert 1000 * MU * assumed / FOCAL == pytest.approx(1000 * MU * DISTANCE / TRUE_FOCAL)
 
 
-def test_tensors_broadcast():
+def test_tensors_broadcast() -> None:
     d = torch.tensor([12.0, 32.0], dtype=F64)
     assert equations.depth_per_pixel(torch.tensor(8.0), torch.tensor(8.0), d, torch.tensor(MU)).shape == (2,)

@@ -13,7 +13,7 @@ from scipy.stats import chi2, kstest
 from torchpose.analysis import pose_errors, rms
 from torchpose.geometry import rotations
 from torchpose.io.truth import Truth
-from torchpose.results import Poses
+from torchpose.results import Detections, Poses
 
 POSES = 4000
 
@@ -26,7 +26,7 @@ def random_covariance(generator: torch.Generator, *shape: int) -> torch.Tensor:
 
 
 @pytest.fixture(scope="module")
-def drawn():
+def drawn() -> tuple[SimpleNamespace, SimpleNamespace, torch.Tensor]:
     """Estimates scattered around the truth by their covariance, in the convention of `Poses`: R_true = exp(w) R."""
     generator = torch.Generator().manual_seed(3)
     covariance = random_covariance(generator, POSES)
@@ -38,7 +38,7 @@ def drawn():
     return estimated, truth, noise[..., 0]
 
 
-def test_errors_are_estimate_minus_truth(drawn):
+def test_errors_are_estimate_minus_truth(drawn: tuple[SimpleNamespace, SimpleNamespace, torch.Tensor]) -> None:
     estimated, truth, noise = drawn
     errors = pose_errors(estimated, truth)
     torch.testing.assert_close(errors.translation, -noise[:, :3], rtol=0, atol=1e-12)
@@ -47,7 +47,7 @@ def test_errors_are_estimate_minus_truth(drawn):
     torch.testing.assert_close(errors.lateral, noise[:, 0].hypot(noise[:, 1]), rtol=0, atol=1e-12)
 
 
-def test_rotation_against_scipy():
+def test_rotation_against_scipy() -> None:
     generator = np.random.default_rng(1)
     a, b = Rotation.random(50, generator), Rotation.random(50, generator)
     estimated = SimpleNamespace(
@@ -61,7 +61,7 @@ def test_rotation_against_scipy():
     np.testing.assert_allclose(errors.angle.numpy(), between.magnitude(), rtol=0, atol=1e-12)
 
 
-def test_nees_is_chi_squared(drawn):
+def test_nees_is_chi_squared(drawn: tuple[SimpleNamespace, SimpleNamespace, torch.Tensor]) -> None:
     estimated, truth, _ = drawn
     nees = pose_errors(estimated, truth).nees.numpy()
     assert kstest(nees, chi2(6).cdf).pvalue > 1e-3
@@ -70,14 +70,14 @@ def test_nees_is_chi_squared(drawn):
     np.testing.assert_allclose(pose_errors(confident, truth).nees.numpy(), 4 * nees, rtol=1e-9)
 
 
-def test_nees_uses_correlations(drawn):
+def test_nees_uses_correlations(drawn: tuple[SimpleNamespace, SimpleNamespace, torch.Tensor]) -> None:
     estimated, truth, noise = drawn
     nees = pose_errors(estimated, truth).nees.numpy()
     e, covariance = noise.numpy(), estimated.covariance.numpy()
     np.testing.assert_allclose(nees, np.einsum("ni,nij,nj->n", e, np.linalg.inv(covariance), e), rtol=1e-6)
 
 
-def test_leading_shape_and_broadcast():
+def test_leading_shape_and_broadcast() -> None:
     generator = torch.Generator().manual_seed(5)
     vector = 0.1 * torch.randn(2, 3, 3, generator=generator, dtype=torch.float64)
     t = torch.randn(2, 3, 3, generator=generator, dtype=torch.float64)
@@ -89,7 +89,7 @@ def test_leading_shape_and_broadcast():
     torch.testing.assert_close(errors.translation, t)
 
 
-def test_rows_without_a_pose_are_nan_and_left_out():
+def test_rows_without_a_pose_are_nan_and_left_out() -> None:
     one = torch.eye(3, dtype=torch.float64).repeat(3, 1, 1)
     unit = torch.eye(6, dtype=torch.float64).repeat(3, 1, 1)
     t = torch.tensor([[3e-3, 4e-3, 0.0]], dtype=torch.float64).repeat(3, 1)
@@ -104,7 +104,7 @@ def test_rows_without_a_pose_are_nan_and_left_out():
     assert rms(errors.lateral[1:2]).isnan()
 
 
-def test_poses_and_truth_are_what_is_compared():
+def test_poses_and_truth_are_what_is_compared() -> None:
     """The result type of the pipeline and the truth file fit the two arguments."""
     rows = 2
     zeros = {name: torch.zeros(rows, dtype=torch.float64) for name in ("rms", "chi2", "rms_alt", "chi2_alt")}
@@ -112,6 +112,11 @@ def test_poses_and_truth_are_what_is_compared():
     eye = torch.eye(3, dtype=torch.float64).repeat(rows, 1, 1)
     t = torch.ones(rows, 3, dtype=torch.float64)
     covariance = torch.eye(6, dtype=torch.float64).repeat(rows, 1, 1)
-    poses = Poses(R=eye, t=t, covariance=covariance, R_alt=eye, t_alt=t, detections=None, **zeros, **whole)
+    none = Detections(
+        **{name: torch.zeros(0, dtype=torch.int64) for name in ("frame", "target", "marker")},
+        **{name: torch.zeros(0, size) for name, size in (("center", 2), ("outer", 5), ("inner", 5))},
+        center_cov=torch.zeros(0, 2, 2),
+    )
+    poses = Poses(R=eye, t=t, covariance=covariance, R_alt=eye, t_alt=t, detections=none, **zeros, **whole)
     truth = Truth(["a", "b"], ["x", "x"], torch.zeros_like(t), torch.zeros_like(t))
     assert pose_errors(poses, truth).nees.tolist() == [3.0, 3.0]

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Literal
 
 import pytest
 import torch
-from exact import exact_ellipses, pinhole
 from torch import Tensor
 
+from tests.exact import exact_ellipses, pinhole
 from torchpose.analysis import (
     Uncertainty,
     edge_noise,
@@ -37,7 +38,9 @@ def distorted() -> Camera:
     return replace(pinhole(), distortion=torch.tensor([-0.08, 0.02, 0.0002, -0.00015], dtype=F64))
 
 
-def volume(distances: tuple[float, ...] = (120.0, 160.0, 300.0), tilts: tuple[float, ...] = (0, 15, 40)):
+def volume(
+    distances: tuple[float, ...] = (120.0, 160.0, 300.0), tilts: tuple[float, ...] = (0, 15, 40)
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Poses over distance, offset and tilt."""
     rows = [(tilt, x, y, z) for tilt in tilts for z in distances for x, y in ((0.0, 0.0), (18.0, 12.0))]
     tilt, x, y, z = torch.tensor(rows, dtype=F64).T
@@ -65,7 +68,7 @@ EACH = {
 ALL = Uncertainty(0.05, 0.0025, 2.0, (1e-3, 1e-3, 1e-4, 1e-4), 0.01, 0.02, 0.05, 1e-3)
 
 
-def test_the_whole_budget_equals_monte_carlo_within_3_percent_over_the_working_volume():
+def test_the_whole_budget_equals_monte_carlo_within_3_percent_over_the_working_volume() -> None:
     R, t = volume((120.0, 300.0), (0, 40))
     budget = propagate(distorted(), Target.load("quad40"), R, t, ALL)
     assert set(budget.sources) == set(EACH)
@@ -78,7 +81,7 @@ def test_the_whole_budget_equals_monte_carlo_within_3_percent_over_the_working_v
 
 
 @pytest.mark.parametrize("source", EACH)
-def test_every_source_equals_monte_carlo(source):
+def test_every_source_equals_monte_carlo(source: str) -> None:
     R, t = volume((160.0,), (0, 40))
     camera, target, draws = distorted(), Target.load("quad40"), 3000
     budget = propagate(camera, target, R, t, EACH[source])
@@ -90,7 +93,7 @@ def test_every_source_equals_monte_carlo(source):
     assert torch.equal(budget.total, budget.sources[source])
 
 
-def test_centres_of_different_quality_are_weighted():
+def test_centres_of_different_quality_are_weighted() -> None:
     R, t = volume((160.0,), (30,))
     target = Target.load("quad40")
     image = torch.diag_embed(torch.tensor([[0.05, 0.02], [0.02, 0.05], [0.2, 0.1], [0.03, 0.03]], dtype=F64).square())
@@ -99,7 +102,7 @@ def test_centres_of_different_quality_are_weighted():
     assert (drawn / budget.std() - 1).abs().max() < 0.03
 
 
-def test_the_calibration_of_the_camera_file_is_a_source():
+def test_the_calibration_of_the_camera_file_is_a_source() -> None:
     root = torch.tensor([[2.0, 0, 0, 0], [1.9, 0.3, 0, 0], [0.1, 0.2, 1.5, 0], [0, 0.1, 0.3, 1.2]], dtype=F64)
     camera = replace(distorted(), covariance=root @ root.T)
     R, t = volume((160.0,), (30,))
@@ -109,7 +112,7 @@ def test_the_calibration_of_the_camera_file_is_a_source():
     assert (drawn / budget.std() - 1).abs().max() < 0.03
 
 
-def test_rings_reach_the_cramer_rao_bound():
+def test_rings_reach_the_cramer_rao_bound() -> None:
     R, t = volume((160.0,), (0, 25, 40))
     camera, target = distorted(), Target.load("quad40")
     bound = pose_crlb(camera, target, R, t, noise_sigma=2.0, psf_sigma=0.9, bits=16)
@@ -119,7 +122,7 @@ def test_rings_reach_the_cramer_rao_bound():
     assert (ratio - 1).abs().max() < 0.02
 
 
-def test_centres_as_good_as_their_edges_allow_come_near_the_bound_and_not_below_it():
+def test_centres_as_good_as_their_edges_allow_come_near_the_bound_and_not_below_it() -> None:
     camera, target = pinhole(), Target.load("quad40")
     t = torch.tensor([[0.0, 0, 160]], dtype=F64)
     length = target.radii.sum(1) * 2 * math.pi * 1111.11 / 160  # px of edge, face on
@@ -138,7 +141,7 @@ def test_centres_as_good_as_their_edges_allow_come_near_the_bound_and_not_below_
 
 
 @pytest.mark.parametrize("features", ["centers", "rings"])
-def test_face_on_the_budget_is_what_the_papers_equations_say(features):
+def test_face_on_the_budget_is_what_the_papers_equations_say(features: Literal["centers", "rings"]) -> None:
     target, t = Target.load("quad40"), torch.tensor([[0.0, 0, 160]], dtype=F64)
     size = Uncertainty(image=0.2, focal_length=0.0025, principal_point=1.0, print_scale=0.001)
     budget = propagate(pinhole(), target, EYE, t, size, features=features)
@@ -155,7 +158,7 @@ def test_face_on_the_budget_is_what_the_papers_equations_say(features):
         assert budget.std("image")[0, 5] == pytest.approx(0.2 * 160 / 1111.11 / 20 / math.sqrt(8))
 
 
-def test_wrong_radii_shift_the_centre_as_the_compensation_of_real_ellipses():
+def test_wrong_radii_shift_the_centre_as_the_compensation_of_real_ellipses() -> None:
     target, (R, t) = Target.load("quad40"), volume((160.0,), (20, 40))
     printed = target.radii + torch.tensor([[0.02, -0.01], [0.0, 0.03], [-0.02, 0.0], [0.01, 0.01]], dtype=F64)
     camera = pinhole()
@@ -174,11 +177,11 @@ def test_wrong_radii_shift_the_centre_as_the_compensation_of_real_ellipses():
 
 
 @pytest.mark.parametrize("source", ["focal_length", "print_scale"])
-def test_rendered_frames_move_as_the_rings_say(source):
+def test_rendered_frames_move_as_the_rings_say(source: str) -> None:
     R, t = volume((160.0,), (30,))
     camera, target = replace(pinhole(800.0, 600, 500), distortion=distorted().distortion), Target.load("quad40")
     # small enough for the grey values to raise no doubt: rows that they contradict are weighted anew
-    size = Uncertainty(**{source: 0.001})
+    size = Uncertainty(**{source: 0.001})  # type: ignore[arg-type]  # either field is a float
     std = propagate(camera, target, R, t, size, features="rings").std(source)
     drawn = simulate_frames(camera, target, R[:1], t[:1], size, draws=3, noise=0.1, bits=16)[:, 0]
     free = simulate_frames(camera, target, R[:1], t[:1], Uncertainty(), draws=3, noise=0.1, bits=16)[:, 0]
@@ -193,7 +196,7 @@ def test_rendered_frames_move_as_the_rings_say(source):
 
 
 @pytest.mark.slow
-def test_wrong_radii_move_rendered_frames_as_the_rings_say():
+def test_wrong_radii_move_rendered_frames_as_the_rings_say() -> None:
     R, t = volume((160.0,), (30,))
     camera, target = pinhole(800.0, 600, 500), Target.load("quad40")
     size = Uncertainty(print_centers=0.02, print_radii=0.02)
@@ -205,7 +208,7 @@ def test_wrong_radii_move_rendered_frames_as_the_rings_say():
     assert abs(nees - 6) < 3.5 * math.sqrt(12 / 40)
 
 
-def test_without_three_markers_in_view_there_is_no_pose():
+def test_without_three_markers_in_view_there_is_no_pose() -> None:
     t = torch.tensor([[0.0, 0, 160], [130.0, 0, 160], [0, 0, -160]], dtype=F64)
     budget = propagate(pinhole(), Target.load("quad40"), EYE.expand(3, 3, 3), t, Uncertainty(0.1, 0.01))
     assert budget.seen.any(1).tolist() == [True, False, False]
@@ -216,7 +219,7 @@ def test_without_three_markers_in_view_there_is_no_pose():
     assert errors[:, 1:].isnan().all()
 
 
-def test_wrong_arguments_are_named():
+def test_wrong_arguments_are_named() -> None:
     with pytest.raises(ValueError, match="focal_length is -1"):
         Uncertainty(focal_length=-1)
     with pytest.raises(ValueError, match="print_radii is nan"):

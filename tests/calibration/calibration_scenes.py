@@ -9,13 +9,14 @@ from torch import Tensor
 
 import torchpose as tp
 from torchpose.calibration import Views
+from torchpose.camera.model import Model
 from torchpose.geometry import rotations
 
 F64 = torch.float64
 Transform = tuple[Tensor, Tensor]
 
 
-def camera(distortion: list[float] | None = None, *, model: str = "brown_conrady", scale: float = 1.0) -> tp.Camera:
+def camera(distortion: list[float] | None = None, *, model: Model = "brown_conrady", scale: float = 1.0) -> tp.Camera:
     """1824 x 1216 px at scale 1, no symmetry anywhere."""
     d = [-0.08, 0.03, 2e-4, -1.5e-4] if distortion is None else distortion
     k = scale * torch.tensor([[1503.0, 0, 905.3], [0, 1500, 612.8], [0, 0, 1 / scale]], dtype=F64)
@@ -45,12 +46,12 @@ def views(
     pixels = pixels + sigma * torch.randn(pixels.shape, dtype=F64, generator=torch.Generator().manual_seed(seed))
     variance = (sigma if said is None else said) ** 2
     return Views(
-        tuple(f"{k}.png" for k in range(n)),
         torch.arange(n).repeat_interleave(m),
         torch.arange(m).repeat(n),
         points.repeat(n, 1),
         pixels,
         variance * torch.eye(2, dtype=F64).expand(n * m, 2, 2),
+        tuple(f"{k}.png" for k in range(n)),
     )
 
 

@@ -3,14 +3,15 @@
 import math
 from dataclasses import replace
 
-import calibration_scenes as scenes
 import pytest
 import torch
 
 import torchpose as tp
+from tests.calibration import calibration_scenes as scenes
 from torchpose.calibration import LENS_MODELS, calibrate_intrinsics
-from torchpose.calibration.bundle import adjust, intrinsics_jacobian, moved_camera
+from torchpose.calibration.bundle import adjust, moved_camera
 from torchpose.calibration.intrinsics import start_cameras
+from torchpose.camera.derivatives import by_intrinsics
 
 TRUE = {
     "pinhole": [],
@@ -32,7 +33,7 @@ def lens(name: str) -> tp.Camera:
 def test_jacobian_by_intrinsics_is_that_of_differences(name: str) -> None:
     camera = lens(name)
     xy = 0.5 * torch.rand(7, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) - 0.25
-    jacobian = intrinsics_jacobian(camera, xy)
+    jacobian = by_intrinsics(camera, xy)
     n = jacobian.shape[-1]
     for k in range(n):
         step = torch.zeros(n, dtype=torch.float64)

@@ -1,13 +1,14 @@
 """Hand-eye: exact without noise, covariance right with it, one clear error where the motion is not enough."""
 
 import math
+from typing import Literal
 
-import calibration_scenes as scenes
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.calibration import calibration_scenes as scenes
 from torchpose.calibration import calibrate_hand_eye
 from torchpose.calibration.hand_eye import linear_start
 from torchpose.calibration.intrinsics import locate_views
@@ -39,7 +40,7 @@ def test_linear_start_is_exact_without_noise(seed: int, mount: str) -> None:
 
 @pytest.mark.parametrize("mount", MOUNTS)
 @pytest.mark.parametrize("known", [True, False], ids=["noise known", "noise estimated"])
-def test_errors_are_what_the_covariance_says(mount: str, known: bool) -> None:
+def test_errors_are_what_the_covariance_says(mount: Literal["base", "tool"], known: bool) -> None:
     noise, trials = (0.02, 1e-4), 40
     sigma = torch.tensor([noise[0]] * 3 + [noise[1]] * 3, dtype=torch.float64)
     x, z = scenes.rig(mount)

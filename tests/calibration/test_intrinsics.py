@@ -2,12 +2,12 @@
 
 from dataclasses import replace
 
-import calibration_scenes as scenes
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.calibration import calibration_scenes as scenes
 from torchpose.calibration import calibrate_intrinsics
 from torchpose.calibration.intrinsics import common_sigma, locate_views, start_cameras
 from torchpose.errors import ConfigError

@@ -2,13 +2,13 @@
 
 from dataclasses import replace
 
-import calibration_scenes as scenes
 import cv2
 import numpy as np
 import pytest
 import torch
 
 import torchpose as tp
+from tests.calibration import calibration_scenes as scenes
 from torchpose.calibration.boards import Board, find_corners
 from torchpose.calibration.session import calibrate_camera, locate_camera
 from torchpose.errors import ConfigError
@@ -23,7 +23,9 @@ def rings() -> tuple[list[str], torch.Tensor, scenes.Transform]:
     return [f"{k}.png" for k in range(10)], add_noise(render(CAMERA, tp.Target.load("hexa50"), *pose), 1.0), pose
 
 
-def test_focal_length_a_quarter_percent_off_is_recovered(rings) -> None:
+def test_focal_length_a_quarter_percent_off_is_recovered(
+    rings: tuple[list[str], torch.Tensor, scenes.Transform],
+) -> None:
     names, frames, pose = rings
     nominal = replace(CAMERA, matrix=CAMERA.matrix * torch.tensor([[1.0025], [1.0025], [1]]), distortion=torch.zeros(4))
     nominal = replace(nominal, distortion=nominal.distortion.double())
@@ -65,7 +67,7 @@ def photograph(picture: np.ndarray, mm_per_px: float, pose: scenes.Transform) ->
         depth = (r[:, 2] @ t) / (ray @ r[:, 2])
         x = ((depth[..., None] * ray - t) @ r)[..., :2] / mm_per_px
         fine_frame = cv2.remap(
-            picture, x.float().numpy(), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=230
+            picture, x.float().numpy(), np.empty(0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=230
         )
         frames.append(cv2.resize(fine_frame, (CAMERA.width, CAMERA.height), interpolation=cv2.INTER_AREA))
     return torch.from_numpy(np.stack(frames))

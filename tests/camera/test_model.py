@@ -139,7 +139,7 @@ def test_no_inverse_beyond_the_fold(distortion: list[float], model: str, largest
 def test_jacobian_and_gradients(distortion: list[float], model: str) -> None:
     cam = camera(distortion, model)
     xy = torch.tensor([[0.0, 0.0], [1e-4, 2e-4], [0.4, -0.3], [-0.2, 0.25]], dtype=torch.float64, requires_grad=True)
-    expected = torch.stack([torch.autograd.functional.jacobian(cam.distort, p) for p in xy.detach()])  # type: ignore[no-untyped-call]
+    expected = torch.stack([torch.autograd.functional.jacobian(cam.distort, p) for p in xy.detach()])
     torch.testing.assert_close(cam.J_distort(xy), expected, rtol=0, atol=1e-8)
     uv = cam.distort(xy).detach().requires_grad_()
     ahead = torch.cat([xy.detach(), torch.ones(4, 1, dtype=torch.float64)], -1).requires_grad_()
@@ -234,7 +234,7 @@ def test_moving_checks_and_reads_nothing() -> None:
 
     for cam in (camera(BROWN["barrel"]), camera(FISHEYE, "kannala_brandt"), camera([0.0] * 4), camera([])):
         cam.to(torch.float32)  # what follows from the coefficients is found once
-        with NoReads():
+        with NoReads():  # type: ignore[no-untyped-call]
             moved = cam.to(torch.float32).to("meta")
         assert moved.fold_radius == cam.fold_radius
         assert moved.matrix.device.type == moved.distortion.device.type == "meta"

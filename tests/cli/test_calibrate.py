@@ -135,6 +135,7 @@ def test_frames_of_two_sizes(capture: Path, tmp_path: Path, capsys: pytest.Captu
     small = tmp_path / "other" / "small.png"
     small.parent.mkdir()
     frame = cv2.imread(str(capture / "0.png"), cv2.IMREAD_GRAYSCALE)
+    assert frame is not None
     cv2.imwrite(str(small), frame[:500, :700])
     assert run(capture / "0.png", small, "--target", "hexa50", "--out", tmp_path / "c.yaml") == 2
     assert "small.png: INPUT: is 700x500, not 912x608" in capsys.readouterr().err

@@ -12,7 +12,11 @@ import os
 import signal
 import threading
 import time
+from collections.abc import Callable
 from importlib.util import find_spec
+from pathlib import Path
+from signal import Signals
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,8 +28,8 @@ from torchpose.camera import Camera
 from torchpose.cli.main import main
 from torchpose.geometry import rotations
 from torchpose.io.manifest import read_manifest
-from torchpose.rig.cameras import Cameras
-from torchpose.rig.robot import Robot
+from torchpose.rig.cameras import Cameras, Frame
+from torchpose.rig.robot import Robot, RobotReading
 from torchpose.rig.twin.controller import TwinController
 from torchpose.rig.twin.scene import Scene
 
@@ -39,21 +43,25 @@ CAMERA = Camera(
 _numbers = itertools.count(1)
 
 
+Script = Callable[[int, TwinController, Cameras], None]
+
+
 class Cell:
     """Files of a small cell on the twin, and the command as a user types it.
 
     A script, if set, is called before every exposure with its number, the twin's controller, and the cameras.
     """
 
-    def __init__(self, folder, monkeypatch, capsys):
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
         self.folder, self.capsys, self.monkeypatch = folder, capsys, monkeypatch
         self.out = folder / "run"
-        self.script = lambda number, controller, cameras: None
-        self.robot = None
+        self.script: Script = lambda number, controller, cameras: None
+        self.robot: Any = None
+        self.watcher: Any = None
         process = os.getpid() % 60000 + 256
         self.host = f"127.{process // 256}.{process % 256}.{next(_numbers) % 250 + 2}"
         CAMERA.save(folder / "camera.json")
-        self.rig = {
+        self.rig: dict[str, Any] = {
             "robot": {
                 "host": "192.0.2.1",
                 "tcp": [0.0, 0.0, 60.0, 0.0, 0.0, 0.0],
@@ -67,14 +75,14 @@ class Cell:
             "cameras": [{"name": "camera", "width": 320, "height": 240, "exposure_us": 1000.0, "timeout_s": 0.4}],
             "dwell_s": 0.0,
         }
-        self.twin = {
+        self.twin: dict[str, Any] = {
             "host": self.host,
             "cameras": [self.twin_camera("camera")],
             "target": "quad40",
             "tool_from_target": {"rotation": [math.pi, 0.0, 0.0], "translation": [0.3, -0.2, 0.4]},
             "imaging": {"plate": [70.0, 70.0]},
         }
-        self.plan = {
+        self.plan: dict[str, Any] = {
             "name": "small",
             "origin": {"translation": [400.0, 0.0, 300.0], "rotation": [math.pi, 0.0, 0.0]},
             "axes": "base",
@@ -83,25 +91,26 @@ class Cell:
         self._watch(monkeypatch)
 
     @staticmethod
-    def twin_camera(name):
+    def twin_camera(name: str) -> dict[str, dict[str, list[float]] | str]:
         place = {"rotation": [0.01, -0.02, 0.03], "translation": [401.0, -2.0, 130.0]}
         return {"name": name, "camera": "camera.json", "base_from_camera": place}
 
-    def _watch(self, monkeypatch):
+    def _watch(self, monkeypatch: pytest.MonkeyPatch) -> None:
         numbers, grab, move = itertools.count(), Cameras.grab, Robot.move
 
-        def scripted(cameras, names):
-            self.script(next(numbers), cameras._scene.__self__.controller, cameras)
+        def scripted(cameras: Cameras, names: list[str]) -> list[Frame]:
+            scene: Any = cameras._scene
+            self.script(next(numbers), scene.__self__.controller, cameras)
             return grab(cameras, names)
 
-        def noted(robot, pose):
+        def noted(robot: Robot, pose: tuple[float, float, float, float, float, float]) -> RobotReading:
             self.robot = robot
             return move(robot, pose)
 
         monkeypatch.setattr(Cameras, "grab", scripted)
         monkeypatch.setattr(Robot, "move", noted)
 
-    def run(self, *options):
+    def run(self, *options: str) -> tuple[str | int | None, list[str]]:
         """Exit code and the lines on stderr."""
         for name in ("rig", "twin", "plan"):
             (self.folder / f"{name}.yaml").write_text(yaml.safe_dump(getattr(self, name)))
@@ -111,11 +120,11 @@ class Cell:
             main(["capture", plan, "--rig", rig, "--twin", twin, "--out", str(self.out), "--yes", *options])
         return ended.value.code, self.capsys.readouterr().err.splitlines()
 
-    def records(self, kind=None):
+    def records(self, kind: str | None = None) -> list[dict[str, Any]]:
         lines = (self.out / "manifest.jsonl").read_text().splitlines()
         return [r for r in map(json.loads, lines) if kind in (None, r["record"])]
 
-    def is_complete(self, names=("0000", "0001", "0002", "0003")):
+    def is_complete(self, names: list[str] | tuple[str, str, str, str] = ("0000", "0001", "0002", "0003")) -> bool:
         """Whether every frame is there once, with its image, and the session is closed."""
         frames = self.records("frame")
         assert [frame["id"] for frame in frames] == list(names)
@@ -129,11 +138,11 @@ class Cell:
 
 
 @pytest.fixture
-def cell(tmp_path, monkeypatch, capsys):
+def cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Cell:
     return Cell(tmp_path, monkeypatch, capsys)
 
 
-def test_a_session_joins_images_and_poses(cell):
+def test_a_session_joins_images_and_poses(cell: Cell) -> None:
     cell.plan["steps"].append({"rotation": {"axes": ["pitch"], "values_deg": [5]}})
     code, lines = cell.run("--camera", str(cell.folder / "camera.json"), "--target", "quad40")
     assert code == 0
@@ -156,7 +165,7 @@ def test_a_session_joins_images_and_poses(cell):
     ]
 
 
-def test_the_poses_of_the_frames_are_those_of_the_robot(cell):
+def test_the_poses_of_the_frames_are_those_of_the_robot(cell: Cell) -> None:
     cell.plan["steps"] = [
         {"handeye": {"count": 3, "x_mm": [-10, 10], "z_mm": [-5, 10], "tilt_deg": [10, 20], "roll_deg": [-15, 15]}}
     ]
@@ -190,13 +199,13 @@ def test_the_poses_of_the_frames_are_those_of_the_robot(cell):
         assert row["tz"] == pytest.approx(float(t[2]), abs=0.3)
 
 
-def test_several_cameras_at_once(cell):
+def test_several_cameras_at_once(cell: Cell) -> None:
     cell.rig["cameras"] = [{**cell.rig["cameras"][0], "name": name} for name in ("left", "right")]
     cell.twin["cameras"] = [cell.twin_camera(name) for name in ("left", "right")]
     cell.twin["cameras"][1]["base_from_camera"]["translation"] = [391.0, -2.0, 130.0]
     names = [f"{i:04d}_{camera}" for i in range(4) for camera in ("left", "right")]
 
-    def full_disk(number, controller, cameras):
+    def full_disk(number: int, controller: TwinController, cameras: Cameras) -> None:
         if number == 2:
             (cell.out / "images" / ".0002_right.png.tmp").symlink_to("/dev/full")
 
@@ -219,39 +228,39 @@ def test_several_cameras_at_once(cell):
     ]
 
 
-def pylon_camera(cameras):
+def pylon_camera(cameras: Cameras) -> Any:
     return cameras._open["camera"]._camera
 
 
-def lose_triggers(cell, controller, cameras):
-    cameras._open["camera"].trigger = time.time
+def lose_triggers(cell: Cell, controller: TwinController, cameras: Cameras) -> None:
+    cameras._open["camera"].trigger = time.time  # type: ignore[method-assign]  # tells the time, triggers nothing
 
 
-def fail_buffers(cell, controller, cameras):
+def fail_buffers(cell: Cell, controller: TwinController, cameras: Cameras) -> None:
     pylon_camera(cameras).ForceFailedBufferCount.Value = 3
     pylon_camera(cameras).ForceFailedBuffer.Execute()
 
 
-def unplug_camera(cell, controller, cameras):
+def unplug_camera(cell: Cell, controller: TwinController, cameras: Cameras) -> None:
     pylon_camera(cameras).FirePnPCallback.Execute()
 
 
-def change_size(cell, controller, cameras):
+def change_size(cell: Cell, controller: TwinController, cameras: Cameras) -> None:
     path = cell.folder / "small.png"
     cv2.imwrite(str(path), np.zeros((200, 320), np.uint8))
     cameras._scene = functools.partial(lambda _scene, _name: path, cameras._scene)
 
 
-def fill_disk(cell, controller, cameras):
+def fill_disk(cell: Cell, controller: TwinController, cameras: Cameras) -> None:
     (cell.out / "images" / ".0002.png.tmp").symlink_to("/dev/full")
 
 
-def robot_fault(name, at_fraction=None):
+def robot_fault(name: str, at_fraction: float | None = None) -> Callable[..., Any]:
     return lambda cell, controller, cameras: controller.inject(name, at_fraction)
 
 
-def kill_driver(cell, controller, cameras):
-    cell.robot._link.kill()
+def kill_driver(cell: Cell, controller: TwinController, cameras: Cameras) -> None:
+    cell.robot._child.kill()
 
 
 FAULTS = [
@@ -269,10 +278,12 @@ FAULTS = [
 
 
 @pytest.mark.parametrize(("make", "reason", "kept"), FAULTS, ids=[reason for _, reason, _ in FAULTS])
-def test_a_fault_ends_the_session_and_resume_completes_it(cell, make, reason, kept):
+def test_a_fault_ends_the_session_and_resume_completes_it(
+    cell: Cell, make: Callable[..., Any], reason: str, kept: int
+) -> None:
     begun = []
 
-    def script(number, controller, cameras):
+    def script(number: int, controller: TwinController, cameras: Cameras) -> None:
         if number == 2:  # before the third exposure
             make(cell, controller, cameras)
             begun.append(time.monotonic())
@@ -294,7 +305,7 @@ def test_a_fault_ends_the_session_and_resume_completes_it(cell, make, reason, ke
 @pytest.mark.parametrize(
     ("fault", "reason"), [("silent", "timed_out"), ("refuse_script", "refused_script"), ("not_remote", "not_remote")]
 )
-def test_a_robot_that_cannot_start(cell, fault, reason, monkeypatch):
+def test_a_robot_that_cannot_start(cell: Cell, fault: str, reason: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as faulty:
         faulty.setattr("torchpose.rig.twin.scene.TwinController", functools.partial(TwinController, faults=[fault]))
         begin = time.monotonic()
@@ -307,10 +318,10 @@ def test_a_robot_that_cannot_start(cell, fault, reason, monkeypatch):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signals_stop_the_robot_at_once(cell, number):
+def test_signals_stop_the_robot_at_once(cell: Cell, number: Signals) -> None:
     times = {}
 
-    def interrupt(controller):
+    def interrupt(controller: TwinController) -> None:
         while controller.state()["fraction"] < 0.2 or not controller.state()["moving"]:
             time.sleep(0.002)
         times["signal"] = time.monotonic()
@@ -320,7 +331,7 @@ def test_signals_stop_the_robot_at_once(cell, number):
         times["stand"] = time.monotonic()
         times["fraction"] = controller.state()["fraction"]
 
-    def script(number, controller, cameras):
+    def script(number: int, controller: TwinController, cameras: Cameras) -> None:
         if number == 2:
             cell.watcher = threading.Thread(target=interrupt, args=[controller])
             cell.watcher.start()
@@ -339,7 +350,7 @@ def test_signals_stop_the_robot_at_once(cell, number):
     assert cell.is_complete()
 
 
-def test_a_killed_run_is_resumed_from_a_torn_line(cell):
+def test_a_killed_run_is_resumed_from_a_torn_line(cell: Cell) -> None:
     assert cell.run()[0] == 0
     manifest = cell.out / "manifest.jsonl"
     lines = manifest.read_bytes().splitlines(keepends=True)
@@ -348,8 +359,8 @@ def test_a_killed_run_is_resumed_from_a_torn_line(cell):
     assert cell.is_complete()
 
 
-def test_nothing_moves_without_consent(cell, monkeypatch):
-    def refuse(*_):
+def test_nothing_moves_without_consent(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
         raise AssertionError("the twin was started")
 
     monkeypatch.setattr("torchpose.rig.twin.scene.TwinController", refuse)
@@ -366,36 +377,36 @@ def test_nothing_moves_without_consent(cell, monkeypatch):
     assert not (cell.out / "manifest.jsonl").exists()
 
 
-def mistakes():
-    def outside(cell):
+def mistakes() -> list[Callable[..., Any]]:
+    def outside(cell: Cell) -> str:
         cell.plan["steps"] = [{"translation": {"axes": ["x"], "values_mm": [70]}}]
         return "waypoint 0001 (translation x 70 mm) has x = 470.0 mm, outside of the workspace"
 
-    def not_a_number(cell):
+    def not_a_number(cell: Cell) -> str:
         cell.plan["steps"] = [{"poses": [[400.0, float("nan"), 300.0, 3.1, 0.0, 0.0]]}]
         return "steps[0].poses[0][1]: is not finite"
 
-    def other_camera(cell):
+    def other_camera(cell: Cell) -> str:
         cell.rig["cameras"][0]["name"] = "left"
         return "cameras: 'left' of the rig file is missing"
 
-    def other_size(cell):
+    def other_size(cell: Cell) -> str:
         cell.rig["cameras"][0]["width"] = 300
         return "320 x 240 px, in the rig file 300 x 240"
 
-    def no_place(cell):
+    def no_place(cell: Cell) -> str:
         del cell.twin["cameras"][0]["base_from_camera"]
         return "does not say where it is"
 
-    def two_places(cell):
+    def two_places(cell: Cell) -> str:
         cell.twin["base_from_target"] = cell.twin["tool_from_target"]
         return "give tool_from_target or base_from_target, one of both"
 
-    def not_loopback(cell):
+    def not_loopback(cell: Cell) -> str:
         cell.twin["host"] = "192.168.0.10"
         return "host"
 
-    def unknown_key(cell):
+    def unknown_key(cell: Cell) -> str:
         cell.rig["dwell"] = 1
         return "did you mean dwell_s?"
 
@@ -403,7 +414,7 @@ def mistakes():
 
 
 @pytest.mark.parametrize("mistake", mistakes(), ids=lambda mistake: mistake.__name__)
-def test_mistakes_in_the_files(cell, mistake):
+def test_mistakes_in_the_files(cell: Cell, mistake: Callable[..., Any]) -> None:
     words = mistake(cell)
     code, lines = cell.run()
     assert code == 2
@@ -412,7 +423,7 @@ def test_mistakes_in_the_files(cell, mistake):
     assert not cell.out.exists()
 
 
-def test_mistakes_with_sessions(cell):
+def test_mistakes_with_sessions(cell: Cell) -> None:
     assert cell.run("--resume") == (2, [lines := cell.run("--resume")[1][0]])
     assert "--resume: does not exist" in lines
     cell.plan["steps"] = [{"static": {"repeats": 1}}]

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import cv2
 import pytest
@@ -20,12 +23,12 @@ GOOD = ["--distance", "150", "--plate", "50x50", "--accuracy-um", "1", "5"]
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch, capfd):
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Callable[..., Any]:
     """Runs the command in a folder of its own with a camera file; gives exit code, stdout and stderr."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "camera.yaml").write_text(CAMERA)
 
-    def call(*words):
+    def call(*words: float | str) -> tuple[str | int | None, str, str]:
         with pytest.raises(SystemExit) as ended:
             main(["design", *map(str, words)])
         return ended.value.code, *capfd.readouterr()
@@ -33,7 +36,7 @@ def run(tmp_path, monkeypatch, capfd):
     return call
 
 
-def test_a_design(run, tmp_path):
+def test_a_design(run: Callable[..., Any], tmp_path: Path) -> None:
     code, out, err = run(
         "--camera", "camera.yaml", "--distance-range", 140, 160, "--tilt", 15, "--offset", 4, 0, "--plate", "50x40",
         "--accuracy-um", 2, 9, "--accuracy-deg", 0.02, "--f-number", 4, "--focal-length", 8, "--name", "left",
@@ -60,11 +63,12 @@ def test_a_design(run, tmp_path):
         assert -4 <= float(row["worst_x_mm"]) <= 4
         assert 0 <= float(row["worst_tilt_deg"]) <= 15.01
     picture = cv2.imread(str(tmp_path / "made" / "left_map.png"))
+    assert picture is not None
     assert picture.shape[1] > 1200
     assert picture.std() > 20
 
 
-def test_the_sheet_of_an_existing_target(run, tmp_path):
+def test_the_sheet_of_an_existing_target(run: Callable[..., Any], tmp_path: Path) -> None:
     code, out, err = run("--target", "quad40", "--plate", "70x70", "--out", "a/b")
     assert (code, err) == (0, "")
     assert out.split() == ["a/b/quad40.svg", "a/b/quad40.pdf"]
@@ -72,7 +76,7 @@ def test_the_sheet_of_an_existing_target(run, tmp_path):
     assert (tmp_path / "a" / "b" / "quad8.pdf").read_bytes().startswith(b"%PDF")
 
 
-def test_the_precision_of_an_existing_target(run, tmp_path):
+def test_the_precision_of_an_existing_target(run: Callable[..., Any], tmp_path: Path) -> None:
     code, out, _ = run("--target", "quad40", "--camera", "camera.yaml", "--distance", 150, "--out", "a", "--blur", 0.9)
     assert code == 0
     assert "depth of field: not counted" in out
@@ -121,7 +125,7 @@ def test_the_precision_of_an_existing_target(run, tmp_path):
         (["--target", "quad40", "--camera", "camera.yaml", "--distance", "60"], "leave the frame"),
     ],
 )
-def test_mistakes_are_one_clear_line(run, tmp_path, words, message):
+def test_mistakes_are_one_clear_line(run: Callable[..., Any], tmp_path: Path, words: list[str], message: str) -> None:
     code, out, err = run(*words, "--out", "made")
     assert code == 2
     assert err.startswith("torchpose: error: ")
@@ -131,7 +135,7 @@ def test_mistakes_are_one_clear_line(run, tmp_path, words, message):
     assert not list(tmp_path.glob("made/*"))
 
 
-def test_a_folder_that_cannot_be_written(run, tmp_path):
+def test_a_folder_that_cannot_be_written(run: Callable[..., Any], tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     code, _, err = run("--target", "quad40", "--out", "file/made")
     assert code == 2

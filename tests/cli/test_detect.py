@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,11 +15,11 @@ from torchpose.cli.main import main
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch, capfd):
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Callable[..., Any]:
     """Runs the command in a folder of its own; gives the exit code and stderr."""
     monkeypatch.chdir(tmp_path)
 
-    def call(*words):
+    def call(*words: str) -> tuple[str | int | None, str]:
         with pytest.raises(SystemExit) as ended:
             main(["detect", *map(str, words)])
         return ended.value.code, capfd.readouterr().err
@@ -24,7 +27,7 @@ def run(tmp_path, monkeypatch, capfd):
     return call
 
 
-def picture(width=320, height=240, ratio=0.5):
+def picture(width: int = 320, height: int = 240, ratio: float = 0.5) -> np.ndarray:
     frame = np.full((height, width), 210, np.uint8)
     cv2.circle(frame, (100 * 16 + 8, 90 * 16), 40 * 16, 40, -1, cv2.LINE_AA, 4)
     cv2.circle(frame, (100 * 16 + 8, 90 * 16), int(ratio * 40 * 16), 210, -1, cv2.LINE_AA, 4)
@@ -32,12 +35,12 @@ def picture(width=320, height=240, ratio=0.5):
     return cv2.GaussianBlur(frame, (0, 0), 0.8)
 
 
-def table(path):
+def table(path: str) -> list[dict[str, str]]:
     with open(path, newline="") as file:
         return list(csv.DictReader(file))
 
 
-def test_shapes_of_pictures_of_different_sizes(run, tmp_path):
+def test_shapes_of_pictures_of_different_sizes(run: Callable[..., Any], tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     cv2.imwrite(str(tmp_path / "in" / "1.png"), picture())
     cv2.imwrite(str(tmp_path / "in" / "2.png"), picture(400, 300))
@@ -65,10 +68,13 @@ def test_shapes_of_pictures_of_different_sizes(run, tmp_path):
             assert np.linalg.norm(corners - corner, axis=1).min() < 4
     for name in ("1.png", "2.png", "10.png"):
         original = cv2.imread(str(tmp_path / "in" / name))
-        assert cv2.imread(str(tmp_path / "seen" / name)).shape == original.shape
+        seen = cv2.imread(str(tmp_path / "seen" / name))
+        assert seen is not None
+        assert original is not None
+        assert seen.shape == original.shape
 
 
-def test_explain_lists_the_rejected_with_reasons(run, tmp_path):
+def test_explain_lists_the_rejected_with_reasons(run: Callable[..., Any], tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), picture())
     assert run("a.png", "--out", "plain.csv") == (0, "")
     assert run("a.png", "--out", "why.csv", "--explain", "--overlay", "seen") == (0, "")
@@ -78,7 +84,7 @@ def test_explain_lists_the_rejected_with_reasons(run, tmp_path):
     assert {row["verdict"] for row in why} > {"accepted"}
 
 
-def test_a_damaged_picture_is_reported_and_the_others_are_done(run, tmp_path):
+def test_a_damaged_picture_is_reported_and_the_others_are_done(run: Callable[..., Any], tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), picture())
     (tmp_path / "b.png").write_bytes(b"no picture")
     code, error = run("a.png", "b.png", "--out", "shapes.jsonl")
@@ -97,7 +103,7 @@ def test_a_damaged_picture_is_reported_and_the_others_are_done(run, tmp_path):
         (("a.png", "--out", "s.csv", "--overlay", "a.png"), "a.png"),
     ],
 )
-def test_mistakes(run, tmp_path, words, named):
+def test_mistakes(run: Callable[..., Any], tmp_path: Path, words: tuple[str, str, str], named: str) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), picture())
     code, error = run(*words)
     assert code == 2

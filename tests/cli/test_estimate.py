@@ -9,7 +9,9 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,6 +22,7 @@ import torch
 from torchpose.camera import Camera
 from torchpose.cli.main import main
 from torchpose.geometry import rotations
+from torchpose.results import Poses
 from torchpose.sim import add_noise, render
 from torchpose.target import Target
 
@@ -38,13 +41,13 @@ POSES = [
 BASE_COLUMNS = [f"base_{c}" for c in ("tx", "ty", "tz", "rx", "ry", "rz", "sx", "sy", "sz", "srx", "sry", "srz")]
 
 
-def png(path, image):
+def png(path: Path, image: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), image)
 
 
 @pytest.fixture(scope="session")
-def pictures():
+def pictures() -> np.ndarray:
     """Frames (3, H, W) uint8 of quad40 at POSES."""
     rotation = rotations.exp(torch.tensor([r for r, _ in POSES], dtype=torch.float64))
     translation = torch.tensor([t for _, t in POSES], dtype=torch.float64)
@@ -52,12 +55,14 @@ def pictures():
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch, capfd):
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Callable[..., Any]:
     """Runs the command in a folder with camera.yaml; gives the exit code and what was printed on stderr."""
     monkeypatch.chdir(tmp_path)
     CAMERA.save("camera.yaml")
 
-    def call(*words, camera="camera.yaml", target="quad40", out="poses.csv"):
+    def call(
+        *words: str, camera: str = "camera.yaml", target: str = "quad40", out: str = "poses.csv"
+    ) -> tuple[str | int | None, str]:
         options = ["--camera", camera, "--target", target, "--out", out, "--threads", "1"]
         with pytest.raises(SystemExit) as exit_:
             main(["estimate", *map(str, words), *options])
@@ -68,16 +73,16 @@ def run(tmp_path, monkeypatch, capfd):
     return call
 
 
-def table(path="poses.csv"):
+def table(path: str = "poses.csv") -> list[dict[str, str]]:
     with Path(path).open(newline="") as file:
         return list(csv.DictReader(file))
 
 
-def vector(row, *columns):
+def vector(row: dict[str, Any], *columns: str) -> np.ndarray:
     return np.array([float(row[c]) for c in columns])
 
 
-def assert_near(row, pose):
+def assert_near(row: dict[str, str], pose: tuple[tuple[float, float, float], tuple[float, float, float]]) -> None:
     """The row is the pose, to what these small frames allow."""
     (rotation, translation) = pose
     assert row["status"] == "ok"
@@ -86,7 +91,7 @@ def assert_near(row, pose):
     np.testing.assert_allclose(vector(row, "rx", "ry", "rz"), rotation, atol=2e-3)
 
 
-def test_a_folder_gives_one_row_a_frame_in_natural_order(run, pictures):
+def test_a_folder_gives_one_row_a_frame_in_natural_order(run: Callable[..., Any], pictures: np.ndarray) -> None:
     for i, picture in enumerate(pictures):
         png(Path(f"frames/f{i * 9 + 2}.png"), picture)  # 2, 11, 20
     assert run("frames", "--detections", "det.csv") == (0, "")
@@ -107,7 +112,7 @@ def test_a_folder_gives_one_row_a_frame_in_natural_order(run, pictures):
     np.testing.assert_allclose(vector(detections[3], "u", "v"), center, atol=0.05)
 
 
-def test_every_format_and_depth_gives_the_same_pose(run, pictures):
+def test_every_format_and_depth_gives_the_same_pose(run: Callable[..., Any], pictures: np.ndarray) -> None:
     grey = pictures[0]
     images = {
         "a8.png": grey,
@@ -129,7 +134,9 @@ def test_every_format_and_depth_gives_the_same_pose(run, pictures):
         assert_near(row, POSES[0])
 
 
-def test_bad_files_have_rows_of_their_own_and_the_good_ones_beside_them_are_solved(run, pictures):
+def test_bad_files_have_rows_of_their_own_and_the_good_ones_beside_them_are_solved(
+    run: Callable[..., Any], pictures: np.ndarray
+) -> None:
     frames = Path("frames")
     for name in ("a.png", "z.jpg"):
         png(frames / name, pictures[0])
@@ -165,7 +172,7 @@ def test_bad_files_have_rows_of_their_own_and_the_good_ones_beside_them_are_solv
     assert {p.name for p in Path("overlays").iterdir()} == {"a.png", "z.jpg.png"}
 
 
-def test_a_wrong_size_alone_is_no_failure(run):
+def test_a_wrong_size_alone_is_no_failure(run: Callable[..., Any]) -> None:
     png(Path("f/small.png"), np.zeros((10, 20), np.uint8))
     assert run("f") == (0, "")
     (row,) = table()
@@ -173,22 +180,22 @@ def test_a_wrong_size_alone_is_no_failure(run):
 
 
 @pytest.mark.parametrize("kind", ["black", "white", "noise", "noise16"])
-def test_frames_without_a_target_say_so(run, kind):
+def test_frames_without_a_target_say_so(run: Callable[..., Any], kind: str) -> None:
     generator = np.random.default_rng(0)
-    image = {
+    images: dict[str, np.ndarray] = {
         "black": np.zeros((HEIGHT, WIDTH), np.uint8),
         "white": np.full((HEIGHT, WIDTH), 255, np.uint8),
         "noise": generator.integers(0, 256, (HEIGHT, WIDTH)).astype(np.uint8),
         "noise16": generator.integers(0, 65536, (HEIGHT, WIDTH)).astype(np.uint16),
-    }[kind]
-    png(Path("f/x.png"), image)
+    }
+    png(Path("f/x.png"), images[kind])
     assert run("f") == (0, "")
     (row,) = table()
     assert row["status"] == "no_target"
     assert all(row[c] == "" for c in row if c not in ("frame", "target", "status", "markers", "reason"))
 
 
-def test_several_targets_have_a_row_each(run, pictures):
+def test_several_targets_have_a_row_each(run: Callable[..., Any], pictures: np.ndarray) -> None:
     png(Path("f/x.png"), pictures[0])
     assert run("f", "--target", "hexa50") == (0, "")
     rows = table()
@@ -197,7 +204,7 @@ def test_several_targets_have_a_row_each(run, pictures):
     assert rows[0]["status"] != "ok"
 
 
-def test_jsonl_has_covariance_quaternion_and_solutions(run, pictures):
+def test_jsonl_has_covariance_quaternion_and_solutions(run: Callable[..., Any], pictures: np.ndarray) -> None:
     png(Path("f/x.png"), pictures[0])
     png(Path("f/y.png"), np.zeros_like(pictures[0]))
     assert run("f", out="poses.jsonl") == (0, "")
@@ -212,7 +219,7 @@ def test_jsonl_has_covariance_quaternion_and_solutions(run, pictures):
     assert missing["covariance"] is None
 
 
-def test_parquet_has_the_rows_of_the_csv_typed(run, pictures):
+def test_parquet_has_the_rows_of_the_csv_typed(run: Callable[..., Any], pictures: np.ndarray) -> None:
     png(Path("f/x.png"), pictures[0])
     (Path("f") / "y.png").touch()
     assert run("f")[0] == 1
@@ -222,7 +229,7 @@ def test_parquet_has_the_rows_of_the_csv_typed(run, pictures):
         assert {c: "" if row[c] is None else str(row[c]) for c in text} == text
 
 
-def test_part_from_target_moves_the_rows_and_not_the_detections(run, pictures):
+def test_part_from_target_moves_the_rows_and_not_the_detections(run: Callable[..., Any], pictures: np.ndarray) -> None:
     png(Path("f/x.png"), pictures[0])
     text = Path("quad40.yaml")
     Target.load("quad40").save(text)
@@ -241,13 +248,13 @@ def test_part_from_target_moves_the_rows_and_not_the_detections(run, pictures):
 HAND_EYE = "{rotation: [0.3, -0.2, 2.0], translation: [700, -50, 900]}"
 
 
-def base_pose(row):
+def base_pose(row: dict[str, str]) -> tuple[np.ndarray, np.ndarray]:
     return rotations.exp(torch.tensor(vector(row, "base_rx", "base_ry", "base_rz"))).numpy(), vector(
         row, *BASE_COLUMNS[:3]
     )
 
 
-def test_hand_eye_adds_the_pose_in_the_robot_base(run, pictures):
+def test_hand_eye_adds_the_pose_in_the_robot_base(run: Callable[..., Any], pictures: np.ndarray) -> None:
     png(Path("f/x.png"), pictures[0])
     png(Path("f/y.png"), np.zeros_like(pictures[0]))
     Path("he.yaml").write_text(f"base_from_camera: {HAND_EYE}\n")
@@ -265,11 +272,13 @@ def test_hand_eye_adds_the_pose_in_the_robot_base(run, pictures):
     assert all(empty[c] == "" for c in BASE_COLUMNS)
 
 
-def test_a_camera_on_the_tool_uses_the_robot_poses_of_the_manifest(run, pictures):
+def test_a_camera_on_the_tool_uses_the_robot_poses_of_the_manifest(
+    run: Callable[..., Any], pictures: np.ndarray
+) -> None:
     png(Path("run/i/7.png"), pictures[0])
     png(Path("run/i/3.png"), pictures[0])
     tools = {"7": [0.1, 0.2, 0.3, 0.5, 0, 0], "3": [-0.4, 0, 0.1, 0, 1.0, 0]}  # metres
-    records = [{"record": "session", "units": {"length": "m"}}]
+    records: list[dict[str, Any]] = [{"record": "session", "units": {"length": "m"}}]
     records += [{"record": "frame", "id": i, "image": f"i/{i}.png", "robot_pose": tool} for i, tool in tools.items()]
     Path("run/manifest.jsonl").write_text("\n".join(map(json.dumps, records)) + '\n{"record": "fra')
     Path("he.yaml").write_text(f"tool_from_camera: {HAND_EYE}\n")
@@ -297,7 +306,7 @@ MARKER = "  - {{id: {0}, center: [{1}, {2}, 0], outer_radius: 5, inner_radius: {
 TARGET_HEAD = "name: t\nunits: mm\nbackground: light\nmarkers:\n"
 
 
-def target_text(*markers, extra=""):
+def target_text(*markers: tuple[int, int, int, float], extra: str = "") -> str:
     return TARGET_HEAD + "".join(MARKER.format(*marker) for marker in markers) + extra
 
 
@@ -392,7 +401,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_ends_in_one_clear_line_and_exit_code_2(run, mistake):
+def test_a_mistake_ends_in_one_clear_line_and_exit_code_2(run: Callable[..., Any], mistake: str) -> None:
     words, options, files, named = MISTAKES[mistake]
     png(Path("f/x.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
     for name, text in files.items():
@@ -408,7 +417,7 @@ def test_a_mistake_ends_in_one_clear_line_and_exit_code_2(run, mistake):
     assert {p: p.read_bytes() for p in Path().rglob("*") if p.is_file()} == before  # nothing made, nothing lost
 
 
-def test_a_camera_of_another_image_size_gives_wrong_size_rows(run, pictures):
+def test_a_camera_of_another_image_size_gives_wrong_size_rows(run: Callable[..., Any], pictures: np.ndarray) -> None:
     png(Path("f/x.png"), pictures[0])
     Path("c.yaml").write_text(CAMERA_TEXT.format(matrix=MATRIX).replace("480", "500"))
     assert run("f", camera="c.yaml") == (0, "")
@@ -419,22 +428,25 @@ def test_a_camera_of_another_image_size_gives_wrong_size_rows(run, pictures):
 @pytest.mark.parametrize(
     ("words", "code", "shown"), [(["--version"], 0, "torchpose "), (["--help"], 0, "estimate"), ([], 2, "estimate")]
 )
-def test_version_and_help(capsys, words, code, shown):
+def test_version_and_help(capsys: pytest.CaptureFixture[str], words: list[str], code: int, shown: str) -> None:
     with pytest.raises(SystemExit) as exit_:
         main(words)
     assert exit_.value.code == code
     assert shown in capsys.readouterr().out
 
 
-def test_an_error_inside_is_reported_as_such_and_computed_rows_are_kept(run, pictures, monkeypatch):
+def test_an_error_inside_is_reported_as_such_and_computed_rows_are_kept(
+    run: Callable[..., Any], pictures: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from torchpose.pipeline import PoseEstimator
 
     for i in range(6):
         png(Path(f"f/{i}.png"), pictures[i % 3])
     assert run("f", "--batch", "2", out="whole.csv") == (0, "")
-    forward, calls = PoseEstimator.forward, []
+    forward = PoseEstimator.forward
+    calls: list[torch.Tensor] = []
 
-    def fail_at_the_third(self, frames, *args, **kwargs):
+    def fail_at_the_third(self: PoseEstimator, frames: torch.Tensor, *args: Any, **kwargs: Any) -> Poses:
         calls.append(frames)
         if len(calls) == 3:
             raise ZeroDivisionError("of all things")
@@ -450,7 +462,9 @@ def test_an_error_inside_is_reported_as_such_and_computed_rows_are_kept(run, pic
     assert Path("poses.csv").read_bytes() == Path("whole.csv").read_bytes()
 
 
-def test_resume_does_new_frames_only(run, pictures, monkeypatch):
+def test_resume_does_new_frames_only(
+    run: Callable[..., Any], pictures: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for i in (1, 2):
         png(Path(f"f/{i}.png"), pictures[i])
     assert run("f", "--batch", "1", "--detections", "d.csv") == (0, "")
@@ -458,9 +472,12 @@ def test_resume_does_new_frames_only(run, pictures, monkeypatch):
     from torchpose.pipeline import PoseEstimator
 
     forward, seen = PoseEstimator.forward, []
-    monkeypatch.setattr(
-        PoseEstimator, "forward", lambda self, frames, *a: (seen.append(len(frames)), forward(self, frames, *a))[1]
-    )
+
+    def counted(self: PoseEstimator, frames: torch.Tensor) -> Poses:
+        seen.append(len(frames))
+        return forward(self, frames)
+
+    monkeypatch.setattr(PoseEstimator, "forward", counted)
     assert run("f", "--batch", "1", "--detections", "d.csv", "--resume") == (0, "")
     assert seen == [1]
     resumed = Path("poses.csv").read_bytes(), Path("d.csv").read_bytes()
@@ -481,18 +498,18 @@ COMMAND = [sys.executable, "-m", "torchpose"]
 OPTIONS = ["--camera", "camera.yaml", "--target", "quad40", "--threads", "1"]
 
 
-def start(*words):
+def start(*words: str) -> subprocess.Popen[str]:
     command = [*COMMAND, "estimate", "f", *OPTIONS, "--batch", "1", *words]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-def finish(process):
+def finish(process: subprocess.Popen[str]) -> tuple[int, str]:
     out, error = process.communicate(timeout=120)
     assert out == ""
     return process.returncode, error
 
 
-def wait_for_rows(process, journal, lines):
+def wait_for_rows(process: subprocess.Popen[str], journal: Path, lines: int) -> bool:
     """Waits until the journal has grown by some lines; False if the process ended before."""
     begin = None
     while process.poll() is None:
@@ -506,7 +523,7 @@ def wait_for_rows(process, journal, lines):
 
 
 @pytest.fixture
-def many(tmp_path, monkeypatch, pictures):
+def many(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pictures: np.ndarray) -> None:
     """A folder of frames, one of them unreadable, one empty of targets."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
@@ -518,12 +535,12 @@ def many(tmp_path, monkeypatch, pictures):
 
 
 @pytest.mark.usefixtures("many")
-def test_a_run_killed_again_and_again_and_resumed_gives_the_rows_of_an_undisturbed_one():
+def test_a_run_killed_again_and_again_and_resumed_gives_the_rows_of_an_undisturbed_one() -> None:
     assert finish(start("--out", "whole.csv", "--detections", "whole_det.csv"))[0] == 1
     chance = random.Random(3)
     journal = Path("poses.csv.partial")
     words = ["--out", "poses.csv", "--detections", "det.csv"]
-    kills = []
+    kills: list[Any] = []
     for _ in range(3):
         process = start(*words, *(["--resume"] if kills else []))
         assert wait_for_rows(process, journal, chance.randint(1, 5))
@@ -544,7 +561,7 @@ def test_a_run_killed_again_and_again_and_resumed_gives_the_rows_of_an_undisturb
 
 
 @pytest.mark.usefixtures("many")
-def test_an_interrupted_run_says_how_to_go_on_and_prints_nothing_else():
+def test_an_interrupted_run_says_how_to_go_on_and_prints_nothing_else() -> None:
     process = start("--out", "poses.csv")
     assert wait_for_rows(process, Path("poses.csv.partial"), 2)
     process.send_signal(signal.SIGINT)
@@ -561,8 +578,8 @@ def test_an_interrupted_run_says_how_to_go_on_and_prints_nothing_else():
 
 
 @pytest.mark.usefixtures("many")
-def test_a_full_disk_ends_in_one_line_and_loses_nothing():
-    def small_files():
+def test_a_full_disk_ends_in_one_line_and_loses_nothing() -> None:
+    def small_files() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (30000, 30000))
 
     process = subprocess.Popen(
@@ -583,7 +600,7 @@ def test_a_full_disk_ends_in_one_line_and_loses_nothing():
 
 @pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs a pseudo-terminal")
 @pytest.mark.usefixtures("many")
-def test_a_terminal_sees_progress_and_a_summary_unless_it_is_told_to_be_quiet():
+def test_a_terminal_sees_progress_and_a_summary_unless_it_is_told_to_be_quiet() -> None:
     for words, loud in (([], True), (["--quiet"], False)):
         master, slave = os.openpty()
         process = subprocess.Popen(

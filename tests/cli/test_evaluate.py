@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import math
+from pathlib import Path
+from typing import Any
 
 import cv2
 import pytest
@@ -20,7 +22,9 @@ POSE = ("tx", "ty", "tz", "rx", "ry", "rz")
 STD = ("sx", "sy", "sz", "srx", "sry", "srz")
 
 
-def case(count=400, seed=0, statuses=None):
+def case(
+    count: int = 400, seed: int = 0, statuses: list[str] | None = None
+) -> tuple[Truth, list[dict[str, Any]], torch.Tensor]:
     """A truth, and rows of estimates drawn from a known covariance with a bias of 1 um in z."""
     g = torch.Generator().manual_seed(seed)
     w, t = torch.randn(count, 3, dtype=F64, generator=g) * 0.2, torch.randn(count, 3, dtype=F64, generator=g) * 10
@@ -38,7 +42,7 @@ def case(count=400, seed=0, statuses=None):
     statuses = statuses or ["ok"] * count
     rows = []
     for i in range(count):
-        row = {"frame": truth.frame[i], "target": "quad40", "status": statuses[i]}
+        row: dict[str, Any] = {"frame": truth.frame[i], "target": "quad40", "status": statuses[i]}
         pose = [*estimate_t[i].tolist(), *estimate_w[i].tolist()]
         empty = statuses[i] in ("no_target", "rejected")
         row |= dict.fromkeys((*POSE, *STD)) if empty else dict(zip(POSE, pose, strict=True))
@@ -49,7 +53,7 @@ def case(count=400, seed=0, statuses=None):
     return truth, rows, error
 
 
-def write(folder, truth, rows, name="poses.jsonl"):
+def write(folder: Path, truth: Truth, rows: list[dict[str, Any]], name: str = "poses.jsonl") -> Path:
     write_truth(folder / "truth.csv", truth)
     path = folder / name
     if name.endswith(".csv"):
@@ -63,13 +67,13 @@ def write(folder, truth, rows, name="poses.jsonl"):
     return path
 
 
-def run(*words):
+def run(*words: Path | str) -> str | int | None:
     with pytest.raises(SystemExit) as end:
         main(["evaluate", *map(str, words)])
     return end.value.code
 
 
-def test_statistics_are_those_of_the_errors():
+def test_statistics_are_those_of_the_errors() -> None:
     truth, rows, error = case()
     result = evaluate(estimates_of(rows), truth)
     shown = error * SCALE
@@ -86,7 +90,7 @@ def test_statistics_are_those_of_the_errors():
     assert result.found == 397
 
 
-def test_a_bias_is_told_from_spread():
+def test_a_bias_is_told_from_spread() -> None:
     truth, rows, _ = case()
     for row in rows:
         row["tz"] += 0.002
@@ -96,7 +100,7 @@ def test_a_bias_is_told_from_spread():
     assert evaluate(estimates_of(rows), truth).nees > 8
 
 
-def test_only_ok_rows_count():
+def test_only_ok_rows_count() -> None:
     statuses = ["ok"] * 5 + ["no_target", "rejected", "ambiguous"]
     truth, rows, error = case(8, statuses=statuses)
     result = evaluate(estimates_of(rows), truth)
@@ -106,7 +110,7 @@ def test_only_ok_rows_count():
     assert (result.visible, result.found) == (5, 2)
 
 
-def test_table_files_and_plots(tmp_path, capsys):
+def test_table_files_and_plots(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     truth, rows, error = case(40)
     poses = write(tmp_path, truth, rows)
     assert run(poses, tmp_path, "--out", tmp_path / "errors.csv", "--plots", tmp_path / "plots") == 0
@@ -119,23 +123,24 @@ def test_table_files_and_plots(tmp_path, capsys):
     assert float(table[7]["roll_mdeg"]) == pytest.approx(math.degrees(float(error[7, 5])) * 1e3, rel=1e-4)
     for name in ("errors", "consistency", "conditions"):
         picture = cv2.imread(str(tmp_path / "plots" / f"{name}.png"))
+        assert picture is not None
         assert picture.shape[1] > 1000
         assert picture.std() > 5
 
 
-def test_csv_has_no_correlations(tmp_path, capsys):
+def test_csv_has_no_correlations(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     truth, rows, _ = case(30)
     assert run(write(tmp_path, truth, rows, "poses.csv"), tmp_path / "truth.csv") == 0
     assert "without correlations" in capsys.readouterr().out
 
 
-def test_no_pose_at_all(tmp_path, capsys):
+def test_no_pose_at_all(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     truth, rows, _ = case(4, statuses=["no_target"] * 4)
     assert run(write(tmp_path, truth, rows), tmp_path, "--plots", tmp_path / "plots") == 0
     assert "4 no_target" in capsys.readouterr().out
 
 
-def test_frames_named_from_the_data_set(tmp_path):
+def test_frames_named_from_the_data_set(tmp_path: Path) -> None:
     truth, rows, _ = case(4)
     for row in rows:
         row["frame"] = f"frames/{row['frame']}"
@@ -143,7 +148,7 @@ def test_frames_named_from_the_data_set(tmp_path):
 
 
 @pytest.mark.parametrize("wrong", ["missing", "rows", "columns", "suffix", "broken", "truth"])
-def test_mistakes_are_one_clear_line(tmp_path, capsys, wrong):
+def test_mistakes_are_one_clear_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], wrong: str) -> None:
     truth, rows, _ = case(4)
     poses = write(tmp_path, truth, rows)
     if wrong == "missing":

@@ -1,17 +1,19 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from torchpose.cli.main import main
 
 
-def run(*arguments: str) -> int:
+def run(*arguments: str) -> str | int | None:
     with pytest.raises(SystemExit) as end:
         main(["reproduce", *arguments])
     return end.value.code
 
 
-def test_one_study_as_a_user_runs_it(tmp_path, capsys):
+def test_one_study_as_a_user_runs_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "report"
     assert run("--out", str(out), "--only", "fig07_subpixel") == 0
     assert capsys.readouterr().out.strip() == str(out / "report.html")
@@ -20,7 +22,7 @@ def test_one_study_as_a_user_runs_it(tmp_path, capsys):
         assert (out / "fig07_subpixel" / name).stat().st_size > 0
 
 
-def test_mistakes_end_in_one_line(tmp_path, capsys):
+def test_mistakes_end_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("--out", str(tmp_path), "--only", "table99") == 2
     assert capsys.readouterr().err.startswith("torchpose: error: table99: --only: is no study; give one of fig02_pnp")
     (tmp_path / "file").write_text("")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from pathlib import Path
 
 import cv2
 import pytest
@@ -12,18 +13,18 @@ from torchpose.cli.main import main
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is:DeprecationWarning")
 
 
-def run(*arguments: object) -> int:
+def run(*arguments: object) -> str | int | None:
     with pytest.raises(SystemExit) as stopped:
         main(["sensitivity", *map(str, arguments)])
     return stopped.value.code
 
 
-def rows_of(path):
+def rows_of(path: Path) -> list[dict[str, str]]:
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
 
 
-def test_the_papers_set_up_by_default(tmp_path, capsys):
+def test_the_papers_set_up_by_default(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("--out", tmp_path / "o", "--steps", 3, "--draws", 50) == 0
     shown = capsys.readouterr().out
     assert "0.2 px, focal length 0.25 %" in shown
@@ -38,7 +39,7 @@ def test_the_papers_set_up_by_default(tmp_path, capsys):
         assert cv2.imread(str(tmp_path / "o" / name)) is not None
 
 
-def test_another_camera_and_every_source(tmp_path, capsys):
+def test_another_camera_and_every_source(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sources = ("--focal-error-percent", 0.05, "--principal-point-px", 1, "--print-um", 5, "--flatness-um", 10)
     more = ("--radius-um", 5, "--scale-percent", 0.05, "--distortion", "1e-4,1e-4,1e-5,1e-5", "--tilt-deg", 20)
     view = ("--camera", "data/sample/camera.yaml", "--target", "quad40", "--distance", 150, 170, "--steps", 3)
@@ -48,7 +49,7 @@ def test_another_camera_and_every_source(tmp_path, capsys):
     assert {"image", "distortion", "print_centers", "print_flatness", "print_radii", "print_scale", "total"} <= found
 
 
-def test_without_other_sources_there_is_noise_alone(tmp_path):
+def test_without_other_sources_there_is_noise_alone(tmp_path: Path) -> None:
     assert run("--out", tmp_path, "--focal-error-percent", 0, "--sigma-px", 0.5, "--steps", 3, "--draws", 5) == 0
     assert {row["case"] for row in rows_of(tmp_path / "errors.csv")} == {"0.5 px"}
 
@@ -69,14 +70,16 @@ def test_without_other_sources_there_is_noise_alone(tmp_path):
         (("--draws", 1), "draws"),
     ],
 )
-def test_wrong_input_is_one_line(tmp_path, capsys, arguments, message):
+def test_wrong_input_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, int | str], message: str
+) -> None:
     assert run("--out", tmp_path / "o", "--steps", 3, "--draws", 5, *arguments) == 2
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
 
 
-def test_a_folder_that_cannot_be_written(tmp_path, capsys):
+def test_a_folder_that_cannot_be_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").write_text("")
     assert run("--out", tmp_path / "file", "--steps", 3, "--draws", 5, "--sigma-px", 1) == 2
     assert "--out" in capsys.readouterr().err

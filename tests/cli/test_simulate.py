@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -36,12 +37,12 @@ PLAN = {
 
 
 @pytest.fixture
-def folder(tmp_path):
+def folder(tmp_path: Path) -> Path:
     CAMERA.save(tmp_path / "camera.json")
     return tmp_path
 
 
-def save(folder, **changes):
+def save(folder: Path, **changes: Any) -> Path:
     """plan.yaml with keys replaced; a key may be a path such as sensor__noise."""
     plan = json.loads(json.dumps(PLAN))
     for name, value in changes.items():
@@ -55,17 +56,18 @@ def save(folder, **changes):
     return path
 
 
-def run(*words):
+def run(*words: int | Path | str) -> str | int | None:
     with pytest.raises(SystemExit) as end:
         main([*map(str, words), "--quiet"])
     return end.value.code
 
 
-def frames_of(out):
-    return {p.name: cv2.imread(str(p), cv2.IMREAD_UNCHANGED) for p in sorted((out / "frames").iterdir())}
+def frames_of(out: Path) -> dict[str, np.ndarray]:
+    paths = sorted((out / "frames").iterdir())
+    return {p.name: np.asarray(cv2.imread(str(p), cv2.IMREAD_UNCHANGED)) for p in paths}
 
 
-def test_frames_are_those_of_the_renderer(folder):
+def test_frames_are_those_of_the_renderer(folder: Path) -> None:
     out = folder / "set"
     assert run("simulate", save(folder), "--out", out) == 0
     truth = read_truth(out / "truth.csv")
@@ -86,7 +88,7 @@ def test_frames_are_those_of_the_renderer(folder):
 
 
 @pytest.mark.parametrize("faults", [{}, {"RandomErasing": {"scale": [0.01, 0.02], "value": 0.3, "p": 0.8}}])
-def test_frames_depend_on_the_plan_alone(folder, faults):
+def test_frames_depend_on_the_plan_alone(folder: Path, faults: dict[str, Any]) -> None:
     path = save(folder, bounds=False, faults=faults)
     assert run("simulate", path, "--out", folder / "a", "--batch", 2, "--threads", 2) == 0
     assert run("simulate", path, "--out", folder / "b", "--batch", 5, "--threads", 1) == 0
@@ -101,7 +103,7 @@ def test_frames_depend_on_the_plan_alone(folder, faults):
     assert (folder / "a" / "truth.csv").read_text() == (folder / "b" / "truth.csv").read_text()
 
 
-def test_resume_keeps_finished_frames(folder):
+def test_resume_keeps_finished_frames(folder: Path) -> None:
     path, out = save(folder, bounds=False), folder / "set"
     assert run("simulate", path, "--out", out) == 0
     kept = out / "frames" / "0001.png"
@@ -112,7 +114,7 @@ def test_resume_keeps_finished_frames(folder):
     assert (out / "frames" / "0002.png").stat().st_size > 1000
 
 
-def test_refuses_to_mix_data_sets(folder, capsys):
+def test_refuses_to_mix_data_sets(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = folder / "set"
     assert run("simulate", save(folder, bounds=False), "--out", out) == 0
     assert run("simulate", save(folder, bounds=False), "--out", out) == 2
@@ -121,7 +123,7 @@ def test_refuses_to_mix_data_sets(folder, capsys):
     assert "another plan" in capsys.readouterr().err
 
 
-def test_bop_export(folder):
+def test_bop_export(folder: Path) -> None:
     out = folder / "set"
     assert run("simulate", save(folder, bounds=False), "--out", out, "--bop") == 0
     scene = out / "bop" / "000000"
@@ -139,7 +141,7 @@ def test_bop_export(folder):
         assert (scene / "gray" / f"{i:06d}.png").read_bytes() == (out / "frames" / truth.frame[i]).read_bytes()
 
 
-def test_depth_of_the_sensor(folder):
+def test_depth_of_the_sensor(folder: Path) -> None:
     assert run("simulate", save(folder, bounds=False, sensor__bits=12), "--out", folder / "set") == 0
     frame = frames_of(folder / "set")["0000.png"]
     assert frame.dtype == np.uint16
@@ -173,7 +175,9 @@ def test_depth_of_the_sensor(folder):
         ),
     ],
 )
-def test_a_wrong_plan_is_one_clear_line(folder, capsys, changes, words):
+def test_a_wrong_plan_is_one_clear_line(
+    folder: Path, capsys: pytest.CaptureFixture[str], changes: dict[str, float | list[float]], words: tuple[str, str]
+) -> None:
     path = save(folder, **changes)
     assert run("simulate", path, "--out", folder / "set") == 2
     message = capsys.readouterr().err
@@ -184,7 +188,7 @@ def test_a_wrong_plan_is_one_clear_line(folder, capsys, changes, words):
     assert not (folder / "set").exists()
 
 
-def test_marked_frames(folder):
+def test_marked_frames(folder: Path) -> None:
     # in view, cut by the border, out of the depth range, out of view, behind the camera
     positions = [[0, 0, 0], [45, 0, 0], [0, 0, 80], [300, 0, 0], [0, 0, -360]]
     path = save(
@@ -203,7 +207,7 @@ def test_marked_frames(folder):
     assert frames["0004.png"].std() < 5  # nothing but noise
 
 
-def test_grid_is_that_of_the_paper():
+def test_grid_is_that_of_the_paper() -> None:
     plan = load_plan(ROOT / "configs" / "plans" / "paper_grid.yaml")
     assert len(plan) == 875
     assert plan.t.unique(dim=0).tolist() == sorted(
@@ -216,7 +220,7 @@ def test_grid_is_that_of_the_paper():
 
 
 @pytest.mark.parametrize("name", ["random", "single_axis", "stress"])
-def test_plans_that_come_with_it(name):
+def test_plans_that_come_with_it(name: str) -> None:
     plan = load_plan(ROOT / "configs" / "plans" / f"{name}.yaml")
     truth = plan_truth(plan)
     if name != "stress":
@@ -232,7 +236,7 @@ def test_plans_that_come_with_it(name):
             assert (share - 0.25).abs().max() < 0.1
 
 
-def test_stress_frame_has_what_the_plan_says(folder):
+def test_stress_frame_has_what_the_plan_says(folder: Path) -> None:
     path = save(
         folder,
         poses__random__count=2,
@@ -254,7 +258,7 @@ def test_stress_frame_has_what_the_plan_says(folder):
     torch.testing.assert_close(again[0].float(), frames[1], rtol=0, atol=1)
 
 
-def test_background_pictures(folder):
+def test_background_pictures(folder: Path) -> None:
     pictures = folder / "pictures"
     pictures.mkdir()
     for i, level in enumerate((40, 160)):

@@ -1,12 +1,13 @@
 """Blender against the analytic renderer: the same plan, two independent programs. Runs where bpy is installed.
 
-pip install -e '.[blender,dev]' under Python 3.11, then pytest -m slow tests/sim/test_blender.py
+pip install -e '.[blender,dev]' under Python 3.11, then pytest -m slow tests/datasets/test_blender.py
 """
 
 from __future__ import annotations
 
 import math
 import os
+from pathlib import Path
 
 import pytest
 import torch
@@ -14,7 +15,7 @@ import torch
 import torchpose as tp
 from torchpose.datasets.blender import filter_width
 from torchpose.datasets.dataset import analytic
-from torchpose.datasets.plan import load_plan
+from torchpose.datasets.plan import Plan, load_plan
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.sim import add_noise
@@ -34,7 +35,7 @@ bounds: false
 
 
 @pytest.fixture
-def plan(tmp_path):
+def plan(tmp_path: Path) -> Plan:
     """The 2 MP camera with unequal focal lengths and a principal point off the centre."""
     matrix = torch.tensor([[1111.0, 0, 925.0], [0, 1105.0, 598.0], [0, 0, 1]], dtype=torch.float64)
     tp.Camera(1824, 1216, matrix, torch.zeros(4, dtype=torch.float64)).save(tmp_path / "camera.json")
@@ -42,9 +43,10 @@ def plan(tmp_path):
     return load_plan(tmp_path / "plan.yaml")
 
 
-def test_filter_width_has_the_variance():
+def test_filter_width_has_the_variance() -> None:
     x = torch.linspace(-0.5, 0.5, 200001, dtype=torch.float64)
-    window = 0.35875 + sum(a * (2 * math.pi * k * x).cos() for k, a in ((1, 0.48829), (2, 0.14128), (3, 0.01168)))
+    terms = ((0, 0.35875), (1, 0.48829), (2, 0.14128), (3, 0.01168))
+    window = torch.stack([a * (2 * math.pi * k * x).cos() for k, a in terms]).sum(0)
     variance = float((x.square() * window).sum() / window.sum())
     for psf in (0.4, 0.7, 1.5):
         assert (2 * filter_width(psf)) ** 2 * variance == pytest.approx(psf**2 + 1 / 12, rel=1e-4)
@@ -58,7 +60,7 @@ def test_filter_width_has_the_variance():
         ("imaging.motion_mm", "plate:", "motion_mm: 0.1, plate:"),
     ],
 )
-def test_what_is_not_modelled_is_an_error(plan, field, old, new):
+def test_what_is_not_modelled_is_an_error(plan: Plan, field: str, old: str, new: str) -> None:
     from torchpose.datasets.blender import blender
 
     path = plan.path
@@ -69,7 +71,7 @@ def test_what_is_not_modelled_is_an_error(plan, field, old, new):
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)  # twelve seconds a frame on one core
-def test_agrees_with_the_analytic_renderer(plan):
+def test_agrees_with_the_analytic_renderer(plan: Plan) -> None:
     pytest.importorskip("bpy")
     from torchpose.datasets.blender import blender
 
@@ -95,7 +97,7 @@ def test_agrees_with_the_analytic_renderer(plan):
     assert (distance < 22.5).all()
 
 
-def ink_centroids(plan, frames):
+def ink_centroids(plan: Plan, frames: torch.Tensor) -> torch.Tensor:
     """(B, M, 2) centroids of the dark mass within 1.2 outer radii of each marker."""
     c = plan.conditions
     camera, target = plan.camera, plan.target
@@ -106,7 +108,7 @@ def ink_centroids(plan, frames):
         R, t = plan.R[i], plan.t[i]
         depth = (R[:, 2] @ t) / (ray @ R[:, 2])
         plane = (depth[..., None] * ray - t) @ R[:, :2]
-        dark = (c["light"][i] - frame) / (c["light"][i] - c["dark"][i])
+        dark = (c.light[i] - frame) / (c.light[i] - c.dark[i])
         for center, radius in zip(target.centers, target.radii[:, 0], strict=True):
             mass = dark * ((plane - center[:2]).norm(dim=-1) < 1.2 * radius)
             out.append(torch.stack([(mass * u).sum(), (mass * v).sum()]) / mass.sum())

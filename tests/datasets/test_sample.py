@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 
 import cv2
@@ -10,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 
+from scripts import make_sample
 from torchpose.camera import Camera
-from torchpose.io.truth import read_truth
+from torchpose.io.truth import Truth, read_truth
 from torchpose.target import Target
 
 ROOT = Path(__file__).parents[2]
@@ -19,23 +19,16 @@ SAMPLE = ROOT / "data" / "sample"
 
 
 @pytest.fixture(scope="module")
-def script():
-    spec = importlib.util.spec_from_file_location("make_sample", ROOT / "scripts" / "make_sample.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.fixture(scope="module")
-def truth():
+def truth() -> Truth:
     return read_truth(SAMPLE / "truth.csv")
 
 
 @pytest.mark.parametrize("row", [3, 10])
-def test_frame_is_reproduced(script, truth, row):
+def test_frame_is_reproduced(truth: Truth, row: int) -> None:
     committed = cv2.imread(str(SAMPLE / "frames" / truth.frame[row]), cv2.IMREAD_UNCHANGED)
+    assert committed is not None
     camera, target = Camera.load(SAMPLE / "camera.yaml"), Target.load(SAMPLE / "target.yaml")
-    made = script.sample_frames(camera, target, truth, slice(row, row + 1))[0].numpy()
+    made = make_sample.sample_frames(camera, target, truth, slice(row, row + 1))[0].numpy()
     assert committed.dtype == made.dtype == np.uint8
     difference = abs(committed.astype(int) - made)
     # another platform's exponential may round a grey value to the other side
@@ -43,8 +36,8 @@ def test_frame_is_reproduced(script, truth, row):
     assert (difference > 0).mean() < 1e-4
 
 
-def test_truth_is_reproduced(script, truth):
-    made = script.sample_truth(script.sample_camera(), Target.load("quad40"))
+def test_truth_is_reproduced(truth: Truth) -> None:
+    made = make_sample.sample_truth(make_sample.sample_camera(), Target.load("quad40"))
     assert (made.frame, made.target, list(made.extra)) == (truth.frame, truth.target, list(truth.extra))
     torch.testing.assert_close(made.t, truth.t, rtol=0, atol=1e-12)
     torch.testing.assert_close(made.rotation_vector, truth.rotation_vector, rtol=0, atol=1e-12)
@@ -52,7 +45,7 @@ def test_truth_is_reproduced(script, truth):
         torch.testing.assert_close(made.extra[name], column, rtol=1e-6, atol=0)
 
 
-def test_conditions(truth):
+def test_conditions(truth: Truth) -> None:
     camera = Camera.load(SAMPLE / "camera.yaml")
     frames = sorted((SAMPLE / "frames").iterdir())
     assert [f.name for f in frames] == truth.frame

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 
 import pytest
 import torch
@@ -21,7 +22,7 @@ sides = st.floats(20.0, 500.0)
 
 @settings(max_examples=60, deadline=None)
 @given(counts, sides, sides, st.floats(0.05, 1.0))
-def test_rings_keep_clear_of_each_other_and_of_the_rim(count, width, height, part):
+def test_rings_keep_clear_of_each_other_and_of_the_rim(count: int, width: float, height: float, part: float) -> None:
     radius = part * LIMITS.largest_radius(count, (width, height))
     if radius == 0:
         return
@@ -36,7 +37,7 @@ def test_rings_keep_clear_of_each_other_and_of_the_rim(count, width, height, par
 
 @settings(max_examples=60, deadline=None)
 @given(counts, st.floats(0.5, 60.0))
-def test_codes_can_be_read_and_told_apart(count, radius):
+def test_codes_can_be_read_and_told_apart(count: int, radius: float) -> None:
     ratios = LIMITS.ratios(count, radius)
     semi_minor = radius * LIMITS.scale
     if ratios is None:
@@ -48,14 +49,14 @@ def test_codes_can_be_read_and_told_apart(count, radius):
     assert float(ratios.diff().min()) >= 2 * ratio_tolerance(semi_minor) - 1e-9
 
 
-def test_many_codes_need_large_rings():
+def test_many_codes_need_large_rings() -> None:
     assert LIMITS.ratios(12, 100.0) is not None
     assert LIMITS.ratios(12, 6.0) is None
     assert LIMITS.ratios(4, 1.9) is None  # below 12 px
 
 
-def test_limits_follow_the_reduced_frame():
-    def of(width, height):
+def test_limits_follow_the_reduced_frame() -> None:
+    def of(width: int, height: int) -> Limits:
         matrix = torch.tensor([[1000.0, 0, width / 2], [0, 1000.0, height / 2], [0, 0, 1]], dtype=F64)
         return Limits.of(Camera(width, height, matrix, torch.zeros(0, dtype=F64)), 5.0)
 
@@ -66,7 +67,7 @@ def test_limits_follow_the_reduced_frame():
 
 @pytest.mark.parametrize("count", ARRANGEMENTS)
 @pytest.mark.parametrize("plate", [(80.0, 80.0), (50.0, 80.0)])
-def test_codes_differ_under_every_symmetry(count, plate):
+def test_codes_differ_under_every_symmetry(count: int, plate: tuple[float, float]) -> None:
     places = LIMITS.places(count, plate, 0.8 * LIMITS.largest_radius(count, plate))
     ratios = torch.linspace(0.25, 0.75, count, dtype=F64)
     codes = assign_codes(places, ratios)
@@ -77,12 +78,12 @@ def test_codes_differ_under_every_symmetry(count, plate):
     for swap, sx, sy in itertools.product((False, True), (1, -1), (1, -1)):
         if (swap, sx, sy) == (False, 1, 1):
             continue
-        change = []
+        change: list[float] = []
         for x, y in places.tolist():
             image = (sx * (y if swap else x), sy * (x if swap else y))
             other = by_place.get((round(image[0], 3) + 0.0, round(image[1], 3) + 0.0))
-            change.append(None if other is None else abs(other - by_place[round(x, 3), round(y, 3)]))
-        if None in change:
+            change.append(math.nan if other is None else abs(other - by_place[round(x, 3), round(y, 3)]))
+        if any(math.isnan(c) for c in change):
             continue  # not a symmetry of these places
         symmetries += 1
         moved = [c for c in change if c > 0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -30,16 +31,16 @@ F64 = torch.float64
 VOLUME = WorkingVolume((140.0, 180.0), (6.0, 4.0), math.radians(40))
 
 
-def camera():
+def camera() -> tp.Camera:
     matrix = torch.tensor([[800.0, 0, 310], [0, 790.0, 250], [0, 0, 1]], dtype=F64)
     return tp.Camera(640, 520, matrix, torch.tensor([-0.1, 0.02, 1e-3, -1e-3], dtype=F64))
 
 
-def poses(count):
+def poses(count: int) -> tuple[torch.Tensor, torch.Tensor]:
     return VOLUME.random(count, torch.Generator().manual_seed(3))
 
 
-def test_edges_are_propagated_as_by_the_sensitivity_analysis():
+def test_edges_are_propagated_as_by_the_sensitivity_analysis() -> None:
     cam, target, imaging = camera(), tp.Target.load("hexa50"), Imaging(psf_sigma=0.9, noise=3.0)
     R, t = poses(10)
     found = edge_covariance(cam, target, R, t, imaging)
@@ -50,7 +51,7 @@ def test_edges_are_propagated_as_by_the_sensitivity_analysis():
     torch.testing.assert_close(found / both, expected / both, rtol=0, atol=5e-3)
 
 
-def test_prediction_lies_a_little_above_the_bound():
+def test_prediction_lies_a_little_above_the_bound() -> None:
     # gradients of the grey levels and the width of the refinement's band cost 2 to 15 %
     cam, target, imaging = camera(), tp.Target.load("quad40"), Imaging()
     R, t = poses(4)
@@ -60,7 +61,7 @@ def test_prediction_lies_a_little_above_the_bound():
     assert (found / bound < 1.2).all()
 
 
-def test_prediction_is_what_the_estimator_states():
+def test_prediction_is_what_the_estimator_states() -> None:
     cam, target, imaging = camera(), tp.Target.load("quad40"), Imaging(noise=3.0)
     R, t = poses(4)
     frames = add_noise(render(cam, target, R, t, psf_sigma=0.7), 3.0, seed=9)
@@ -70,13 +71,13 @@ def test_prediction_is_what_the_estimator_states():
     torch.testing.assert_close(found, deviations(stated.covariance), rtol=0.05, atol=0)
 
 
-def test_deviations_in_um_and_mdeg():
+def test_deviations_in_um_and_mdeg() -> None:
     covariance = torch.diag(torch.tensor([1e-3, 2e-3, 3e-3, 1e-5, 2e-5, 3e-5], dtype=F64).square())[None]
     expected = [1.0, 2.0, 3.0, *(math.degrees(x) * 1e3 for x in (1e-5, 2e-5, 3e-5))]
     assert deviations(covariance)[0].tolist() == pytest.approx(expected)
 
 
-def test_defocus_widens_the_blur():
+def test_defocus_widens_the_blur() -> None:
     cam = camera()
     lens = Defocus(4.0, 8.0, best_focus(120.0, 240.0))
     assert lens.focus_distance == pytest.approx(160.0)
@@ -108,6 +109,6 @@ def test_defocus_widens_the_blur():
         {"light": 300.0},
     ],
 )
-def test_impossible_conditions_are_refused(wrong):
+def test_impossible_conditions_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match="; "):
         Imaging(**wrong)

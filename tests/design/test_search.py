@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
 
 import torchpose as tp
 from torchpose.design import (
+    Design,
     Imaging,
     Need,
     WorkingVolume,
@@ -25,17 +27,17 @@ VOLUME = WorkingVolume((140.0, 160.0), (5.0, 3.0), math.radians(25))
 IMAGING = Imaging()
 
 
-def camera(scale=1.0):
+def camera(scale: float = 1.0) -> tp.Camera:
     matrix = torch.tensor([[800.0 * scale, 0, 319.5 * scale], [0, 800.0 * scale, 259.5 * scale], [0, 0, 1]], dtype=F64)
     return tp.Camera(round(640 * scale), round(520 * scale), matrix, torch.zeros(0, dtype=F64))
 
 
 @pytest.fixture(scope="module")
-def made():
+def made() -> Design:
     return design_target(camera(), VOLUME, (50.0, 50.0), Need(1.0, 5.0), IMAGING)
 
 
-def test_a_design_promises_what_was_needed(made, tmp_path):
+def test_a_design_promises_what_was_needed(made: Design, tmp_path: Path) -> None:
     worst = made.precision.worst
     assert float(worst[:2].max()) <= 1.0
     assert float(worst[2]) <= 5.0
@@ -51,13 +53,13 @@ def test_a_design_promises_what_was_needed(made, tmp_path):
     assert torch.equal(again.radii, made.target.radii)
 
 
-def test_no_point_of_the_volume_is_worse_than_the_worst(made):
+def test_no_point_of_the_volume_is_worse_than_the_worst(made: Design) -> None:
     R, t = VOLUME.random(24, torch.Generator().manual_seed(1))
     found = deviations(predicted_covariance(camera(), made.target, R, t, IMAGING))
     assert (found.amax(0) < 1.03 * made.precision.worst).all()
 
 
-def test_a_designed_target_is_read_at_the_extremes(made):
+def test_a_designed_target_is_read_at_the_extremes(made: Design) -> None:
     R, t = VOLUME.extremes()
     some = torch.arange(0, len(t), 97)
     frames = render(camera(), made.target, R[some], t[some], plate=(50.0, 50.0), surround=128.0)
@@ -68,7 +70,7 @@ def test_a_designed_target_is_read_at_the_extremes(made):
     assert (error < 5 * made.precision.worst[:3]).all()
 
 
-def test_more_rings_where_four_do_not_reach_it():
+def test_more_rings_where_four_do_not_reach_it() -> None:
     # nine rings have longer edges than four on an oblong plate
     plate, volume = (70.0, 30.0), WorkingVolume((150.0, 150.0))
     four = design_target(camera(), volume, plate, Need(9.0, 9.0), IMAGING, markers=4)
@@ -78,7 +80,7 @@ def test_more_rings_where_four_do_not_reach_it():
     assert len(design_target(camera(), volume, plate, Need(between, 9.0), IMAGING).target) > 4
 
 
-def test_dark_background_and_name():
+def test_dark_background_and_name() -> None:
     found = design_target(
         camera(), VOLUME, (60.0, 40.0), Need(2.0, 9.0, 0.02), IMAGING, name="left", background="dark", markers=6
     )
@@ -86,19 +88,19 @@ def test_dark_background_and_name():
     assert float(found.precision.worst[3:].max()) <= 20.0
 
 
-def test_out_of_reach_says_what_can_be_reached():
+def test_out_of_reach_says_what_can_be_reached() -> None:
     with pytest.raises(ConfigError, match=r"cannot be reached: the best layout .* um, .*enlarge the plate"):
         design_target(camera(), VOLUME, (50.0, 50.0), Need(0.01, 0.05), IMAGING, markers=6)
 
 
-def test_a_plate_out_of_view_says_what_is_in_view():
+def test_a_plate_out_of_view_says_what_is_in_view() -> None:
     with pytest.raises(ConfigError, match=r"larger than what is in view .* about [1-9]"):
         design_target(camera(), VOLUME, (300.0, 300.0), Need(1, 5), IMAGING)
     with pytest.raises(ConfigError, match=r"larger than what is in view .* about [1-9]"):
         design_target(camera(), VOLUME, (1e6, 1e6), Need(1, 5), IMAGING)
 
 
-def test_a_plate_too_small_says_so():
+def test_a_plate_too_small_says_so() -> None:
     with pytest.raises(ConfigError, match="4 codes need"):
         design_target(camera(), VOLUME, (8.0, 8.0), Need(1, 5), IMAGING)
     with pytest.raises(ConfigError, match="12 codes need"):
@@ -106,12 +108,12 @@ def test_a_plate_too_small_says_so():
 
 
 @pytest.mark.parametrize("plate", [(0.0, 50.0), (-5.0, 50.0), (math.nan, 50.0), (50.0, math.inf)])
-def test_impossible_plates_are_refused(plate):
+def test_impossible_plates_are_refused(plate: tuple[float, float]) -> None:
     with pytest.raises(ConfigError, match=r"plate: .*; give"):
         design_target(camera(), VOLUME, plate, Need(1, 5), IMAGING)
 
 
-def test_impossible_needs_and_numbers_are_refused():
+def test_impossible_needs_and_numbers_are_refused() -> None:
     for need in ((0.0, 1.0), (1.0, -1.0), (math.nan, 1.0), (1.0, 1.0, math.nan)):
         with pytest.raises(ConfigError, match=r"accuracy: .*; give"):
             Need(*need)
@@ -119,6 +121,6 @@ def test_impossible_needs_and_numbers_are_refused():
         design_target(camera(), VOLUME, (50.0, 50.0), Need(1, 5), IMAGING, markers=5)
 
 
-def test_an_existing_target_out_of_view_is_refused():
+def test_an_existing_target_out_of_view_is_refused() -> None:
     with pytest.raises(ConfigError, match="leave the frame"):
         predict_volume(camera(), tp.Target.load("quad40"), WorkingVolume((60.0, 160.0)), IMAGING)

@@ -6,6 +6,7 @@ import csv
 import math
 import re
 from dataclasses import replace
+from pathlib import Path
 from xml.etree import ElementTree
 
 import cv2
@@ -15,7 +16,7 @@ import torch
 
 from torchpose.camera import Camera
 from torchpose.cli.main import main
-from torchpose.design import make_sheet, plate_around
+from torchpose.design import Sheet, make_sheet, plate_around
 from torchpose.design.drawing import Circle, Line, Page, Text
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
@@ -27,21 +28,22 @@ SVG = "{http://www.w3.org/2000/svg}"
 DPI = 1200
 
 
-def rows_of(target, sheet):
+def rows_of(target: Target, sheet: Sheet) -> list[list[float]]:
     """Expected centre (x, y) on the page, outer and inner radius of every ring, mm."""
     centers = target.centers[:, :2] + torch.tensor(sheet.origin, dtype=torch.float64)
     return torch.cat([centers, target.radii], 1).tolist()
 
 
 @pytest.mark.parametrize("name", ["quad8", "quad40", "quad40_dark", "hexa50"])
-def test_svg_holds_the_target(name):
+def test_svg_holds_the_target(name: str) -> None:
     target = Target.load(name)
     sheet = make_sheet(target, plate_around(target))
     root = ElementTree.fromstring(sheet.page.svg())
     # one unit is a mm
-    assert root.get("width") == root.get("viewBox").split()[2] + "mm"
-    assert root.get("height") == root.get("viewBox").split()[3] + "mm"
-    circles = [tuple(float(c.get(k)) for k in ("cx", "cy", "r")) for c in root.iter(f"{SVG}circle")]
+    _, _, width, height = root.attrib["viewBox"].split()
+    assert root.attrib["width"] == width + "mm"
+    assert root.attrib["height"] == height + "mm"
+    circles = [tuple(float(c.attrib[k]) for k in ("cx", "cy", "r")) for c in root.iter(f"{SVG}circle")]
     colours = [c.get("fill") for c in root.iter(f"{SVG}circle")]
     expected = [one for x, y, outer, inner in rows_of(target, sheet) for one in ((x, y, outer), (x, y, inner))]
     assert np.allclose(circles, expected, atol=1e-8)
@@ -49,10 +51,10 @@ def test_svg_holds_the_target(name):
     assert colours == [ink, paper] * len(target)
     texts = [text.text for text in root.iter(f"{SVG}text")]
     assert target.name in texts
-    assert [t for t in texts if t.isdigit()] == [str(i) for i in target.ids.tolist()]
+    assert [t for t in texts if t and t.isdigit()] == [str(i) for i in target.ids.tolist()]
 
 
-def test_bars_have_the_length_that_they_say():
+def test_bars_have_the_length_that_they_say() -> None:
     sheet = make_sheet(Target.load("quad40"), (75.0, 52.0))
     lines = [s for s in sheet.page.shapes if isinstance(s, Line)]
     # the longest line along each axis besides the outline, whose width is another
@@ -66,7 +68,7 @@ def test_bars_have_the_length_that_they_say():
 
 
 @pytest.mark.parametrize("name", ["quad8", "quad40_dark"])
-def test_nothing_but_rings_lies_within_the_plate(name):
+def test_nothing_but_rings_lies_within_the_plate(name: str) -> None:
     target = Target.load(name)
     sheet = make_sheet(target, plate_around(target))
     x, y, width, height = sheet.page.trim
@@ -88,10 +90,10 @@ def test_nothing_but_rings_lies_within_the_plate(name):
             assert 0 < shape.y < sheet.page.height
 
 
-def test_pdf_circles_are_round():
+def test_pdf_circles_are_round() -> None:
     page = Page("one", 60.0, 60.0, (10.0, 10.0, 40.0, 40.0), [Circle(30.0, 28.0, 7.0, 0.0)])
     content = page.pdf().split(b"stream\n")[1].decode()
-    numbers = [float(n) for n in re.search(r"g ([\d. -]+) m", content)[1].split()]
+    numbers = [float(n) for n in re.findall(r"g ([\d. -]+) m", content)[0].split()]
     at = np.array(numbers)
     worst = 0.0
     curves = re.findall(r"([\d.\- ]+) c\b(?!m)", content)
@@ -105,7 +107,7 @@ def test_pdf_circles_are_round():
     assert worst < 7 * 5e-6
 
 
-def test_pdf_is_well_formed():
+def test_pdf_is_well_formed() -> None:
     target = replace(Target.load("quad40"), name="a(b) & größer")
     data = make_sheet(target, (70.0, 70.0)).page.pdf()
     assert data.startswith(b"%PDF-1.6")
@@ -113,11 +115,11 @@ def test_pdf_is_well_formed():
     assert data[start:].startswith(b"xref")
     for number, offset in enumerate(re.findall(rb"(\d{10}) 00000 n", data), 1):
         assert data[int(offset) :].startswith(b"%d 0 obj" % number)
-    length = int(re.search(rb"/Length (\d+)", data)[1])
+    length = int(re.findall(rb"/Length (\d+)", data)[0])
     body = data.split(b"stream\n", 1)[1]
     assert body[length : length + 10] == b"\nendstream"
     assert rb"(a\(b\) & gr\366\337er)".replace(rb"\366", b"\xf6").replace(rb"\337", b"\xdf") in data
-    box = [float(n) for n in re.search(rb"/MediaBox \[([\d. ]+)\]", data)[1].split()]
+    box = [float(n) for n in re.findall(rb"/MediaBox \[([\d. ]+)\]", data)[0].split()]
     page = make_sheet(target, (70.0, 70.0)).page
     assert box == pytest.approx([0, 0, page.width * 72 / 25.4, page.height * 72 / 25.4], abs=1e-3)
     assert b"/PrintScaling /None" in data
@@ -128,7 +130,9 @@ def test_pdf_is_well_formed():
     ("name", "plate"),
     [("quad40", (70.0, 70.0)), ("quad8", None), pytest.param("quad40_dark", None, marks=pytest.mark.slow)],
 )
-def test_rasterised_pdf_measures_as_the_target_file(name, plate, tmp_path):
+def test_rasterised_pdf_measures_as_the_target_file(
+    name: str, plate: tuple[float, float] | None, tmp_path: Path
+) -> None:
     pdfium = pytest.importorskip("pypdfium2")
     target = Target.load(name)
     sheet = make_sheet(target, plate or plate_around(target))
@@ -158,7 +162,7 @@ def test_rasterised_pdf_measures_as_the_target_file(name, plate, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["quad40", "quad40_dark", "hexa50"])
-def test_a_camera_that_faces_the_sheet_reads_its_ids(name, tmp_path):
+def test_a_camera_that_faces_the_sheet_reads_its_ids(name: str, tmp_path: Path) -> None:
     pdfium = pytest.importorskip("pypdfium2")
     target, dpi, distance = Target.load(name), 200, 160.0
     sheet = make_sheet(target, plate_around(target))
@@ -181,7 +185,7 @@ def test_a_camera_that_faces_the_sheet_reads_its_ids(name, tmp_path):
     assert rotations.log(poses.R)[0].abs().max() < 1e-3
 
 
-def test_targets_that_are_not_flat_are_refused():
+def test_targets_that_are_not_flat_are_refused() -> None:
     target = Target.load("quad40")
     high = replace(target, centers=target.centers + torch.tensor([0, 0, 1.0], dtype=torch.float64))
     away = replace(target, normals=-target.normals)
@@ -191,11 +195,11 @@ def test_targets_that_are_not_flat_are_refused():
 
 
 @pytest.mark.parametrize("plate", [(49.0, 70.0), (70.0, 10.0), (math.nan, 70.0), (math.inf, 70.0)])
-def test_plates_that_do_not_hold_the_rings_are_refused(plate):
+def test_plates_that_do_not_hold_the_rings_are_refused(plate: tuple[float, float]) -> None:
     with pytest.raises(ConfigError, match="does not hold the rings of quad40; give 50 x 50 mm"):
         make_sheet(Target.load("quad40"), plate)
 
 
-def test_a_folder_that_cannot_be_written(tmp_path):
+def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot be written"):
         make_sheet(Target.load("quad8"), (20.0, 20.0)).save(tmp_path / "none", "quad8")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -16,12 +17,12 @@ F64 = torch.float64
 VOLUME = WorkingVolume((150.0, 170.0), (10.0, 5.0), math.radians(20), math.radians(30))
 
 
-def camera(distortion=(-0.1, 0.02, 1e-3, -1e-3)):
+def camera(distortion: tuple[float, float, float, float] = (-0.1, 0.02, 1e-3, -1e-3)) -> Camera:
     matrix = torch.tensor([[1100.0, 0, 450], [0, 1090.0, 300], [0, 0, 1]], dtype=F64)
     return Camera(901, 601, matrix, torch.tensor(distortion, dtype=F64))
 
 
-def angles(R):
+def angles(R: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Tilt of the normal, and turn about the optical axis, of R = exp(lean) Rz(roll)."""
     tilt = R[:, 2, 2].clamp(max=1).acos()
     axis = torch.stack([R[:, 1, 2], -R[:, 0, 2], torch.zeros(len(R), dtype=F64)], 1)
@@ -33,7 +34,7 @@ def angles(R):
 
 
 @pytest.mark.parametrize("kind", ["extremes", "random"])
-def test_poses_lie_within_the_volume_and_reach_its_borders(kind):
+def test_poses_lie_within_the_volume_and_reach_its_borders(kind: str) -> None:
     g = torch.Generator().manual_seed(0)
     R, t = VOLUME.extremes() if kind == "extremes" else VOLUME.random(4000, g)
     tilt, roll = angles(R)
@@ -49,14 +50,14 @@ def test_poses_lie_within_the_volume_and_reach_its_borders(kind):
         assert float(value.max()) == pytest.approx(high, abs=1e-5 if kind == "extremes" else 0.01 * span)
 
 
-def test_middle():
+def test_middle() -> None:
     R, t = VOLUME.middle
     assert torch.equal(R[0], torch.eye(3, dtype=F64))
     assert t.tolist() == [[0, 0, 160]]
     assert WorkingVolume((150, 170), nominal=155).middle[1].tolist() == [[0, 0, 155]]
 
 
-def test_least_scale_is_the_smallest_semi_minor_axis_of_small_rings():
+def test_least_scale_is_the_smallest_semi_minor_axis_of_small_rings() -> None:
     cam = camera()
     R, t = VOLUME.extremes()
     angle = torch.arange(32, dtype=F64) * (2 * math.pi / 32)
@@ -85,6 +86,6 @@ def test_least_scale_is_the_smallest_semi_minor_axis_of_small_rings():
         {"distance": (100.0, 200.0), "nominal": 250.0},
     ],
 )
-def test_impossible_volumes_are_refused(limits):
+def test_impossible_volumes_are_refused(limits: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match="; "):
         WorkingVolume(**limits)

@@ -13,7 +13,14 @@ from torchpose.detect.reduce import reduction_factor
 from torchpose.geometry import conics
 
 
-def ellipse_frames(ellipses, height=120, width=160, inside=50.0, outside=200.0, sub=8):
+def ellipse_frames(
+    ellipses: torch.Tensor,
+    height: int = 120,
+    width: int = 160,
+    inside: float = 50.0,
+    outside: float = 200.0,
+    sub: int = 8,
+) -> torch.Tensor:
     """Frames (B, H, W) of one filled ellipse each, by supersampling."""
     fine_v = (torch.arange(height * sub, dtype=torch.float64) + 0.5) / sub - 0.5
     fine_u = (torch.arange(width * sub, dtype=torch.float64) + 0.5) / sub - 0.5
@@ -34,7 +41,7 @@ ELLIPSES = torch.tensor(
 )
 
 
-def best(found, frame, truth):
+def best(found: Candidates, frame: int, truth: torch.Tensor) -> int:
     """Index of the candidate nearest to an ellipse among those of a frame."""
     far = (found.ellipse[:, :4] - truth[:4]).norm(dim=-1).masked_fill(found.frame != frame, torch.inf)
     return int(far.argmin())
@@ -42,7 +49,7 @@ def best(found, frame, truth):
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.uint16, torch.float32, torch.float64])
 @pytest.mark.parametrize(("inside", "outside", "polarity"), [(50, 200, 1.0), (200, 50, -1.0)])
-def test_found_with_polarity(dtype, inside, outside, polarity):
+def test_found_with_polarity(dtype: torch.dtype, inside: int, outside: int, polarity: float) -> None:
     frames = ellipse_frames(ELLIPSES, inside=inside, outside=outside).round().to(dtype)
     found = find_candidates(frames)
     for k, truth in enumerate(ELLIPSES):
@@ -55,7 +62,7 @@ def test_found_with_polarity(dtype, inside, outside, polarity):
         assert found.cover[i] > 0.9
 
 
-def test_found_in_noise():
+def test_found_in_noise() -> None:
     clean = ellipse_frames(ELLIPSES[:3])
     noisy = clean + 15 * torch.randn(clean.shape, generator=torch.Generator().manual_seed(0))
     found = find_candidates(noisy)
@@ -66,7 +73,7 @@ def test_found_in_noise():
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.7, 1.5])
-def test_nothing_in_noise(correlation):
+def test_nothing_in_noise(correlation: float) -> None:
     """Less than one false alarm a frame is the promise; smooth noise has real blobs but no large ellipses."""
     generator = torch.Generator().manual_seed(12)
     noise = torch.randn(40, 240, 320, generator=generator)
@@ -78,12 +85,12 @@ def test_nothing_in_noise(correlation):
 
 
 @pytest.mark.parametrize("value", [0, 77, 255])
-def test_nothing_in_flat_frames(value):
+def test_nothing_in_flat_frames(value: int) -> None:
     assert len(find_candidates(torch.full((2, 90, 70), value, dtype=torch.uint8))) == 0
 
 
 @pytest.mark.parametrize("kind", ["step", "square", "stripes"])
-def test_straight_edges_are_no_ellipses(kind):
+def test_straight_edges_are_no_ellipses(kind: str) -> None:
     frame = torch.full((1, 120, 160), 60.0)
     if kind == "step":
         frame[:, :, 70:] = 180
@@ -97,7 +104,7 @@ def test_straight_edges_are_no_ellipses(kind):
 @pytest.mark.parametrize("factor", [1, 2, 3, 4])
 @pytest.mark.parametrize("size", [(240, 320), (241, 322), (243, 319)])
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
-def test_pixel_convention_of_the_reduction(factor, size, dtype):
+def test_pixel_convention_of_the_reduction(factor: int, size: tuple[int, int], dtype: torch.dtype) -> None:
     truth = torch.tensor([[151.3, 118.6, 70, 55, 0.4]], dtype=torch.float64)
     frame = ellipse_frames(truth, *size, sub=4).round().to(dtype)
     found = find_candidates(frame, factor)
@@ -106,7 +113,7 @@ def test_pixel_convention_of_the_reduction(factor, size, dtype):
     torch.testing.assert_close(found.ellipse[i, 2:4], truth[0, 2:4], rtol=0, atol=0.3)
 
 
-def test_batch_equals_single_frames():
+def test_batch_equals_single_frames() -> None:
     frames = ellipse_frames(ELLIPSES)
     frames = frames + 3 * torch.randn(frames.shape, generator=torch.Generator().manual_seed(5))
     together = find_candidates(frames)
@@ -120,20 +127,20 @@ def test_batch_equals_single_frames():
 @pytest.mark.parametrize("factor", [None, 1, 3])
 @pytest.mark.parametrize("shape", [(0, 40, 50), (2, 0, 5), (2, 1, 40), (2, 40, 1), (1, 1, 1), (2, 5, 5)])
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.uint16, torch.float32, torch.bool])
-def test_tiny_frames(shape, dtype, factor):
+def test_tiny_frames(shape: tuple[int, int, int], dtype: torch.dtype, factor: int | None) -> None:
     found = find_candidates(torch.ones(shape).to(dtype), factor)
     assert found.ellipse.shape == (0, 5)
     assert found.log10_nfa.dtype == torch.float64
 
 
-def test_broken_pixels():
+def test_broken_pixels() -> None:
     frames = ellipse_frames(ELLIPSES[:1])
     whole = find_candidates(frames)
     frames[0, 5, 5], frames[0, 110, 3] = math.nan, math.inf
     torch.testing.assert_close(find_candidates(frames).ellipse, whole.ellipse)
 
 
-def test_selection():
+def test_selection() -> None:
     found = find_candidates(ellipse_frames(ELLIPSES))
     large = found[found.ellipse[:, 2] > 20]
     assert isinstance(large, Candidates)
@@ -141,7 +148,7 @@ def test_selection():
     assert (large.ellipse[:, 2] > 20).all()
 
 
-def test_large_frames_are_reduced():
+def test_large_frames_are_reduced() -> None:
     """The factor chosen for a 5 megapixel frame keeps the pixel convention, too."""
     truth = torch.tensor([[1000.4, 901.2, 200, 150, 1.0]], dtype=torch.float64)
     frame = torch.full((1, 2048, 2448), 200.0)

@@ -8,7 +8,7 @@ from torchpose.detect.arcs import follow
 from torchpose.detect.regions import gradient
 
 
-def test_ellipses_larger_than_the_frame_are_given_up():
+def test_ellipses_larger_than_the_frame_are_given_up() -> None:
     # a hairline in a clean raster fits an ellipse of a hundred million pixels; its samples would fill the memory
     frame = torch.full((1, 60, 80), 255.0)
     frame[:, 30] = 0.0

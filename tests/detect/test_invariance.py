@@ -37,7 +37,8 @@ def picture(seed: int, width: int = WIDTH, height: int = HEIGHT, bar: bool = Fal
     if bar:
         cv2.rectangle(fine, (4 * 85, 4 * 100), (4 * 120, 4 * 190), 110.0, -1)
     reduced = cv2.resize(cv2.GaussianBlur(fine, (0, 0), 3.0), (width, height), interpolation=cv2.INTER_AREA)
-    return torch.from_numpy(reduced + rng.normal(0, 1.0, reduced.shape).astype(np.float32))[None]
+    noise = np.asarray(rng.normal(0, 1.0, reduced.shape), np.float32)
+    return torch.from_numpy(reduced + noise)[None]
 
 
 def changed(frame: torch.Tensor, uv: torch.Tensor, change: str) -> tuple[torch.Tensor, torch.Tensor]:

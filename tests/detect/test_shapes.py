@@ -15,12 +15,19 @@ from torchpose.detect.arcs import fit_joint
 from torchpose.geometry import conics
 
 
-def polygon(center, radius, sides, turn=0.2):
+def polygon(center: tuple[int, int], radius: int, sides: int, turn: float = 0.2) -> np.ndarray:
     angle = turn + 2 * np.pi * np.arange(sides) / sides
     return np.stack([center[0] + radius * np.cos(angle), center[1] + radius * np.sin(angle)], 1)
 
 
-def drawn(*polygons, size=(200, 300), ink=40, paper=200, blur=0.8, noise=1.0):
+def drawn(
+    *polygons: np.ndarray,
+    size: tuple[int, int] = (200, 300),
+    ink: int = 40,
+    paper: int = 200,
+    blur: float = 0.8,
+    noise: float = 1.0,
+) -> torch.Tensor:
     picture = np.full(size, paper, np.uint8)
     for corners in polygons:
         cv2.fillPoly(picture, [np.round(np.asarray(corners) * 256).astype(np.int32)], ink, cv2.LINE_AA, 8)
@@ -29,7 +36,7 @@ def drawn(*polygons, size=(200, 300), ink=40, paper=200, blur=0.8, noise=1.0):
     return torch.from_numpy(noisy.round().clip(0, 255).astype(np.uint8))[None]
 
 
-def disc(u, v, a, b=None, theta=0.0):
+def disc(u: int, v: int, a: int, b: int | None = None, theta: float = 0.0) -> np.ndarray:
     b = a if b is None else b
     angle = np.linspace(0, 2 * np.pi, 400)
     x, y = a * np.cos(angle), b * np.sin(angle)
@@ -38,7 +45,7 @@ def disc(u, v, a, b=None, theta=0.0):
 
 @pytest.mark.parametrize("degrees", [60, 90, 150, 360])
 @pytest.mark.parametrize("theta", [0.0, 0.9])
-def test_joint_fit_of_arcs(degrees, theta):
+def test_joint_fit_of_arcs(degrees: int, theta: float) -> None:
     truth = torch.tensor([[50.0, 40.0, 30.0, 18.0, theta]], dtype=torch.float64)
     angle = torch.linspace(0.3, 0.3 + math.radians(degrees), 200, dtype=torch.float64)
     xy = conics.points_on(truth.expand(200, -1), angle)
@@ -51,7 +58,7 @@ def test_joint_fit_of_arcs(degrees, theta):
     torch.testing.assert_close(conics.shape_matrix(found), conics.shape_matrix(truth), rtol=0, atol=1e-6)
 
 
-def test_directions_hold_an_arc():
+def test_directions_hold_an_arc() -> None:
     """A third of a circle with 0.3 px of noise: positions alone would miss by pixels."""
     g = torch.Generator().manual_seed(2)
     angle = torch.linspace(0, 2 * math.pi / 3, 80, dtype=torch.float64).repeat(50)
@@ -65,7 +72,7 @@ def test_directions_hold_an_arc():
 
 
 @pytest.mark.parametrize("width", [6, 12])
-def test_a_bar_across_a_disc(width):
+def test_a_bar_across_a_disc(width: int) -> None:
     """Two arcs that only together are a circle."""
     bar = np.array([[60, 100 - width], [240, 100 - width], [240, 100 + width], [60, 100 + width]])
     picture = drawn(disc(150, 100, 40))
@@ -79,7 +86,7 @@ def test_a_bar_across_a_disc(width):
 
 
 @pytest.mark.parametrize("sides", [3, 4, 5, 6, 8])
-def test_a_polygon_is_no_ellipse(sides):
+def test_a_polygon_is_no_ellipse(sides: int) -> None:
     corners = polygon((150, 100), 70, sides)
     shapes = find_shapes(drawn(corners), 1)
     assert len(shapes.ellipses) == 0
@@ -90,13 +97,13 @@ def test_a_polygon_is_no_ellipse(sides):
     assert shapes.segments.place[shapes.segments.chain == 0].sort().values.tolist() == list(range(sides))
 
 
-def test_a_disc_is_no_polygon():
+def test_a_disc_is_no_polygon() -> None:
     shapes = find_shapes(drawn(disc(150, 100, 60, 40, 0.5)), 1)
     assert len(shapes.ellipses) == 1
     assert len(shapes.segments) == 0
 
 
-def test_a_segment_has_the_light_on_its_left():
+def test_a_segment_has_the_light_on_its_left() -> None:
     frame = torch.full((1, 100, 120), 50, dtype=torch.uint8)
     frame[:, 60:] = 200  # light below
     segments = find_shapes(frame, 1).segments
@@ -107,14 +114,14 @@ def test_a_segment_has_the_light_on_its_left():
     assert segments.chain.tolist() == [-1]
 
 
-def test_no_line_in_noise():
+def test_no_line_in_noise() -> None:
     noise = 128 + 20 * torch.randn(20, 200, 300, generator=torch.Generator().manual_seed(5))
     shapes = find_shapes(noise.clamp(0, 255).to(torch.uint8))
     assert len(shapes.ellipses) == 0
     assert len(shapes.segments) <= 2  # less than one a frame is the promise
 
 
-def test_explanations():
+def test_explanations() -> None:
     picture = drawn(disc(60, 100, 30), polygon((180, 100), 50, 6))
     plain, explained = find_shapes(picture, 1), find_shapes(picture, 1, explain=True)
     verdict = explained.ellipses.verdict
@@ -129,7 +136,7 @@ SCENE = (disc(80, 70, 30, 20, 0.4), disc(80, 70, 9, 6, 0.4), disc(220, 120, 40),
 
 
 @pytest.mark.parametrize("change", ["flip_u", "flip_v", "transpose", "shift", "gain"])
-def test_the_same_set_under(change):
+def test_the_same_set_under(change: str) -> None:
     frame = drawn(*SCENE, noise=2.0)
     original = find_candidates(frame, 1)
     uv = original.ellipse[:, :2].clone()

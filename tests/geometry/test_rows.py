@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
@@ -55,7 +55,7 @@ def test_parts_join_in_order() -> None:
 
 
 def test_parts_of_different_wholes_do_not_join() -> None:
-    other = Outer(*(getattr(rows(1), name) for name in ("number", "inner", "planes")), torch.zeros(3, 3))
+    other = replace(rows(1), matrix=torch.zeros(3, 3))
     with pytest.raises(ValueError, match=r"Outer\.matrix"):
         Outer.cat([rows(1), other])
 

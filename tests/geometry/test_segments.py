@@ -23,7 +23,7 @@ groups = st.lists(st.integers(0, 5), max_size=40)
 
 @no_deadline
 @given(groups)
-def test_sum_and_mean(members):
+def test_sum_and_mean(members: list[int]) -> None:
     index = torch.tensor(members, dtype=torch.int64)
     values = torch.arange(2.0 * len(members), dtype=torch.float64).reshape(-1, 2).sin()
     weights = torch.arange(len(members), dtype=torch.float64).cos() + 2
@@ -35,7 +35,7 @@ def test_sum_and_mean(members):
         torch.testing.assert_close(mean[g], expected, equal_nan=True)
 
 
-def test_sum_is_differentiable():
+def test_sum_is_differentiable() -> None:
     values = torch.randn(7, 3, dtype=torch.float64, requires_grad=True)
     index = torch.tensor([2, 0, 2, 1, 0, 0, 2])
     assert torch.autograd.gradcheck(lambda v: segment_sum(v, index, 4), values)
@@ -43,7 +43,7 @@ def test_sum_is_differentiable():
 
 @no_deadline
 @given(groups, st.integers(1, 7))
-def test_tiles_sum_the_same_and_give_the_values_back(members, size):
+def test_tiles_sum_the_same_and_give_the_values_back(members: list[int], size: int) -> None:
     index = torch.tensor(members, dtype=torch.int64)
     values = torch.arange(2.0 * len(members), dtype=torch.float64).reshape(-1, 2).sin()
     tiles = Tiles.of(index, 6, size)
@@ -57,12 +57,12 @@ def test_tiles_sum_the_same_and_give_the_values_back(members, size):
 
 @no_deadline
 @given(st.lists(st.booleans(), max_size=40))
-def test_positions(mask):
+def test_positions(mask: list[bool]) -> None:
     assert positions(torch.tensor(mask, dtype=torch.bool)).tolist() == [i for i, true in enumerate(mask) if true]
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.uint16, torch.float16, torch.float32, torch.float64])
-def test_values_of_every_dtype(dtype):
+def test_values_of_every_dtype(dtype: torch.dtype) -> None:
     most = 60_000 if dtype in (torch.uint16, torch.float32, torch.float64) else 250
     frames = torch.linspace(0, most, 60).to(dtype).view(2, 5, 6)
     cell = torch.tensor([[0, 59, 7], [30, 30, 1]])
@@ -73,7 +73,7 @@ def test_values_of_every_dtype(dtype):
 
 @no_deadline
 @given(st.lists(st.integers(0, 7), max_size=12))
-def test_ragged_arange(sizes):
+def test_ragged_arange(sizes: list[int]) -> None:
     group, position = ragged_arange(torch.tensor(sizes, dtype=torch.int64))
     expected = [(g, k) for g, size in enumerate(sizes) for k in range(size)]
     assert list(zip(group.tolist(), position.tolist(), strict=True)) == expected
@@ -81,6 +81,6 @@ def test_ragged_arange(sizes):
 
 @no_deadline
 @given(groups)
-def test_rank_in_group(members):
+def test_rank_in_group(members: list[int]) -> None:
     rank = rank_in_group(torch.tensor(members, dtype=torch.int64), 6)
     assert rank.tolist() == [members[:i].count(g) for i, g in enumerate(members)]

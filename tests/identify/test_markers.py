@@ -6,9 +6,9 @@ import dataclasses
 
 import pytest
 import torch
-from exact import F64, exact_ellipses, pinhole, random_poses, rings_of
 from torch import Tensor
 
+from tests.exact import F64, exact_ellipses, pinhole, random_poses, rings_of
 from torchpose.geometry import rotations
 from torchpose.identify import Identified, MarkerTable, identify
 from torchpose.pose import crossed_out

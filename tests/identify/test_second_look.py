@@ -7,18 +7,20 @@ from dataclasses import replace
 
 import pytest
 import torch
-from exact import pinhole, random_poses
 from torch import Tensor
 
 import torchpose as tp
+from tests.exact import pinhole, random_poses
 from torchpose import pipeline
 from torchpose.detect import find_candidates
 from torchpose.sim import add_noise, render
 from torchpose.target import Target
 
+Scene = tuple[tp.Camera, Target, Tensor, Tensor, Tensor]
+
 
 @pytest.fixture(scope="module")
-def scene() -> tuple[tp.Camera, Target, Tensor, Tensor, Tensor]:
+def scene() -> Scene:
     camera = replace(pinhole(1111.11, 912, 608), distortion=torch.tensor([-0.1, 0.02, 0, 0], dtype=torch.float64))
     target = Target.load("quad40")
     r, t = random_poses(6, 40.0, (150, 200), seed=3)
@@ -26,7 +28,7 @@ def scene() -> tuple[tp.Camera, Target, Tensor, Tensor, Tensor]:
     return camera, target, r, t, add_noise(render(camera, target, r, t, psf_sigma=0.8), 1.0, seed=2)
 
 
-def estimate(monkeypatch: pytest.MonkeyPatch, scene: tuple, lost: int, frames: Tensor | None = None) -> tp.Poses:
+def estimate(monkeypatch: pytest.MonkeyPatch, scene: Scene, lost: int, frames: Tensor | None = None) -> tp.Poses:
     """Poses where the first search loses ``lost`` markers of every frame, those with the highest ids."""
     camera, target, r, t, pictures = scene
     pictures = pictures if frames is None else frames
@@ -43,7 +45,7 @@ def estimate(monkeypatch: pytest.MonkeyPatch, scene: tuple, lost: int, frames: T
 
 
 @pytest.mark.parametrize("lost", [1, 2])
-def test_lost_markers_are_found(monkeypatch: pytest.MonkeyPatch, scene: tuple, lost: int) -> None:
+def test_lost_markers_are_found(monkeypatch: pytest.MonkeyPatch, scene: Scene, lost: int) -> None:
     camera, target, _, _, frames = scene
     whole = tp.PoseEstimator(camera, target)(frames)
     found = estimate(monkeypatch, scene, lost)
@@ -52,7 +54,7 @@ def test_lost_markers_are_found(monkeypatch: pytest.MonkeyPatch, scene: tuple, l
     assert ((found.t - whole.t).abs() < 0.2 * whole.std[:, :3]).all()
 
 
-def test_what_is_not_there_is_not_found(monkeypatch: pytest.MonkeyPatch, scene: tuple) -> None:
+def test_what_is_not_there_is_not_found(monkeypatch: pytest.MonkeyPatch, scene: Scene) -> None:
     camera, target, r, t, frames = scene
     frames = frames.clone()
     for k, (u, v) in enumerate(camera.project((r @ target.centers[3]) + t).round().long().tolist()):
@@ -61,7 +63,7 @@ def test_what_is_not_there_is_not_found(monkeypatch: pytest.MonkeyPatch, scene: 
     assert (found.markers == 3).all()
 
 
-def test_another_code_is_no_marker(monkeypatch: pytest.MonkeyPatch, scene: tuple) -> None:
+def test_another_code_is_no_marker(monkeypatch: pytest.MonkeyPatch, scene: Scene) -> None:
     """A ring in the right place whose inner circle is that of no marker."""
     camera, target, r, t, _ = scene
     radii = target.radii.clone()

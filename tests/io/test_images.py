@@ -3,6 +3,9 @@
 import io
 import struct
 import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,17 +20,17 @@ RAMP = (np.add.outer(np.arange(61) * 3, np.arange(83)) % 256).astype(np.uint8)
 RAMP16 = RAMP.astype(np.uint16) * 257 + 3
 
 
-def encoded(suffix, image):
+def encoded(suffix: str, image: np.ndarray) -> bytes:
     return cv2.imencode(suffix, image)[1].tobytes()
 
 
-def from_pil(image, kind, **options):
+def from_pil(image: Image.Image, kind: str, **options: Any) -> bytes:
     buffer = io.BytesIO()
     image.save(buffer, kind, **options)
     return buffer.getvalue()
 
 
-def tiff(image, **options):
+def tiff(image: np.ndarray, **options: Any) -> bytes:
     buffer = io.BytesIO()
     tifffile.imwrite(
         buffer, image, photometric="minisblack", **options
@@ -35,7 +38,7 @@ def tiff(image, **options):
     return buffer.getvalue()
 
 
-LOSSLESS = {
+LOSSLESS: dict[str, tuple[bytes, np.ndarray]] = {
     "png8": (encoded(".png", RAMP), RAMP),
     "png16": (encoded(".png", RAMP16), RAMP16),
     "tiff8": (encoded(".tiff", RAMP), RAMP),
@@ -54,7 +57,7 @@ LOSSLESS = {
 
 
 @pytest.mark.parametrize("kind", LOSSLESS)
-def test_lossless_formats_come_out_bit_by_bit_in_their_own_depth(tmp_path, kind):
+def test_lossless_formats_come_out_bit_by_bit_in_their_own_depth(tmp_path: Path, kind: str) -> None:
     data, expected = LOSSLESS[kind]
     path = tmp_path / "f"
     path.write_bytes(data)
@@ -63,7 +66,7 @@ def test_lossless_formats_come_out_bit_by_bit_in_their_own_depth(tmp_path, kind)
     np.testing.assert_array_equal(image, expected)
 
 
-def test_colour_is_reduced_to_luma(tmp_path):
+def test_colour_is_reduced_to_luma(tmp_path: Path) -> None:
     bgr = np.random.default_rng(0).integers(0, 256, (40, 50, 3)).astype(np.uint8)
     (tmp_path / "f").write_bytes(encoded(".png", bgr))
     luma = bgr @ np.array([0.114, 0.587, 0.299])  # ITU-R BT.601
@@ -71,7 +74,7 @@ def test_colour_is_reduced_to_luma(tmp_path):
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_exif_orientation_does_not_turn_the_sensor(tmp_path, orientation):
+def test_exif_orientation_does_not_turn_the_sensor(tmp_path: Path, orientation: int) -> None:
     exif = Image.Exif()
     exif[0x0112] = orientation
     colour = Image.fromarray(cv2.GaussianBlur(RAMP // 4 + 90, (0, 0), 3)).convert("RGB")
@@ -82,7 +85,7 @@ def test_exif_orientation_does_not_turn_the_sensor(tmp_path, orientation):
     assert np.abs(image.astype(int) - np.asarray(colour)[..., 0]).max() < 12
 
 
-def jpeg_with_preview():
+def jpeg_with_preview() -> bytes:
     """A JPEG whose EXIF segment holds a whole JPEG, end marker included, as cameras write it."""
     data, preview = encoded(".jpg", RAMP), encoded(".jpg", RAMP[:16, :16])
     body = b"Exif\0\0" + preview
@@ -98,7 +101,7 @@ TRUNCATABLE = {kind: data for kind, (data, _) in LOSSLESS.items()} | {
 
 @pytest.mark.parametrize("kind", TRUNCATABLE)
 @pytest.mark.parametrize("share", [0.01, 0.2, 0.5, 0.9, 0.99, "all but one byte"])
-def test_a_file_that_ends_early_is_refused(tmp_path, kind, share):
+def test_a_file_that_ends_early_is_refused(tmp_path: Path, kind: str, share: float | str) -> None:
     data = TRUNCATABLE[kind]
     kept = len(data) - 1 if share == "all but one byte" else int(len(data) * share)
     path = tmp_path / "f"
@@ -110,7 +113,7 @@ def test_a_file_that_ends_early_is_refused(tmp_path, kind, share):
 
 
 @pytest.mark.parametrize("kind", ["png8", "png16"])
-def test_a_flipped_bit_in_a_png_is_refused(tmp_path, kind):
+def test_a_flipped_bit_in_a_png_is_refused(tmp_path: Path, kind: str) -> None:
     data = bytearray(LOSSLESS[kind][0])
     data[len(data) // 2] ^= 4
     (tmp_path / "f").write_bytes(data)
@@ -130,7 +133,7 @@ def test_a_flipped_bit_in_a_png_is_refused(tmp_path, kind):
         (b"BM" + bytes(100), "corrupt"),
     ],
 )
-def test_the_reason_says_what_is_wrong(tmp_path, data, reason):
+def test_the_reason_says_what_is_wrong(tmp_path: Path, data: bytes | None, reason: str) -> None:
     path = tmp_path / "f.png"
     if data is not None:
         path.write_bytes(data)
@@ -139,11 +142,20 @@ def test_the_reason_says_what_is_wrong(tmp_path, data, reason):
     assert caught.value.reason == reason
 
 
-def chunk(kind, body):
+def chunk(kind: bytes, body: bytes) -> bytes:
     return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
 
-def png(image, *, extra=b"", filters=0, damage=lambda stream: stream, chunks=1, header=(0, 0, 0, 0), size=None):
+def png(
+    image: np.ndarray,
+    *,
+    extra: bytes = b"",
+    filters: int = 0,
+    damage: Callable[[bytes], bytes] = lambda stream: stream,
+    chunks: int = 1,
+    header: tuple[int, ...] = (0, 0, 0, 0),
+    size: tuple[int, ...] | None = None,
+) -> bytes:
     """A grey PNG file written by hand: rows with the filter types given, chunks before the pixels, damaged stream."""
     rows = image.astype(">u2" if image.dtype == np.uint16 else np.uint8)
     raw = b"".join(bytes([filters]) + row.tobytes() for row in rows)
@@ -155,7 +167,7 @@ def png(image, *, extra=b"", filters=0, damage=lambda stream: stream, chunks=1, 
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", start) + extra + pixels + chunk(b"IEND", b"")
 
 
-def outcome(path, threads):
+def outcome(path: Path, threads: int) -> np.ndarray | str:
     """Grey values as decoded by kornia_rs (few threads) or by OpenCV alone (many), or the reason."""
     try:
         return decode(path, threads=threads)
@@ -163,19 +175,18 @@ def outcome(path, threads):
         return error.reason
 
 
-def assert_same_as_opencv(path, data):
+def assert_same_as_opencv(path: Path, data: bytes) -> None:
     path.write_bytes(data)
     ours, opencv = outcome(path, 1), outcome(path, 99)
-    assert type(ours) is type(opencv)
-    if isinstance(ours, str):
+    if isinstance(ours, str) or isinstance(opencv, str):
+        assert isinstance(ours, str)
         assert ours == opencv
     else:
         assert ours.dtype == opencv.dtype
         np.testing.assert_array_equal(ours, opencv)
-    return opencv
 
 
-def from_pil_raw(mode, **options):
+def from_pil_raw(mode: str, **options: Any) -> bytes:
     return from_pil(Image.fromarray(RAMP).convert(mode), "PNG", **options)
 
 
@@ -213,12 +224,12 @@ ODD_PNG = {
 
 
 @pytest.mark.parametrize("kind", ODD_PNG)
-def test_odd_png_files_decode_as_by_opencv(tmp_path, kind):
+def test_odd_png_files_decode_as_by_opencv(tmp_path: Path, kind: str) -> None:
     assert_same_as_opencv(tmp_path / "f", ODD_PNG[kind])
 
 
 @pytest.mark.parametrize("image", [RAMP, RAMP16, RAMP[:1, :1], RAMP16[:, :1]], ids=["8", "16", "1 px", "16 bit column"])
-def test_every_flipped_byte_is_judged_as_by_opencv(tmp_path, image):
+def test_every_flipped_byte_is_judged_as_by_opencv(tmp_path: Path, image: np.ndarray) -> None:
     """Damage anywhere in a file, its last checksum and its end included, of which kornia_rs itself reads nothing."""
     data = png(image[:9, :9], chunks=2)
     for position in range(8, len(data)):
@@ -227,7 +238,7 @@ def test_every_flipped_byte_is_judged_as_by_opencv(tmp_path, image):
         assert_same_as_opencv(tmp_path / "f", bytes(damaged))
 
 
-def test_plain_files_go_to_kornia_and_are_equal(tmp_path):
+def test_plain_files_go_to_kornia_and_are_equal() -> None:
     """Filters, depths and compressions: kornia_rs decodes them, no OpenCV behind it."""
     noise = np.random.default_rng(0).integers(0, 65536, (57, 91)).astype(np.uint16)
     for image in (RAMP, RAMP16, noise, (noise >> 8).astype(np.uint8)):
@@ -239,11 +250,11 @@ def test_plain_files_go_to_kornia_and_are_equal(tmp_path):
             np.testing.assert_array_equal(ours, image)
 
 
-def test_a_panic_of_the_decoder_leaves_the_file_to_opencv(tmp_path, monkeypatch):
+def test_a_panic_of_the_decoder_leaves_the_file_to_opencv(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class PanicException(BaseException):
         pass
 
-    def panic(*_):
+    def panic(*_: object) -> None:
         raise PanicException("index out of bounds")
 
     monkeypatch.setattr("kornia_rs.io.decode_image_png_u8", panic)
@@ -254,7 +265,7 @@ def test_a_panic_of_the_decoder_leaves_the_file_to_opencv(tmp_path, monkeypatch)
         decode(tmp_path / "f")
 
 
-def test_what_the_checksum_of_the_zlib_stream_alone_would_tell_is_not_seen(tmp_path):
+def test_what_the_checksum_of_the_zlib_stream_alone_would_tell_is_not_seen(tmp_path: Path) -> None:
     """The one difference to OpenCV (docs/decisions): no storage or transport leaves the chunks' sums right."""
     path = tmp_path / "f"
     path.write_bytes(png(RAMP, damage=lambda stream: stream[:-4] + bytes(4)))

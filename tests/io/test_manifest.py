@@ -1,6 +1,8 @@
 """Capture manifests: torn ends are tolerated, everything else that is wrong is refused by line and field."""
 
 import json
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -11,12 +13,12 @@ SESSION = {"record": "session", "schema": 1, "units": {"length": "mm"}}
 FRAME = {"record": "frame", "id": 0, "image": "0.png", "robot_pose": [1, 2, 3, 0.1, 0.2, 0.3], "sha256": "ignored"}
 
 
-def write(path, *records, end="\n"):
+def write(path: Path, *records: dict[str, Any] | str, end: str = "\n") -> Path:
     path.write_text("\n".join(r if isinstance(r, str) else json.dumps(r) for r in records) + end)
     return path
 
 
-def test_frames_without_image_other_records_and_blank_lines_are_passed_over(tmp_path):
+def test_frames_without_image_other_records_and_blank_lines_are_passed_over(tmp_path: Path) -> None:
     failed = FRAME | {"id": 1, "image": None}
     path = write(tmp_path / "m.jsonl", SESSION, FRAME, "", {"record": "note", "text": "x"}, failed, {"record": "end"})
     (frame,) = read_manifest(path)
@@ -25,13 +27,13 @@ def test_frames_without_image_other_records_and_blank_lines_are_passed_over(tmp_
 
 
 @pytest.mark.parametrize("kept", range(1, len(json.dumps(FRAME))))
-def test_a_torn_last_line_is_dropped_wherever_it_was_cut(tmp_path, kept):
+def test_a_torn_last_line_is_dropped_wherever_it_was_cut(tmp_path: Path, kept: int) -> None:
     torn = json.dumps(FRAME | {"id": 1, "image": "1.png"})[:kept]
     path = write(tmp_path / "m.jsonl", SESSION, FRAME, torn, end="")
     assert [frame.image for frame in read_manifest(path)] == ["0.png"]
 
 
-def test_a_whole_last_line_counts_without_its_newline(tmp_path):
+def test_a_whole_last_line_counts_without_its_newline(tmp_path: Path) -> None:
     path = write(tmp_path / "m.jsonl", SESSION, FRAME, FRAME | {"id": 1, "image": "1.png"}, end="")
     assert [frame.image for frame in read_manifest(path)] == ["0.png", "1.png"]
 
@@ -51,9 +53,15 @@ def test_a_whole_last_line_counts_without_its_newline(tmp_path):
         ([SESSION, FRAME | {"robot_pose": [1, 2, 3, 4, 5]}], "line 2: robot_pose"),
         ([SESSION, FRAME | {"robot_pose": [1, 2, 3, 4, 5, float("nan")]}], "line 2: robot_pose"),
         ([SESSION, FRAME | {"robot_pose": "home"}], "line 2: robot_pose"),
+        ([SESSION, FRAME | {"robot_pose": [10**400, 2, 3, 4, 5, 6]}], "line 2: robot_pose"),
+        ([SESSION, FRAME | {"robot_pose": [1, 2, 3, 4, 5, "6"]}], "line 2: robot_pose"),
+        ([SESSION, FRAME | {"id": True}], "line 2: id"),
+        ([SESSION | {"units": ["mm"]}], "line 1: units"),
     ],
 )
-def test_broken_records_are_refused_by_line_and_field(tmp_path, records, field):
+def test_broken_records_are_refused_by_line_and_field(
+    tmp_path: Path, records: list[dict[str, Any] | str], field: str
+) -> None:
     path = write(tmp_path / "m.jsonl", *records)
     with pytest.raises(ConfigError, match=field) as caught:
         read_manifest(path)
@@ -61,7 +69,7 @@ def test_broken_records_are_refused_by_line_and_field(tmp_path, records, field):
     assert "\n" not in str(caught.value)
 
 
-def test_frames_of_one_camera(tmp_path):
+def test_frames_of_one_camera(tmp_path: Path) -> None:
     path = tmp_path / "manifest.jsonl"
     frames = [{"record": "frame", "id": i, "image": f"{i}.png", "camera": "ab"[i % 2]} for i in range(4)]
     path.write_text("".join(json.dumps(frame) + "\n" for frame in frames))

@@ -21,13 +21,13 @@ def names(*inputs: Path) -> list[str]:
     return [source.name for source in find_sources(inputs)]
 
 
-def test_folders_are_searched_recursively_in_natural_order(tmp_path):
+def test_folders_are_searched_recursively_in_natural_order(tmp_path: Path) -> None:
     expected = ["a/2.png", "a/10.png", "a10/1.png", "b.png", "frame_1.PNG", "frame_02.tiff", "frame_10.jpeg", "z.pgm"]
     touch(*(tmp_path / name for name in reversed(expected)))
     assert names(tmp_path) == expected
 
 
-def test_hidden_files_other_files_folders_and_pipes_are_passed_over(tmp_path):
+def test_hidden_files_other_files_folders_and_pipes_are_passed_over(tmp_path: Path) -> None:
     touch(
         tmp_path / "a.png",
         tmp_path / ".b.png",
@@ -40,7 +40,7 @@ def test_hidden_files_other_files_folders_and_pipes_are_passed_over(tmp_path):
     assert names(tmp_path) == ["a.png"]
 
 
-def test_linked_folders_are_followed_once_and_dangling_links_are_frames(tmp_path):
+def test_linked_folders_are_followed_once_and_dangling_links_are_frames(tmp_path: Path) -> None:
     touch(tmp_path / "real" / "1.png")
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "link").symlink_to(tmp_path / "real")
@@ -49,19 +49,19 @@ def test_linked_folders_are_followed_once_and_dangling_links_are_frames(tmp_path
     assert names(tmp_path / "in") == ["gone.png", "link/1.png"]
 
 
-def test_files_are_named_without_their_folder_and_keep_the_order_given(tmp_path):
+def test_files_are_named_without_their_folder_and_keep_the_order_given(tmp_path: Path) -> None:
     touch(tmp_path / "x" / "2.png", tmp_path / "y" / "1.png")
     assert names(tmp_path / "x" / "2.png", tmp_path / "y" / "1.png") == ["2.png", "1.png"]
 
 
-def test_names_that_are_not_utf8_become_valid_text(tmp_path):
+def test_names_that_are_not_utf8_become_valid_text(tmp_path: Path) -> None:
     touch(Path(os.fsdecode(os.fsencode(tmp_path) + b"/f\xff.png")))
     (source,) = find_sources([tmp_path])
     assert source.name == "f\\xff.png"
     assert source.path.exists()
 
 
-def test_manifest_frames_come_in_the_order_of_capture_with_their_robot_pose(tmp_path):
+def test_manifest_frames_come_in_the_order_of_capture_with_their_robot_pose(tmp_path: Path) -> None:
     manifest = tmp_path / "run.jsonl"
     manifest.write_text(
         '{"record": "session", "units": {"length": "m"}}\n'
@@ -74,7 +74,7 @@ def test_manifest_frames_come_in_the_order_of_capture_with_their_robot_pose(tmp_
 
 
 @pytest.mark.parametrize("kind", ["missing", "empty folder", "no image", "unknown suffix", "same name", "same file"])
-def test_unusable_inputs_are_refused_in_one_line_that_names_them(tmp_path, kind):
+def test_unusable_inputs_are_refused_in_one_line_that_names_them(tmp_path: Path, kind: str) -> None:
     touch(tmp_path / "a" / "1.png", tmp_path / "b" / "1.png", tmp_path / "c" / "notes.txt", tmp_path / "d.raw")
     (tmp_path / "e").mkdir()
     inputs, named = {
@@ -92,6 +92,6 @@ def test_unusable_inputs_are_refused_in_one_line_that_names_them(tmp_path, kind)
 
 
 @given(st.lists(st.tuples(st.sampled_from(["f", "img_", "F"]), st.integers(0, 10**12)), unique=True))
-def test_natural_order_sorts_equal_prefixes_by_the_value_of_the_number(pairs):
+def test_natural_order_sorts_equal_prefixes_by_the_value_of_the_number(pairs: list[tuple[str, int]]) -> None:
     ordered = sorted(pairs, key=lambda pair: natural_key(f"{pair[0]}{pair[1]}.png"))
     assert ordered == sorted(pairs, key=lambda pair: (pair[0].casefold(), pair[1], f"{pair[0]}{pair[1]}"))

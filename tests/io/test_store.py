@@ -1,9 +1,15 @@
 """Rows, tables and the journal: exact round trips, whole files or none, resuming after any cut."""
 
 import csv
+import errno
 import io
 import json
 import math
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
@@ -21,7 +27,7 @@ from torchpose.io.rows import (
     pose_rows,
 )
 from torchpose.io.store import ResultStore
-from torchpose.io.writers import read_rows, write_rows
+from torchpose.io.writers import read_rows, read_table, write_rows
 from torchpose.results import Detections, Poses, Reason, Status
 
 CONTRACT = "frame,target,status,tx,ty,tz,rx,ry,rz,sx,sy,sz,srx,sry,srz,rms_px,markers,reason"
@@ -29,12 +35,12 @@ DETECTION_CONTRACT = "frame,target,marker,u,v,su,sv,outer_a,outer_b,outer_theta,
 NAN = float("nan")
 
 
-def some_poses(frames=3, targets=2, seed=0):
+def some_poses(frames: int = 3, targets: int = 2, seed: int = 0) -> Poses:
     """Random poses; the last row has none, the last but one is ambiguous with a second solution."""
     g = torch.Generator().manual_seed(seed)
     n = frames * targets
 
-    def normal(*shape):
+    def normal(*shape: int) -> torch.Tensor:
         return torch.randn(*shape, generator=g, dtype=torch.float64)
 
     root = normal(n, 6, 6)
@@ -72,13 +78,13 @@ def some_poses(frames=3, targets=2, seed=0):
 FRAMES, TARGETS = ["b.png", "a,1.png", 'c "x"\n.png'], ["left", "right"]
 
 
-def rows_with_base():
+def rows_with_base() -> list[dict[str, Any]]:
     poses = some_poses()
     cells = base_cells(poses.seen_from(rotations.exp(torch.tensor([0.1, 0.2, 0.3])), torch.tensor([1.0, 2.0, 3.0])))
     return [row | cell for row, cell in zip(pose_rows(poses, FRAMES, TARGETS), cells, strict=True)]
 
 
-def test_rows_hold_the_poses_exactly():
+def test_rows_hold_the_poses_exactly() -> None:
     poses = some_poses()
     rows = pose_rows(poses, FRAMES, TARGETS)
     assert [(row["frame"], row["target"]) for row in rows] == [(f, t) for f in FRAMES for t in TARGETS]
@@ -101,7 +107,7 @@ def test_rows_hold_the_poses_exactly():
     assert all(value is None for column, value in rows[5].items() if column not in without)
 
 
-def test_detection_rows_are_ordered_by_frame_target_and_marker():
+def test_detection_rows_are_ordered_by_frame_target_and_marker() -> None:
     poses = some_poses()
     rows = detection_rows(poses.detections, FRAMES, TARGETS)
     assert [(r["frame"], r["target"], r["marker"]) for r in rows] == [
@@ -115,7 +121,7 @@ def test_detection_rows_are_ordered_by_frame_target_and_marker():
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".jsonl", ".parquet"])
-def test_tables_read_back_to_the_same_bits(tmp_path, suffix):
+def test_tables_read_back_to_the_same_bits(tmp_path: Path, suffix: str) -> None:
     schema = POSE_SCHEMA | BASE_SCHEMA
     rows = [
         *rows_with_base(),
@@ -128,7 +134,14 @@ def test_tables_read_back_to_the_same_bits(tmp_path, suffix):
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
-def test_csv_has_the_columns_of_the_contract(tmp_path):
+@pytest.mark.parametrize("row", ["a.png", "a.png,quad,3"])
+def test_a_row_with_another_number_of_cells_is_refused(tmp_path: Path, row: str) -> None:
+    (tmp_path / "t.csv").write_text(f"frame,target\n{row}\n")
+    with pytest.raises(ConfigError, match=r"t\.csv: POSES: cannot be read \(a row has another number of cells"):
+        read_table(tmp_path / "t.csv")
+
+
+def test_csv_has_the_columns_of_the_contract(tmp_path: Path) -> None:
     write_rows(tmp_path / "a.csv", [], POSE_SCHEMA)
     write_rows(tmp_path / "b.csv", [], POSE_SCHEMA | BASE_SCHEMA)
     write_rows(tmp_path / "d.csv", [], DETECTION_SCHEMA)
@@ -137,7 +150,7 @@ def test_csv_has_the_columns_of_the_contract(tmp_path):
     assert (tmp_path / "d.csv").read_text() == DETECTION_CONTRACT + "\n"
 
 
-def test_csv_cells_are_empty_where_there_is_no_pose(tmp_path):
+def test_csv_cells_are_empty_where_there_is_no_pose(tmp_path: Path) -> None:
     write_rows(tmp_path / "a.csv", rows_with_base()[-1:], POSE_SCHEMA)
     (row,) = csv.DictReader(io.StringIO((tmp_path / "a.csv").read_text(), newline=""))
     empty = {c for c, kind in POSE_SCHEMA.items() if kind is float}
@@ -145,12 +158,12 @@ def test_csv_cells_are_empty_where_there_is_no_pose(tmp_path):
     assert (row["markers"], row["reason"]) == ("2", "ring_shape")
 
 
-def test_jsonl_is_strict_json_and_parquet_is_typed(tmp_path):
+def test_jsonl_is_strict_json_and_parquet_is_typed(tmp_path: Path) -> None:
     rows = rows_with_base()
     write_rows(tmp_path / "a.jsonl", rows, POSE_SCHEMA)
     write_rows(tmp_path / "a.parquet", rows, POSE_SCHEMA)
 
-    def refuse(text):
+    def refuse(text: str) -> None:
         raise AssertionError(text)
 
     parsed = [json.loads(line, parse_constant=refuse) for line in (tmp_path / "a.jsonl").read_text().splitlines()]
@@ -160,12 +173,12 @@ def test_jsonl_is_strict_json_and_parquet_is_typed(tmp_path):
     assert (types["frame"], types["tx"], types["markers"]) == ("string", "double", "int64")
 
 
-def test_a_failed_write_leaves_the_old_table(tmp_path):
+def test_a_failed_write_leaves_the_old_table(tmp_path: Path) -> None:
     path = tmp_path / "t.csv"
     write_rows(path, [fault_row("old", "t", Status.UNREADABLE, "empty")], POSE_SCHEMA)
     before = path.read_bytes()
 
-    def rows():
+    def rows() -> Iterator[dict[str, Any]]:
         yield fault_row("new", "t", Status.UNREADABLE, "empty")
         raise OSError(28, "No space left on device")
 
@@ -177,28 +190,28 @@ def test_a_failed_write_leaves_the_old_table(tmp_path):
 
 # --- the journal ---
 
-ORIGIN = {"--camera": "c1", "--target": [["quad", "t1"]]}
+ORIGIN: dict[str, Any] = {"--camera": "c1", "--target": [["quad", "t1"]]}
 NAMES = [f"{i}.png" for i in range(5)]
 
 
-def record(name):
+def record(name: str) -> dict[str, list[dict[str, Any]] | str]:
     number = int(name.split(".")[0])
-    row = fault_row(name, "quad", Status.OK, None) | {"tx": number + 0.1, "markers": 4}
+    row = fault_row(name, "quad", Status.OK, "") | {"reason": None, "tx": number + 0.1, "markers": 4}
     detection = dict.fromkeys(DETECTION_SCHEMA) | {"frame": name, "target": "quad", "marker": 1, "u": number / 3}
     return {"frame": name, "rows": [row], "detections": [detection]}
 
 
-def store(folder, *, resume=False, origin=ORIGIN, suffix=".csv"):
+def store(folder: Path, *, resume: bool = False, origin: dict[str, Any] = ORIGIN, suffix: str = ".csv") -> ResultStore:
     return ResultStore(
         folder / f"p{suffix}", folder / "d.csv", schema=POSE_SCHEMA, targets=1, origin=origin, resume=resume
     )
 
 
-def tables(folder, suffix=".csv"):
+def tables(folder: Path, suffix: str = ".csv") -> tuple[bytes, bytes]:
     return (folder / f"p{suffix}").read_bytes(), (folder / "d.csv").read_bytes()
 
 
-def complete(folder, names=NAMES, resume=False, **options):
+def complete(folder: Path, names: list[str] = NAMES, resume: bool = False, **options: Any) -> list[str]:
     with_rows = store(folder, resume=resume, **options)
     done = [name for name in names if name in with_rows]
     with_rows.append([record(name) for name in names if name not in with_rows])
@@ -207,19 +220,19 @@ def complete(folder, names=NAMES, resume=False, **options):
 
 
 @pytest.fixture
-def whole(tmp_path_factory):
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, bytes]:
     folder = tmp_path_factory.mktemp("whole")
     complete(folder)
     return tables(folder)
 
 
-def test_a_completed_run_leaves_tables_and_their_origin_only(tmp_path):
+def test_a_completed_run_leaves_tables_and_their_origin_only(tmp_path: Path) -> None:
     complete(tmp_path)
     assert {p.name for p in tmp_path.iterdir()} == {"p.csv", "d.csv", "p.csv.run.json"}
     assert json.loads((tmp_path / "p.csv.run.json").read_text()) == ORIGIN
 
 
-def test_a_journal_cut_at_any_byte_is_resumed_to_the_same_tables(tmp_path, whole):
+def test_a_journal_cut_at_any_byte_is_resumed_to_the_same_tables(tmp_path: Path, whole: tuple[bytes, bytes]) -> None:
     first = store(tmp_path)
     first.append([record(name) for name in NAMES[:2]])
     first.append([record(NAMES[2])])
@@ -237,7 +250,7 @@ def test_a_journal_cut_at_any_byte_is_resumed_to_the_same_tables(tmp_path, whole
             leftover.unlink()
 
 
-def test_a_journal_that_ends_in_zeros_is_resumed(tmp_path, whole):
+def test_a_journal_that_ends_in_zeros_is_resumed(tmp_path: Path, whole: tuple[bytes, bytes]) -> None:
     first = store(tmp_path)
     first.append([record(name) for name in NAMES[:3]])
     first.close()
@@ -247,7 +260,7 @@ def test_a_journal_that_ends_in_zeros_is_resumed(tmp_path, whole):
     assert tables(tmp_path) == whole
 
 
-def test_frames_are_written_in_the_order_asked_for(tmp_path, whole):
+def test_frames_are_written_in_the_order_asked_for(tmp_path: Path, whole: tuple[bytes, bytes]) -> None:
     first = store(tmp_path)
     first.append([record(name) for name in reversed(NAMES)])
     first.finish(NAMES)
@@ -255,7 +268,7 @@ def test_frames_are_written_in_the_order_asked_for(tmp_path, whole):
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".jsonl", ".parquet"])
-def test_finished_tables_are_resumed_with_their_rows_kept(tmp_path, suffix):
+def test_finished_tables_are_resumed_with_their_rows_kept(tmp_path: Path, suffix: str) -> None:
     (tmp_path / "a").mkdir()
     complete(tmp_path / "a", suffix=suffix)
     (tmp_path / "b").mkdir()
@@ -266,13 +279,13 @@ def test_finished_tables_are_resumed_with_their_rows_kept(tmp_path, suffix):
     assert tables(tmp_path / "b", suffix) == tables(tmp_path / "a", suffix)
 
 
-def test_rows_of_frames_that_are_gone_are_kept_in_front(tmp_path):
+def test_rows_of_frames_that_are_gone_are_kept_in_front(tmp_path: Path) -> None:
     complete(tmp_path, NAMES[:2])
     complete(tmp_path, NAMES[1:], resume=True)
     assert [row["frame"] for row in read_rows(tmp_path / "p.csv", POSE_SCHEMA)] == NAMES
 
 
-def test_counts_and_unreadable_frames_include_those_of_the_earlier_run(tmp_path):
+def test_counts_and_unreadable_frames_include_those_of_the_earlier_run(tmp_path: Path) -> None:
     first = store(tmp_path)
     bad = {"frame": "x.png", "rows": [fault_row("x.png", "quad", Status.UNREADABLE, "empty")], "detections": []}
     first.append([record(NAMES[0]), bad])
@@ -285,7 +298,7 @@ def test_counts_and_unreadable_frames_include_those_of_the_earlier_run(tmp_path)
 
 
 @pytest.mark.parametrize("finished", [True, False])
-def test_resuming_with_another_origin_is_refused_and_changes_nothing(tmp_path, finished):
+def test_resuming_with_another_origin_is_refused_and_changes_nothing(tmp_path: Path, finished: bool) -> None:
     first = store(tmp_path)
     first.append([record(name) for name in NAMES])
     if finished:
@@ -297,14 +310,16 @@ def test_resuming_with_another_origin_is_refused_and_changes_nothing(tmp_path, f
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
 
 
-def test_a_table_of_unknown_origin_is_not_resumed(tmp_path):
+def test_a_table_of_unknown_origin_is_not_resumed(tmp_path: Path) -> None:
     complete(tmp_path)
     (tmp_path / "p.csv.run.json").unlink()
     with pytest.raises(ConfigError, match=r"p\.csv\.run\.json: --resume: missing"):
         store(tmp_path, resume=True)
 
 
-def test_without_resume_everything_starts_over_and_the_old_table_stays_until_the_end(tmp_path, whole):
+def test_without_resume_everything_starts_over_and_the_old_table_stays_until_the_end(
+    tmp_path: Path, whole: tuple[bytes, bytes]
+) -> None:
     complete(tmp_path)
     second = store(tmp_path)
     assert NAMES[0] not in second
@@ -314,7 +329,7 @@ def test_without_resume_everything_starts_over_and_the_old_table_stays_until_the
     assert len(list(read_rows(tmp_path / "p.csv", POSE_SCHEMA))) == 1
 
 
-def test_two_runs_cannot_write_one_table(tmp_path):
+def test_two_runs_cannot_write_one_table(tmp_path: Path) -> None:
     first = store(tmp_path)
     with pytest.raises(ConfigError, match="another run is writing"):
         store(tmp_path)
@@ -325,8 +340,44 @@ def test_two_runs_cannot_write_one_table(tmp_path):
     second.close()
 
 
+def test_a_killed_run_holds_no_lock(tmp_path: Path) -> None:
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "from tests.io.test_store import NAMES, Path, record, store\n"
+        "one = store(Path(sys.argv[2])); one.append([record(NAMES[0])]); print('held', flush=True); sys.stdin.read()"
+    )
+    command = [sys.executable, "-c", code, str(Path(__file__).parents[2]), str(tmp_path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "held\n"
+        with pytest.raises(ConfigError, match=r"p\.csv\.partial: --out: another run is writing it; wait for it or"):
+            store(tmp_path, resume=True)
+        other.kill()
+    assert complete(tmp_path, resume=True) == NAMES[:1]
+    assert {p.name for p in tmp_path.iterdir()} == {"p.csv", "d.csv", "p.csv.run.json"}
+
+
+def test_places_without_locks_are_written_unguarded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr("torchpose.io.store.lock_descriptor", missing)
+    assert complete(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    "line", ["[1]", '{"frame": "0.png"}', '{"frame": "0.png", "rows": [], "detections": []}', '{"rows": [{}]}', "3"]
+)
+@pytest.mark.parametrize("first", [True, False])
+def test_a_journal_of_another_program_is_one_clear_line(tmp_path: Path, line: str, first: bool) -> None:
+    head = "" if first else json.dumps({"origin": ORIGIN}) + "\n"
+    (tmp_path / "p.csv.partial").write_text(head + line + "\n")
+    with pytest.raises(ConfigError, match=r"p\.csv\.partial: --resume: not written by torchpose; run without --resume"):
+        store(tmp_path, resume=True)
+
+
 @pytest.mark.parametrize("place", ["p.txt", "p", "gone/p.csv", "folder.csv", "file/p.csv", "/proc/p.csv"])
-def test_places_that_cannot_be_written_are_refused_at_once(tmp_path, place):
+def test_places_that_cannot_be_written_are_refused_at_once(tmp_path: Path, place: str) -> None:
     (tmp_path / "folder.csv").mkdir()
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="--out: ") as caught:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 
@@ -21,7 +23,7 @@ def some_truth() -> Truth:
     )
 
 
-def test_round_trip_is_exact(tmp_path):
+def test_round_trip_is_exact(tmp_path: Path) -> None:
     truth = some_truth()
     write_truth(tmp_path / "truth.csv", truth)
     again = read_truth(tmp_path / "truth.csv")
@@ -33,13 +35,13 @@ def test_round_trip_is_exact(tmp_path):
     assert list(tmp_path.iterdir()) == [tmp_path / "truth.csv"]
 
 
-def test_rotation_matrix(tmp_path):
+def test_rotation_matrix(tmp_path: Path) -> None:
     R = some_truth().R
     torch.testing.assert_close(R @ R.mT, torch.eye(3, dtype=F64).expand(3, 3, 3), rtol=0, atol=1e-14)
     torch.testing.assert_close(torch.linalg.det(R), torch.ones(3, dtype=F64))
 
 
-def test_columns_in_any_order(tmp_path):
+def test_columns_in_any_order(tmp_path: Path) -> None:
     path = tmp_path / "truth.csv"
     path.write_text("rz,noise,frame,ry,rx,tz,target,ty,tx\n6,7,f.png,5,4,3,q,2,1\n")
     truth = read_truth(path)
@@ -48,7 +50,7 @@ def test_columns_in_any_order(tmp_path):
     assert truth.extra["noise"].tolist() == [7]
 
 
-def test_header_only(tmp_path):
+def test_header_only(tmp_path: Path) -> None:
     path = tmp_path / "truth.csv"
     path.write_text("frame,target,tx,ty,tz,rx,ry,rz\n")
     truth = read_truth(path)
@@ -65,7 +67,7 @@ def test_header_only(tmp_path):
         ("frame,target,tx,ty,tz,rx,ry,rz\nf,q,1,2,3,4,5,6\nf,q,1,2,east,4,5,6\n", "tz"),
     ],
 )
-def test_errors_name_file_and_field(tmp_path, text, field):
+def test_errors_name_file_and_field(tmp_path: Path, text: str, field: str) -> None:
     path = tmp_path / "truth.csv"
     path.write_text(text)
     with pytest.raises(ConfigError) as caught:
@@ -76,6 +78,6 @@ def test_errors_name_file_and_field(tmp_path, text, field):
     assert "\n" not in message
 
 
-def test_missing_file(tmp_path):
+def test_missing_file(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="does not exist"):
         read_truth(tmp_path / "none.csv")

@@ -19,7 +19,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from torchpose import ConfigError
-from torchpose.kernels import LEAST, build, compiled, has_compiler, padded, repeated, tracing
+from torchpose.kernels import LEAST, build, compiled, functions, has_compiler, mapped, padded, repeated, tracing
+from torchpose.kernels.build import Kernel
 
 pytestmark = pytest.mark.skipif(not has_compiler(), reason="needs a C++ compiler (apt-get install g++)")
 F32, F64 = torch.float32, torch.float64
@@ -186,7 +187,7 @@ class Lens:
 
 
 def test_arguments_and_results_are_arranged_as_they_are_in_python() -> None:
-    def function(pair: Pair, lens: Lens, missing: Tensor | None) -> dict[str, Pair]:
+    def function(pair: Pair, lens: Lens, missing: Tensor | None) -> dict[str, Any]:
         scale = pair.second[1] * lens.matrix[0, 1]
         return {lens.name: Pair(pair.first * scale, (pair.second[0] + (0 if missing is None else missing), 1.0))[:1]}
 
@@ -199,6 +200,28 @@ def test_arguments_and_results_are_arranged_as_they_are_in_python() -> None:
         pair._replace(second=(pair.second[0], 7.0)), Lens(torch.tensor([[0, 2.0]]), "right"), None
     )
     torch.testing.assert_close(other["right"][0], 14 * pair.first)
+
+
+def test_numbers_are_no_reason_to_compile_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[str] = []
+
+    def counted(source: str) -> Kernel:
+        made.append(source)
+        return build.build(source)
+
+    monkeypatch.setattr(functions, "build", counted)
+
+    def function(pair: Pair, scale: float) -> Tensor:
+        return torch.where(pair.first > scale, pair.second[1] * pair.first, pair.second[0])
+
+    for dtype in (F32, F64):
+        first, second = numbers(12, dtype=dtype), numbers(12, dtype=dtype, seed=1)
+        for scale, factor in ((0.5, 2.0), (-0.5, 3.0), (0.0, math.inf)):
+            args = Pair(first, (second, factor)), scale
+            ours, theirs = compiled(function)(*args), function(*args)
+            assert ours.dtype == theirs.dtype == dtype
+            torch.testing.assert_close(ours, theirs, rtol=0, atol=0)
+    assert len(made) == 2, "one for each dtype"
 
 
 @pytest.mark.parametrize("by_problem", [False, True])
@@ -258,6 +281,72 @@ def test_what_it_cannot_do_it_says() -> None:
     with pytest.raises(ValueError, match=f"5 problems; a compiled function needs {LEAST}"):
         compiled(lambda a: 2 * a)(numbers(3, 5))
     assert not tracing()
+
+
+DENSE: dict[str, Callable[[Tensor, Tensor], Any]] = {
+    "solve": lambda a, b: (torch.linalg.solve(a, b), torch.linalg.solve_ex(a, b[..., 0]).result),
+    "inverse": lambda a, b: (torch.linalg.inv(a), torch.linalg.inv_ex(a).inverse, a.det()),
+    "eigh": lambda a, b: (
+        torch.linalg.eigh(a + a.mT).eigenvalues,
+        torch.linalg.eigh(a + a.mT).eigenvectors.abs(),
+    ),
+    "embedded": lambda a, b: (torch.diag_embed(b[..., 0]) @ a, torch.linalg.cross(b[:, :3, 0], b[:, :3, 1])),
+    "angles": lambda a, b: (a.cos(), a.sin(), torch.atan2(a, a.mT), torch.hypot(a, a.mT), a.remainder(torch.pi)),
+    "powers": lambda a, b: (a.abs() ** (1 / 3), a.sign(), a.square()),
+}
+
+
+@pytest.mark.parametrize("count", [1, 5, 8, 100])
+@pytest.mark.parametrize("name", DENSE)
+def test_problems_first_and_what_lapack_does(name: str, count: int) -> None:
+    function = DENSE[name]
+    matrices, right = numbers(count, 3, 3), numbers(count, 3, 2, seed=1)
+    ours, theirs = mapped(function)(matrices, right), function(matrices, right)
+    for x, y in zip(ours, theirs, strict=True):
+        assert x.shape == y.shape
+        torch.testing.assert_close(x, y, rtol=1e-9, atol=1e-11)
+
+
+def test_larger_systems_and_shared_arguments() -> None:
+    root, shared = numbers(20, 7, 7), numbers(1, 7, 3)
+
+    def function(root: Tensor, shared: Tensor, ridge: float) -> Tensor:
+        return torch.linalg.solve(root @ root.mT + ridge * torch.eye(7), shared.expand(len(root), 7, 3))
+
+    for ridge in (0.1, 1.0):
+        torch.testing.assert_close(mapped(function)(root, shared, ridge), function(root, shared, ridge))
+
+
+def test_eager_where_it_cannot_be_compiled(monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder) -> None:
+    a = numbers(4, 3)
+
+    def sorted_rows(a: Tensor) -> Tensor:
+        return a.sort(1).values
+
+    def by_number(a: Tensor) -> Tensor:
+        return a if bool((a > 0).any()) else -a
+
+    def doubled(a: Tensor) -> Tensor:
+        return 2 * a
+
+    for function, why in ((sorted_rows, r"aten\.sort"), (by_number, "a look at numbers")):
+        with pytest.warns(UserWarning, match=f"{function.__name__} is not compiled: {why}"):
+            torch.testing.assert_close(mapped(function)(a), function(a))
+        torch.testing.assert_close(mapped(function)(a), function(a))
+    with pytest.warns(UserWarning, match="doubled is not compiled: a tensor is on meta"):
+        assert mapped(doubled)(a.to("meta")).shape == a.shape
+    assert mapped(doubled)(a[:0]).shape == (0, 3)
+    leaf = a.clone().requires_grad_()
+    mapped(doubled)(leaf).sum().backward()
+    assert leaf.grad is not None
+    torch.testing.assert_close(mapped(doubled)(a), 2 * a)
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("CXX", raising=False)
+    mapped.cache_clear()
+    with pytest.warns(UserWarning, match=r"doubled is not compiled: needs a C\+\+ compiler"):
+        torch.testing.assert_close(mapped(doubled)(a), 2 * a)
+    mapped.cache_clear()
+    assert not recwarn.list, "each is said once"
 
 
 def test_threads_may_compile_and_run_at_the_same_time() -> None:

@@ -10,9 +10,9 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import CUBOID, F64, GRID, SQUARE, errors, project, views
 from torch import Tensor
 
+from tests.pnp.scenes import CUBOID, F64, GRID, SQUARE, errors, project, views
 from torchpose.geometry import rotations
 from torchpose.pnp import Candidates, dlt, epnp, lines, p3p, planar, posit
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
-from scenes import F64
 from torch import Tensor
 
+from tests.pnp.scenes import F64
 from torchpose.camera import Camera
 from torchpose.geometry import rotations
 from torchpose.geometry.small_linalg import matmul3

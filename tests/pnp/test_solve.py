@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from scenes import CUBOID, F64, FOCAL, GRID, MATRIX, SQUARE, errors, pixels, project, views
 from scipy.optimize import least_squares
 from torch import Tensor
 
+from tests.pnp.scenes import CUBOID, F64, FOCAL, GRID, MATRIX, SQUARE, errors, pixels, project, views
 from torchpose import ConfigError, kernels, pnp
 from torchpose.camera import Camera
 from torchpose.geometry import rotations
@@ -50,8 +50,8 @@ def test_cost_equals_the_optimum_of_scipy(camera: Camera | Tensor) -> None:
     result = pnp.solve(GRID, image, camera, sigma_px=0.3)
     for i in range(20):
 
-        def residual(x: np.ndarray, i: int = i) -> np.ndarray:
-            x = torch.from_numpy(x)
+        def residual(step: np.ndarray, i: int = i) -> np.ndarray:
+            x = torch.from_numpy(step)
             moved = GRID @ rotations.exp(x[:3]).T @ r[i].T + t[i] + x[3:]
             return ((lens.project(moved) - image[i]) / 0.3).flatten().numpy()
 
@@ -125,11 +125,7 @@ def test_uncertain_intrinsics_widen_the_covariance_as_finite_differences_say() -
 
 
 def test_random_planar_scenes_obey_their_covariance() -> None:
-    import sys
-    from pathlib import Path
-
-    sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
-    import pnp_statistics
+    from scripts import pnp_statistics
 
     row = pnp_statistics.table(pnp_statistics.run(14_000, seed=1))[0]
     assert 5.7 < row["decided_nees"] < 6.3
@@ -141,11 +137,7 @@ def test_random_planar_scenes_obey_their_covariance() -> None:
 
 def test_no_pose_creeps_off_a_saddle() -> None:
     """Other minima that start near a saddle held the whole batch up."""
-    import sys
-    from pathlib import Path
-
-    sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
-    import bench_pnp
+    from scripts import bench_pnp
 
     for points in bench_pnp.TARGETS.values():
         result = pnp.solve(points, bench_pnp.scene(points, 65536), bench_pnp.MATRIX, sigma_px=bench_pnp.SIGMA_PX)

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
 import torch
-from scenes import CUBOID, F64, FOCAL, GRID, MATRIX, SQUARE, pixels, views
 from torch import Tensor
 
-from torchpose import pnp
+from tests.pnp.scenes import CUBOID, F64, FOCAL, GRID, MATRIX, SQUARE, pixels, views
+from torchpose import kernels, pnp
 from torchpose.camera import Camera
-from torchpose.kernels import has_compiler
+from torchpose.kernels import functions, has_compiler
+from torchpose.kernels.build import Kernel, build
 from torchpose.pnp import PnPCode, PnPResult
 
 pytestmark = pytest.mark.skipif(not has_compiler(), reason="needs a C++ compiler (apt-get install g++)")
@@ -71,7 +73,8 @@ def test_cameras_share_what_was_compiled() -> None:
 def test_options(kind: str) -> None:
     g = torch.Generator().manual_seed(5)
     r, t, xy = views(GRID, 80)
-    points, image, camera, options = GRID, pixels(xy, 0.1), MATRIX, {}
+    options: dict[str, Any] = {}
+    points, image, camera = GRID, pixels(xy, 0.1), MATRIX
     if kind == "own":
         points = GRID.expand(80, -1, -1) * torch.linspace(1, 1.5, 80, dtype=F64)[:, None, None]
         camera_points = points @ r.mT + t[:, None]
@@ -98,6 +101,31 @@ def test_options(kind: str) -> None:
         image = (xy * (FOCAL + torch.arange(80, dtype=F64))[:, None, None]) + MATRIX[:2, 2]
     # a pose at which a residual is just at the limit of Huber's square comes to its end in many small steps
     same(*both(points, image, camera, **options), factor=100 if kind == "huber" else 1)
+
+
+@pytest.mark.parametrize("robust", [False, True], ids=["squares", "huber"])
+def test_noise_and_the_limit_of_huber_are_no_reason_to_compile_anew(
+    robust: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[str] = []
+
+    def counted(source: str) -> Kernel:
+        made.append(source)
+        return build(source)
+
+    monkeypatch.setattr(functions, "build", counted)
+    kernels.compiled.cache_clear()
+    kernels.repeated.cache_clear()
+    image = pixels(views(SQUARE, 80, tilt_deg=(0, 75), far=60)[2], 0.1)
+    image[::3, 0] += 2 * torch.rand(27, 2, generator=torch.Generator().manual_seed(5), dtype=F64)
+    # all that a call may need, with some poses left over by the first pass
+    pnp.solve(SQUARE, image, MATRIX, sigma_px=0.15, huber=1.7 if robust else math.inf, compile=True)
+    first = len(made)
+    assert first > 1
+    for sigma_px, huber in ((0.1, 1.5), (0.2, 1.5), (0.1, 3.0)):
+        options = {"sigma_px": sigma_px, "huber": huber} if robust else {"sigma_px": sigma_px}
+        same(*both(SQUARE, image, MATRIX, **options), factor=100 if robust else 1)
+        assert len(made) == first
 
 
 @pytest.mark.parametrize("batch", [0, 1, 3, 7, 8, 9, 63, 16385])

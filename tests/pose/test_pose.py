@@ -6,13 +6,13 @@ import dataclasses
 
 import pytest
 import torch
-from exact import F64, exact_ellipses, pinhole, random_poses, rings_of
 from torch import Tensor
 
+from tests.exact import F64, exact_ellipses, pinhole, random_poses, rings_of
 from torchpose.camera import Camera
 from torchpose.geometry import rotations
 from torchpose.identify import MarkerTable
-from torchpose.pose import Evidence, compensate, gather_evidence, intrinsics_covariance, solve_poses
+from torchpose.pose import Evidence, Solutions, compensate, gather_evidence, intrinsics_covariance, solve_poses
 from torchpose.pose import solve as pose
 from torchpose.results import Reason, Status
 from torchpose.target import Target
@@ -37,16 +37,16 @@ def evidence(
     if shift is not None:
         ellipses[..., :2] += shift[:, :, None]
     rings = rings_of(ellipses.flatten(0, 1), torch.arange(count).repeat_interleave(markers), sigma, seed=seed)
-    markers = MarkerTable.of([target])[torch.zeros(count, dtype=torch.int64)]
+    table = MarkerTable.of([target])[torch.zeros(count, dtype=torch.int64)]
     ring = torch.arange(count * len(target)).view(count, len(target))
-    return gather_evidence(rings, ring, markers, camera.matrix, compensate)
+    return gather_evidence(rings, ring, table, camera.matrix, compensate)
 
 
 def hide(e: Evidence, marker: int) -> Evidence:
     return e.without(torch.full((len(e.mask),), marker))
 
 
-def errors(s: pose.Solutions, r: Tensor, t: Tensor) -> Tensor:
+def errors(s: Solutions, r: Tensor, t: Tensor) -> Tensor:
     return torch.cat([s.t - t, rotations.log(s.R @ r.mT)], -1)
 
 

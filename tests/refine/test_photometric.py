@@ -6,9 +6,9 @@ import math
 
 import pytest
 import torch
-from exact import F64, exact_ellipses, pinhole, random_poses
 from torch import Tensor
 
+from tests.exact import F64, exact_ellipses, pinhole, random_poses
 from torchpose.analysis import pose_crlb
 from torchpose.camera import Camera
 from torchpose.geometry import rotations

@@ -5,19 +5,18 @@ Few frames of every case of scripts/precision_statistics.py; the figures of docs
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
+from typing import Any
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
-import precision_statistics as statistics
+from scripts import precision_statistics as statistics
+from torchpose.pipeline import Method
 
 FRAMES = 12
 RATIOS = ("lateral_ratio", "depth_ratio", "rotation_ratio")
 
 
-def row(case: str, method: str) -> dict[str, float]:
+def row(case: str, method: Method) -> dict[str, Any]:
     (found,) = statistics.run(case, statistics.CASES[case], [method], FRAMES, seed=7)
     return found
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 
 import torch
-from exact import F64, exact_ellipses, pinhole, random_poses, rings_of
 
 import torchpose as tp
+from tests.exact import F64, exact_ellipses, pinhole, random_poses, rings_of
 from torchpose.geometry import rotations
 from torchpose.identify import MarkerTable
 from torchpose.pose import Evidence, gather_evidence, solve_poses

@@ -7,10 +7,10 @@ import math
 
 import pytest
 import torch
-from exact import F64, pinhole, random_poses
 from torch import Tensor
 
 import torchpose as tp
+from tests.exact import F64, pinhole, random_poses
 from torchpose import ellipse
 from torchpose.geometry import conics, rotations
 from torchpose.refine import Refined, Sight, refine_edges

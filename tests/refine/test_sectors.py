@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import torch
-from exact import F64, exact_ellipses, pinhole, random_poses
 from torch import Tensor
 
+from tests.exact import F64, exact_ellipses, pinhole, random_poses
 from torchpose.geometry import rotations
 from torchpose.refine import Refined, Sight, refine_photometric
 from torchpose.refine.photometric.grey_chi2 import grey_chi2

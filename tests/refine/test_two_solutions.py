@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 
 import torch
-from exact import F64, exact_ellipses, pinhole, random_poses
 from torch import Tensor
 
+from tests.exact import F64, exact_ellipses, pinhole, random_poses
 from torchpose.pose import Evidence, Solutions
 from torchpose.refine import Sight, decide_on_grey
 from torchpose.results import Reason, Status
@@ -39,10 +39,10 @@ def evidence(r: Tensor, t: Tensor) -> Evidence:
 def solutions(r: Tensor, t: Tensor, r_alt: Tensor, t_alt: Tensor, status: Status, reason: Reason) -> Solutions:
     """Whose rms is 1 and chi2 10, 2 and 20 of the alternative."""
     one = torch.ones(len(r), dtype=F64)
-    state = (torch.full((len(r),), int(s)) for s in (status, reason))
+    codes, reasons = (torch.full((len(r),), int(s)) for s in (status, reason))
     mask = torch.ones(len(r), len(QUAD), dtype=torch.bool)
     covariance = torch.eye(6, dtype=F64).repeat(len(r), 1, 1)
-    return Solutions(r, t, covariance, one, 10 * one, r_alt, t_alt, 2 * one, 20 * one, *state, mask)
+    return Solutions(r, t, covariance, one, 10 * one, r_alt, t_alt, 2 * one, 20 * one, codes, reasons, mask)
 
 
 def decided(s: Solutions, frames: Tensor, r: Tensor, t: Tensor) -> Solutions:

@@ -26,7 +26,12 @@ TARGET = Target.load("quad40")
 NAN = float("nan")
 
 
-def one_pose(status=Status.OK, translation=(-10.0, 8.0, 150.0), rotation=(0.5, -0.3, 0.2), reason=Reason.NONE):
+def one_pose(
+    status: Status = Status.OK,
+    translation: tuple[float, float, float] = (-10.0, 8.0, 150.0),
+    rotation: tuple[float, float, float] = (0.5, -0.3, 0.2),
+    reason: Reason = Reason.NONE,
+) -> Poses:
     """One pose with two markers whose ellipses are known."""
     none = torch.full((1,), NAN, dtype=torch.float64)
     center = torch.tensor([[120.3, 170.7], [260.25, 200.5]], dtype=torch.float64)
@@ -59,21 +64,21 @@ def one_pose(status=Status.OK, translation=(-10.0, 8.0, 150.0), rotation=(0.5, -
     )
 
 
-def draw(tmp_path, poses, frame=None):
+def draw(tmp_path: Path, poses: Poses, frame: torch.Tensor | None = None) -> np.ndarray:
     frame = torch.zeros(HEIGHT, WIDTH, dtype=torch.uint8) if frame is None else frame
     return Overlay(CAMERA, [TARGET], tmp_path).draw(frame, poses, "f.png").astype(int)
 
 
-def share(picture, colour):
+def share(picture: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:
     """How much of a colour each pixel of a picture drawn on black has, 0 to 1."""
-    colour = np.array(colour, float)
-    amount = (picture * colour).sum(-1) / (colour**2).sum()
-    pure = np.abs(picture - amount[..., None] * colour).max(-1) < 6
+    drawn = np.array(colour, float)
+    amount = (picture * drawn).sum(-1) / (drawn**2).sum()
+    pure = np.abs(picture - amount[..., None] * drawn).max(-1) < 6
     return np.where(pure & (amount > 0.05), amount, 0)
 
 
 @pytest.mark.parametrize(("ring", "colour"), [("outer", overlay._OUTER), ("inner", overlay._INNER)])
-def test_ellipses_are_drawn_at_their_sub_pixel_place(tmp_path, ring, colour):
+def test_ellipses_are_drawn_at_their_sub_pixel_place(tmp_path: Path, ring: str, colour: tuple[int, int, int]) -> None:
     poses = one_pose(translation=(NAN, NAN, NAN))
     weight = share(draw(tmp_path, poses), colour)
     for cx, cy, a, b, theta in getattr(poses.detections, ring).tolist():
@@ -91,7 +96,7 @@ def test_ellipses_are_drawn_at_their_sub_pixel_place(tmp_path, ring, colour):
         assert (bins > 0).sum() >= 18  # all round, but where a marker's number lies over it
 
 
-def test_axes_end_where_the_camera_sees_them_through_its_distortion(tmp_path):
+def test_axes_end_where_the_camera_sees_them_through_its_distortion(tmp_path: Path) -> None:
     poses = one_pose()
     picture = draw(tmp_path, poses)
     length = (TARGET.centers - TARGET.centers.mean(0)).norm(dim=-1).max()
@@ -106,7 +111,7 @@ def test_axes_end_where_the_camera_sees_them_through_its_distortion(tmp_path):
 
 
 @pytest.mark.parametrize("status", Status)
-def test_the_plate_has_the_colour_of_the_status(tmp_path, status):
+def test_the_plate_has_the_colour_of_the_status(tmp_path: Path, status: Status) -> None:
     plate = draw(tmp_path, one_pose(status))[1, -2]
     green, amber, red = overlay._GREEN, overlay._AMBER, overlay._RED
     expected = {Status.OK: green, Status.AMBIGUOUS: amber}.get(status, red)
@@ -114,14 +119,16 @@ def test_the_plate_has_the_colour_of_the_status(tmp_path, status):
 
 
 @pytest.mark.parametrize("translation", [(NAN, NAN, NAN), (0.0, 0.0, -100.0), (0.0, 0.0, 5.0), (1e6, 0.0, 1.0)])
-def test_poses_that_are_missing_or_out_of_view_draw_no_wrong_axes(tmp_path, translation):
+def test_poses_that_are_missing_or_out_of_view_draw_no_wrong_axes(
+    tmp_path: Path, translation: tuple[float, float, float]
+) -> None:
     picture = draw(tmp_path, one_pose(Status.REJECTED, translation, reason=Reason.RESIDUAL))
     assert picture.shape == (HEIGHT, WIDTH, 3)
     if not translation[2] > 0:
         assert all(share(picture, colour).max() < 0.5 for colour in overlay._AXES)
 
 
-def test_the_frame_shows_through_in_8_and_16_bit_and_is_left_as_it_was(tmp_path):
+def test_the_frame_shows_through_in_8_and_16_bit_and_is_left_as_it_was(tmp_path: Path) -> None:
     ramp = torch.arange(WIDTH, dtype=torch.int32).expand(HEIGHT, WIDTH)
     nothing = one_pose(translation=(NAN, NAN, NAN))
     for frame in ((ramp // 2).to(torch.uint8), (1000 + 60 * ramp).to(torch.uint16)):
@@ -133,17 +140,19 @@ def test_the_frame_shows_through_in_8_and_16_bit_and_is_left_as_it_was(tmp_path)
         np.testing.assert_array_equal(frame.numpy(), before)
 
 
-def test_pictures_mirror_the_paths_of_the_frames(tmp_path):
+def test_pictures_mirror_the_paths_of_the_frames(tmp_path: Path) -> None:
     assert picture_path(Path("o"), "a/b.PNG") == Path("o/a/b.PNG")
     assert picture_path(Path("o"), "a/b.tif") == Path("o/a/b.tif.png")
     frames = torch.zeros(1, HEIGHT, WIDTH, dtype=torch.uint8)
     Overlay(CAMERA, [TARGET], tmp_path / "new" / "folder").write(frames, one_pose(), ["sub/f.tif"])
     (written,) = [p for p in tmp_path.rglob("*") if p.is_file()]
     assert written == tmp_path / "new" / "folder" / "sub" / "f.tif.png"
-    assert cv2.imread(str(written)).shape == (HEIGHT, WIDTH, 3)
+    picture = cv2.imread(str(written))
+    assert picture is not None
+    assert picture.shape == (HEIGHT, WIDTH, 3)
 
 
-def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
+def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="--overlay: cannot be written"):
         Overlay(CAMERA, [TARGET], tmp_path / "file" / "o")

@@ -3,39 +3,43 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from torchpose.errors import ConfigError
-from torchpose.rig.camera import CameraFault, CameraReason, CameraSettings
 from torchpose.rig.cameras import Cameras
-from torchpose.rig.settings import load_rig
+from torchpose.rig.faults import CameraFault, CameraReason
+from torchpose.rig.settings import CameraSettings, load_rig
 
 pytest.importorskip("pypylon.pylon", reason="pypylon is not installed (extra: rig)")
 
 SIZE = (64, 48)
 
 
-def settings(**changes):
+def settings(**changes: Any) -> CameraSettings:
     return CameraSettings(**{"width": SIZE[0], "height": SIZE[1], "exposure_us": 5000, "timeout_s": 0.3, **changes})
 
 
 @pytest.fixture(autouse=True)
-def _emulators(monkeypatch):
+def _emulators(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYLON_CAMEMU", "2")
 
 
 class Pictures:
     """A scene of random pictures, a new one at every look."""
 
-    def __init__(self, folder, shape=(SIZE[1], SIZE[0]), dtype=np.uint8):
+    def __init__(self, folder: Path, shape: tuple[int, int] = (SIZE[1], SIZE[0]), dtype: Any = np.uint8) -> None:
         self.folder, self.shape, self.dtype = folder, shape, dtype
         self.random = np.random.default_rng(0)
-        self.shown = {}
+        self.shown: dict[str, NDArray[Any]] = {}
 
-    def __call__(self, name):
+    def __call__(self, name: str) -> Path:
         image = self.random.integers(0, np.iinfo(self.dtype).max, self.shape, self.dtype, endpoint=True)
         path = self.folder / f"{name}.tiff"
         cv2.imwrite(str(path), image, [cv2.IMWRITE_TIFF_COMPRESSION, 1])
@@ -43,12 +47,12 @@ class Pictures:
         return path
 
 
-def driver(cameras, name="camera"):
+def driver(cameras: Cameras, name: str = "camera") -> Any:
     """The pylon camera behind one of ours, to make faults in it."""
     return cameras._open[name]._camera
 
 
-def test_frames_are_what_the_cameras_see(tmp_path):
+def test_frames_are_what_the_cameras_see(tmp_path: Path) -> None:
     pictures = Pictures(tmp_path)
     with Cameras([settings(name="left"), settings(name="right")], pictures) as cameras:
         for _ in range(5):
@@ -62,7 +66,7 @@ def test_frames_are_what_the_cameras_see(tmp_path):
 
 
 @pytest.mark.parametrize(("pixel_format", "shift"), [("Mono10", 6), ("Mono12", 4), ("Mono16", 0)])
-def test_deeper_pixels_keep_their_values(tmp_path, pixel_format, shift):
+def test_deeper_pixels_keep_their_values(tmp_path: Path, pixel_format: str, shift: int) -> None:
     pictures = Pictures(tmp_path, dtype=np.uint16)
     with Cameras([settings(pixel_format=pixel_format)], pictures) as cameras:
         (frame,) = cameras.grab(["camera"])
@@ -70,7 +74,7 @@ def test_deeper_pixels_keep_their_values(tmp_path, pixel_format, shift):
     np.testing.assert_array_equal(frame.image, pictures.shown["camera"] >> shift)
 
 
-def test_settings_are_read_back():
+def test_settings_are_read_back() -> None:
     wanted = settings(width=128, height=96, exposure_us=1234, gain_db=3.0, nodes={"Gamma": 0.5, "ReverseX": True})
     with Cameras([wanted]) as cameras:
         (description,) = cameras.descriptions
@@ -82,18 +86,18 @@ def test_settings_are_read_back():
     assert (description["emulated"], description["serial"]) == (True, "0815-0000")
 
 
-def test_full_resolution_of_the_paper_is_taken():
+def test_full_resolution_of_the_paper_is_taken() -> None:
     with Cameras([settings(width=5472, height=3648, timeout_s=5)]) as cameras:
         (frame,) = cameras.grab(["camera"])
     assert frame.image.shape == (3648, 5472)
 
 
-def test_a_camera_is_found_by_its_serial_number():
+def test_a_camera_is_found_by_its_serial_number() -> None:
     with Cameras([settings(name="first", serial="0815-0001"), settings(name="any")]) as cameras:
         assert [d["serial"] for d in cameras.descriptions] == ["0815-0001", "0815-0000"]
 
 
-def refused(reason, *words, action):
+def refused(reason: CameraReason, *words: str, action: Callable[[], object]) -> float:
     start = time.monotonic()
     with pytest.raises(CameraFault) as caught:
         action()
@@ -105,18 +109,18 @@ def refused(reason, *words, action):
     return time.monotonic() - start
 
 
-def opened(*wanted):
+def opened(*wanted: CameraSettings) -> None:
     with Cameras(wanted):
         pass
 
 
-def test_missing_cameras_are_named():
+def test_missing_cameras_are_named() -> None:
     refused(CameraReason.NOT_FOUND, "4711", "0815-0000", action=lambda: opened(settings(serial="4711")))
     three = [settings(name=name) for name in "abc"]
     refused(CameraReason.NOT_FOUND, "camera c", action=lambda: opened(*three))
 
 
-def test_refused_settings_are_named():
+def test_refused_settings_are_named() -> None:
     reason = CameraReason.REFUSED_SETTING
     refused(reason, "Gian", action=lambda: opened(settings(nodes={"Gian": 1.0})))
     refused(reason, "TriggerSource", "Fax", action=lambda: opened(settings(nodes={"TriggerSource": "Fax"})))
@@ -124,7 +128,7 @@ def test_refused_settings_are_named():
     opened(settings())  # a refused camera is given back
 
 
-def test_time_out(monkeypatch):
+def test_time_out(monkeypatch: pytest.MonkeyPatch) -> None:
     with Cameras([settings(attempts=2)]) as cameras:
         with monkeypatch.context() as lost:
             lost.setattr(cameras._open["camera"], "trigger", time.time)
@@ -133,13 +137,13 @@ def test_time_out(monkeypatch):
         assert cameras.grab(["camera"])[0].attempts == 1
 
 
-def test_the_trigger_stays_as_the_capture_needs_it(tmp_path):
+def test_the_trigger_stays_as_the_capture_needs_it(tmp_path: Path) -> None:
     with Cameras([settings(nodes={"TriggerMode": "Off"})], Pictures(tmp_path)) as cameras:
         assert cameras.descriptions[0]["settings"]["TriggerMode"] == "On"
         assert cameras.grab(["camera"])
 
 
-def test_failed_buffers_are_tried_again(tmp_path):
+def test_failed_buffers_are_tried_again(tmp_path: Path) -> None:
     pictures = Pictures(tmp_path)
     with Cameras([settings(name="left"), settings(name="right")], pictures) as cameras:
         left = driver(cameras, "left")
@@ -154,14 +158,14 @@ def test_failed_buffers_are_tried_again(tmp_path):
         refused(CameraReason.FAILED_BUFFER, "left", action=lambda: cameras.grab(["left", "right"]))
 
 
-def test_a_removed_camera_is_seen_although_it_still_delivers():
+def test_a_removed_camera_is_seen_although_it_still_delivers() -> None:
     with Cameras([settings()]) as cameras:
         assert cameras.grab(["camera"])
         driver(cameras).FirePnPCallback.Execute()
         refused(CameraReason.REMOVED, "cable", action=lambda: cameras.grab(["camera"]))
 
 
-def test_a_camera_removed_while_it_exposes(monkeypatch):
+def test_a_camera_removed_while_it_exposes(monkeypatch: pytest.MonkeyPatch) -> None:
     with Cameras([settings()]) as cameras:
         camera = cameras._open["camera"]
         trigger = camera.trigger
@@ -169,12 +173,12 @@ def test_a_camera_removed_while_it_exposes(monkeypatch):
         refused(CameraReason.REMOVED, action=lambda: cameras.grab(["camera"]))
 
 
-def test_frames_of_another_size(tmp_path):
+def test_frames_of_another_size(tmp_path: Path) -> None:
     with Cameras([settings()], Pictures(tmp_path, shape=(40, 64))) as cameras:
         refused(CameraReason.WRONG_SIZE, "64 x 40", "64 x 48", action=lambda: cameras.grab(["camera"]))
 
 
-def rig_file(folder, text):
+def rig_file(folder: Path, text: str) -> Path:
     path = folder / "rig.yaml"
     robot = "robot: {host: 127.0.0.2, workspace: {min: [0, 0, 0], max: [1, 1, 1]}}\n"
     path.write_text(robot + text)
@@ -193,7 +197,7 @@ def rig_file(folder, text):
         ("cameras: [{width: 6, height: 4, exposure_us: 5}, {width: 6, height: 4, exposure_us: 5}]\n", ["twice"]),
     ],
 )
-def test_mistakes_in_a_rig_file(tmp_path, text, words):
+def test_mistakes_in_a_rig_file(tmp_path: Path, text: str, words: list[str]) -> None:
     path = rig_file(tmp_path, text)
     with pytest.raises(ConfigError) as caught:
         load_rig(path)

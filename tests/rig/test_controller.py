@@ -45,7 +45,7 @@ def move(m: Machine, goal: np.ndarray, now: float, asynchronous: bool = True) ->
 
 
 def is_running(m: Machine) -> bool:
-    return bool(m.registers["output_int_register_2"] >> 15 & 1)
+    return bool(int(m.registers["output_int_register_2"]) >> 15 & 1)
 
 
 def test_asynchronous_move_is_done_at_once_and_runs_until_it_arrives() -> None:
@@ -57,7 +57,7 @@ def test_asynchronous_move_is_done_at_once_and_runs_until_it_arrives() -> None:
     m.advance(end + 0.001)
     assert not is_running(m)
     np.testing.assert_allclose(m.pose(end + 1), goal, atol=1e-12)
-    changes = m.registers["output_int_register_2"] >> 16 & 127
+    changes = int(m.registers["output_int_register_2"]) >> 16 & 127
     assert changes == 3  # ready, started, finished
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -14,21 +15,21 @@ from scipy.spatial.transform import Rotation
 
 from torchpose.errors import ConfigError
 from torchpose.rig.plan import load_plan
-from torchpose.rig.robot_settings import Workspace
+from torchpose.rig.settings import Workspace
 
 ROOT = Path(__file__).parents[2]
 DOWN = [math.pi, 0.0, 0.0]
-AXIS = {"x": 0, "y": 1, "z": 2, "pitch": 0, "yaw": 1, "roll": 2}
+AXIS: dict[str | None, int] = {"x": 0, "y": 1, "z": 2, "pitch": 0, "yaw": 1, "roll": 2}
 
 
-def written(folder, steps, axes="tool", rotation=DOWN):
+def written(folder: Path, steps: list[Any], axes: str | list[float] = "tool", rotation: list[float] = DOWN) -> Path:
     origin = {"translation": [400.0, 0.0, 300.0], "rotation": rotation}
     path = folder / "plan.yaml"
     path.write_text(yaml.safe_dump({"name": "try", "origin": origin, "axes": axes, "steps": steps}))
     return path
 
 
-def test_the_paper_plan():
+def test_the_paper_plan() -> None:
     plan = load_plan(ROOT / "configs/rig/paper_plan.yaml")
     assert [w.id for w in plan.waypoints[:2]] == ["0000", "0001"]
     assert [w.kind for w in plan.waypoints] == ["static"] * 20 + ["translation"] * 18 + ["rotation"] * 33
@@ -40,10 +41,10 @@ def test_the_paper_plan():
             expected[AXIS[w.axis]] = w.value  # its axes are those of the base
         torch.testing.assert_close(shift, expected, atol=1e-5, rtol=0)
         turn = Rotation.from_rotvec(w.pose[3:]) * Rotation.from_rotvec(plan.origin[3:]).inv()
-        expected = [0.0, 0.0, 0.0]
+        turned = [0.0, 0.0, 0.0]
         if w.kind == "rotation":
-            expected[AXIS[w.axis]] = math.radians(w.value)
-        assert turn.as_rotvec() == pytest.approx(expected, abs=1e-9)
+            turned[AXIS[w.axis]] = math.radians(w.value)
+        assert turn.as_rotvec() == pytest.approx(turned, abs=1e-9)
 
 
 vectors = st.lists(st.floats(-2, 2), min_size=3, max_size=3)
@@ -51,7 +52,9 @@ vectors = st.lists(st.floats(-2, 2), min_size=3, max_size=3)
 
 @given(rotation=vectors, axes=st.one_of(st.just("tool"), vectors), value=st.floats(-20, 20))
 @settings(max_examples=30, deadline=None)
-def test_moves_and_turns_are_about_the_given_axes(tmp_path_factory, rotation, axes, value):
+def test_moves_and_turns_are_about_the_given_axes(
+    tmp_path_factory: pytest.TempPathFactory, rotation: list[float], axes: str | list[float], value: float
+) -> None:
     steps = [{"translation": {"axes": ["y"], "values_mm": [value]}}, {"rotation": {"values_deg": [value]}}]
     plan = load_plan(written(tmp_path_factory.mktemp("plan"), steps, axes, rotation))
     frame = Rotation.from_rotvec(rotation if axes == "tool" else axes)
@@ -67,7 +70,7 @@ def test_moves_and_turns_are_about_the_given_axes(tmp_path_factory, rotation, ax
         assert (Rotation.from_rotvec(w.pose[3:]) * expected.inv()).magnitude() < 1e-9
 
 
-def test_spread_sets_cover_their_ranges(tmp_path):
+def test_spread_sets_cover_their_ranges(tmp_path: Path) -> None:
     ranges = {"x_mm": [-50, 50], "y_mm": [-30, 30], "z_mm": [-40, 0], "tilt_deg": [10, 30], "roll_deg": [-90, 90]}
     plan = load_plan(written(tmp_path, [{"calibration": {"count": 32, **ranges}}], "base"))
     shift = plan.positions() - torch.tensor([400.0, 0, 300])
@@ -86,7 +89,7 @@ def test_spread_sets_cover_their_ranges(tmp_path):
     assert other.digest != plan.digest
 
 
-def test_explicit_poses_and_repeats(tmp_path):
+def test_explicit_poses_and_repeats(tmp_path: Path) -> None:
     pose = [410.0, 1.0, 290.0, 3.0, 0.1, 0.0]
     plan = load_plan(written(tmp_path, [{"poses": [pose]}, {"rotation": {"values_deg": [0, 2], "repeats": 2}}]))
     assert plan.waypoints[0].pose == tuple(pose)
@@ -94,7 +97,7 @@ def test_explicit_poses_and_repeats(tmp_path):
     assert len({w.id for w in plan.waypoints}) == len(plan.waypoints) == 13
 
 
-def test_a_waypoint_out_of_the_workspace(tmp_path):
+def test_a_waypoint_out_of_the_workspace(tmp_path: Path) -> None:
     plan = load_plan(written(tmp_path, [{"translation": {"axes": ["z"], "values_mm": [1, 9]}}], "base"))
     plan.check(Workspace(min=[390, -5, 295], max=[405, 5, 309]))
     with pytest.raises(ConfigError, match=r"plan.yaml: steps: waypoint 0002 \(translation z 9 mm\) has z = 309.0 mm"):
@@ -115,7 +118,7 @@ def test_a_waypoint_out_of_the_workspace(tmp_path):
         ([{"poses": [[1, 2, 3]]}], "steps[0].poses[0]: has 3 entries; give 6"),
     ],
 )
-def test_mistakes(tmp_path, steps, words):
+def test_mistakes(tmp_path: Path, steps: list[Any], words: str) -> None:
     path = written(tmp_path, steps)
     with pytest.raises(ConfigError) as caught:
         load_plan(path)

@@ -15,7 +15,6 @@ import threading
 import time
 from collections.abc import Iterator
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -144,7 +143,7 @@ def test_a_pose_passes_exactly_when_it_is_finite_and_inside(pose: list[float]) -
 def test_poses_on_the_edge_of_the_workspace_are_inside() -> None:
     robot = Robot(settings("127.0.0.1"))
     for corner in (WORKSPACE.min, WORKSPACE.max):
-        assert robot.check(np.array([*corner, 0, 0, 1])) == (*corner, 0, 0, 1)
+        assert robot.check([*corner, 0, 0, 1]) == (*corner, 0, 0, 1)
 
 
 def test_nobody_there() -> None:
@@ -294,8 +293,8 @@ def test_tool_outside_the_workspace_at_the_start(loopback: str) -> None:
 
 @needs_ur_rtde
 def test_driver_process_killed_in_mid_move(robot: Robot, twin: TwinController) -> None:
-    assert robot._link is not None
-    threading.Timer(0.3, os.kill, (robot._link.pid, signal.SIGKILL)).start()
+    assert robot._child is not None
+    threading.Timer(0.3, os.kill, (robot._child.pid, signal.SIGKILL)).start()
     with fault_within(1.5, RobotReason.CHILD_DIED):
         robot.move(FAR)
     assert stands(twin, 0.2)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 import yaml
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from torchpose.camera import Camera
@@ -22,13 +24,13 @@ CAMERA = Camera(
 TOOL = [400.0, 10.0, 300.0, 3.0, 0.2, -0.1]
 
 
-def matrix(pose):
+def matrix(pose: dict[str, Any]) -> NDArray[np.float64]:
     m = np.eye(4)
     m[:3, :3], m[:3, 3] = Rotation.from_rotvec(pose["rotation"]).as_matrix(), pose["translation"]
     return m
 
 
-def scene(folder, camera, target, **changes):
+def scene(folder: Path, camera: dict[str, Any], target: dict[str, Any], **changes: Any) -> Scene:
     CAMERA.save(folder / "camera.json")
     given = {"cameras": [{"camera": "camera.json", "focal_scale": 1.01, **camera}], "target": "quad40", **target}
     path = folder / "twin.yaml"
@@ -38,7 +40,7 @@ def scene(folder, camera, target, **changes):
 
 @pytest.mark.parametrize("camera_on", ["base", "tool"])
 @pytest.mark.parametrize("target_on", ["base", "tool"])
-def test_where_the_target_is(tmp_path, camera_on, target_on):
+def test_where_the_target_is(tmp_path: Path, camera_on: str, target_on: str) -> None:
     camera = {"rotation": [0.1, -0.2, 0.3], "translation": [10.0, 20.0, 30.0]}
     target = {"rotation": [-0.3, 0.1, 0.2], "translation": [5.0, -4.0, 3.0]}
     there = scene(tmp_path, {f"{camera_on}_from_camera": camera}, {f"{target_on}_from_target": target})
@@ -51,7 +53,7 @@ def test_where_the_target_is(tmp_path, camera_on, target_on):
 
 
 @pytest.mark.parametrize(("bits", "noise"), [(8, 1.0), (12, 0.5)])
-def test_frames_have_the_asked_depth_and_noise(tmp_path, bits, noise):
+def test_frames_have_the_asked_depth_and_noise(tmp_path: Path, bits: int, noise: float) -> None:
     place = {"rotation": [0.02, 0.01, 0.0], "translation": [0.0, 0.0, 160.0]}
     imaging = {"noise": noise, "psf_sigma": 0.8, "dark": 40.0, "light": 200.0}
     there = scene(
@@ -72,7 +74,7 @@ def test_frames_have_the_asked_depth_and_noise(tmp_path, bits, noise):
     assert float((frames[0] - scale * ideal).mean()) == pytest.approx(0, abs=0.1)
 
 
-def test_the_flange_is_where_the_tool_offset_says():
+def test_the_flange_is_where_the_tool_offset_says() -> None:
     tcp = [10.0, -5.0, 60.0, 0.1, 0.2, -0.3]
     flange = _flange(TOOL, tcp)
     as_matrix = [matrix({"rotation": p[3:], "translation": p[:3]}) for p in (flange, tcp, TOOL)]
@@ -81,7 +83,7 @@ def test_the_flange_is_where_the_tool_offset_says():
 
 
 @pytest.mark.parametrize("size", ["", "_2mp"])
-def test_the_shipped_files_belong_together(size):
+def test_the_shipped_files_belong_together(size: str) -> None:
     from torchpose.datasets.plan import markers_in_view
     from torchpose.rig.plan import load_plan
     from torchpose.rig.settings import load_rig

@@ -18,7 +18,9 @@ TRUTH = torch.cat([CENTER, RADIUS[:, None].expand(2, 2), torch.zeros(2, 1, dtype
 FRAME = torch.tensor([0, 1])
 
 
-def disc_frames(dark_inside=True, height=96, width=120, psf=0.7, sub=3):
+def disc_frames(
+    dark_inside: bool = True, height: int = 96, width: int = 120, psf: float = 0.7, sub: int = 3
+) -> torch.Tensor:
     """Two frames of one blurred disc each (straight-edge profile along the radius, averaged over the pixel)."""
     fine = (torch.arange(height * sub, dtype=torch.float64) + 0.5) / sub - 0.5
     v, u = fine[:, None], ((torch.arange(width * sub, dtype=torch.float64) + 0.5) / sub - 0.5)[None]
@@ -30,7 +32,7 @@ def disc_frames(dark_inside=True, height=96, width=120, psf=0.7, sub=3):
     return (40 + 160 * (light if dark_inside else 1 - light)).float()
 
 
-def rough(offset=1.5):
+def rough(offset: float = 1.5) -> torch.Tensor:
     """The true circles, moved and blown up by a pixel or two."""
     return TRUTH + torch.tensor([offset, -offset, 0.5, 0.5, 0.3])
 
@@ -40,7 +42,7 @@ REACHES = torch.full((2,), float(REACH), dtype=torch.float64)
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.uint16, torch.float32])
-def test_edge_pixels_follow_the_circle(dtype):
+def test_edge_pixels_follow_the_circle(dtype: torch.dtype) -> None:
     pixels, ring = edge_pixels(disc_frames().round().to(dtype), FRAME, rough(), OUTWARD, REACHES)
     assert torch.equal(ring, ring.sort().values)
     assert torch.unique(torch.cat([ring[:, None], pixels], -1), dim=0).shape[0] == len(ring)
@@ -56,7 +58,7 @@ def test_edge_pixels_follow_the_circle(dtype):
 
 
 @pytest.mark.parametrize("dark_inside", [True, False])
-def test_points_lie_on_the_circle(dark_inside):
+def test_points_lie_on_the_circle(dark_inside: bool) -> None:
     sign = 1.0 if dark_inside else -1.0
     found = ring_edges(disc_frames(dark_inside), FRAME, rough(), sign * OUTWARD, REACHES)
     assert torch.equal(found.ring, found.ring.sort().values)
@@ -77,12 +79,12 @@ def test_points_lie_on_the_circle(dark_inside):
     assert torch.unique(key, dim=0).shape[0] == len(key)
 
 
-def test_wrong_polarity_finds_next_to_nothing():
+def test_wrong_polarity_finds_next_to_nothing() -> None:
     found = ring_edges(disc_frames(), FRAME, rough(), -OUTWARD, REACHES)
     assert len(found.ring) == 0
 
 
-def test_reach_is_kept():
+def test_reach_is_kept() -> None:
     far = rough(0.0) + torch.tensor([0, 0, 5.0, 5.0, 0])
     near = torch.full((2,), 2.0, dtype=torch.float64)
     pixels, ring = edge_pixels(disc_frames(), FRAME, far, OUTWARD, near)
@@ -90,7 +92,7 @@ def test_reach_is_kept():
     assert len(ring_edges(disc_frames(), FRAME, far, OUTWARD, near).ring) == 0
 
 
-def test_batch_equals_single_frames():
+def test_batch_equals_single_frames() -> None:
     frames = disc_frames()
     together = ring_edges(frames, FRAME, rough(), OUTWARD, REACHES)
     for k in range(2):
@@ -102,7 +104,7 @@ def test_batch_equals_single_frames():
         torch.testing.assert_close(alone.step, together.step[mine], rtol=0, atol=1e-3)
 
 
-def test_margin_to_the_border():
+def test_margin_to_the_border() -> None:
     frames = disc_frames()[:, 30:, :]
     moved = TRUTH - torch.tensor([0.0, 30, 0, 0, 0])
     found = ring_edges(frames, FRAME, moved, OUTWARD, REACHES)
@@ -112,7 +114,7 @@ def test_margin_to_the_border():
     assert set(found.ring.tolist()) == {0, 1}
 
 
-def test_nan_pixels_lose_their_windows_only():
+def test_nan_pixels_lose_their_windows_only() -> None:
     frames = disc_frames()
     whole = ring_edges(frames, FRAME, rough(), OUTWARD, REACHES)
     frames[0, 45, 34] = math.nan  # on the left end of the first circle
@@ -123,12 +125,12 @@ def test_nan_pixels_lose_their_windows_only():
 
 
 @pytest.mark.parametrize("shape", [(2, 5, 5), (2, 1, 40), (2, 40, 1), (2, 1, 1)])
-def test_frames_smaller_than_the_mask(shape):
+def test_frames_smaller_than_the_mask(shape: tuple[int, int, int]) -> None:
     found = ring_edges(torch.rand(shape), FRAME, rough(), OUTWARD, REACHES)
     assert found.points.shape == (0, 2)
 
 
-def test_no_rings():
+def test_no_rings() -> None:
     none = torch.zeros(0, dtype=torch.int64)
     found = ring_edges(disc_frames(), none, torch.zeros(0, 5).double(), OUTWARD[:0], REACHES[:0])
     assert found.points.shape == (0, 2)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
-from exact import exact_ellipses, pinhole, random_poses
 
+from tests.exact import exact_ellipses, pinhole, random_poses
 from torchpose.identify.markers import ratio_tolerance
 from torchpose.rings.small_rings import fit_small_rings
 from torchpose.sim import add_noise, render
@@ -14,7 +14,7 @@ from torchpose.target import Target
 
 @pytest.mark.parametrize("tilt", [0.1, 40.0])
 @pytest.mark.parametrize("noise", [1.0, 4.0])
-def test_within_their_own_covariance(tilt, noise):
+def test_within_their_own_covariance(tilt: float, noise: float) -> None:
     camera, target = pinhole(1111.11, 400, 300), Target.load("quad40")
     r, t = random_poses(12, tilt, (600, 800), seed=4)
     t[:, :2] = 0
@@ -39,7 +39,7 @@ def test_within_their_own_covariance(tilt, noise):
 
 
 @pytest.mark.parametrize("blur", [1.7, 2.5])
-def test_codes_of_much_blurred_rings(blur):
+def test_codes_of_much_blurred_rings(blur: float) -> None:
     """Rings of 7 to 10 px under a blur of half their inner circle or more: the codes stay within their tolerance."""
     camera, target = pinhole(1111.11, 400, 300), Target.load("quad40")
     r, t = random_poses(10, 30.0, (560, 700), seed=2)
@@ -57,7 +57,7 @@ def test_codes_of_much_blurred_rings(blur):
     assert off[found.good].quantile(0.95) < 1
 
 
-def test_codes_without_noise():
+def test_codes_without_noise() -> None:
     """A blur of 0.37 of the outer radius; to first order in the distance the codes would be wrong by 0.1 to 0.2."""
     camera, target = pinhole(1111.11, 200, 200), Target.load("quad40")
     r = torch.eye(3, dtype=torch.float64)[None]
@@ -73,7 +73,7 @@ def test_codes_without_noise():
     assert abs(code[3] - 0.6) < 0.05
 
 
-def test_refuses_what_is_no_ring():
+def test_refuses_what_is_no_ring() -> None:
     frames = 128 + 20 * torch.randn(1, 80, 80, generator=torch.Generator().manual_seed(1))
     frames[0, 30:50, 30:50] = 20.0  # a square without a hole
     v, u = torch.meshgrid(torch.arange(80), torch.arange(80), indexing="ij")

@@ -12,9 +12,10 @@ from scipy.integrate import quad_vec
 from scipy.special import ndtr
 
 from torchpose.rings import zernike
+from torchpose.rings.zernike import Edges
 
 
-def zernike_polynomials(x, y, orders):
+def zernike_polynomials(x: float, y: np.ndarray, orders: tuple[tuple[int, int], ...]) -> np.ndarray:
     """R_nm cos(m theta), R_nm sin(m theta) as polynomials in x and y, through z^m = rho^m e^(i m theta)."""
     rho2, z = x * x + y * y, x + 1j * y
     planes = []
@@ -30,12 +31,12 @@ def zernike_polynomials(x, y, orders):
 
 
 @pytest.mark.parametrize("size", [3, 5, 7])
-def test_kernels_equal_quadrature(size):
+def test_kernels_equal_quadrature(size: int) -> None:
     """Exact in y by Gauss-Legendre between the disc and the pixel rows, adaptive in x with the kinks as breakpoints."""
     lines = np.linspace(-1, 1, size + 1)
     node, weight = np.polynomial.legendre.leggauss(4)
 
-    def column(x):
+    def column(x: float) -> np.ndarray:
         reach = math.sqrt(max(0.0, 1 - x * x))
         low, high = np.clip(lines[:-1], -reach, reach), np.clip(lines[1:], -reach, reach)
         y = 0.5 * (low + high)[:, None] + 0.5 * (high - low)[:, None] * node
@@ -53,7 +54,7 @@ def test_kernels_equal_quadrature(size):
     assert abs(actual - expected).max() < 1e-3 * (2 / size) ** 2
 
 
-def test_orthogonality():
+def test_orthogonality() -> None:
     """The squares integrate to pi / (n + 1), half of it for each wave; the coarse rim takes some of it off."""
     size = 15
     kernels = zernike.kernels(size).flatten(1)
@@ -65,14 +66,14 @@ def test_orthogonality():
 
 
 @pytest.mark.parametrize("size", [1, 2, 6, -3])
-def test_bad_size(size):
+def test_bad_size(size: int) -> None:
     with pytest.raises(ValueError, match="odd and at least 3"):
         zernike.kernels(size)
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.uint16, torch.float32, torch.float64])
 @pytest.mark.parametrize("size", [3, 7])
-def test_layer_equals_gathered_windows(dtype, size):
+def test_layer_equals_gathered_windows(dtype: torch.dtype, size: int) -> None:
     generator = torch.Generator().manual_seed(3)
     frames = torch.randint(0, 256, (2, 23, 31), generator=generator).to(dtype)
     layer = zernike.ZernikeMoments(size, dtype=torch.float64)
@@ -84,14 +85,22 @@ def test_layer_equals_gathered_windows(dtype, size):
     torch.testing.assert_close(gathered.double(), dense.permute(0, 2, 3, 1).reshape(-1, 15), rtol=0, atol=1e-3)
 
 
-def test_layer_is_a_module():
+def test_layer_is_a_module() -> None:
     layer = zernike.ZernikeMoments()
     assert layer(torch.zeros(1, 1, 9, 12)).dtype == torch.float32
     assert list(layer.state_dict()) == ["weight"]
     assert not list(layer.parameters())
 
 
-def edge_frames(angle, distance, size=21, sigma=0.0, dark=30.0, light=200.0, sub=24):
+def edge_frames(
+    angle: torch.Tensor,
+    distance: torch.Tensor,
+    size: int = 21,
+    sigma: float = 0.0,
+    dark: float = 30.0,
+    light: float = 200.0,
+    sub: int = 24,
+) -> torch.Tensor:
     """Frames (B, N, N) of straight edges at ``distance`` (B,) px from the middle along ``angle`` (B,), box pixels.
 
     By supersampling; without blur, each fine cell is clipped linearly, which is exact to (1 / sub)^2.
@@ -108,19 +117,19 @@ def edge_frames(angle, distance, size=21, sigma=0.0, dark=30.0, light=200.0, sub
     return torch.stack(out)
 
 
-def locate_middle(frames, size=zernike.MASK):
+def locate_middle(frames: torch.Tensor, size: int = zernike.MASK) -> Edges:
     count, middle = frames.shape[0], frames.shape[-1] // 2
     return zernike.locate(frames, torch.arange(count), torch.full((count, 2), middle), size)
 
 
 @pytest.fixture(scope="module")
-def edges():
+def edges() -> tuple[torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(5)
     u = torch.rand(2, 60, generator=generator, dtype=torch.float64)
     return 2 * math.pi * u[0], u[1] - 0.5
 
 
-def test_ideal_edges(edges):
+def test_ideal_edges(edges: tuple[torch.Tensor, torch.Tensor]) -> None:
     """The areas of the pixels blur edge and kernel: 1 - 2/N^2 of the distance is left, so a large mask is used."""
     angle, distance = edges
     found = locate_middle(edge_frames(angle, distance, size=23), size=21)
@@ -131,7 +140,7 @@ def test_ideal_edges(edges):
     torch.testing.assert_close(found.step, torch.full_like(angle, 170.0), rtol=5e-3, atol=0)
 
 
-def test_mask_of_seven(edges):
+def test_mask_of_seven(edges: tuple[torch.Tensor, torch.Tensor]) -> None:
     angle, distance = edges
     found = locate_middle(edge_frames(angle, distance))
     assert (found.offset - distance).abs().max() < 0.05
@@ -143,7 +152,7 @@ def test_mask_of_seven(edges):
     assert torch.equal(found.inside[clear], (shift.abs() <= 0.5).all(-1)[clear])
 
 
-def test_symmetric_edges_are_exact():
+def test_symmetric_edges_are_exact() -> None:
     angle = torch.arange(8, dtype=torch.float64) * (math.pi / 4)
     found = locate_middle(edge_frames(angle, torch.zeros(8), dark=190.0))  # faint on bright: no mean grey may leak in
     torch.testing.assert_close(found.points, torch.full((8, 2), 10.0, dtype=torch.float64), rtol=0, atol=1e-4)
@@ -151,7 +160,7 @@ def test_symmetric_edges_are_exact():
 
 
 @pytest.mark.parametrize("sigma", [0.5, 0.8])
-def test_deblur_straight_edges(edges, sigma):
+def test_deblur_straight_edges(edges: tuple[torch.Tensor, torch.Tensor], sigma: float) -> None:
     angle, distance = edges
     found = locate_middle(edge_frames(angle, distance, sigma=sigma))
     group = torch.zeros(60, dtype=torch.int64)
@@ -164,7 +173,7 @@ def test_deblur_straight_edges(edges, sigma):
     assert after < 0.3 * before
 
 
-def test_deblur_inverts_its_law():
+def test_deblur_inverts_its_law() -> None:
     distance = torch.linspace(-0.7, 0.7, 15, dtype=torch.float64)
     for slope in (1.0, 0.85, 0.7):
         l2 = (distance / 3.5).square()
@@ -173,14 +182,14 @@ def test_deblur_inverts_its_law():
         torch.testing.assert_close(back, distance, rtol=0, atol=1e-4)
 
 
-def test_blur_slope_of_groups_apart():
+def test_blur_slope_of_groups_apart() -> None:
     distance = torch.linspace(-0.5, 0.5, 10, dtype=torch.float64)
     offset, group = torch.cat([0.8 * distance, 0.6 * distance]), torch.arange(2).repeat_interleave(10)
     slope = zernike.blur_slope(offset, distance.repeat(2), group, 4)
     torch.testing.assert_close(slope, torch.tensor([0.8, 0.6, 1.0, 1.0], dtype=torch.float64))
 
 
-def test_edge_correlation():
+def test_edge_correlation() -> None:
     """Variance of the mean offset along an edge against that of a single one, white noise."""
     generator = torch.Generator().manual_seed(9)
     length, trials = 160, 3000
@@ -195,7 +204,7 @@ def test_edge_correlation():
     assert zernike.edge_correlation() > 1.5
 
 
-def test_flat_and_nan_windows_are_no_edges():
+def test_flat_and_nan_windows_are_no_edges() -> None:
     frames = torch.full((1, 9, 9), 80.0)
     flat = locate_middle(frames)
     frames[0, 2, 3] = math.nan
@@ -204,14 +213,14 @@ def test_flat_and_nan_windows_are_no_edges():
     assert not broken.inside.any()
 
 
-def test_no_edges():
+def test_no_edges() -> None:
     none = torch.zeros(0, dtype=torch.int64)
     found = zernike.locate(torch.zeros(1, 3, 3), none, torch.zeros(0, 2, dtype=torch.int64))
     assert found.points.shape == (0, 2)
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.4, 0.8, 1.2])
-def test_curvature_shift_equals_its_integral(sigma):
+def test_curvature_shift_equals_its_integral(sigma: float) -> None:
     """The integrals over the disc by quadrature; the blur (px) includes both areas of pixels."""
     s = math.sqrt(sigma**2 + 1 / 6) * 2 / zernike.MASK if sigma else 1e-3
     node, weight = np.polynomial.hermite_e.hermegauss(201)

@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -17,7 +18,7 @@ TRUTH = ROOT / "data" / "sample" / "truth.csv"
 
 
 @pytest.fixture(scope="module")
-def rows():
+def rows() -> list[dict[str, Any]]:
     """The truth itself as rows of ``torchpose estimate``, 1 um beside in x, with 1 um and 0.1 mrad of sigma."""
     truth = read_truth(TRUTH)
     covariance = torch.diag(torch.tensor([1e-6] * 3 + [1e-8] * 3, dtype=torch.float64)).tolist()
@@ -31,14 +32,16 @@ def rows():
     ]
 
 
-def report(tmp_path, rows, *options, truth=TRUTH):
+def report(
+    tmp_path: Path, rows: list[dict[str, Any]], *options: str, truth: Path = TRUTH
+) -> subprocess.CompletedProcess[str]:
     poses = tmp_path / "poses.jsonl"
     poses.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
     command = [sys.executable, "scripts/sample_report.py", "--poses", str(poses), "--truth", str(truth), *options]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
 
 
-def test_within(tmp_path, rows):
+def test_within(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
     done = report(tmp_path, rows, "--markdown")
     assert done.returncode == 0, done.stderr
     total = next(line for line in done.stdout.splitlines() if line.startswith("| RMS"))
@@ -50,13 +53,13 @@ def test_within(tmp_path, rows):
 
 
 @pytest.mark.parametrize(("column", "error"), [("ty", 3e-3), ("tz", 7e-3), ("rx", 2e-4)])
-def test_errors_beyond(tmp_path, rows, column, error):
+def test_errors_beyond(tmp_path: Path, rows: list[dict[str, Any]], column: str, error: float) -> None:
     done = report(tmp_path, [row | {column: row[column] + error} for row in rows])
     assert done.returncode == 1
     assert "BEYOND" in done.stdout
 
 
-def test_a_frame_without_a_pose(tmp_path, rows):
+def test_a_frame_without_a_pose(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
     nothing = dict.fromkeys(("tx", "ty", "tz", "rx", "ry", "rz", "covariance"))
     done = report(tmp_path, [rows[0] | nothing | {"status": "no_target"}, *rows[1:]])
     assert done.returncode == 1
@@ -64,7 +67,7 @@ def test_a_frame_without_a_pose(tmp_path, rows):
     assert "no_target" in done.stdout
 
 
-def test_wrong_input_is_one_line(tmp_path, rows):
+def test_wrong_input_is_one_line(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
     header = TRUTH.read_text(encoding="utf-8").splitlines()[0]
     for name, text in (("few_columns", "frame,target,tx,ty,tz,rx,ry,rz\n"), ("no_row", header + "\n")):
         (tmp_path / name).write_text(text, encoding="utf-8")

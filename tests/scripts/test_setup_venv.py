@@ -13,18 +13,18 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
-def checkout(tmp_path):
+def checkout(tmp_path: Path) -> Path:
     shutil.copytree(ROOT / "scripts", tmp_path / "scripts")
     return tmp_path
 
 
-def run(checkout, python):
+def run(checkout: Path, python: Path) -> subprocess.CompletedProcess[str]:
     script = checkout / "scripts" / "run_sample.sh"
     environment = os.environ | {"PYTHON": str(python)}
     return subprocess.run(["bash", str(script)], cwd="/", env=environment, capture_output=True, text=True)
 
 
-def fake_python(checkout, body):
+def fake_python(checkout: Path, body: str) -> Path:
     path = checkout / "python"
     path.write_text(f"#!/bin/sh\n{body}\n", encoding="utf-8")
     path.chmod(0o755)
@@ -39,7 +39,7 @@ def fake_python(checkout, body):
     ],
     ids=["old", "no venv"],
 )
-def test_unsuitable_python(checkout, body, message):
+def test_unsuitable_python(checkout: Path, body: str, message: str) -> None:
     done = run(checkout, fake_python(checkout, body))
     assert done.returncode == 2
     assert message in done.stderr
@@ -47,7 +47,7 @@ def test_unsuitable_python(checkout, body, message):
     assert not (checkout / ".venv").exists()
 
 
-def test_missing_python(checkout):
+def test_missing_python(checkout: Path) -> None:
     done = run(checkout, checkout / "nowhere")
     assert done.returncode == 2
     assert done.stderr.startswith(f"error: {checkout / 'nowhere'}: is not Python 3.11 or newer")

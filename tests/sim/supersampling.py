@@ -21,8 +21,8 @@ def rays(camera: Camera, pixels: Array) -> Array:
     matrix, distortion = camera.matrix.numpy(), camera.distortion.numpy()
     points = pixels[:, None]
     if camera.model == "kannala_brandt":
-        return cv2.fisheye.undistortPoints(points, matrix, distortion, criteria=_CRITERIA)[:, 0]
-    return cv2.undistortPoints(points, matrix, distortion, criteria=_CRITERIA)[:, 0]
+        return np.asarray(cv2.fisheye.undistortPoints(points, matrix, distortion, criteria=_CRITERIA)[:, 0], np.float64)
+    return np.asarray(cv2.undistortPoints(points, matrix, distortion, criteria=_CRITERIA)[:, 0], np.float64)
 
 
 def cell_coverage(distance: Array, gx: Array, gy: Array) -> Array:
@@ -55,7 +55,7 @@ def ring_image(
     R: Array,
     t: Array,
     center: Array,
-    radii: Array,
+    radii: tuple[float, float],
     psf_sigma: float,
     window: tuple[int, int, int, int],
     oversampling: int,

@@ -4,30 +4,32 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from supersampling import blur_operator
-from test_renderer import BROWN, camera, pose, target
 from torch import Tensor
 
+from tests.sim.supersampling import blur_operator
+from tests.sim.test_renderer import BROWN, camera, pose, target
+from torchpose.camera import Camera
 from torchpose.errors import ConfigError, FrameError
 from torchpose.geometry import rotations
-from torchpose.sim import Defocus, Lighting, add_noise, render, shapes
+from torchpose.sim import Defocus, Lighting, Shapes, add_noise, render, shapes
 
 F64 = torch.float64
 
 
-def shifted(cam, du: float, dv: float):
+def shifted(cam: Camera, du: float, dv: float) -> Camera:
     """The camera whose picture lies (du, dv) px further right and down."""
     matrix = cam.matrix.clone()
     matrix[:2, 2] += torch.tensor([du, dv], dtype=F64)
     return replace(cam, matrix=matrix)
 
 
-def test_defocus_is_the_average_over_the_disc():
+def test_defocus_is_the_average_over_the_disc() -> None:
     cam = camera(distortion=BROWN)
     R, t = pose(40, 30, (8.0, -9.0, 200.0))
     lens = Defocus(f_number=2.0, focal_length=8.0, focus_distance=180.0)
@@ -47,7 +49,7 @@ def test_defocus_is_the_average_over_the_disc():
     assert (found - sharp).abs().max() > 15
 
 
-def test_no_defocus_at_the_focus():
+def test_no_defocus_at_the_focus() -> None:
     R, t = pose(0, 0, (0.0, 0.0, 200.0))
     lens = Defocus(f_number=1.4, focal_length=8.0, focus_distance=200.0)
     torch.testing.assert_close(
@@ -55,7 +57,7 @@ def test_no_defocus_at_the_focus():
     )
 
 
-def test_each_marker_has_the_disc_of_its_own_depth():
+def test_each_marker_has_the_disc_of_its_own_depth() -> None:
     cam = camera()
     near, far = shapes.ring((-12, 0, -30.0), 5.0), shapes.ring((12, 0, 0.0), 5.0)
     both = shapes.cat([near, far])
@@ -68,7 +70,7 @@ def test_each_marker_has_the_disc_of_its_own_depth():
     assert (blurred - sharp)[:, middle + 1 :].abs().max() < 0.01
 
 
-def test_motion_is_the_average_over_the_exposure():
+def test_motion_is_the_average_over_the_exposure() -> None:
     cam = camera(distortion=BROWN)
     R, t = pose(30, 50, (3.0, 2.0, 200.0))
     motion = torch.tensor([[1.5, -0.6, 3.0, 0.01, -0.02, 0.05]], dtype=F64)  # about 4 px
@@ -80,7 +82,7 @@ def test_motion_is_the_average_over_the_exposure():
     assert (found - render(cam, target(), R, t, psf_sigma=0.6, plate=(40, 40))).abs().max() > 20
 
 
-def test_motion_and_defocus_are_differentiable():
+def test_motion_and_defocus_are_differentiable() -> None:
     cam = camera(80, 70)
     R, t = pose(20, 40, (-6.0, -8.0, 200.0))
     lens = Defocus(f_number=1.4, focal_length=8.0, focus_distance=180.0)
@@ -99,7 +101,7 @@ def test_motion_and_defocus_are_differentiable():
     torch.testing.assert_close(gradient, differences, rtol=2e-3, atol=0.05)
 
 
-def test_light_gradient_and_vignetting():
+def test_light_gradient_and_vignetting() -> None:
     cam = camera()
     R, t = pose(0, 0, (0.0, 0.0, 200.0))
     gain = Lighting(gradient=(0.3, -0.1), vignetting=4.0).gain(cam, R, t)[0].double()
@@ -111,7 +113,7 @@ def test_light_gradient_and_vignetting():
     )  # (8 px / f)^2 of the interpolation
 
 
-def test_point_light():
+def test_point_light() -> None:
     cam = camera()
     R, t = pose(35, 20, (3.0, -2.0, 200.0))
     light = torch.tensor([40.0, -30.0, 20.0], dtype=F64)
@@ -125,7 +127,7 @@ def test_point_light():
     torch.testing.assert_close(found, expected / expected[0], rtol=1e-3, atol=0)
 
 
-def test_light_multiplies_the_picture():
+def test_light_multiplies_the_picture() -> None:
     R, t = pose(0, 0, (0.0, 0.0, 200.0))
     light = Lighting(gradient=(0.2, 0.0))
     even = render(camera(), target(), R, t)
@@ -145,21 +147,21 @@ def test_light_multiplies_the_picture():
         (shapes.polygon([[[-8, -8], [8, -8], [8, 8], [-8, 8]], [[-4, -4], [-4, 4], [4, 4], [4, -4]]]), 192.0),
     ],
 )
-def test_shapes_have_their_area(shape, area):
+def test_shapes_have_their_area(shape: Shapes, area: float) -> None:
     R, t = torch.eye(3, dtype=F64)[None], torch.tensor([[0.0, 0.0, 200.0]], dtype=F64)
     frame = render(camera(), shape, R, t, light=255.0)[0].double()
     mass = (255 - frame).sum() / (255 - 30)
     torch.testing.assert_close(mass, torch.tensor(area * 400 * 405 / 200**2, dtype=F64), rtol=1e-6, atol=0)
 
 
-def test_shape_winding_does_not_matter():
+def test_shape_winding_does_not_matter() -> None:
     corners = np.array([[0, 0], [12, 0], [0, 9]])
     R, t = pose(30, 10, (0.0, 0.0, 200.0))
     one, other = (render(camera(), shapes.polygon([c]), R, t) for c in (corners, corners[::-1].copy()))
     torch.testing.assert_close(one, other, rtol=0, atol=1e-4)
 
 
-def test_text_is_the_traced_picture():
+def test_text_is_the_traced_picture() -> None:
     R, t = torch.eye(3, dtype=F64)[None], torch.tensor([[0.0, 0.0, 200.0]], dtype=F64)
     frame = render(camera(), shapes.text("AB8", (0, 0), 12.0), R, t, light=220.0)[0]
     dark = (frame < 125).numpy()
@@ -171,7 +173,7 @@ def test_text_is_the_traced_picture():
     assert cv2.connectedComponents((~dark).astype(np.uint8), connectivity=4)[0] - 1 == 6
 
 
-def test_cover_over_a_ring_within_what_is_said():
+def test_cover_over_a_ring_within_what_is_said() -> None:
     # a cover's edge across a ring's edges: the blurred coverages are multiplied
     psf, n, size = 0.7, 16, 60
     cam = replace(camera(size, size), matrix=torch.tensor([[400.0, 0, 30.0], [0, 400.0, 30.0], [0, 0, 1]], dtype=F64))
@@ -194,7 +196,7 @@ def test_cover_over_a_ring_within_what_is_said():
     assert 0 < crossing.sum() < 400
 
 
-def test_clutter_belongs_to_its_frame():
+def test_clutter_belongs_to_its_frame() -> None:
     R, t = pose(0, 0, (0.0, 0.0, 200.0))
     R, t = R.expand(3, 3, 3), t.expand(3, 3)
     clutter = shapes.cat([shapes.ring((18, 0), 5, 2, level=100.0, frame=1), shapes.cross((0, 18), 9, 3, frame=2)])
@@ -205,7 +207,7 @@ def test_clutter_belongs_to_its_frame():
     assert (changed[1:] > 50).all()
 
 
-def test_background_pictures_lie_behind_the_plate():
+def test_background_pictures_lie_behind_the_plate() -> None:
     R, t = pose(0, 0, (0.0, 0.0, 200.0))
     picture = torch.rand(1, 120, 128, generator=torch.Generator().manual_seed(1)) * 255
     frame = render(camera(), target(), R, t, plate=(20, 20), surround=picture)
@@ -217,7 +219,7 @@ def test_background_pictures_lie_behind_the_plate():
         render(camera(), target(), R, t, plate=(20, 20), surround=picture[:, 1:])
 
 
-def test_shot_noise_grows_with_the_light():
+def test_shot_noise_grows_with_the_light() -> None:
     grey = torch.tensor([20.0, 120.0, 220.0])[:, None, None].expand(3, 300, 400)
     z = add_noise(grey, 1.5, seed=4, bits=16, full_well=12000.0).double() * (255 / 65535)
     expected = (1.5**2 + grey[:, 0, 0] * 255 / 12000).sqrt().double()
@@ -226,18 +228,18 @@ def test_shot_noise_grows_with_the_light():
     assert ((z.flatten(1).mean(1) - grey[:, 0, 0]) / expected).abs().max() < 4 / math.sqrt(n)
 
 
-def test_gamma_comes_before_rounding():
+def test_gamma_comes_before_rounding() -> None:
     out = add_noise(torch.tensor([[[0.0, 51.0, 255.0]]]), 0.0, gamma=2.2)
     assert out.flatten().tolist() == [0, round(255 * 0.2 ** (1 / 2.2)), 255]
 
 
 @pytest.mark.parametrize("wrong", [{"sigma": -1.0}, {"sigma": 1.0, "full_well": 0.0}, {"sigma": 1.0, "gamma": -2.0}])
-def test_bad_sensor(wrong):
+def test_bad_sensor(wrong: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match=r"negative|above 0"):
         add_noise(torch.zeros(1, 2, 2), **wrong)
 
 
-def test_bad_lens_and_motion():
+def test_bad_lens_and_motion() -> None:
     R, t = pose(0, 0, (0.0, 0.0, 200.0))
     with pytest.raises(ConfigError, match="f_number"):
         Defocus(f_number=0.0, focal_length=8.0, focus_distance=100.0)

@@ -2,15 +2,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 import pytest
 import torch
 from scipy import integrate, stats
-from supersampling import ring_image
 from torch import Tensor
 
+from tests.sim.supersampling import ring_image
 from torchpose.camera import Camera
+from torchpose.camera.model import Model
 from torchpose.errors import ConfigError, FrameError
 from torchpose.geometry import rotations
 from torchpose.sim import add_noise, render
@@ -22,13 +24,13 @@ DARK, LIGHT = 30.0, 220.0
 
 
 def camera(
-    width: int = 128, height: int = 120, model: str = "brown_conrady", distortion: tuple[float, ...] = ()
+    width: int = 128, height: int = 120, model: Model = "brown_conrady", distortion: tuple[float, ...] = ()
 ) -> Camera:
     matrix = torch.tensor([[400.0, 0, 63.3], [0, 405.0, 60.8], [0, 0, 1]], dtype=F64)
     return Camera(width, height, matrix, torch.tensor(distortion, dtype=F64), model)
 
 
-def target(radii: tuple[float, float] = (5.0, 1.5), background: str = "light") -> Target:
+def target(radii: tuple[float, float] = (5.0, 1.5), background: Literal["light", "dark"] = "light") -> Target:
     """Three rings, of which the first has the given radii; the others lie outside the small frames above."""
     far = [[200.0, 0.0, 0.0], [0.0, 200.0, 0.0]]
     return Target(
@@ -61,8 +63,11 @@ class Witness:
     unconverged: float  # grey levels rms, witness against its own coarser grid
 
 
+Case = tuple[Model, tuple[float, ...], float, float, tuple[float, float], float]
+
+
 def compare(
-    model: str,
+    model: Model,
     distortion: tuple[float, ...],
     tilt: float,
     azimuth: float,
@@ -111,7 +116,7 @@ CASES = [
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_matches_supersampling(case):
+def test_matches_supersampling(case: Case) -> None:
     found = compare(*case, n=16)
     assert found.unconverged < 0.05
     assert found.rms < 0.02
@@ -121,7 +126,7 @@ def test_matches_supersampling(case):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
-def test_matches_converged_supersampling(case):
+def test_matches_converged_supersampling(case: Case) -> None:
     found = compare(*case, n=64)
     print(case, found)
     assert found.unconverged < 2e-3
@@ -131,7 +136,7 @@ def test_matches_converged_supersampling(case):
 
 
 # rings of 6 px, tilted by 70 degrees
-SMALL = [
+SMALL: list[Case] = [
     ("brown_conrady", BROWN, 70, 30, (3.0, 1.2), 0.7),
     ("brown_conrady", BROWN, 70, 100, (3.0, 0.9), 0.4),
     ("brown_conrady", (), 70, 0, (3.0, 1.9), 0.5),
@@ -140,7 +145,7 @@ SMALL = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", SMALL)
-def test_small_steep_rings_match_supersampling_at_128(case):
+def test_small_steep_rings_match_supersampling_at_128(case: Case) -> None:
     found = compare(*case, n=128, window=(68, 31, 23, 24))
     print(case, found)
     assert found.unconverged < 2e-3
@@ -148,7 +153,7 @@ def test_small_steep_rings_match_supersampling_at_128(case):
     assert found.centroid < 1e-5
 
 
-def test_dark_mass_is_the_area_of_the_ellipses():
+def test_dark_mass_is_the_area_of_the_ellipses() -> None:
     # blur keeps the integral; a circle under perspective without distortion is an ellipse of known area and centre
     cam, radii = camera(), (5.0, 2.0)
     R, t = pose(50, 20, (4.0, -3.0, 180.0))
@@ -168,7 +173,7 @@ def test_dark_mass_is_the_area_of_the_ellipses():
     torch.testing.assert_close(centroid, moment / area, rtol=0, atol=1e-5)
 
 
-def test_plate_edge_is_the_blurred_step():
+def test_plate_edge_is_the_blurred_step() -> None:
     cam, psf = camera(), 0.8
     R, t = torch.eye(3, dtype=F64)[None], torch.tensor([[0.0, 0.0, 200.0]], dtype=F64)
     frame = render(cam, target(), R, t, psf_sigma=psf, light=200.0, plate=(40.0, 30.0), surround=50.0)[0]
@@ -182,7 +187,7 @@ def test_plate_edge_is_the_blurred_step():
     np.testing.assert_allclose(frame[row, 18:30].numpy(), [expected(u) for u in range(18, 30)], atol=1e-3)
 
 
-def test_plate_area_under_perspective():
+def test_plate_area_under_perspective() -> None:
     cam = camera()
     R, t = pose(40, 70, (2.0, 1.0, 220.0))
     blank = replace(target(), centers=target().centers + torch.tensor([900.0, 0, 0], dtype=F64))
@@ -194,7 +199,7 @@ def test_plate_area_under_perspective():
     torch.testing.assert_close(frame.sum(), area, rtol=1e-6, atol=0)
 
 
-def test_frame_is_a_window_of_a_larger_one():
+def test_frame_is_a_window_of_a_larger_one() -> None:
     # whatever crosses the border of the small frame is whole in the large one
     large = camera(200, 190, distortion=BROWN)
     shift = torch.tensor([70, 64])
@@ -204,13 +209,13 @@ def test_frame_is_a_window_of_a_larger_one():
     R, t = pose(30, 50, (4.0, 5.0, 200.0))
     # the ring is cut by the left or upper border, then by the right or lower one
     R, t = R.expand(3, 3, 3), t + torch.tensor([[0, 0, 0], [-3, 8, 0], [24, 9, 0]], dtype=F64)
-    kwargs = {"plate": (30.0, 30.0), "psf_sigma": 0.9}
+    kwargs: dict[str, Any] = {"plate": (30.0, 30.0), "psf_sigma": 0.9}
     cut = render(large, target(), R, t, **kwargs)[:, 64:114, 70:130]
     torch.testing.assert_close(render(small, target(), R, t, **kwargs), cut, rtol=0, atol=1e-4)
     assert (cut[:, :, 0].amin(1) < 89).any() or (cut[:, 0].amin(1) < 89).any()
 
 
-def test_batch_equals_single_frames():
+def test_batch_equals_single_frames() -> None:
     cam = camera(distortion=BROWN)
     poses = [pose(10 * i, 40 * i, (i, -i, 180.0 + 5 * i)) for i in range(4)]
     R, t = torch.cat([p[0] for p in poses]), torch.cat([p[1] for p in poses])
@@ -224,7 +229,7 @@ def test_batch_equals_single_frames():
     assert together.dtype == torch.float32
 
 
-def test_dark_background_is_the_negative():
+def test_dark_background_is_the_negative() -> None:
     R, t = pose(30, 10, (0.0, 0.0, 200.0))
     positive = render(camera(), target(), R, t, dark=DARK, light=LIGHT)
     negative = render(camera(), target(background="dark"), R, t, dark=DARK, light=LIGHT)
@@ -232,14 +237,14 @@ def test_dark_background_is_the_negative():
     assert negative[0, 0, 0] == DARK
 
 
-def test_levels_are_reached():
+def test_levels_are_reached() -> None:
     R, t = pose(0, 0, (0.0, 0.0, 100.0))
     frame = render(camera(), target((10.0, 5.0)), R, t, dark=DARK, light=LIGHT)
     assert frame.min().item() == pytest.approx(DARK, abs=1e-3)
     assert frame.max().item() == pytest.approx(LIGHT, abs=1e-3)
 
 
-def test_target_turned_in_its_own_frame():
+def test_target_turned_in_its_own_frame() -> None:
     # rings of any normal: turning the target's coordinates is undone by the pose
     turn = rotations.exp(torch.tensor([2.0, -0.8, 0.5], dtype=F64))
     turned = replace(target(), centers=target().centers @ turn.T, normals=target().normals @ turn.T)
@@ -249,14 +254,14 @@ def test_target_turned_in_its_own_frame():
     )
 
 
-def test_drawn_from_either_side():
+def test_drawn_from_either_side() -> None:
     R, t = pose(30, 80, (0.0, 0.0, 200.0))
     front = render(camera(), target(), R, t)
     flip = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=F64))  # the first ring is its own mirror image
     torch.testing.assert_close(render(camera(), target(), R @ flip, t), front, rtol=0, atol=1e-4)
 
 
-def test_nothing_behind_the_camera_or_beyond_the_fold():
+def test_nothing_behind_the_camera_or_beyond_the_fold() -> None:
     cam = camera(distortion=(-0.3, 0.0, 0.0, 0.0))
     R = torch.eye(3, dtype=F64).expand(2, 3, 3)
     # the second lies beyond the radius from which the distortion folds back into the image
@@ -265,13 +270,13 @@ def test_nothing_behind_the_camera_or_beyond_the_fold():
     assert (frames == LIGHT).all()
 
 
-def test_no_plate_that_reaches_behind_the_camera():
+def test_no_plate_that_reaches_behind_the_camera() -> None:
     R, t = pose(80, 0, (0.0, 0.0, 20.0))
     frame = render(camera(), target(), R, t, plate=(70.0, 70.0), surround=90.0, light=220.0)
     assert frame.max() <= 90
 
 
-def test_bad_arguments():
+def test_bad_arguments() -> None:
     R, t = pose(0, 0, (0.0, 0.0, 200.0))
     with pytest.raises(ConfigError, match="psf_sigma"):
         render(camera(), target(), R, t, psf_sigma=0.0)
@@ -281,12 +286,18 @@ def test_bad_arguments():
         add_noise(torch.zeros(1, 2, 2), 1.0, bits=17)
 
 
-def test_no_frames():
+def test_settings_by_another_name_are_refused() -> None:
+    R, t = pose(0, 0, (0.0, 0.0, 200.0))
+    with pytest.raises(TypeError, match="psf_sigmas"):
+        render(camera(), target(), R, t, psf_sigmas=0.7)
+
+
+def test_no_frames() -> None:
     assert render(camera(), target(), torch.zeros(0, 3, 3), torch.zeros(0, 3), plate=(9, 9)).shape == (0, 120, 128)
     assert add_noise(torch.zeros(0, 3, 4), 1.0).shape == (0, 3, 4)
 
 
-def test_fill_gradcheck():
+def test_fill_gradcheck() -> None:
     theta = torch.arange(20, dtype=F64) * (2 * math.pi / 20)
     position = (6 + 3 * torch.stack([theta.cos(), theta.sin()], 1)).requires_grad_()
     dv = (3 * theta.cos() * (2 * math.pi / 20)).requires_grad_()
@@ -302,7 +313,7 @@ def test_fill_gradcheck():
     )
 
 
-def test_gradient_is_that_of_finite_differences():
+def test_gradient_is_that_of_finite_differences() -> None:
     cam = camera(distortion=BROWN)
     R, t = pose(35, 60, (1.0, 2.0, 190.0))
     torch.manual_seed(0)
@@ -324,7 +335,7 @@ def test_gradient_is_that_of_finite_differences():
     torch.testing.assert_close(gradient, differences, rtol=2e-3, atol=0.1)
 
 
-def test_noise_is_independent_of_the_batch():
+def test_noise_is_independent_of_the_batch() -> None:
     frames = torch.full((5, 40, 61), 100.0)
     together = add_noise(frames, 3.0, seed=9)
     assert together.dtype == torch.uint8
@@ -334,7 +345,7 @@ def test_noise_is_independent_of_the_batch():
     assert not torch.equal(together, add_noise(frames, 3.0, seed=10))
 
 
-def test_noise_is_white_and_gaussian():
+def test_noise_is_white_and_gaussian() -> None:
     sigma = torch.tensor([50.0, 100.0])
     grey = add_noise(torch.full((2, 300, 401), 128.0), sigma, seed=1, bits=16).double() * (255 / 65535)
     inside = grey[0].flatten()
@@ -353,7 +364,7 @@ def test_noise_is_white_and_gaussian():
 @pytest.mark.parametrize(
     ("bits", "white", "dtype"), [(8, 255, torch.uint8), (10, 1023, torch.uint16), (12, 4095, torch.uint16)]
 )
-def test_depth_of_the_sensor(bits, white, dtype):
+def test_depth_of_the_sensor(bits: int, white: int, dtype: torch.dtype) -> None:
     out = add_noise(torch.tensor([[[-5.0, 0.0, 127.5, 255.0, 300.0]]]), 0.0, bits=bits)
     assert out.dtype == dtype
     levels = out.to(torch.int64).flatten().tolist()

@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 import re
 import sys
+from collections.abc import Callable
 from html.parser import HTMLParser
+from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
@@ -19,14 +22,16 @@ from torchpose.studies.study import Comparison, Picture, StudyResult, Table
 def small(name: str, calls: list[str], error: Exception | None = None) -> ModuleType:
     study = ModuleType(f"torchpose.studies.{name}")
 
-    def run(*, full, seed, progress):
+    def run(*, full: bool, seed: int, progress: Callable[..., Any]) -> StudyResult:
         calls.append(name)
         if error:
             raise error
         progress(0.5)
         figure, ((axis,),) = subplots(1, 1, (3, 2))
         axis.plot([0, 1])
-        rows = [{"noise": n, "error_px": float("nan") if n == 0 else 0.1234567 * n, "kind": "a<b"} for n in range(30)]
+        rows: list[dict[str, Any]] = [
+            {"noise": n, "error_px": float("nan") if n == 0 else 0.1234567 * n, "kind": "a<b"} for n in range(30)
+        ]
         return StudyResult(
             [Table("rows", "Thirty rows", rows, "a note")],
             [Picture("plot", "A plot", figure)],
@@ -35,12 +40,12 @@ def small(name: str, calls: list[str], error: Exception | None = None) -> Module
             {"frames": 3},
         )
 
-    study.NAME, study.TITLE, study.run = name, f"{name.capitalize()}: title", run
+    vars(study).update(NAME=name, TITLE=f"{name.capitalize()}: title", run=run)
     return study
 
 
 @pytest.fixture
-def studies(monkeypatch):
+def studies(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     calls: list[str] = []
     names = ("one", "broken", "two")
     for name in names:
@@ -50,7 +55,9 @@ def studies(monkeypatch):
     return calls
 
 
-def test_every_study_is_run_and_a_failure_is_reported_without_holding_up_the_others(tmp_path, studies):
+def test_every_study_is_run_and_a_failure_is_reported_without_holding_up_the_others(
+    tmp_path: Path, studies: list[str]
+) -> None:
     told = []
     failed = module.reproduce(tmp_path / "out", seed=3, progress=lambda name, done: told.append((name, done)))
     assert studies == ["one", "broken", "two"]
@@ -67,7 +74,7 @@ def test_every_study_is_run_and_a_failure_is_reported_without_holding_up_the_oth
     assert "0.1235" in text
 
 
-def test_the_report_needs_no_other_file_and_its_tags_match(tmp_path, studies):
+def test_the_report_needs_no_other_file_and_its_tags_match(tmp_path: Path, studies: list[str]) -> None:
     module.reproduce(tmp_path)
     text = (tmp_path / "report.html").read_text()
     assert not re.search(r'(src|href)="(?!data:|#)', text)
@@ -75,18 +82,18 @@ def test_the_report_needs_no_other_file_and_its_tags_match(tmp_path, studies):
     stack: list[str] = []
 
     class Tags(HTMLParser):
-        def handle_starttag(self, tag, attrs):
+        def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
             if tag not in ("meta", "img", "br"):
                 stack.append(tag)
 
-        def handle_endtag(self, tag):
+        def handle_endtag(self, tag: str) -> None:
             assert stack.pop() == tag
 
     Tags().feed(text)
     assert stack == []
 
 
-def test_resume_keeps_what_is_finished_with_the_same_settings(tmp_path, studies):
+def test_resume_keeps_what_is_finished_with_the_same_settings(tmp_path: Path, studies: list[str]) -> None:
     module.reproduce(tmp_path)
     studies.clear()
     module.reproduce(tmp_path, resume=True)
@@ -100,7 +107,7 @@ def test_resume_keeps_what_is_finished_with_the_same_settings(tmp_path, studies)
     assert 'id="one"' in (tmp_path / "report.html").read_text()
 
 
-def test_unknown_studies_and_places_that_cannot_be_written_are_refused(tmp_path, studies):
+def test_unknown_studies_and_places_that_cannot_be_written_are_refused(tmp_path: Path, studies: list[str]) -> None:
     with pytest.raises(ConfigError, match=r"table99: --only: is no study; give one of one, broken, two"):
         module.reproduce(tmp_path, only=["table99"])
     (tmp_path / "file").write_text("")

@@ -3,7 +3,7 @@ from __future__ import annotations
 from torchpose.studies import fig02_pnp
 
 
-def test_the_iterative_method_is_as_good_as_opencvs_and_errors_grow_with_the_noise():
+def test_the_iterative_method_is_as_good_as_opencvs_and_errors_grow_with_the_noise() -> None:
     result = fig02_pnp.run(poses=60)
     errors, times = result.tables
     by = {(row["method"], row["noise_px"]): row for row in errors.rows}

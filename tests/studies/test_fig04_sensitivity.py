@@ -8,22 +8,23 @@ import pytest
 import torch
 
 from torchpose.analysis.sensitivity import Uncertainty
+from torchpose.analysis.sweep import Sweep, sweep
 from torchpose.studies import fig04_sensitivity, table01_orientation
-from torchpose.studies.fig04_sensitivity import SIGMAS_PX, exponent, paper_camera, simulate
+from torchpose.studies.fig04_sensitivity import SIGMAS_PX, cases_of, exponent, paper_camera
 from torchpose.target import Target
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is:DeprecationWarning")
 
 
 @pytest.fixture(scope="module")
-def cases():
+def cases() -> list[Sweep]:
     distance = torch.linspace(12, 32, 11, dtype=torch.float64)
     size = Uncertainty(focal_length=fig04_sensitivity.FOCAL_ERROR)
-    found = simulate(paper_camera(), Target.load("quad8"), distance, SIGMAS_PX, size, draws=3000, seed=5)
-    return list(found.values())
+    plans = cases_of(SIGMAS_PX, size).values()
+    return [sweep(paper_camera(), Target.load("quad8"), distance, plan, draws=3000, seed=5) for plan in plans]
 
 
-def test_without_focal_error_x_and_y_are_linear_and_z_is_quadratic(cases):
+def test_without_focal_error_x_and_y_are_linear_and_z_is_quadratic(cases: list[Sweep]) -> None:
     for case in cases[:2]:
         for axis in (0, 1):
             assert exponent(case, axis) == pytest.approx(1, abs=0.03)
@@ -32,11 +33,11 @@ def test_without_focal_error_x_and_y_are_linear_and_z_is_quadratic(cases):
         assert case.rms[:, 2].tolist() == pytest.approx((case.depth / math.sqrt(2)).tolist(), rel=0.05)
 
 
-def test_five_times_the_noise_gives_five_times_the_errors(cases):
+def test_five_times_the_noise_gives_five_times_the_errors(cases: list[Sweep]) -> None:
     assert torch.allclose(cases[1].rms / cases[0].rms, torch.full((11, 6), 5.0).double(), rtol=0.02)
 
 
-def test_with_focal_error_z_is_the_sum_of_both_and_x_and_y_hardly_change(cases):
+def test_with_focal_error_z_is_the_sum_of_both_and_x_and_y_hardly_change(cases: list[Sweep]) -> None:
     without, _, wrong = cases
     # the largest error: what noise gives at its largest, and the focal error on top
     together = without.largest[:, 2] + wrong.depth_focal
@@ -48,7 +49,7 @@ def test_with_focal_error_z_is_the_sum_of_both_and_x_and_y_hardly_change(cases):
     assert torch.allclose(share, torch.full((11,), 0.0025).double(), atol=0.0005)
 
 
-def test_the_study_has_the_papers_figures_beside_ours(cases):
+def test_the_study_has_the_papers_figures_beside_ours(cases: list[Sweep]) -> None:
     result = fig04_sensitivity.run()
     assert {table.name for table in result.tables} == {"errors", "budget"}
     by = {c.what.split(";")[0]: c for c in result.comparisons}
@@ -57,7 +58,7 @@ def test_the_study_has_the_papers_figures_beside_ours(cases):
     assert any("quadratic" in s for s in result.statements)
 
 
-def test_table_one_yaw_and_pitch_are_worse_than_roll_and_the_papers_numbers_have_their_circumstances():
+def test_table_one_yaw_and_pitch_are_worse_than_roll_and_the_papers_numbers_have_their_circumstances() -> None:
     result = table01_orientation.run()
     noise, focal, readings = result.tables
     for yaw, roll in zip(noise.rows[::2], noise.rows[1::2], strict=True):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from torchpose.studies import fig05_shapes
@@ -10,7 +12,7 @@ from torchpose.studies.fig05_shapes import Condition
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is:DeprecationWarning")
 
 
-def test_the_study_says_which_shape_is_best_where(monkeypatch, tmp_path):
+def test_the_study_says_which_shape_is_best_where(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     curves = {
         "noise": {v: Condition(noise=v) for v in (2.0, 16.0)},
         "blur_px": {1.5: Condition(blur=1.5)},
@@ -21,7 +23,7 @@ def test_the_study_says_which_shape_is_best_where(monkeypatch, tmp_path):
     }
     monkeypatch.setattr(fig05_shapes, "CURVES", curves)
     monkeypatch.setattr(fig05_shapes, "recognition", lambda frames, seed: fig05_recognition_of(seed))
-    done = []
+    done: list[float] = []
     result = fig05_shapes.run(progress=done.append)
     assert done == sorted(done)
     assert done[-1] == 1

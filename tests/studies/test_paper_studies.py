@@ -31,7 +31,7 @@ def check(result: StudyResult, folder: Path) -> None:
         assert text_of(table).count("\n") == len(table.rows) + 1
 
 
-def test_table_ii_finds_all_circles_and_explains_the_papers_error(tmp_path):
+def test_table_ii_finds_all_circles_and_explains_the_papers_error(tmp_path: Path) -> None:
     result = table02_detection.run(seeds=1)
     found, explained = result.tables
     for row in found.rows:
@@ -42,7 +42,7 @@ def test_table_ii_finds_all_circles_and_explains_the_papers_error(tmp_path):
     check(result, tmp_path)
 
 
-def test_fig_6_finds_every_circle_and_knows_the_markers(tmp_path):
+def test_fig_6_finds_every_circle_and_knows_the_markers(tmp_path: Path) -> None:
     result = fig06_regions.run()
     drawing, phone = result.tables[0].rows
     assert (drawing["found"], drawing["other_ellipses"], drawing["rings"]) == (8, 0, 4)
@@ -51,7 +51,7 @@ def test_fig_6_finds_every_circle_and_knows_the_markers(tmp_path):
     check(result, tmp_path)
 
 
-def test_fig_7_corrected_edges_give_the_true_size(tmp_path):
+def test_fig_7_corrected_edges_give_the_true_size(tmp_path: Path) -> None:
     result = fig07_subpixel.run()
     for row in result.tables[0].rows:
         assert row["axes_error_corrected_px"] < 0.02 < row["axes_error_as_read_px"]
@@ -60,7 +60,7 @@ def test_fig_7_corrected_edges_give_the_true_size(tmp_path):
 
 
 @pytest.mark.slow
-def test_table_iii_photometric_is_near_the_bound_and_the_papers_chain_below_its_figures(tmp_path):
+def test_table_iii_photometric_is_near_the_bound_and_the_papers_chain_below_its_figures(tmp_path: Path) -> None:
     result = table03_centers.run(seeds=12)
     for row in result.tables[0].rows:
         if row["noise"] > 0:
@@ -70,7 +70,7 @@ def test_table_iii_photometric_is_near_the_bound_and_the_papers_chain_below_its_
     check(result, tmp_path)
 
 
-def test_table_iv_compensates_at_every_tilt(tmp_path, monkeypatch):
+def test_table_iv_compensates_at_every_tilt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(table04_compensation, "TILTS_DEG", (5, 10, 60))
     result = table04_compensation.run(seeds=3)
     for row in result.tables[0].rows:
@@ -81,7 +81,7 @@ def test_table_iv_compensates_at_every_tilt(tmp_path, monkeypatch):
     check(result, tmp_path)
 
 
-def test_fig_11_has_the_plan_of_the_configs_and_obeys_equation_5(tmp_path):
+def test_fig_11_has_the_plan_of_the_configs_and_obeys_equation_5(tmp_path: Path) -> None:
     ours, configured = fig11_simulation.paper_plan(), load_plan(CONFIGS / "plans" / "paper_grid.yaml")
     assert torch.equal(ours.R, configured.R)
     assert torch.equal(ours.t, configured.t)
@@ -89,14 +89,14 @@ def test_fig_11_has_the_plan_of_the_configs_and_obeys_equation_5(tmp_path):
     assert ours.file.imaging == configured.file.imaging
     assert ours.file.sensor == configured.file.sensor
     result = fig11_simulation.run(frames=6)
-    rows = {(row["frames"], row["axis"]): row for row in result.tables[0].rows}
-    assert rows["analytic", "z"]["ok"] == 6
-    assert rows["analytic", "z"]["rms"] < 4 * rows["analytic", "z"]["bound_sigma"]
-    assert rows["analytic, focal length 0.25 % too long", "z"]["bias"] == pytest.approx(400, abs=30)
+    by = {(row["frames"], row["axis"]): row for row in result.tables[0].rows}
+    assert by["analytic", "z"]["ok"] == 6
+    assert by["analytic", "z"]["rms"] < 4 * by["analytic", "z"]["bound_sigma"]
+    assert by["analytic, focal length 0.25 % too long", "z"]["bias"] == pytest.approx(400, abs=30)
     check(result, tmp_path)
 
 
-def test_every_study_of_the_report_has_a_script():
+def test_every_study_of_the_report_has_a_script() -> None:
     scripts = {path.read_text(encoding="utf-8") for path in (CONFIGS.parent / "scripts").glob("*.py")}
     for name in reproduce.STUDIES:
         assert any(f"import {name}\n" in text for text in scripts), name

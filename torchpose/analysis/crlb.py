@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TypedDict, Unpack
+
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.geometry import rotations
+from torchpose.geometry.least_squares import scaled_inverse
 from torchpose.sim import boundary, renderer
 from torchpose.sim.sensor import GREY_MAX
 from torchpose.sim.shapes import rings
@@ -15,19 +19,22 @@ from torchpose.target import Target
 _CHUNK_POSES = 16  # poses differentiated at a time
 
 
+class Settings(TypedDict, total=False):
+    """Conditions of B frames, numbers or (B,): Gaussian blur in px (0.7 if not given), grey levels of 0..255 (30, 220)
+    and their white noise (1), bits of the sensor (8), whose step is 255 / (2^bits - 1) grey levels.
+    """
+
+    psf_sigma: float | Tensor
+    dark: float | Tensor
+    light: float | Tensor
+    noise_sigma: float | Tensor
+    bits: int
+
+
 @torch.enable_grad()
 def pose_crlb(
-    camera: Camera,
-    target: Target,
-    R: Tensor,
-    t: Tensor,
-    *,
-    psf_sigma: float | Tensor = 0.7,
-    dark: float | Tensor = 30.0,
-    light: float | Tensor = 220.0,
-    noise_sigma: float | Tensor = 1.0,
-    bits: int = 8,
-) -> Tensor:
+    camera: Camera, target: Target, R: Tensor, t: Tensor, **settings: Unpack[Settings]
+) -> Float[Tensor, "B 6 6"]:
     """Lower bound of the pose covariance from frames of `torchpose.sim.render` with white Gaussian noise.
 
     Inverse Fisher information of the grey values (Kay 1993, section 3.9), of all pixels of every marker's bounding box
@@ -36,29 +43,26 @@ def pose_crlb(
     as noise of step^2 / 12, which holds from a noise of about half a step upwards; clipping is not modelled.
 
     Args:
-        camera, target: as in `torchpose.sim.render`.
-        R, t: (B, 3, 3), (B, 3), target to camera, mm.
-        psf_sigma: px. dark, light, noise_sigma: grey levels of 0..255. Numbers or (B,).
-        bits: of the sensor; its step is 255 / (2^bits - 1) grey levels.
+        R: (B, 3, 3), target to camera.
+        t: (B, 3), target to camera, mm.
+        settings: ``psf_sigma``, ``dark``, ``light``, ``noise_sigma``, ``bits``, see `Settings`.
 
     Returns:
-        (B, 6, 6) float64, mm and rad: translation, then rotation w with R_true = exp(w) R. NaN where the markers in
-        view do not determine the pose.
+        float64, mm and rad: translation, then rotation w with R_true = exp(w) R. NaN where the markers in view do not
+        determine the pose.
 
     Raises:
         ConfigError: ``psf_sigma`` is not above 0. FrameError: shapes of R and t disagree.
     """
     R, t = renderer.check_poses(R, t)
-    sigma = renderer.check_blur(psf_sigma, t)
-    dark_, light_, noise = (renderer.per_frame(x, t) for x in (dark, light, noise_sigma))
-    step = GREY_MAX / (2**bits - 1)
-    variance = noise.square() + step * step / 12
-    out = []
-    for a in range(0, t.shape[0], _CHUNK_POSES):
-        s = slice(a, a + _CHUNK_POSES)
-        information = _fisher(camera, target, R[s], t[s], sigma[s], (light_ - dark_)[s]) / variance[s, None, None]
-        out.append(_invert(information)[:, :6, :6])
-    return torch.cat(out) if out else t.new_zeros(0, 6, 6)
+    sigma = renderer.check_blur(settings.get("psf_sigma", 0.7), t)
+    levels = settings.get("dark", 30.0), settings.get("light", 220.0), settings.get("noise_sigma", 1.0)
+    dark, light, noise = (renderer.per_frame(level, t) for level in levels)
+    step = GREY_MAX / (2 ** settings.get("bits", 8) - 1)
+    parts = zip(*(x.split(_CHUNK_POSES) for x in (R, t, sigma, light - dark)), strict=True)
+    information = torch.cat([_fisher(camera, target, *part) for part in parts]) if len(t) else t.new_zeros(0, 7, 7)
+    inverse, known = scaled_inverse(information / (noise.square() + step * step / 12)[:, None, None])
+    return torch.where(known[:, None, None], inverse, torch.nan)[:, :6, :6]
 
 
 def _fisher(camera: Camera, target: Target, R: Tensor, t: Tensor, sigma: Tensor, contrast: Tensor) -> Tensor:
@@ -84,8 +88,8 @@ def _fisher(camera: Camera, target: Target, R: Tensor, t: Tensor, sigma: Tensor,
         rotation, translation, blur = rotations.exp(delta[3:6]) @ R, t + delta[:3], sigma + delta[6]
         position, dv = boundary.project(camera, edges, rotation, translation)
         rows = boundary.fill(position, dv, blur[edges.frame], window, boxes)
-        c = rows.view(len(pair), height, width + 1)[..., :width]
-        return c, c
+        covered = rows.view(len(pair), height, width + 1)[..., :width]
+        return covered, covered
 
     jacobian, c = torch.func.jacfwd(coverage, has_aux=True)(t.new_zeros(7))  # (P, h, w, 7), (P, h, w)
 
@@ -101,13 +105,3 @@ def _fisher(camera: Camera, target: Target, R: Tensor, t: Tensor, sigma: Tensor,
     cross = levels.mT @ jacobian
     fisher = jacobian.mT @ jacobian - cross.mT @ torch.linalg.solve(levels.mT @ levels, cross)
     return t.new_zeros(t.shape[0], 7, 7).index_add(0, frame, fisher)
-
-
-def _invert(information: Tensor) -> Tensor:
-    """Inverse of positive semidefinite (B, n, n), whatever the units of the unknowns; NaN where it is singular."""
-    scale = information.diagonal(dim1=-2, dim2=-1).clamp_min(torch.finfo(information.dtype).tiny).rsqrt()
-    values, vectors = torch.linalg.eigh(information * scale[:, :, None] * scale[:, None])
-    # a direction that the frame does not show has an eigenvalue at the square of the renderer's accuracy
-    values = torch.where(values[:, :1] > 1e-12, values, torch.nan)
-    vectors = scale[:, :, None] * vectors
-    return (vectors / values[:, None]) @ vectors.mT

@@ -42,11 +42,6 @@ def lateral_focal_error(d_true: Number, dn: Number, f: Number, f_true: Number, m
     """Eq. (6), its middle: (d_true / f_true - d_true / f) mu dn = -d_true mu dn (f_true - f) / (f f_true), mm.
 
     By how much the wrong focal length changes the length that ``dn`` px stand for, the distance d_true being known.
-    The paper's right side has no minus sign; with df = f_true - f, as in eq. (5), the middle is minus the right side.
-
-    Over the lateral error of eq. (3) it is -(f_true - f) / f_true: the relative focal error itself, 0.25 % of the
-    0.2 px that dn stands for, so the paper neglects it. It is not negligible where dn is an offset in the image instead
-    of an error of extraction and the distance is held from elsewhere: 1000 px off the axis, it is 2.5 px. A distance
-    that is estimated with the same ``f`` is wrong in the same proportion (eq. (5)) and takes this error away.
+    The paper's right side lacks the minus sign; docs/sensitivity.md has when the term can be neglected.
     """
     return (d_true / f_true - d_true / f) * mu * dn

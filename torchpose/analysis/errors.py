@@ -6,9 +6,11 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.geometry import rotations
+from torchpose.geometry.rows import Rows
 
 
 class Pose(Protocol):
@@ -28,34 +30,34 @@ class UncertainPose(Pose, Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class PoseErrors:
+class PoseErrors(Rows):
     """Estimate minus truth, float64; NaN where either has no pose.
 
     Attributes:
-        translation: (..., 3), mm, along the camera axes.
-        rotation: (..., 3), rad, rotation vector w about the camera axes with R_estimated = exp(w) R_true.
-        nees: (...), normalised estimation error squared e^T C^-1 e of e = (translation, rotation). Chi-squared with 6
+        translation: mm, along the camera axes.
+        rotation: rad, rotation vector w about the camera axes with R_estimated = exp(w) R_true.
+        nees: normalised estimation error squared e^T C^-1 e of e = (translation, rotation). Chi-squared with 6
             degrees of freedom, so 6 in the mean, where the errors are Gaussian with the predicted covariance C
             (Bar-Shalom, Li and Kirubarajan 2001, section 5.4.2). NaN where C is not positive definite.
     """
 
-    translation: Tensor
-    rotation: Tensor
-    nees: Tensor
+    translation: Float[Tensor, "*batch 3"]
+    rotation: Float[Tensor, "*batch 3"]
+    nees: Float[Tensor, "*batch"]
 
     @property
-    def lateral(self) -> Tensor:
-        """(...) mm, length of the error across the optical axis."""
+    def lateral(self) -> Float[Tensor, "*batch"]:
+        """Length of the error across the optical axis, mm."""
         return torch.linalg.vector_norm(self.translation[..., :2], dim=-1)
 
     @property
-    def depth(self) -> Tensor:
-        """(...) mm, signed error along the optical axis; positive where the estimate is too far."""
+    def depth(self) -> Float[Tensor, "*batch"]:
+        """Signed error along the optical axis, mm; positive where the estimate is too far."""
         return self.translation[..., 2]
 
     @property
-    def angle(self) -> Tensor:
-        """(...) rad, angle of the rotation between estimate and truth."""
+    def angle(self) -> Float[Tensor, "*batch"]:
+        """Angle of the rotation between estimate and truth, rad."""
         return torch.linalg.vector_norm(self.rotation, dim=-1)
 
 
@@ -66,13 +68,15 @@ def pose_errors(estimated: UncertainPose, truth: Pose) -> PoseErrors:
         estimated: poses with covariance, for example `torchpose.Poses`.
         truth: poses of the same leading shape, or of one that broadcasts to it.
     """
-    translation = estimated.t - truth.t
-    rotation = rotations.log(estimated.R @ truth.R.mT)
-    error = torch.cat([translation, rotation], -1)
+    error = pose_difference(estimated, truth)
     factor, failed = torch.linalg.cholesky_ex(estimated.covariance)
     whitened = torch.linalg.solve_triangular(factor, error[..., None], upper=False)[..., 0]
-    nees = whitened.square().sum(-1).masked_fill(failed != 0, torch.nan)
-    return PoseErrors(translation=translation, rotation=rotation, nees=nees)
+    return PoseErrors(error[..., :3], error[..., 3:], whitened.square().sum(-1).masked_fill(failed != 0, torch.nan))
+
+
+def pose_difference(estimated: Pose, truth: Pose) -> Float[Tensor, "*batch 6"]:
+    """Translation (mm) and rotation vector (rad) of estimate minus truth, about the camera axes."""
+    return torch.cat([estimated.t - truth.t, rotations.log(estimated.R @ truth.R.mT)], -1)
 
 
 def rms(values: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.analysis.errors import PoseErrors, pose_errors, rms
@@ -23,89 +24,63 @@ NEES_MEAN = 6.0  # of errors with the predicted covariance, which has 6 degrees 
 
 @dataclass(frozen=True, eq=False)
 class Estimates:
-    """Rows of a result table in the order of a truth; NaN where there is no pose.
-
-    Attributes:
-        status: N words. R: (N, 3, 3). t: (N, 3), mm. covariance: (N, 6, 6), mm and rad.
-        full_covariance: whether the table held it; otherwise it is the diagonal of the standard deviations.
-    """
+    """Rows of a result table in the order of a truth, mm and rad; NaN where there is no pose."""
 
     status: list[str]
-    R: Tensor
-    t: Tensor
-    covariance: Tensor
-    full_covariance: bool
+    R: Float[Tensor, "N 3 3"]
+    t: Float[Tensor, "N 3"]
+    covariance: Float[Tensor, "N 6 6"]
+    full_covariance: bool  # whether the table held it; otherwise it is the diagonal of the standard deviations
 
 
 @dataclass(frozen=True)
 class AxisErrors:
-    """Errors along or about one camera axis, in the units of `UNITS`; frames with the status ok.
-
-    Attributes:
-        bias: mean. spread: standard deviation. rms. worst: largest magnitude. predicted: RMS of the standard deviations
-        that the estimates claim. bound: RMS of the Cramer-Rao standard deviations, NaN where the truth has none.
-    """
+    """Errors along or about one camera axis, in the units of `UNITS`; frames with the status ok."""
 
     axis: str
     unit: str
     bias: float
-    spread: float
+    spread: float  # standard deviation
     rms: float
-    worst: float
-    predicted: float
-    bound: float
+    worst: float  # largest magnitude
+    predicted: float  # RMS of the standard deviations that the estimates claim
+    bound: float  # RMS of the Cramer-Rao standard deviations, NaN where the truth has none
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Estimates against their truth.
-
-    Attributes:
-        errors: (N,) `PoseErrors`. error: (N, 6) in the units of `UNITS`, NaN where the status is not ok.
-        predicted, bound: (N, 6) standard deviations in the same units.
-        axes: one `AxisErrors` each.
-        counts: rows by status. nees: mean over the ok rows, 6 where the covariances are right.
-        nees_interval: (low, high), where 95 % of such means lie.
-        center: largest lateral error of the target's origin over the ok rows, um.
-        visible: rows whose target is in view as a whole, where the truth says so. found: ok rows among them.
-    """
+    """Estimates against their truth."""
 
     errors: PoseErrors
-    error: Tensor
-    predicted: Tensor
-    bound: Tensor
+    error: Float[Tensor, "N 6"]  # in the units of `UNITS`, NaN where the status is not ok
+    predicted: Float[Tensor, "N 6"]  # standard deviations in the same units
+    bound: Float[Tensor, "N 6"]  # the same
     axes: list[AxisErrors]
-    counts: Counter[str]
-    nees: float
-    nees_interval: tuple[float, float]
-    center: float
-    visible: int
-    found: int
+    counts: Counter[str]  # rows by status
+    nees: float  # mean over the ok rows, 6 where the covariances are right
+    nees_interval: tuple[float, float]  # where 95 % of such means lie
+    center: float  # largest lateral error of the target's origin over the ok rows, um
+    visible: int  # rows whose target is in view as a whole, where the truth says so
+    found: int  # ok rows among them
 
 
 def evaluate(estimates: Estimates, truth: Truth) -> Evaluation:
-    """Errors of N estimates, row by row of the truth."""
+    """Errors of estimates, row by row of the truth."""
     errors = pose_errors(estimates, truth)
-    ok = torch.tensor([status == "ok" for status in estimates.status])
-    error = torch.cat([errors.translation, errors.rotation], 1) * SCALE
-    error[~ok] = torch.nan
-    predicted = estimates.covariance.diagonal(dim1=1, dim2=2).sqrt() * SCALE
-    predicted[~ok] = torch.nan
+    scale = SCALE.to(errors.nees)
+    ok = torch.tensor([status == "ok" for status in estimates.status], device=scale.device)
+    error = torch.where(ok[:, None], torch.cat([errors.translation, errors.rotation], 1) * scale, torch.nan)
+    std = estimates.covariance.diagonal(dim1=1, dim2=2).sqrt()
+    predicted = torch.where(ok[:, None], std * scale, torch.nan)
     bound = torch.full_like(error, torch.nan)
     if all(name in truth.extra for name in BOUND):
-        bound = torch.stack([truth.extra[name] for name in BOUND], 1) * SCALE
-        bound = torch.where(error.isnan(), torch.nan, bound)
+        claimed = torch.stack([truth.extra[name] for name in BOUND], 1)
+        bound = torch.where(error.isnan(), torch.nan, claimed * scale)
     bias = error.nanmean(0)
-    columns = (
-        bias,
-        rms(error - bias),
-        rms(error),
-        error.abs().nan_to_num(-1).amax(0) if len(error) else bias,
-        rms(predicted),
-        rms(bound),
-    )
-    rows = zip(AXES, UNITS, *(c.tolist() for c in columns), strict=True)
-    in_view = torch.ones(len(truth), dtype=torch.bool)
+    worst = error.abs().nan_to_num(-1).amax(0) if len(error) else bias
+    columns = (bias, rms(error - bias), rms(error), worst, rms(predicted), rms(bound))
+    rows = zip(AXES, UNITS, *(column.tolist() for column in columns), strict=True)
+    in_view = torch.ones_like(ok)
     if "markers_in_view" in truth.extra:
         in_view = truth.extra["markers_in_view"] >= truth.extra["markers_in_view"].max()
     nees = errors.nees[ok]
@@ -131,15 +106,12 @@ def estimates_of(rows: Sequence[dict[str, object]]) -> Estimates:
     """Estimates from rows of a result table; cells may be None."""
 
     def cells(names: Sequence[str]) -> Tensor:
-        values = [[math.nan if row[n] is None else float(str(row[n])) for n in names] for row in rows]
+        values = [[math.nan if row[name] is None else float(str(row[name])) for name in names] for row in rows]
         return torch.tensor(values, dtype=torch.float64).reshape(-1, len(names))
 
     pose, std = cells(("tx", "ty", "tz", "rx", "ry", "rz")), cells(BOUND)
     full = any(row.get("covariance") is not None for row in rows)
-    nothing = [[math.nan] * 6] * 6
-    covariance = (
-        torch.tensor([row.get("covariance") or nothing for row in rows], dtype=torch.float64)
-        if full
-        else torch.diag_embed(std.square())
-    )
+    covariance, nothing = torch.diag_embed(std.square()), [[math.nan] * 6] * 6
+    if full:
+        covariance = torch.tensor([row.get("covariance") or nothing for row in rows], dtype=torch.float64)
     return Estimates([str(row["status"]) for row in rows], rotations.exp(pose[:, 3:]), pose[:, :3], covariance, full)

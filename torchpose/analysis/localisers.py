@@ -13,10 +13,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchpose import ellipse
 from torchpose.camera import Camera
+from torchpose.geometry.least_squares import geman_mcclure
+from torchpose.geometry.rows import Rows, shared
 from torchpose.geometry.segments import segment_sum
 from torchpose.rings import ideal_pixels, zernike
 
@@ -28,46 +31,48 @@ _SCALES = (1.0, 0.3, 0.3, 0.3)  # px, of the robust weights
 
 
 @dataclass(frozen=True, eq=False)
-class EdgePoints:
-    """Sub-pixel edges near outlines, flat. points: (P, 2) px. curve: (P,) int64, frame times E plus the curve's number.
+class EdgePoints(Rows):
+    """Sub-pixel edges near outlines, px."""
 
-    count: frames times E.
-    """
-
-    points: Tensor
-    curve: Tensor
-    count: int
+    points: Float[Tensor, "P 2"]
+    curve: Int[Tensor, " P"]  # frame times E plus the curve's number
+    count: int = shared()  # frames times E
 
 
 def edge_points(frames: Tensor, outline: Tensor, blur: float, camera: Camera | None = None) -> EdgePoints:
     """Zernike edges at the pixels near rough outlines.
 
     Args:
-        frames: (B, H, W) grey. outline: (B, E, S, 2) px, S points along each of E curves, a pixel apart or so.
+        frames: (B, H, W) grey.
+        outline: (B, E, S, 2) px, S points along each of E curves, a pixel apart or so.
         blur: px, of the point-spread function; the edges are freed from what it does to their offsets.
         camera: takes its distortion off the points; None leaves them as they are.
     """
     batch, curves, _, _ = outline.shape
     height, width = frames.shape[-2:]
-    tangent = outline.diff(dim=2)
-    tangent = torch.cat([tangent, tangent[:, :, -1:]], 2)
-    normal = torch.stack([-tangent[..., 1], tangent[..., 0]], -1) / tangent.norm(dim=-1, keepdim=True)
-    offset = torch.arange(-_REACH, _REACH + 0.1, 0.5, dtype=outline.dtype)[:, None]
+    normal, _ = _sides(torch.cat([outline, 2 * outline[:, :, -1:] - outline[:, :, -2:-1]], 2))
+    offset = torch.arange(-_REACH, _REACH + 0.1, 0.5, dtype=outline.dtype, device=outline.device)[:, None]
     pixel = (outline[..., None, :] + offset * normal[..., None, :]).round().long().flatten(2, 3)
-    curve = torch.arange(batch * curves).view(batch, curves, 1).expand(pixel.shape[:-1])
+    curve = torch.arange(batch * curves, device=pixel.device).view(batch, curves, 1).expand(pixel.shape[:-1])
     margin = zernike.MASK // 2
-    size = torch.tensor([width, height])
-    clear = ((pixel >= margin) & (pixel < size - margin)).all(-1)
+    clear = ((pixel >= margin) & (pixel < pixel.new_tensor([width - margin, height - margin]))).all(-1)
     key = ((curve * height + pixel[..., 1]) * width + pixel[..., 0])[clear].unique()
     pixels = torch.stack([key % width, key // width % height], -1)
     curve = key // (width * height)
     edges = zernike.locate(frames.contiguous(), curve // curves, pixels)
-    s = 2 * math.sqrt(blur * blur + 1 / 12) / zernike.MASK
-    slope = torch.full_like(edges.offset, 1 - 3 * s * s).clamp_min(_LEAST_SLOPE)
+    relative = 2 * math.sqrt(blur * blur + 1 / 12) / zernike.MASK
+    slope = torch.full_like(edges.offset, max(1 - 3 * relative * relative, _LEAST_SLOPE))
     shift = zernike.deblur(edges.offset, slope)[:, None] * edges.normal
     keep = (shift.abs() <= 0.5).all(-1) & (edges.step > _LEAST_STEP)
     points = (pixels + shift)[keep]
     return EdgePoints(points if camera is None else ideal_pixels(camera, points), curve[keep], batch * curves)
+
+
+def _sides(points: Tensor) -> tuple[Tensor, Tensor]:
+    """Unit normals (..., S - 1, 2) and lengths (..., S - 1, 1) of the steps along curves (..., S, 2)."""
+    step = points.diff(dim=-2)
+    length = step.norm(dim=-1, keepdim=True)
+    return torch.stack([-step[..., 1], step[..., 0]], -1) / length, length
 
 
 def fit_lines(edges: EdgePoints) -> tuple[Tensor, Tensor]:
@@ -76,16 +81,15 @@ def fit_lines(edges: EdgePoints) -> tuple[Tensor, Tensor]:
     Total least squares with Geman-McClure weights of falling scale; NaN where fewer than `_LEAST_POINTS` count.
     """
     weight = torch.ones_like(edges.points[:, 0])
-    line = torch.zeros(edges.count, 3, dtype=torch.float64)
     for scale in (*_SCALES, 0.0):
         total = segment_sum(weight, edges.curve, edges.count)
         mean = segment_sum(weight[:, None] * edges.points, edges.curve, edges.count) / total.clamp_min(1e-9)[:, None]
-        d = edges.points - mean[edges.curve]
-        outer = segment_sum(weight[:, None] * (d[:, :, None] * d[:, None]).flatten(1), edges.curve, edges.count)
-        normal = torch.linalg.eigh(outer.view(-1, 2, 2)).eigenvectors[:, :, 0]
-        line = torch.cat([normal, -(normal * mean).sum(-1, keepdim=True)], -1)
+        away = edges.points - mean[edges.curve]
+        spread = segment_sum(weight[:, None, None] * away[:, :, None] * away[:, None], edges.curve, edges.count)
+        normal = torch.linalg.eigh(spread).eigenvectors[:, :, 0]
         if scale:
-            weight = (1 + ((d * normal[edges.curve]).sum(-1) / scale).square()).reciprocal().square()
+            weight = geman_mcclure((away * normal[edges.curve]).sum(-1) / scale)
+    line = torch.cat([normal, -(normal * mean).sum(-1, keepdim=True)], -1)
     return torch.where(total[:, None] > _LEAST_POINTS, line, torch.nan), total
 
 
@@ -95,21 +99,15 @@ def meet(a: Tensor, b: Tensor) -> Tensor:
     return x[..., :2] / x[..., 2:]
 
 
-def through(a: Tensor, b: Tensor) -> Tensor:
-    """Homogeneous lines (..., 3) through points (..., 2)."""
-    one = torch.ones_like(a[..., :1])
-    return torch.linalg.cross(torch.cat([a, one], -1), torch.cat([b, one], -1))
-
-
 def diagonals(sides: Tensor) -> Tensor:
     """Centre (..., 2) of a square seen in perspective: where the diagonals of its sides (..., 4, 3) meet."""
-    corner = meet(sides, sides.roll(-1, -2))
-    return meet(through(corner[..., 0, :], corner[..., 2, :]), through(corner[..., 1, :], corner[..., 3, :]))
+    corner = torch.nn.functional.pad(meet(sides, sides.roll(-1, -2)), (0, 1), value=1.0)
+    return meet(*torch.linalg.cross(corner[..., :2, :], corner[..., 2:, :]).unbind(-2))
 
 
 def fit_circles(edges: EdgePoints, outline: Tensor) -> Tensor:
     """Ellipses (B, E, 5) px of circles from a rough outline (B, E, S, 2); NaN where too few points follow."""
-    index = torch.arange(edges.count).repeat_interleave(outline.shape[2])
+    index = torch.arange(edges.count, device=outline.device).repeat_interleave(outline.shape[2])
     rough = ellipse.fit(outline.reshape(-1, 2), index, edges.count)
     found, keep = ellipse.fit_robust(edges.points, edges.curve, edges.count, start=rough)
     many = segment_sum(keep.double(), edges.curve, edges.count) > _LEAST_POINTS
@@ -153,8 +151,8 @@ def by_corner(frames: Tensor, start: Tensor, half: int) -> Tensor:
     """Chessboard vertices (B, 2) by `cv2.cornerSubPix`, from ``start``, in a window of 2 ``half`` + 1 px."""
     found = start.clone()
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-5)
-    for k, frame in enumerate(frames.numpy()):
-        at = start[k].numpy().astype(np.float32).reshape(1, 1, 2)
+    for k, frame in enumerate(frames.cpu().numpy()):
+        at = start[k].cpu().numpy().astype(np.float32).reshape(1, 1, 2)
         found[k] = torch.from_numpy(cv2.cornerSubPix(frame, at, (half, half), (-1, -1), criteria)[0, 0].astype(float))
     return found
 
@@ -162,7 +160,8 @@ def by_corner(frames: Tensor, start: Tensor, half: int) -> Tensor:
 def by_centroid(frames: Tensor, start: Tensor, half: float, dark: float, light: float) -> Tensor:
     """Centres (B, 2): darkness-weighted means of a round window of the radius ``half`` px that follows them."""
     height, width = frames.shape[-2:]
-    v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
+    u = torch.arange(width, dtype=start.dtype, device=start.device)
+    v = torch.arange(height, dtype=start.dtype, device=start.device)[:, None]
     darkness = (light - frames.double()) / (light - dark)
     center = start.clone()
     for _ in range(8):
@@ -176,11 +175,13 @@ def centre_bound(outline: Tensor, edge_noise: float) -> Tensor:
     """(B,) px, root mean square per axis of the least error of a centre, from all edges of a known shape.
 
     Inverse of the information sum n n^T ds / e^2 of edges whose position over 1 px of length has the standard deviation
-    e (`torchpose.analysis.edge_noise`). Args: outline: (B, E, S, 2) px.
+    e (`torchpose.analysis.edge_noise`).
+
+    Args:
+        outline: (B, E, S, 2) px.
+        edge_noise: e, px.
     """
-    step = outline.diff(dim=2)
-    length = step.norm(dim=-1, keepdim=True)
-    normal = torch.stack([-step[..., 1], step[..., 0]], -1) / length
+    normal, length = _sides(outline)
     length = torch.where(length > 3 * length.median(2, keepdim=True).values, 0.0, length)  # a gap between two edges
     information = (length[..., None] * normal[..., :, None] * normal[..., None, :]).sum((1, 2)) / edge_noise**2
     return (torch.linalg.inv(information).diagonal(dim1=1, dim2=2).sum(-1) / 2).sqrt()

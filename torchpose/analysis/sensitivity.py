@@ -8,21 +8,23 @@ moves the pose by (J^T W J)^-1 J^T W S e to first order. `torchpose.analysis.mon
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
-from typing import Literal
+from dataclasses import dataclass, fields
+from typing import Literal, NamedTuple
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.camera import Camera
-from torchpose.geometry import rotations
+from torchpose.camera.derivatives import by_intrinsics
+from torchpose.geometry.least_squares import scaled_inverse
+from torchpose.geometry.projection import by_pose, image_by_point
 from torchpose.geometry.rotations import plane_axes
 from torchpose.target import Target
 
 Features = Literal["centers", "rings"]
 MIN_MARKERS = 3
 _POINTS = 24  # on a circle: the sums over it are exact to the perspective's sixth power
-_SINGULAR = 1e-12  # least eigenvalue of the information, scaled to a unit diagonal
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,20 +71,17 @@ class Uncertainty:
 class ErrorBudget:
     """What every source contributes to the covariance of B poses.
 
-    Attributes:
-        sources: by the names of the fields of `Uncertainty`, and ``calibration`` for `Camera.covariance`; those that
-            are not zero. Each (B, 6, 6) float64, mm and rad: translation, then rotation w with R_true = exp(w) R, in
-            camera axes. NaN where the markers in view do not determine the pose.
-        total: (B, 6, 6), their sum.
-        seen: (B, M) bool, the markers in view.
+    By the names of the fields of `Uncertainty`, and ``calibration`` for `Camera.covariance`; those that are not zero.
+    In mm and rad: translation, then rotation w with R_true = exp(w) R, in camera axes. NaN where the markers in view do
+    not determine the pose.
     """
 
-    sources: dict[str, Tensor]
-    total: Tensor
-    seen: Tensor
+    sources: dict[str, Float[Tensor, "B 6 6"]]
+    total: Float[Tensor, "B 6 6"]  # their sum
+    seen: Bool[Tensor, "B M"]  # the markers in view
 
-    def std(self, source: str | None = None) -> Tensor:
-        """(B, 6) standard deviations, mm and rad, of one source or of all together."""
+    def std(self, source: str | None = None) -> Float[Tensor, "B 6"]:
+        """Standard deviations, mm and rad, of one source or of all together."""
         covariance = self.total if source is None else self.sources[source]
         return covariance.diagonal(dim1=-2, dim2=-1).sqrt()
 
@@ -98,18 +97,13 @@ def edge_noise(noise: float, contrast: float, blur: float) -> float:
 
 
 def propagate(
-    camera: Camera,
-    target: Target,
-    R: Tensor,
-    t: Tensor,
-    uncertainty: Uncertainty,
-    *,
-    features: Features = "centers",
+    camera: Camera, target: Target, R: Tensor, t: Tensor, uncertainty: Uncertainty, *, features: Features = "centers"
 ) -> ErrorBudget:
     """Covariances that the sources give the estimated poses, to first order, through the full camera model.
 
     Args:
-        R, t: (B, 3, 3), (B, 3) mm, target to camera.
+        R: (B, 3, 3), target to camera.
+        t: (B, 3), target to camera, mm.
         uncertainty: of measurement, camera and print.
         features: what the pose is fitted to. "centers": the compensated marker centres, as `torchpose.pnp.solve`.
             "rings": both edges of every ring, weighted by their length in the image, as the refinements on edges and
@@ -126,50 +120,67 @@ def propagate(
     R, t = R.double(), t.double()
     camera, target = camera.to(R), target.to(R)
     seen = markers_seen(camera, target, R, t)
-    # columns of the Jacobian: pose 6, fx fy cx cy 4, the marker's centre in its axes 3, its radii 2, scale, distortion
-    zero = t.new_zeros(16 + coefficients)
-    observe = _center_images if features == "centers" else _edge_images
-
-    def image(delta: Tensor) -> Tensor:
-        return observe(camera, target, R, t, delta)
-
-    jacobian = torch.func.jacfwd(image)(zero)  # (B, M, N, 2, 16 + n): N points of each marker
-    jacobian = torch.where(seen[:, :, None, None, None], jacobian, 0.0)
-    if features == "centers":
-        inverse = _inverse_covariances(uncertainty.image, jacobian)
-        variance = 1.0 if isinstance(uncertainty.image, Tensor) else uncertainty.image**2
+    point = _centers(camera, target, R, t) if features == "centers" else ring_edges(camera, target, R, t, _POINTS)
+    image = uncertainty.image
+    if features == "centers" and isinstance(image, Tensor):
+        information, variance = torch.linalg.inv(image.to(R)).reshape(-1, len(target), 1, 2, 2), 1.0
     else:
-        inverse, variance = _edge_weights(camera, target, R, t), float(uncertainty.image) ** 2
-    weighted = jacobian[..., :6].mT @ inverse  # (B, M, N, 6, 2)
-    information = (weighted @ jacobian[..., :6]).sum((1, 2))
-    inverted = _invert(information)
+        information, variance = point.information, float(image) ** 2
+    jacobian = torch.where(seen[:, :, None, None, None], _jacobian(camera, target, R, point), 0.0)
+    weighted = jacobian[..., :6].mT @ information  # (B, M, N, 6, 2): N points of each marker
+    inverted, known = scaled_inverse((weighted @ jacobian[..., :6]).sum((1, 2)))
+    inverted = torch.where(known[:, None, None], inverted, torch.nan)
     # (B, M, 6, columns): how an error common to the points of a marker moves the pose
     gain = inverted[:, None] @ (weighted @ jacobian[..., 6:]).sum(2)
+    sources = ({"image": variance * inverted} if variance else {}) | _shares(camera, gain, uncertainty)
+    return ErrorBudget(sources, torch.stack([0 * inverted, *sources.values()]).sum(0), seen)
+
+
+class Points(NamedTuple):
+    """N measured points of each marker."""
+
+    arm: Float[Tensor, "B M N 3"]  # about the target's origin, camera axes, mm
+    depth: Float[Tensor, "B M N"]  # mm
+    xy: Float[Tensor, "B M N 2"]  # image on the plane z = 1
+    by_point: Float[Tensor, "B M N 2 3"]  # derivatives of the pixels by the place
+    by_radii: Float[Tensor, "B M N 2 2"]  # and by the marker's radii
+    information: Float[Tensor, "B M N 2 2"]  # about the pixels at unit noise
+
+
+def _jacobian(camera: Camera, target: Target, R: Tensor, point: Points) -> Tensor:
+    """Derivatives (B, M, N, 2, 16 + n) of the pixels.
+
+    By pose 6, fx fy cx cy, the marker's centre along its axes 3, its radii 2, the scale of the print, distortion n.
+    """
+    by_camera, axes = by_intrinsics(camera, point.xy), R[:, None] @ marker_axes(target).mT
+    by_print = (point.by_point @ axes[:, :, None], point.by_radii, point.by_point @ point.arm[..., None])
+    both = by_camera.tensor_split([4], -1)
+    return torch.cat([by_pose(point.by_point, point.arm), both[0], *by_print, both[1]], -1)
+
+
+def _shares(camera: Camera, gain: Tensor, uncertainty: Uncertainty) -> dict[str, Tensor]:
+    """Covariance (B, 6, 6) by every source but the image that is not exact, from `propagate`'s gains of markers."""
     whole = gain.sum(1)
-    shares = {
-        "focal_length": _outer(whole[:, :, :2] @ camera.matrix.diagonal()[:2, None]),
-        "principal_point": _outer(whole[:, :, 2:4]),
-        "distortion": _outer(whole[:, :, 10:] * t.new_tensor(uncertainty.distortion or (0.0,) * coefficients)),
-        "print_centers": _outer(gain[..., 4:6]).sum(1),
-        "print_flatness": _outer(gain[..., 6:7]).sum(1),
-        "print_radii": _outer(gain[..., 7:9]).sum(1),
-        "print_scale": _outer(whole[:, :, 9:10]),
+    bent = any(uncertainty.distortion)
+    # what moves with every marker on its own (B, M, 6, ...), and with all of them together (B, 1, 6, ...)
+    columns = {
+        "focal_length": whole[:, None, :, :2] @ camera.matrix.diagonal()[:2, None],
+        "principal_point": whole[:, None, :, 2:4],
+        "distortion": whole[:, None, :, 10:] * whole.new_tensor(uncertainty.distortion if bent else 0.0),
+        "print_centers": gain[..., 4:6],
+        "print_flatness": gain[..., 6:7],
+        "print_radii": gain[..., 7:9],
+        "print_scale": whole[:, None, :, 9:10],
     }
-    sources = {"image": variance * inverted} if variance else {}
-    for name, share in shares.items():
-        size = getattr(uncertainty, name)
-        if name == "distortion":
-            sources |= {name: share} if any(size) else {}
-        elif size:
-            sources[name] = size**2 * share
+    sizes = {name: float(bent if name == "distortion" else getattr(uncertainty, name)) for name in columns}
+    shares = {name: size**2 * (columns[name] @ columns[name].mT).sum(1) for name, size in sizes.items() if size}
     if camera.covariance is not None:
-        sources["calibration"] = whole[:, :, :4] @ camera.covariance @ whole[:, :, :4].mT
-    total = torch.stack([torch.zeros_like(inverted), *sources.values()]).sum(0) + 0 * inverted
-    return ErrorBudget(sources, total, seen)
+        shares["calibration"] = whole[:, :, :4] @ camera.covariance @ whole[:, :, :4].mT
+    return shares
 
 
-def markers_seen(camera: Camera, target: Target, R: Tensor, t: Tensor) -> Tensor:
-    """(B, M) bool: the marker's centre is inside the frame and its printed side faces the camera."""
+def markers_seen(camera: Camera, target: Target, R: Tensor, t: Tensor) -> Bool[Tensor, "B M"]:
+    """Whether the marker's centre is inside the frame and its printed side faces the camera."""
     centers = target.centers @ R.mT + t[:, None]
     pixel = camera.project(centers)
     size = pixel.new_tensor([camera.width - 0.5, camera.height - 0.5])
@@ -178,104 +189,75 @@ def markers_seen(camera: Camera, target: Target, R: Tensor, t: Tensor) -> Tensor
     return enough & (enough.sum(-1, keepdim=True) >= MIN_MARKERS)
 
 
-def _center_images(camera: Camera, target: Target, R: Tensor, t: Tensor, delta: Tensor) -> Tensor:
-    """Pixels (B, M, 1, 2) of the compensated centres where pose, camera and print differ by ``delta``."""
-    R, t = rotations.exp(delta[3:6]) @ R, t + delta[:3]
-    centers, radii = _print(target, delta)
-    c = centers @ R.mT + t[:, None]
-    n = target.normals @ R.mT
-    xy = c[..., :2] / c[..., 2:] + radius_shift(c, n, radii, target.radii)
-    return _pixels(camera, xy, delta)[:, :, None]
+def _centers(camera: Camera, target: Target, R: Tensor, t: Tensor) -> Points:
+    """The compensated centres, one point a marker."""
+    arm, normal = target.centers @ R.mT, target.normals @ R.mT
+    xy, depth, by_point = _seen(camera, arm + t[:, None])
+    # of `radius_shift` by the true radii
+    outer, inner = target.radii.square().unbind(-1)
+    by_factor = torch.stack([inner, -outer], -1) * 2 * target.radii / (outer - inner).square()[:, None]
+    shift = _between_ellipses(arm + t[:, None], normal, target.radii)[..., None] * by_factor[:, None]
+    eye = torch.eye(2, dtype=t.dtype, device=t.device).expand(*xy.shape, 2)
+    return Points(*(value[:, :, None] for value in (arm, depth, xy, by_point, camera.J_distort(xy) @ shift, eye)))
 
 
 def radius_shift(centers: Tensor, normals: Tensor, true: Tensor, nominal: Tensor) -> Tensor:
     """Shift (..., 2) of the centre that eq. (7) finds where the circles have other radii than it is told.
 
-    Eq. (7) extrapolates the centres of both ellipses, e_inner + K2 (e_inner - e_outer), with K2 = r2^2 / (r1^2 - r2^2);
-    the circle of radius r has its ellipse's centre at (c_xy c_z + r^2 n_xy n_z) / (c_z^2 - r^2 (1 - n_z^2)) (derived
-    from the dual conic). On the normalised plane.
-
-    Args:
-        centers, normals: (..., 3) of the circles, camera frame. true, nominal: (..., 2) outer and inner radius.
+    Eq. (7) extrapolates the centres of both ellipses, e_inner + K2 (e_inner - e_outer), with K2 = r2^2 / (r1^2 - r2^2).
+    On the plane z = 1; centres and normals (..., 3) in the camera frame, radii (..., 2) outer and inner.
     """
-    nz, cz = normals[..., 2:], centers[..., 2:]
-
-    def ellipse_center(radius: Tensor) -> Tensor:
-        square = radius.square()[..., None]
-        numerator = centers[..., :2] * cz + square * normals[..., :2] * nz
-        return numerator / (cz.square() - square * (1 - nz.square()))
 
     def factor(radii: Tensor) -> Tensor:
         outer, inner = radii.square().unbind(-1)
         return (inner / (outer - inner))[..., None]
 
-    return (factor(nominal) - factor(true)) * (ellipse_center(true[..., 1]) - ellipse_center(true[..., 0]))
+    return (factor(nominal) - factor(true)) * _between_ellipses(centers, normals, true)
 
 
-def _edge_images(camera: Camera, target: Target, R: Tensor, t: Tensor, delta: Tensor) -> Tensor:
-    """Pixels (B, M, 2 `_POINTS`, 2) of points on both circles of every ring."""
-    R, t = rotations.exp(delta[3:6]) @ R, t + delta[:3]
-    centers, radii = _print(target, delta)
-    points = centers[:, None] + _circle(target, radii)
-    return _pixels(camera, _normalised(points, R, t), delta)
+def _between_ellipses(centers: Tensor, normals: Tensor, radii: Tensor) -> Tensor:
+    """Centre of the inner ellipse minus that of the outer one, (..., 2).
+
+    The circle of radius r has its ellipse's centre at (c_xy c_z + r^2 n_xy n_z) / (c_z^2 - r^2 (1 - n_z^2)) (derived
+    from the dual conic).
+    """
+    (c, cz), (n, nz) = (vector[..., None, :].tensor_split([2], -1) for vector in (centers, normals))
+    square = radii.square()[..., None]
+    return ((c * cz + square * n * nz) / (cz.square() - square * (1 - nz.square()))).diff(dim=-2).squeeze(-2)
 
 
-def _edge_weights(camera: Camera, target: Target, R: Tensor, t: Tensor) -> Tensor:
-    """Information (B, M, 2 `_POINTS`, 2, 2) of the edges at unit noise: n n^T ds, n the normal in the image."""
+def ring_edges(camera: Camera, target: Target, R: Tensor, t: Tensor, count: int) -> Points:
+    """Bits of edge, ``count`` on each of both circles of every ring, at poses (B, 3, 3), (B, 3) mm.
 
-    def image(turn: Tensor) -> Tensor:
-        points = target.centers[:, None] + _circle(target, target.radii, turn)
-        return camera.distort(_normalised(points, R, t))
-
-    tangent = torch.func.jacfwd(image)(t.new_zeros(()))  # px per rad
-    speed = tangent.norm(dim=-1, keepdim=True)
-    normal = torch.stack([-tangent[..., 1], tangent[..., 0]], -1) / speed
-    return normal[..., :, None] * normal[..., None, :] * (speed * 2 * torch.pi / _POINTS)[..., None]
-
-
-def _circle(target: Target, radii: Tensor, turn: float | Tensor = 0.0) -> Tensor:
-    """Offsets (M, 2 `_POINTS`, 3) mm of points of both circles from their centre."""
-    angle = torch.arange(_POINTS, dtype=radii.dtype, device=radii.device) * (2 * torch.pi / _POINTS) + turn
-    one, two = plane_axes(target.normals)
-    direction = angle.cos()[:, None] * one[:, None] + angle.sin()[:, None] * two[:, None]
-    return (radii[:, :, None, None] * direction[:, None]).flatten(1, 2)
+    The information about a bit is n n^T ds, n its normal in the image.
+    """
+    (out, ahead), radii = around(target, count), target.radii[..., None, None]
+    turn = R[:, None, None]
+    out, ahead = out[:, None] @ turn.mT, ahead[:, None] @ turn.mT  # (B, M, 1, count, 3)
+    arm = (target.centers @ R.mT)[:, :, None, None] + radii * out
+    xy, depth, by_point = _seen(camera, arm + t[:, None, None, None])
+    step = (by_point @ (radii * ahead * (2 * math.pi / count))[..., None])[..., 0]  # px from bit to bit
+    normal = torch.stack([step[..., 1], -step[..., 0]], -1)
+    information = normal[..., None] * normal[..., None, :] / step.norm(dim=-1)[..., None, None]
+    of_circle = torch.eye(2, dtype=t.dtype, device=t.device)[:, None, None]  # its own radius only
+    by_radii = (by_point @ out[..., None]) * of_circle
+    each = (arm, depth, xy, by_point, by_radii, information)
+    return Points(*(value.flatten(2, 3) for value in each))
 
 
-def _normalised(points: Tensor, R: Tensor, t: Tensor) -> Tensor:
-    """(B, M, N, 2) of points (M, N, 3) in the target frame."""
-    c = points @ R[:, None].mT + t[:, None, None]
-    return c[..., :2] / c[..., 2:]
+def _seen(camera: Camera, point: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of points (..., 3): image on the plane z = 1, depth, derivatives (..., 2, 3) of the pixels."""
+    depth, xy = point[..., 2], point[..., :2] / point[..., 2:]
+    return xy, depth, camera.J_distort(xy) @ image_by_point(xy, depth)
 
 
-def _print(target: Target, delta: Tensor) -> tuple[Tensor, Tensor]:
-    """Centres (M, 3) and radii (M, 2) of a print that differs from the target by ``delta``."""
-    one, two = plane_axes(target.normals)
-    offset = delta[10] * one + delta[11] * two + delta[12] * target.normals
-    return target.centers * (1 + delta[15]) + offset, target.radii * (1 + delta[15]) + delta[13:15]
+def around(target: Target, count: int) -> tuple[Float[Tensor, "M count 3"], Float[Tensor, "M count 3"]]:
+    """Unit vectors around each ring in its plane, and those a quarter turn ahead of them."""
+    angle = torch.arange(count, dtype=target.radii.dtype, device=target.radii.device)[:, None] * (2 * math.pi / count)
+    one, two = (axis[:, None] for axis in plane_axes(target.normals))
+    return angle.cos() * one + angle.sin() * two, angle.cos() * two - angle.sin() * one
 
 
-def _pixels(camera: Camera, xy: Tensor, delta: Tensor) -> Tensor:
-    """Pixels of normalised points (..., 2) with a camera that differs by ``delta``."""
-    bent = replace(camera, distortion=camera.distortion + delta[16:], covariance=None)
-    focal, center = camera.matrix.diagonal()[:2], camera.matrix[:2, 2]
-    return (bent.distort(xy) - center) * (1 + delta[6:8] / focal) + center + delta[8:10]
-
-
-def _inverse_covariances(image: float | Tensor, jacobian: Tensor) -> Tensor:
-    """Weights (B | 1, M, 1, 2, 2) of the centres; the identity where all are alike."""
-    if not isinstance(image, Tensor):
-        return torch.eye(2).to(jacobian)
-    return torch.linalg.inv(image.to(jacobian)).reshape(-1, jacobian.shape[1], 1, 2, 2)
-
-
-def _outer(columns: Tensor) -> Tensor:
-    return columns @ columns.mT
-
-
-def _invert(information: Tensor) -> Tensor:
-    """Inverse of positive semidefinite (B, 6, 6), whatever the units; NaN where it is singular."""
-    scale = information.diagonal(dim1=-2, dim2=-1).clamp_min(torch.finfo(information.dtype).tiny).rsqrt()
-    values, vectors = torch.linalg.eigh(information * scale[:, :, None] * scale[:, None])
-    values = torch.where(values[:, :1] > _SINGULAR, values, torch.nan)
-    vectors = scale[:, :, None] * vectors
-    return (vectors / values[:, None]) @ vectors.mT
+def marker_axes(target: Target) -> Float[Tensor, "M 3 3"]:
+    """Rows: two directions in the plane of each marker and its normal."""
+    return torch.stack([*plane_axes(target.normals), target.normals], 1)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.analysis import equations
@@ -20,29 +21,25 @@ from torchpose.target import Target
 class Sweep:
     """Errors of a target's pose at D distances on the optical axis; mm and rad, x y z and rotations about x y z.
 
-    Attributes:
-        distance: (D,) mm.
-        budget: predicted, by source. Its ``focal_length`` is the size of the effect of an error of exactly that share.
-        errors: (N, D, 6) of N draws, estimate minus truth. The focal length is wrong by its whole share in every draw.
-        lateral, depth, depth_focal: (D,) mm, size of eq. (3), (2) and (5) for the distance between neighbouring
-            markers.
+    The focal length is wrong by its whole share in every one of N draws; in the budget, ``focal_length`` is the size of
+    the effect of an error of exactly that share.
     """
 
-    distance: Tensor
-    budget: ErrorBudget
-    errors: Tensor
-    lateral: Tensor
-    depth: Tensor
-    depth_focal: Tensor
+    distance: Float[Tensor, " D"]
+    budget: ErrorBudget  # predicted, by source
+    errors: Float[Tensor, "N D 6"]  # estimate minus truth
+    lateral: Float[Tensor, " D"]  # size of eq. (3) for the distance between neighbouring markers
+    depth: Float[Tensor, " D"]  # the same of eq. (2)
+    depth_focal: Float[Tensor, " D"]  # the same of eq. (5)
 
     @property
-    def largest(self) -> Tensor:
-        """(D, 6), largest error of the draws."""
+    def largest(self) -> Float[Tensor, "D 6"]:
+        """Largest error of the draws."""
         return self.errors.abs().amax(0)
 
     @property
-    def rms(self) -> Tensor:
-        """(D, 6), root mean square of the draws."""
+    def rms(self) -> Float[Tensor, "D 6"]:
+        """Root mean square of the draws."""
         return self.errors.square().mean(0).sqrt()
 
 
@@ -59,25 +56,20 @@ def sweep(
     """Errors at the distances (D,), mm, the target's middle on the optical axis.
 
     Args:
+        distance: (D,) mm.
         uncertainty: with one number for ``image``. Its ``focal_length`` is taken as an error of that very size, the
             true lens being the longer one.
         tilt: rad, about the x axis.
     """
-    R = rotations.exp(torch.tensor([tilt, 0.0, 0.0], dtype=torch.float64)).expand(len(distance), 3, 3)
-    t = torch.stack([torch.zeros_like(distance), torch.zeros_like(distance), distance], -1).double()
-    t = t - (R @ target.centers.mean(0)) * torch.tensor([1.0, 1.0, 0.0])
+    distance = distance.double()
+    R = rotations.exp(distance.new_tensor([tilt, 0.0, 0.0])).expand(len(distance), 3, 3)
+    x, y, _ = (R @ target.centers.mean(0)).unbind(-1)
+    t = torch.stack([-x, -y, distance], -1)
     longer = camera.matrix.clone()
     longer[[0, 1], [0, 1]] *= 1 + uncertainty.focal_length
-    errors = simulate_points(
-        camera,
-        target,
-        R,
-        t,
-        replace(uncertainty, focal_length=0.0),
-        draws=draws,
-        seed=seed,
-        true_camera=replace(camera, matrix=longer),
-    )
+    true = replace(camera, matrix=longer)
+    exact = replace(uncertainty, focal_length=0.0)
+    errors = simulate_points(camera, target, R, t, exact, draws=draws, seed=seed, true_camera=true)
     f, near = float(camera.matrix[0, 0]), float(torch.pdist(target.centers).min())
     assert not isinstance(uncertainty.image, Tensor)
     return Sweep(
@@ -92,5 +84,5 @@ def sweep(
 
 def fit(distance: Tensor, value: Tensor, powers: Sequence[int]) -> Tensor:
     """Values (D,) of the least-squares polynomial in the distance with the given powers."""
-    columns = torch.stack([(distance / distance.max()) ** p for p in powers], -1)
+    columns = torch.stack([(distance / distance.max()) ** power for power in powers], -1)
     return columns @ torch.linalg.lstsq(columns, value[:, None]).solution[:, 0]

@@ -5,179 +5,114 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.calibration.views import Views
 from torchpose.camera import Camera
+from torchpose.camera.derivatives import by_intrinsics
 from torchpose.errors import ConfigError
-from torchpose.geometry import rotations
+from torchpose.geometry import least_squares
+from torchpose.geometry.least_squares import Code, Eliminated, Normal, Pose, Unknowns, Vector
+from torchpose.geometry.projection import by_pose, image_by_point
 from torchpose.geometry.segments import segment_sum
 
 _ITERATIONS = 200
+_DAMPING = 1e-3  # to begin with
 _RELATIVE = 1e-10  # decrease that a step must promise, of the cost
 
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Least-squares estimate of n intrinsics (fx, fy, cx, cy, then the distortion) and N poses.
-
-    Attributes:
-        camera: the estimate. R, t: (N, 3, 3), (N, 3), target to camera, mm.
-        residual: (K, 2) px, seen - predicted. chi2: (K,), in the covariances of the points.
-        information: (n, n), of the intrinsics, the poses being unknown (Schur complement).
-        pose_covariance: (N, 6, 6) of translation (mm), then rotation about the camera axes (rad), for exact intrinsics.
-        gain: (N, 6, n), d pose / d intrinsics at the optimum.
-        converged: whether the last step promised next to nothing.
-    """
+    """Least-squares estimate of n intrinsics (fx, fy, cx, cy, then the distortion) and N poses, target to camera."""
 
     camera: Camera
-    R: Tensor
-    t: Tensor
-    residual: Tensor
-    chi2: Tensor
-    information: Tensor
-    pose_covariance: Tensor
-    gain: Tensor
-    converged: bool
+    R: Float[Tensor, "N 3 3"]
+    t: Float[Tensor, "N 3"]  # mm
+    residual: Float[Tensor, "K 2"]  # seen - predicted, px
+    chi2: Float[Tensor, " K"]  # in the covariances of the points
+    information: Float[Tensor, "n n"]  # about the intrinsics, the poses being unknown
+    pose_covariance: Float[Tensor, "N 6 6"]  # translation (mm), rotation about the camera axes; for exact intrinsics
+    gain: Float[Tensor, "N 6 n"]  # d pose / d intrinsics at the optimum
+    converged: bool  # whether the last step promised next to nothing
 
 
-@dataclass(frozen=True, eq=False)
-class _Normal:
-    """Normal equations: U (n, n), W (N, 6, n), V (N, 6, 6), right-hand sides g (n,) and h (N, 6), cost, residuals."""
-
-    u: Tensor
-    w: Tensor
-    v: Tensor
-    g: Tensor
-    h: Tensor
-    cost: Tensor
-    residual: Tensor
-    chi2: Tensor
-
-
-def adjust(views: Views, camera: Camera, rotation: Tensor, translation: Tensor, *, free: bool = True) -> Bundle:
-    """Levenberg-Marquardt over intrinsics and poses; poses are eliminated by the Schur complement (Triggs et al. 2000).
-
-    Residuals are whitened by the covariances of the points. Without ``free`` the camera is given, only poses are found.
+def adjust(views: Views, camera: Camera, R: Tensor, t: Tensor, *, free: bool = True) -> Bundle:
+    """Levenberg-Marquardt over intrinsics and poses, the latter eliminated; residuals are whitened.
 
     Args:
-        views: with regular covariances. camera: to start from; its model and number of coefficients stay.
-        rotation, translation: (N, 3, 3), (N, 3), to start from.
+        views: with regular covariances.
+        camera: to start from; its model and number of coefficients stay.
+        R: (N, 3, 3), to start from.
+        t: (N, 3), to start from, mm.
+        free: whether the intrinsics are unknown; otherwise only poses are found.
 
     Raises:
         ConfigError: the start puts points behind the camera.
     """
-    root = torch.linalg.inv(torch.linalg.cholesky(views.covariance))
-    now = _normal(views, camera, rotation, translation, root, free)
-    if now is None:
+    whiten = torch.linalg.inv(torch.linalg.cholesky(views.covariance))
+    own = {"intrinsics": Vector(views.pixels.new_zeros(1, 4 + len(camera.distortion)))} if free else {}
+    start = Unknowns(own, {"pose": Pose(R, t)}, views.view.new_zeros(len(views)))
+
+    def bent(unknowns: Unknowns) -> Camera | None:
+        return moved_camera(camera, unknowns.values("intrinsics")[0]) if free else camera
+
+    def problem(unknowns: Unknowns) -> Normal:
+        moved = bent(unknowns)
+        if moved is None:
+            return replace(problem(start), cost=views.pixels.new_full((1,), torch.inf))
+        return _normal(views, moved, unknowns.pose, whiten, free)
+
+    found = least_squares.minimise(problem, start, _ITERATIONS, damping=_DAMPING, adaptive=True, tolerance=_RELATIVE)
+    moved, pose = bent(found.unknowns), found.unknowns.pose
+    normal = found.normal if free or moved is None else _normal(views, moved, pose, whiten, True)
+    part = normal.eliminated
+    if moved is None or part is None or not bool(normal.cost.isfinite().all()):
         raise ConfigError("INPUT: a view has points behind the camera that calibration starts from; remove --camera")
-    r, t, damping, converged = rotation, translation, 1e-3, False
-    for _ in range(_ITERATIONS):
-        step_k, step_pose, decrease = _step(now, damping)
-        if decrease < _RELATIVE * float(now.cost) + 1e-12:
-            converged = True
-            break
-        moved = moved_camera(camera, step_k) if free else camera
-        r_new, t_new = rotations.exp(step_pose[:, 3:]) @ r, t + step_pose[:, :3]
-        trial = None if moved is None else _normal(views, moved, r_new, t_new, root, free)
-        if moved is not None and trial is not None and trial.cost < now.cost:
-            camera, r, t, now, damping = moved, r_new, t_new, trial, max(0.1 * damping, 1e-12)
-        else:
-            damping *= 10
-            if damping > 1e12:  # rounding decides: nowhere lower
-                converged = True
-                break
-    if not free:
-        now = _normal(views, camera, r, t, root, True) or now
-    covariance = torch.linalg.inv(now.v)
-    information = now.u - (now.w.mT @ covariance @ now.w).sum(0)
-    return Bundle(camera, r, t, now.residual, now.chi2, information, covariance, -covariance @ now.w, converged)
+    covariance, _ = least_squares.scaled_inverse(part.information)
+    residual = views.pixels - moved.project(_placed(views, pose)[1])
+    chi2 = (whiten @ residual[..., None]).square().sum((-1, -2))
+    gain, converged = -covariance @ part.mixed.mT, int(found.code) == Code.CONVERGED
+    # without the trace of a diagonal that steps are solved with: whether the views tell is decided by this
+    information = normal.information[0] - (part.mixed @ covariance @ part.mixed.mT).sum(0)
+    return Bundle(moved, pose.R, pose.t, residual, chi2, information, covariance, gain, converged)
 
 
 def moved_camera(camera: Camera, step: Tensor) -> Camera | None:
     """The camera with intrinsics changed by ``step`` (n,); None where that is no camera."""
     matrix = camera.matrix.clone()
-    matrix[0, 0] += step[0]
-    matrix[1, 1] += step[1]
-    matrix[:2, 2] += step[2:4]
+    matrix[[0, 1, 0, 1], [0, 1, 2, 2]] += step[:4]
     if not bool(step.isfinite().all()) or float(matrix.diagonal()[:2].min()) <= 0:
         return None
     return replace(camera, matrix=matrix, distortion=camera.distortion + step[4:])
 
 
-def _step(n: _Normal, damping: float) -> tuple[Tensor, Tensor, float]:
-    """Damped steps of intrinsics (n,) and poses (N, 6), and the decrease of the cost that they promise."""
-    u = n.u + damping * torch.diag(n.u.diagonal())
-    v = n.v + damping * torch.diag_embed(n.v.diagonal(dim1=-2, dim2=-1))
-    v_inverse = torch.linalg.inv(v)
-    reduced = u - (n.w.mT @ v_inverse @ n.w).sum(0)
-    right = n.g - (n.w.mT @ v_inverse @ n.h[..., None]).sum(0)[:, 0]
-    # focal lengths count in thousands of px, distortion in hundredths
-    scale = reduced.diagonal().clamp_min(1e-300).rsqrt()
-    scaled, _ = torch.linalg.solve_ex(reduced * scale[:, None] * scale, right * scale)
-    step_k = scale * scaled
-    step_pose = (v_inverse @ (n.h - n.w @ step_k)[..., None])[..., 0]
-    gradient = step_k @ n.g + (step_pose * n.h).sum()
-    size = damping * ((step_k.square() * n.u.diagonal()).sum() + (step_pose.square() * n.v.diagonal(0, -2, -1)).sum())
-    return step_k, step_pose, float(gradient + size)
+def _placed(views: Views, pose: Pose) -> tuple[Tensor, Tensor]:
+    """Points about the target's origin (K, 3), and in the camera (K, 3), camera axes."""
+    arm = (pose.R[views.view] @ views.points[..., None])[..., 0]
+    return arm, arm + pose.t[views.view]
 
 
-def _normal(
-    views: Views, camera: Camera, rotation: Tensor, translation: Tensor, root: Tensor, free: bool
-) -> _Normal | None:
-    """Normal equations at a state, or None where a point is behind the camera or beyond the lens model."""
-    arm = (rotation[views.view] @ views.points[..., None])[..., 0]
-    x = arm + translation[views.view]
-    depth = x[:, 2]
-    if not bool((depth > 0).all()):
-        return None
-    xy = x[:, :2] / depth[:, None]
-    if float(xy.norm(dim=-1).max()) >= camera.fold_radius:
-        return None
-    predicted = camera.distort(xy)
-    residual = (root @ (views.pixels - predicted)[..., None])[..., 0]
-    eye = torch.eye(2, dtype=xy.dtype).expand(len(xy), 2, 2)
-    by_x = camera.J_distort(xy) @ torch.cat([eye, -xy[..., None]], -1) / depth[:, None, None]
-    pose = root @ torch.cat([by_x, -by_x @ rotations.skew(arm)], -1)
-    intrinsics = root @ (intrinsics_jacobian(camera, xy) if free else xy.new_zeros(len(xy), 2, 0))
-    count = len(views)
-    return _Normal(
-        (intrinsics.mT @ intrinsics).sum(0),
-        segment_sum(pose.mT @ intrinsics, views.view, count),
-        segment_sum(pose.mT @ pose, views.view, count),
-        (intrinsics.mT @ residual[..., None]).sum(0)[:, 0],
-        segment_sum((pose.mT @ residual[..., None])[..., 0], views.view, count),
-        residual.square().sum(),
-        views.pixels - predicted,
-        residual.square().sum(-1),
+def _normal(views: Views, camera: Camera, pose: Pose, whiten: Tensor, free: bool) -> Normal:
+    """Normal equations, of infinite cost where a point is behind the camera or beyond the lens model."""
+    arm, at = _placed(views, pose)
+    depth, xy = at[:, 2], at[:, :2] / at[:, 2:]
+    possible = (depth > 0).all() & (xy.norm(dim=-1) < camera.fold_radius).all()
+    residual = whiten @ (views.pixels - camera.distort(xy))[..., None]
+    by_view = whiten @ by_pose(camera.J_distort(xy) @ image_by_point(xy, depth), arm)
+    by_camera = whiten @ (by_intrinsics(camera, xy) if free else xy.new_zeros(len(xy), 2, 0))
+
+    def of_views(values: Tensor) -> Tensor:
+        return segment_sum(values, views.view, len(views))
+
+    return Normal(
+        (by_camera.mT @ by_camera).sum(0, keepdim=True),
+        (by_camera.mT @ residual).sum(0)[None, :, 0],
+        torch.where(possible, residual.square().sum(), torch.inf)[None],
+        Eliminated(
+            of_views(by_camera.mT @ by_view),
+            of_views(by_view.mT @ by_view),
+            of_views((by_view.mT @ residual)[..., 0]),
+            views.view.new_zeros(len(views)),
+        ),
     )
-
-
-def intrinsics_jacobian(camera: Camera, xy: Tensor) -> Tensor:
-    """d(u, v) / d(fx, fy, cx, cy, distortion): (K, 2, 4 + len(distortion)) at normalised coordinates (K, 2)."""
-    focal, center = camera.matrix.diagonal()[:2], camera.matrix[:2, 2]
-    bent = (camera.distort(xy) - center) / focal
-    eye = torch.eye(2, dtype=xy.dtype).expand(len(xy), 2, 2)
-    return torch.cat([torch.diag_embed(bent), eye, focal[:, None] * _by_distortion(camera, xy)], -1)
-
-
-def _by_distortion(camera: Camera, xy: Tensor) -> Tensor:
-    """Derivatives (K, 2, n) of the distorted normalised coordinates by the coefficients, in their order."""
-    d, r2 = camera.distortion, xy.square().sum(-1)
-    powers = torch.stack([r2, r2.square(), r2.pow(3)], -1)
-    if camera.model == "kannala_brandt":
-        r = r2.sqrt().clamp_min(1e-12)
-        theta = torch.atan(r)
-        odd = torch.stack([theta.pow(3), theta.pow(5), theta.pow(7), theta.pow(9)], -1) / r[:, None]
-        return xy[:, :, None] * odd[:, None]
-    if len(d) == 0:
-        return xy.new_zeros(len(xy), 2, 0)
-    denominator = 1 + powers @ d[5:8] if len(d) == 8 else torch.ones_like(r2)
-    radial = xy[:, :, None] * (powers / denominator[:, None])[:, None]
-    cross, square = 2 * xy.prod(-1), 2 * xy.square() + r2[:, None]
-    tangential = torch.stack([torch.stack([cross, square[:, 1]], -1), torch.stack([square[:, 0], cross], -1)], -1)
-    columns = [radial[..., :2], tangential, radial[..., 2:]]
-    if len(d) == 8:
-        numerator = 1 + powers @ d[[0, 1, 4]]
-        columns.append(-radial * (numerator / denominator)[:, None, None])
-    return torch.cat(columns, -1)[..., : len(d)]

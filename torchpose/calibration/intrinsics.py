@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field, replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchpose import pnp
@@ -39,29 +40,20 @@ _SINGULAR = 1e-12  # least eigenvalue of the information, scaled to a unit diago
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Result of `calibrate_intrinsics`.
+    """Result of `calibrate_intrinsics`."""
 
-    Attributes:
-        camera: the calibrated camera, with ``camera.covariance`` of fx, fy, cx, cy.
-        covariance: (n, n) of fx, fy, cx, cy (px) and the distortion; ``names`` says which is which.
-        views: those that were used, with the points that were used. bundle: poses and residuals of these.
-        left_out: points left out because they contradict the others.
-        chi2: sum over all points. degrees: of freedom. Their quotient is the reduced chi-squared.
-        common_sigma_px: standard deviation, px per axis, that had to be added to every point (print, flatness, lens
-            model) to make the reduced chi-squared 1; 0 where the covariances of the points explain the residuals.
-        warnings: what makes the result doubtful, one sentence each.
-    """
-
-    camera: Camera
-    covariance: Tensor
-    names: tuple[str, ...]
-    views: Views
-    bundle: Bundle
-    left_out: int
-    chi2: float
-    degrees: int
+    camera: Camera  # with ``camera.covariance`` of fx, fy, cx, cy
+    covariance: Float[Tensor, "n n"]  # of fx, fy, cx, cy (px) and the distortion
+    names: tuple[str, ...]  # of the intrinsics
+    views: Views  # that were used, with the points that were used
+    bundle: Bundle  # poses and residuals of these
+    left_out: int  # points left out because they contradict the others
+    chi2: float  # sum over all points
+    degrees: int  # of freedom
+    # px per axis, that had to be added to every point (print, flatness, lens model) to make the reduced chi-squared 1;
+    # 0 where the covariances of the points explain the residuals
     common_sigma_px: float
-    warnings: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)  # what makes the result doubtful, one sentence each
 
     @property
     def rms_px(self) -> float:
@@ -73,8 +65,8 @@ class Calibration:
         return self.chi2 / self.degrees
 
     @property
-    def pose_covariance(self) -> Tensor:
-        """(N, 6, 6) of the views' poses, the uncertainty of the intrinsics included."""
+    def pose_covariance(self) -> Float[Tensor, "N 6 6"]:
+        """Of the views' poses, the uncertainty of the intrinsics included."""
         gain = self.bundle.gain
         return self.bundle.pose_covariance + gain @ self.covariance @ gain.mT
 
@@ -86,8 +78,8 @@ def start_cameras(width: int, height: int, lens: str) -> list[Camera]:
         ConfigError: an unknown lens model.
     """
     model, names = _lens(lens)
-    matrices = [[[f * width, 0, (width - 1) / 2], [0, f * width, (height - 1) / 2], [0, 0, 1]] for f in _START_FOCALS]
-    return [Camera(width, height, torch.tensor(m).double(), torch.zeros(len(names)).double(), model) for m in matrices]
+    ideal = [Camera.ideal(width, height, focal * width) for focal in _START_FOCALS]
+    return [replace(camera, model=model, distortion=camera.matrix.new_zeros(len(names))) for camera in ideal]
 
 
 def _lens(name: str) -> tuple[Model, tuple[str, ...]]:
@@ -104,8 +96,8 @@ def with_lens(camera: Camera, lens: str) -> Camera:
     """
     model, names = _lens(lens)
     old = camera.distortion if camera.model == model else camera.distortion[:0]
-    distortion = torch.nn.functional.pad(old, (0, max(0, len(names) - len(old))))[: len(names)]
-    return replace(camera, model=model, distortion=distortion.double(), matrix=camera.matrix.double(), covariance=None)
+    distortion = torch.nn.functional.pad(old, (0, len(names) - len(old)))
+    return replace(camera, model=model, distortion=distortion, covariance=None).to(torch.float64)
 
 
 def calibrate_intrinsics(views: Views, starts: list[Camera], *, lens: str = "brown5") -> Calibration:
@@ -129,15 +121,12 @@ def calibrate_intrinsics(views: Views, starts: list[Camera], *, lens: str = "bro
     names = ("fx", "fy", "cx", "cy", *coefficients)
     views = views.of_views(views.counts >= MIN_POINTS)
     _check_count(views, len(names))
-    best = min(
-        (one for start in starts for one in [_first_fit(views, with_lens(start, lens))] if one is not None),
-        key=lambda one: float(one[0].chi2.sum()),
-        default=None,
-    )
+    fits = [_first_fit(views, with_lens(start, lens).to(views.pixels)) for start in starts]
+    best = min(filter(None, fits), key=lambda one: float(one[1].chi2.sum()), default=None)
     if best is None:
         raise ConfigError("INPUT: no pose explains the views; give --camera to start from and check the target")
-    before = len(best[1].view)
-    views, bundle, common = _weigh(best[1], best[0], len(names))
+    before = len(best[0].view)
+    views, bundle, common = _weigh(*best, len(names))
     if not bundle.converged:
         raise ConfigError("INPUT: calibration did not converge; use a simpler --model or more varied views")
     covariance = _covariance(bundle, names)
@@ -162,18 +151,14 @@ def locate_views(views: Views, camera: Camera) -> tuple[Views, Bundle]:
         ConfigError: no view has a pose.
     """
     views = views.of_views(views.counts >= MIN_POINTS)
-    first = _first_fit(views, camera, free=False) if len(views) else None
+    first = _first_fit(views, camera.to(views.pixels), free=False) if len(views) else None
     if first is None:
         raise ConfigError("INPUT: no view has a pose; check --camera, the target and the frames")
-    views, bundle, _ = _weigh(first[1], first[0], 0)
-    return views, bundle
+    return _weigh(*first, 0)[:2]
 
 
 def _weigh(views: Views, bundle: Bundle, unknowns: int) -> tuple[Views, Bundle, float]:
-    """Views without contradicting points, their fit with proper weights, and the common error in px.
-
-    ``unknowns``: number of intrinsics, 0 for a known camera.
-    """
+    """Views without contradicting points, their fit, weighted, of n unknown intrinsics, and the common error in px."""
     free, common = unknowns > 0, 0.0
     for _ in range(_ROUNDS):
         common = common_sigma(bundle.residual, views.covariance, _degrees(views, unknowns))
@@ -181,22 +166,22 @@ def _weigh(views: Views, bundle: Bundle, unknowns: int) -> tuple[Views, Bundle, 
         keep = bundle.chi2 < _OUTLIER * max(1.0, float(bundle.chi2.median()) / _MEDIAN)
         if bool(keep.all()):
             continue
-        views, bundle = _without(views, bundle, keep)
+        views = views[keep]
+        enough = views.counts >= MIN_POINTS
+        views = views.of_views(enough)
         _check_count(views, unknowns)
-        bundle = adjust(_with_common(views, common), bundle.camera, bundle.R, bundle.t, free=free)
+        bundle = adjust(_with_common(views, common), bundle.camera, bundle.R[enough], bundle.t[enough], free=free)
     return views, bundle, common
 
 
-def common_sigma(residual: Tensor, covariance: Tensor, degrees: int) -> float:
+def common_sigma(residual: Float[Tensor, "K 2"], covariance: Float[Tensor, "K 2 2"], degrees: int) -> float:
     """Standard deviation s, px per axis, with sum of r^T (C + s^2 I)^-1 r = degrees of freedom; 0 where C suffices.
 
-    Args:
-        residual: (K, 2) px. covariance: (K, 2, 2) px^2, zero where unknown. degrees: of freedom.
+    The covariance C is zero where it is unknown.
     """
 
-    def excess(s: float) -> float:
-        c = covariance + s * s * torch.eye(2, dtype=covariance.dtype)
-        return float((residual * torch.linalg.solve(c, residual)).sum()) / degrees - 1
+    def excess(sigma: float) -> float:
+        return float((residual * torch.linalg.solve(_widened(covariance, sigma), residual)).sum()) / degrees - 1
 
     high = max(float(residual.square().sum() / degrees) ** 0.5, 1e-9)
     low = 1e-6 * high
@@ -209,36 +194,31 @@ def common_sigma(residual: Tensor, covariance: Tensor, degrees: int) -> float:
     return high
 
 
+def _widened(covariance: Tensor, sigma: float) -> Tensor:
+    return covariance + sigma * sigma * torch.eye(2, dtype=covariance.dtype, device=covariance.device)
+
+
 def _with_common(views: Views, sigma: float) -> Views:
-    eye = torch.eye(2, dtype=torch.float64)
-    return replace(views, covariance=views.covariance + sigma * sigma * eye)
+    return replace(views, covariance=_widened(views.covariance, sigma))
 
 
-def _first_fit(views: Views, start: Camera, *, free: bool = True) -> tuple[Bundle, Views] | None:
+def _first_fit(views: Views, camera: Camera, *, free: bool = True) -> tuple[Views, Bundle] | None:
     """Fit with equal weights from one start: poses, everything, poses anew (the other planar solution), everything."""
-    equal = replace(views, covariance=_START_SIGMA**2 * torch.eye(2, dtype=torch.float64).expand(len(views.view), 2, 2))
-    camera, bundle = start, None
+    bundle = None
     for _ in range(2):
-        points, pixels, mask = equal.padded()
+        points, pixels, mask = views.padded()
         poses = pnp.solve(points, pixels, camera, mask=mask)
         solved = poses.R.isfinite().all(-1).all(-1) & (poses.t[:, 2] > 0)
-        if int(solved.sum()) < len(equal):
-            equal, views = equal.of_views(solved), views.of_views(solved)
-            if len(equal) == 0:
-                return None
+        if not bool(solved.any()):
+            return None
+        views = views.of_views(solved)
+        equal = _with_common(replace(views, covariance=torch.zeros_like(views.covariance)), _START_SIGMA)
         try:
             bundle = adjust(equal, camera, poses.R[solved], poses.t[solved], free=free)
         except (ConfigError, torch.linalg.LinAlgError):
             return None
         camera = bundle.camera
-    return None if bundle is None else (bundle, views)
-
-
-def _without(views: Views, bundle: Bundle, keep: Tensor) -> tuple[Views, Bundle]:
-    """Views and state without some of the points, and without views that have too few left."""
-    rest = views.of_points(keep)
-    enough = rest.counts >= MIN_POINTS
-    return rest.of_views(enough), replace(bundle, R=bundle.R[enough], t=bundle.t[enough])
+    return None if bundle is None else (views, bundle)
 
 
 def _degrees(views: Views, unknowns: int) -> int:
@@ -265,41 +245,35 @@ def _covariance(bundle: Bundle, names: tuple[str, ...]) -> Tensor:
             f"INPUT: the views are too alike to tell the intrinsics apart (mostly {direction}); "
             "add views tilted by 20 to 45 degrees in different directions"
         )
-    vectors = scale[:, None] * vectors
-    covariance = (vectors / values) @ vectors.T
-    return 0.5 * (covariance + covariance.T)
-
-
-def tilt_spread_deg(rotation: Tensor) -> float:
-    """Largest angle between the normals of any two views (N, 3, 3), in degrees."""
-    normal = rotation[:, :, 2]
-    return float((normal @ normal.T).clamp(-1, 1).acos().max().rad2deg())
+    root = scale[:, None] * vectors * values.rsqrt()
+    return root @ root.T
 
 
 def _warnings(views: Views, bundle: Bundle, covariance: Tensor, common: float) -> list[str]:
-    notes = []
-    if common > _LARGE_ERROR:
-        notes.append(
+    normal, reach = bundle.R[:, :, 2], views.pixels.amax(0) - views.pixels.amin(0)
+    spread = float((normal @ normal.T).clamp(-1, 1).acos().max().rad2deg())
+    focal = float((covariance.diagonal()[:2].sqrt() / bundle.camera.matrix.diagonal()[:2]).max())
+    covered = reach > _LITTLE_COVER * reach.new_tensor([bundle.camera.width, bundle.camera.height])
+    doubts = [
+        (
+            common > _LARGE_ERROR,
             f"the points are {common:.2g} px off, more than print and lens explain; check the target file, --model, "
-            "and that all frames are of one camera with one focus"
-        )
-    focal, sigma = bundle.camera.matrix.diagonal()[:2], covariance.diagonal()[:2].sqrt()
-    spread = tilt_spread_deg(bundle.R)
-    if spread < _LITTLE_TILT_DEG:
-        notes.append(
+            "and that all frames are of one camera with one focus",
+        ),
+        (
+            spread < _LITTLE_TILT_DEG,
             f"views too alike: their tilts differ by {spread:.0f} degrees at most, so focal length and distance are "
-            "hard to tell apart; add views tilted by 20 to 45 degrees in different directions"
-        )
-    if float((sigma / focal).max()) > _WIDE_SIGMA:
-        notes.append(
-            f"the focal length is known to {float((sigma / focal).max()):.2%} only, which is the relative error of "
-            "every distance; add tilted views, or views that fill the frame"
-        )
-    reach = views.pixels.amax(0) - views.pixels.amin(0)
-    size = reach.new_tensor([bundle.camera.width, bundle.camera.height])
-    if len(bundle.camera.distortion) and not bool((reach > _LITTLE_COVER * size).all()):
-        notes.append(
+            "hard to tell apart; add views tilted by 20 to 45 degrees in different directions",
+        ),
+        (
+            focal > _WIDE_SIGMA,
+            f"the focal length is known to {focal:.2%} only, which is the relative error of every distance; "
+            "add tilted views, or views that fill the frame",
+        ),
+        (
+            len(bundle.camera.distortion) > 0 and not bool(covered.all()),
             "the points cover less than half of the frame's width or height, so the distortion beyond them is "
-            "extrapolated; add views with the target near borders and corners"
-        )
-    return notes
+            "extrapolated; add views with the target near borders and corners",
+        ),
+    ]
+    return [text for doubtful, text in doubts if doubtful]

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchpose.calibration.views import Views
 from torchpose.camera import Camera
 from torchpose.detect import find_candidates
+from torchpose.geometry.projection import image_by_point
 from torchpose.identify import MarkerTable, identify
 from torchpose.pipeline import PoseEstimator
 from torchpose.pose import common_center, raw_centers
@@ -26,7 +27,8 @@ def find_rings(names: Sequence[str], frames: Tensor, cameras: Sequence[Camera], 
     """Views of a target by cameras that are rough guesses: the exact common centres of each ring's two ellipses.
 
     Args:
-        names: of the B frames. frames: (B, H, W), see `torchpose.PoseEstimator`.
+        names: of the B frames.
+        frames: (B, H, W), see `torchpose.PoseEstimator`.
         cameras: to identify the markers with, one after the other; if there are several, all without distortion.
 
     Returns:
@@ -44,7 +46,7 @@ def find_rings(names: Sequence[str], frames: Tensor, cameras: Sequence[Camera], 
         center, covariance = common_center(rings.outer[at], rings.inner[at], target.radii[marker])
         # ellipses are in the pixels of the first camera without its distortion
         pixels, covariance = raw_centers(cameras[0], center, covariance)
-        every.append(Views(tuple(names), view, target.ids[marker], target.centers[marker], pixels, covariance))
+        every.append(Views(view, target.ids[marker], target.centers[marker], pixels, covariance, tuple(names)))
     return every
 
 
@@ -66,8 +68,8 @@ def measure_centers(names: Sequence[str], frames: Tensor, camera: Camera, target
     marker = (found.marker[:, None] == target.ids).long().argmax(1)
     points, rotation = target.centers[marker], poses.R[found.frame]
     arm = (rotation @ points[..., None])[..., 0]
-    held = torch.diag(torch.tensor([0.0, 0, 0, _HELD, _HELD, _HELD], dtype=torch.float64)).expand(len(marker), 6, 6)
-    one = torch.ones(len(marker), 1, dtype=torch.float64, device=rotation.device)
+    held = torch.diag(points.new_tensor([0.0, 0, 0, _HELD, _HELD, _HELD])).expand(len(marker), 6, 6)
+    one = torch.ones_like(points[:, :1])
     sight = Sight(
         found.frame,
         one > 0,
@@ -80,11 +82,9 @@ def measure_centers(names: Sequence[str], frames: Tensor, camera: Camera, target
         camera,
     )
     refined = refine_photometric(sight, rotation, arm + poses.t[found.frame], prior=held)
-    x = refined.t
-    xy = x[:, :2] / x[:, 2:]
-    eye = torch.eye(2, dtype=torch.float64).expand(len(x), 2, 2)
-    jacobian = camera.J_distort(xy) @ torch.cat([eye, -xy[..., None]], -1) / x[:, 2, None, None]
+    xy = refined.t[:, :2] / refined.t[:, 2:]
+    jacobian = camera.J_distort(xy) @ image_by_point(xy, refined.t[:, 2])
     covariance = jacobian @ refined.covariance[:, :3, :3] @ jacobian.mT
     pixels = camera.distort(xy)
     good = refined.good & (refined.kept > _LEAST_KEPT) & pixels.isfinite().all(-1)
-    return Views(tuple(names), found.frame, found.marker, points, pixels, covariance).of_points(good)
+    return Views(found.frame, found.marker, points, pixels, covariance, tuple(names))[good]

@@ -4,19 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
-import torch
 from torch import Tensor
 
 from torchpose.calibration.boards import Board, find_corners
 from torchpose.calibration.bundle import Bundle
-from torchpose.calibration.hand_eye import HandEyeFit, calibrate_hand_eye
-from torchpose.calibration.intrinsics import (
-    Calibration,
-    calibrate_intrinsics,
-    locate_views,
-    start_cameras,
-    with_lens,
-)
+from torchpose.calibration.hand_eye import HandEyeFit, Mount, calibrate_hand_eye
+from torchpose.calibration.intrinsics import Calibration, calibrate_intrinsics, locate_views, start_cameras, with_lens
 from torchpose.calibration.rings import find_rings, measure_centers
 from torchpose.calibration.views import Views
 from torchpose.camera import Camera
@@ -37,8 +30,9 @@ def calibrate_camera(frames: Frames, shown: Target | Board, start: Camera, *, gu
     the grey values.
 
     Args:
-        frames: read once for a board, twice for a target. start: with the frames' size.
+        frames: read once for a board, twice for a target.
         guess: only the size of ``start`` is known; several focal lengths are tried.
+        lens: a name of `torchpose.calibration.LENS_MODELS`.
 
     Raises:
         ConfigError: nothing in view, or as `calibrate_intrinsics`.
@@ -88,13 +82,11 @@ def calibrate_robot(
     Raises:
         ConfigError: as `calibrate_hand_eye`, or poses of robot and target that have nothing to do with each other.
     """
-    tool = torch.tensor([robot[name] for name in views.names], dtype=torch.float64)
-    poses = (rotations.exp(tool[:, 3:]), tool[:, :3])
+    tool = bundle.t.new_tensor([robot[name] for name in views.names])
+    poses, seen = (rotations.exp(tool[:, 3:]), tool[:, :3]), (bundle.R, bundle.t)
     shift = None if intrinsics is None else (bundle.gain[..., : len(intrinsics)], intrinsics)
-    fits = [
-        calibrate_hand_eye(poses, (bundle.R, bundle.t), bundle.pose_covariance, mount, intrinsics=shift)
-        for mount in ("base", "tool")
-    ]
+    mounts: tuple[Mount, Mount] = ("base", "tool")
+    fits = [calibrate_hand_eye(poses, seen, bundle.pose_covariance, mount, intrinsics=shift) for mount in mounts]
     fit = min(fits, key=lambda one: one.robot_sigma_mm)
     if fit.robot_sigma_mm > _MOST_NOISE[0] or fit.robot_sigma_rad > _MOST_NOISE[1]:
         raise ConfigError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
@@ -65,10 +66,22 @@ class Camera:
     model: Model = "brown_conrady"
     covariance: Tensor | None = None
 
+    if TYPE_CHECKING:  # of tensors the fields are made by __post_init__
+
+        def __init__(
+            self,
+            width: int,
+            height: int,
+            matrix: Tensor | np.ndarray | Sequence[Sequence[float]],
+            distortion: Tensor | np.ndarray | Sequence[float],
+            model: Model = "brown_conrady",
+            covariance: Tensor | np.ndarray | Sequence[Sequence[float]] | None = None,
+        ) -> None: ...
+
     @classmethod
     def ideal(cls, width: int, height: int, focal: float) -> Camera:
         """A camera without distortion, its optical axis in the middle of the frame; all in px."""
-        return cls(width, height, [[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]], [])  # type: ignore[arg-type]
+        return cls(width, height, [[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]], [])
 
     def __post_init__(self) -> None:
         for name, field in _FIELDS.items():
@@ -172,7 +185,7 @@ class Camera:
             ConfigError: its matrix has skew, or another field is wrong.
         """
         width, height = (int(size[index]) for size in (camera.width, camera.height))
-        return cls(width, height, camera.camera_matrix[index].double(), [])  # type: ignore[arg-type]
+        return cls(width, height, camera.camera_matrix[index].double(), [])
 
     @cached_property
     def _distorts(self) -> bool:

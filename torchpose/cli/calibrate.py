@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchpose.cli.common import INTERRUPTED, cores, report_unreadable
+from torchpose.cli.common import Quiet, Threads, check_robot_poses, cores, ended, interrupted
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -21,54 +21,30 @@ if TYPE_CHECKING:
     from torchpose.io.sources import Source
     from torchpose.target import Target
 
-EPILOG = """
-Examples:
-
-`torchpose calibrate views/ --target quad40 --out camera.yaml --plots calibration/`
-
-`torchpose calibrate views/ --board chessboard:9x6:5mm --out camera.yaml --model brown4`
-
-`torchpose calibrate run/manifest.jsonl --target quad40 --out camera.yaml --hand-eye-out handeye.yaml`
-
-`torchpose calibrate run/manifest.jsonl --target quad40 --camera camera.yaml --hand-eye-out handeye.yaml`
-
-Take 15 views or more, tilted by 20 to 45 degrees in all directions, that reach borders and corners of the frame.
-
-Exit codes: 0 calibrated, also with warnings; 1 a frame could not be read (the others were used); 2 a usage or
-configuration error, too few views or views too alike; 130 interrupted.
-"""
+_BOARD = (
+    "Instead of a target: chessboard:9x6:5mm (inner corners, square) or charuco:8x5:10mm:7mm:4X4_50 (squares, square, "
+    "marker, dictionary)."
+)
+_HAND_EYE_OUT = (
+    "Hand-eye file to write; needs a manifest with robot poses. Which of camera and target is on the tool is found "
+    "from the poses."
+)
+_LENSES = "pinhole|brown4|brown5|rational8|kannala_brandt"
+_INPUTS = "Image files, folders or capture manifests (.jsonl) of one camera."
+_OUT = "Camera file to write; without it --camera is taken as it is."
 
 
 def calibrate(
-    inputs: Annotated[
-        list[Path],
-        typer.Argument(metavar="INPUT...", help="Image files, folders or capture manifests (.jsonl) of one camera."),
-    ],
+    inputs: Annotated[list[Path], typer.Argument(metavar="INPUT...", help=_INPUTS)],
     target: Annotated[str | None, typer.Option(help="Target file or name of a built-in target.")] = None,
-    board: Annotated[
-        str | None,
-        typer.Option(
-            help="Instead of a target: chessboard:9x6:5mm (inner corners, square) or charuco:8x5:10mm:7mm:4X4_50 "
-            "(squares, square, marker, dictionary)."
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="Camera file to write; without it --camera is taken as it is.")
-    ] = None,
+    board: Annotated[str | None, typer.Option(help=_BOARD)] = None,
+    out: Annotated[Path | None, typer.Option(help=_OUT)] = None,
     camera: Annotated[str | None, typer.Option(help="Camera file to start from, or to use.")] = None,
-    model: Annotated[
-        str, typer.Option(metavar="pinhole|brown4|brown5|rational8|kannala_brandt", help="Distortion of the lens.")
-    ] = "brown5",
-    hand_eye_out: Annotated[
-        Path | None,
-        typer.Option(
-            help="Hand-eye file to write; needs a manifest with robot poses. Which of camera and target is on "
-            "the tool is found from the poses."
-        ),
-    ] = None,
+    model: Annotated[str, typer.Option(metavar=_LENSES, help="Distortion of the lens.")] = "brown5",
+    hand_eye_out: Annotated[Path | None, typer.Option(help=_HAND_EYE_OUT)] = None,
     plots: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for residual plots and tables.")] = None,
-    threads: Annotated[int | None, typer.Option(min=1, help="Threads to use; by default one a core.")] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar.")] = False,
+    threads: Threads = None,
+    quiet: Quiet = False,
 ) -> int:
     """Calibrate a camera from views of a target, and where it sits on the robot, each with its covariance."""
     from torchpose.calibration.boards import Board
@@ -79,6 +55,35 @@ def calibrate(
 
     if (target is None) == (board is None):
         raise ConfigError("--target: give either --target or --board, what the frames show")
+    _check_files(out, hand_eye_out, camera)
+    sources = find_sources(inputs)
+    if hand_eye_out is not None:
+        check_robot_poses(sources)
+    start = None if camera is None else Camera.load(camera)
+    shown = Target.load(target) if target is not None else Board.parse(board or "")
+    frames = _Frames(sources, start, threads=threads or cores(), quiet=quiet)
+    calibration = fit = None
+    try:
+        with native_stderr_silenced():
+            if out is not None:
+                calibration = _calibrate(frames, shown, start, model)
+                _show(calibration, len(sources))
+                calibration.camera.save(out)
+            if hand_eye_out is not None:
+                fit = _hand_eye(frames, shown, calibration, start)
+                _show_hand_eye(fit)
+                fit.hand_eye.save(hand_eye_out)
+            if plots is not None:
+                from torchpose.report.calibration import save_calibration
+
+                for path in save_calibration(calibration, fit, plots):
+                    typer.echo(str(path))
+    except KeyboardInterrupt:
+        return interrupted("nothing more was written; run again")
+    return ended(frames.unreadable)
+
+
+def _check_files(out: Path | None, hand_eye_out: Path | None, camera: str | None) -> None:
     if out is None and hand_eye_out is None:
         raise ConfigError(
             "--out: nothing to write; give --out for the camera, --hand-eye-out for its place on the robot"
@@ -88,47 +93,13 @@ def calibrate(
     for path, option in ((out, "--out"), (hand_eye_out, "--hand-eye-out")):
         if path is not None and not path.parent.is_dir():
             raise ConfigError(f"{path}: {option}: folder {path.parent} does not exist; create it or choose another")
-    sources = find_sources(inputs)
-    without = [source for source in sources if source.robot_pose is None]
-    if hand_eye_out is not None and without:
-        raise ConfigError(
-            f"{without[0].path}: robot_pose: missing for {len(without)} of {len(sources)} frames; "
-            "give a capture manifest with robot poses as INPUT"
-        )
-    start = None if camera is None else Camera.load(camera)
-    robot = {source.name: source.robot_pose for source in sources if source.robot_pose is not None}
-    shown = Target.load(target) if target is not None else Board.parse(board or "")
-    frames = _Frames(sources, start, threads=threads or cores(), quiet=quiet)
-    try:
-        with native_stderr_silenced():
-            calibration = None if out is None else _calibrate(frames, shown, start, model)
-            if calibration is not None and out is not None:
-                _show(calibration, len(sources))
-                calibration.camera.save(out)
-            fit = None
-            if hand_eye_out is not None:
-                fit = _hand_eye(frames, shown, calibration, start, robot)
-                _show_hand_eye(fit)
-                fit.hand_eye.save(hand_eye_out)
-            if plots is not None:
-                from torchpose.report.calibration import save_calibration
-
-                for path in save_calibration(calibration, fit, plots):
-                    typer.echo(str(path))
-    except KeyboardInterrupt:
-        typer.echo("torchpose: error: interrupted: nothing more was written; run again", err=True)
-        return INTERRUPTED
-    if frames.unreadable:
-        report_unreadable(frames.unreadable)
-        return 1
-    return 0
 
 
 class _Frames:
     """The frames of all sources in batches, anew at every call; what could not be read is remembered."""
 
     def __init__(self, sources: Sequence[Source], start: Camera | None, *, threads: int, quiet: bool) -> None:
-        self._sources, self._threads, self._quiet = sources, threads, quiet
+        self.sources, self._threads, self._quiet = sources, threads, quiet
         self.width, self.height = (start.width, start.height) if start is not None else _first_size(sources)
         self.unreadable: dict[str, str] = {}
 
@@ -139,8 +110,8 @@ class _Frames:
         from torchpose.io.reader import FrameReader, default_batch, in_batches
         from torchpose.results import Status
 
-        batches = in_batches(self._sources, default_batch(self.width, self.height))
-        with FrameProgress(len(self._sources), 0, quiet=self._quiet) as progress:
+        batches = in_batches(self.sources, default_batch(self.width, self.height))
+        with FrameProgress(len(self.sources), 0, quiet=self._quiet) as progress:
             for batch in FrameReader(batches, self.width, self.height, threads=self._threads):
                 for position, fault in batch.faults.items():
                     source = batch.sources[position]
@@ -176,14 +147,11 @@ def _calibrate(frames: _Frames, shown: Target | Board, start: Camera | None, mod
 
 
 def _hand_eye(
-    frames: _Frames,
-    shown: Target | Board,
-    calibration: Calibration | None,
-    camera: Camera | None,
-    robot: dict[str, tuple[float, ...]],
+    frames: _Frames, shown: Target | Board, calibration: Calibration | None, camera: Camera | None
 ) -> HandEyeFit:
     from torchpose.calibration.session import calibrate_robot, locate_camera
 
+    robot = {source.name: source.robot_pose for source in frames.sources if source.robot_pose is not None}
     if calibration is not None:
         return calibrate_robot(calibration.views, calibration.bundle, calibration.covariance, robot)
     assert camera is not None  # checked with the options
@@ -191,30 +159,30 @@ def _hand_eye(
     return calibrate_robot(views, bundle, camera.covariance, robot)
 
 
-def _show(c: Calibration, frames: int) -> None:
+def _show(found: Calibration, frames: int) -> None:
     """The intrinsics with their standard deviations, and what they were computed from."""
-    k = c.camera.matrix
-    values = [*k.diagonal()[:2].tolist(), *k[:2, 2].tolist(), *c.camera.distortion.tolist()]
-    for name, value, sigma in zip(c.names, values, c.covariance.diagonal().sqrt().tolist(), strict=True):
+    matrix = found.camera.matrix
+    values = [*matrix.diagonal()[:2].tolist(), *matrix[:2, 2].tolist(), *found.camera.distortion.tolist()]
+    for name, value, sigma in zip(found.names, values, found.covariance.diagonal().sqrt().tolist(), strict=True):
         digits = max(0, 1 - math.floor(math.log10(sigma))) if sigma > 0 else 6
         typer.echo(f"{name:>3} {value:14.{digits}f} +- {sigma:.2g}{' px' if name[0] in 'fc' else ''}")
-    left = f", {c.left_out} points left out" if c.left_out else ""
-    typer.echo(f"{len(c.views)} of {frames} views, {len(c.views.view)} points{left}, residual RMS {c.rms_px:.3g} px")
-    if c.common_sigma_px:
-        typer.echo(f"{c.common_sigma_px:.3g} px per axis, beyond the noise of the frames, in every point")
-    for warning in c.warnings:
+    points = f"{len(found.views.view)} points{f', {found.left_out} points left out' if found.left_out else ''}"
+    typer.echo(f"{len(found.views)} of {frames} views, {points}, residual RMS {found.rms_px:.3g} px")
+    if found.common_sigma_px:
+        typer.echo(f"{found.common_sigma_px:.3g} px per axis, beyond the noise of the frames, in every point")
+    for warning in found.warnings:
         typer.echo(f"warning: {warning}", err=True)
 
 
 def _show_hand_eye(fit: HandEyeFit) -> None:
     from torchpose.geometry import rotations
 
-    h = fit.hand_eye
-    assert h.covariance is not None  # always there after a fit
-    sigma = h.covariance.diagonal().sqrt().tolist()
-    typer.echo(f"{h.mount}_from_camera, from {len(fit.residual)} poses")
-    for name, value, s in zip("xyz", h.translation.tolist(), sigma[:3], strict=True):
-        typer.echo(f"{name:>3} {value:12.4f} +- {s:.2g} mm")
-    for name, value, s in zip(("rx", "ry", "rz"), rotations.log(h.rotation).tolist(), sigma[3:], strict=True):
-        typer.echo(f"{name:>3} {value:12.7f} +- {s:.2g} rad")
+    found = fit.hand_eye
+    assert found.covariance is not None  # always there after a fit
+    sigmas = found.covariance.diagonal().sqrt().tolist()
+    typer.echo(f"{found.mount}_from_camera, from {len(fit.residual)} poses")
+    for name, value, sigma in zip("xyz", found.translation.tolist(), sigmas[:3], strict=True):
+        typer.echo(f"{name:>3} {value:12.4f} +- {sigma:.2g} mm")
+    for name, value, sigma in zip("xyz", rotations.log(found.rotation).tolist(), sigmas[3:], strict=True):
+        typer.echo(f" r{name} {value:12.7f} +- {sigma:.2g} rad")
     typer.echo(f"robot noise {fit.robot_sigma_mm:.2g} mm and {fit.robot_sigma_rad:.2g} rad per axis")

@@ -17,20 +17,6 @@ if TYPE_CHECKING:
     from torchpose.rig.settings import Rig
     from torchpose.rig.status import LiveStatus
 
-EPILOG = """
-Examples:
-
-`torchpose capture configs/rig/paper_plan.yaml --rig configs/rig/ur5_20mp.yaml --out run --dry-run`
-
-`torchpose capture configs/rig/paper_plan.yaml --rig configs/rig/ur5_20mp.yaml --twin configs/rig/twin.yaml --out run`
-
-Then `torchpose estimate run/manifest.jsonl --camera camera.yaml --target quad40 --out poses.csv`. docs/rig.md describes
-the files, the faults and the first run on real hardware.
-
-Exit codes: 0 all frames are there; 1 a fault of robot, camera or disk ended the session (go on with `--resume`); 2 a
-usage or configuration error; 130 interrupted, the robot is stopped (go on with `--resume`).
-"""
-
 
 def capture(
     plan: Annotated[Path, typer.Argument(metavar="PLAN", help="Capture plan (YAML): the poses of the tool.")],

@@ -1,11 +1,11 @@
-"""What the commands share: cores, checks of outputs, the line about unreadable files, exit codes."""
+"""What the commands share: options, cores, checks of inputs and outputs, the last line and the exit code."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -16,12 +16,18 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130  # as shells have it: 128 + SIGINT
 
+Threads = Annotated[int | None, typer.Option(min=1, help="Threads to use; by default one a core.")]
+Batch = Annotated[int | None, typer.Option(min=1, help="Frames at once; by default chosen by their size.")]
+Overlay = Annotated[
+    Path | None, typer.Option(metavar="DIR", help="Folder for pictures of what was found, one a frame.")
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar.")]
+Silent = Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar and no summary.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Keep the frames that an earlier run finished.")]
+
 
 def check_outputs(
-    inputs: Sequence[Path],
-    sources: Sequence[Source],
-    tables: list[Path],
-    overlay: Path | None,
+    inputs: Sequence[Path], sources: Sequence[Source], tables: Sequence[Path], overlay: Path | None
 ) -> None:
     """Refuses outputs that would overwrite or mingle with inputs."""
     read = {path.resolve() for path in inputs}
@@ -44,12 +50,31 @@ def check_outputs(
         raise ConfigError(f"{overlay}: --overlay: its pictures would overwrite the frames; choose another folder")
 
 
+def check_robot_poses(sources: Sequence[Source], why: str = "") -> None:
+    """Refuses frames without a robot pose; ``why`` they need one."""
+    without = [source for source in sources if source.robot_pose is None]
+    if without:
+        raise ConfigError(
+            f"{without[0].path}: robot_pose: missing for {len(without)} of {len(sources)} frames{why}; "
+            "give a capture manifest with robot poses as INPUT"
+        )
+
+
 def cores() -> int:
     """Cores that this process may use, where the system tells."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def report_unreadable(unreadable: dict[str, str]) -> None:
+def interrupted(what: str) -> int:
+    """Tells what an interruption has left; the exit code."""
+    typer.echo(f"torchpose: error: interrupted: {what}", err=True)
+    return INTERRUPTED
+
+
+def ended(unreadable: dict[str, str]) -> int:
+    """Tells of frames that could not be read, by name with the reason; the exit code of a run that came to its end."""
+    if not unreadable:
+        return 0
     shown = [f"{frame} ({reason})" for frame, reason in list(unreadable.items())[:5]]
     more = [f"and {len(unreadable) - 5} more"] if len(unreadable) > 5 else []
     typer.echo(
@@ -57,3 +82,4 @@ def report_unreadable(unreadable: dict[str, str]) -> None:
         "replace the files and run again",
         err=True,
     )
+    return 1

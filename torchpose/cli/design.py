@@ -15,61 +15,42 @@ from torchpose.errors import ConfigError
 if TYPE_CHECKING:  # imported where they are used: torch takes more than a second, which --help need not wait for
     from torchpose.camera import Camera
     from torchpose.design import Imaging, Need, Precision, WorkingVolume
-    from torchpose.io.rows import Row
     from torchpose.target import Target
 
-EPILOG = """
-Examples:
-
-`torchpose design --camera camera.yaml --distance 160 --tilt 20 --plate 70x70 --accuracy-um 0.5 2 --out design/`
-
-`torchpose design --target quad40 --plate 70x70 --out sheet/`: the print sheet of an existing target; with `--camera`
-and `--distance` its predicted precision as well.
-
-Exit codes: 0 the files are written; 2 a usage or configuration error, or no target reaches the accuracy.
-"""
+_Need = Annotated[
+    tuple[float, float] | None,
+    typer.Option(metavar="LATERAL DEPTH", help="Standard deviations needed across and along the optical axis, um."),
+]
+_TARGET = "Existing target, file or built-in name: its sheet instead of a new design."
+_RANGE = "Nearest and farthest distance, mm."
+_TILT = "Largest tilt against the optical axis, in any direction, degrees."
+_OFFSET = "Largest distance off the optical axis, mm."
+_ANGLE = "Standard deviation needed about every axis, degrees."
+_MARKERS = "Number of rings: 4, 6, 8, 9, 10 or 12; by default the fewest that do."
+_LEVELS = "Grey levels of print and paper."
+_APERTURE = "Aperture: counts the blur out of focus and notes the depth of field."
+_TONE = "Tone around the rings: dark rings on light, or the reverse."
 
 
 def design(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for target file, print sheet, table and map.")],
     camera: Annotated[str | None, typer.Option(help="Camera file, as for estimate.")] = None,
-    target: Annotated[
-        str | None, typer.Option(help="Existing target, file or built-in name: its sheet instead of a new design.")
-    ] = None,
+    target: Annotated[str | None, typer.Option(help=_TARGET)] = None,
     distance: Annotated[float | None, typer.Option(help="Distance of the target, mm.")] = None,
-    distance_range: Annotated[
-        tuple[float, float] | None, typer.Option(metavar="NEAR FAR", help="Nearest and farthest distance, mm.")
-    ] = None,
-    tilt: Annotated[
-        float, typer.Option(help="Largest tilt against the optical axis, in any direction, degrees.")
-    ] = 0.0,
+    distance_range: Annotated[tuple[float, float] | None, typer.Option(metavar="NEAR FAR", help=_RANGE)] = None,
+    tilt: Annotated[float, typer.Option(help=_TILT)] = 0.0,
     roll: Annotated[float, typer.Option(help="Largest turn about the optical axis, degrees; 180: any.")] = 180.0,
-    offset: Annotated[
-        tuple[float, float], typer.Option(metavar="X Y", help="Largest distance off the optical axis, mm.")
-    ] = (0.0, 0.0),
+    offset: Annotated[tuple[float, float], typer.Option(metavar="X Y", help=_OFFSET)] = (0.0, 0.0),
     plate: Annotated[str | None, typer.Option(metavar="WxH", help="Width and height of the plate, mm.")] = None,
-    accuracy_um: Annotated[
-        tuple[float, float] | None,
-        typer.Option(metavar="LATERAL DEPTH", help="Standard deviations needed across and along the optical axis, um."),
-    ] = None,
-    accuracy_deg: Annotated[
-        float | None, typer.Option(help="Standard deviation needed about every axis, degrees.")
-    ] = None,
-    markers: Annotated[
-        int | None, typer.Option(help="Number of rings: 4, 6, 8, 9, 10 or 12; by default the fewest that do.")
-    ] = None,
+    accuracy_um: _Need = None,
+    accuracy_deg: Annotated[float | None, typer.Option(help=_ANGLE)] = None,
+    markers: Annotated[int | None, typer.Option(help=_MARKERS)] = None,
     blur: Annotated[float, typer.Option(help="Standard deviation of the lens's blur in focus, px.")] = 0.7,
     noise: Annotated[float, typer.Option(help="Standard deviation of the noise, grey levels of 255.")] = 2.0,
-    levels: Annotated[
-        tuple[float, float], typer.Option(metavar="DARK LIGHT", help="Grey levels of print and paper.")
-    ] = (30.0, 220.0),
-    f_number: Annotated[
-        float | None, typer.Option(help="Aperture: counts the blur out of focus and notes the depth of field.")
-    ] = None,
+    levels: Annotated[tuple[float, float], typer.Option(metavar="DARK LIGHT", help=_LEVELS)] = (30.0, 220.0),
+    f_number: Annotated[float | None, typer.Option(help=_APERTURE)] = None,
     focal_length: Annotated[float | None, typer.Option(help="Of the lens, mm; with --f-number.")] = None,
-    background: Annotated[
-        str, typer.Option(metavar="light|dark", help="Tone around the rings: dark rings on light, or the reverse.")
-    ] = "light",
+    background: Annotated[str, typer.Option(metavar="light|dark", help=_TONE)] = "light",
     name: Annotated[str | None, typer.Option(help="Name of the target and of the files.")] = None,
 ) -> int:
     """Choose a target for a camera, a working volume and an accuracy, and draw it at true scale (SVG, PDF).
@@ -77,39 +58,36 @@ def design(
     Standard deviations are those of the image noise with an exactly known camera and print. The target is the one with
     the fewest rings that does, at the worst point of the volume.
     """
-    from torchpose.design import make_sheet, plate_around, predict_volume
+    from torchpose.design import Need, make_sheet, plate_around, predict_volume
+    from torchpose.report.files import make_folder
     from torchpose.target import Target
 
     sides = None if plate is None else _sides(plate)
     if target is None:
-        missing = [option for option, value in (("--plate", plate), ("--accuracy-um", accuracy_um)) if value is None]
-        if missing:
-            raise ConfigError(f"{missing[0]}: is missing; a design needs it (--target draws an existing target alone)")
+        for option, value in (("--plate", plate), ("--accuracy-um", accuracy_um)):
+            if value is None:
+                raise ConfigError(f"{option}: is missing; a design needs it (--target draws an existing target alone)")
     elif name is not None or markers is not None:
         raise ConfigError("--target: is there already; leave --name and --markers out")
     existing = None if target is None else Target.load(target)
     scene = None
-    if target is None or camera is not None or distance is not None or distance_range is not None:
+    if existing is None or camera is not None or distance is not None or distance_range is not None:
         volume = _volume(distance, distance_range, tilt, roll, offset)
         scene = _Scene(_camera(camera), volume, _imaging(volume, blur, noise, levels, f_number, focal_length))
-    needed = None if accuracy_um is None else _need(accuracy_um, accuracy_deg)
-    _make_folder(out)
-    written: list[Path] = []
-    precision = None
+    need = None if accuracy_um is None else Need(*accuracy_um, *(() if accuracy_deg is None else (accuracy_deg,)))
+    make_folder(out, "--out")
     if existing is None:
         assert scene is not None
-        assert needed is not None
+        assert need is not None
         assert sides is not None
-        chosen, precision = _new_target(scene, sides, needed, name, background, markers)
-        written.append(out / f"{chosen.name}.yaml")
-        chosen.save(written[0])
+        chosen, precision, written = _new_target(scene, sides, need, out, name, background, markers)
     else:
-        chosen = existing
+        chosen, written = existing, []
         if scene is not None:
             precision = predict_volume(scene.camera, chosen, scene.volume, scene.imaging)
     written += make_sheet(chosen, sides or plate_around(chosen)).save(out, chosen.name)
-    if scene is not None and precision is not None:
-        written += _tell_precision(chosen, scene, precision, needed, out)
+    if scene is not None:
+        written += _tell_precision(chosen, scene, precision, need, out)
     for path in written:
         typer.echo(str(path))
     return 0
@@ -161,12 +139,6 @@ def _imaging(
     return Imaging(blur, noise, *levels, lens=lens)
 
 
-def _need(accuracy_um: tuple[float, float], accuracy_deg: float | None) -> Need:
-    from torchpose.design import Need
-
-    return Need(*accuracy_um, *([] if accuracy_deg is None else [accuracy_deg]))
-
-
 def _sides(text: str) -> tuple[float, float]:
     number = r"(\d+\.?\d*|\.\d+)"
     match = re.fullmatch(rf"{number}[xX]{number}", text)
@@ -175,22 +147,16 @@ def _sides(text: str) -> tuple[float, float]:
     return float(match[1]), float(match[2])
 
 
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"{folder}: --out: {error.strerror}; choose a folder that can be written") from None
-
-
 def _new_target(
     scene: _Scene,
     plate: tuple[float, float],
     need: Need,
+    out: Path,
     name: str | None,
     background: str,
     markers: int | None,
-) -> tuple[Target, Precision]:
-    """The designed target and its precision; its rings are told."""
+) -> tuple[Target, Precision, list[Path]]:
+    """The designed target, its precision and its file; its rings are told."""
     from torchpose.design import design_target
 
     made = design_target(
@@ -201,36 +167,26 @@ def _new_target(
         f"{len(made.target)} rings of {2 * made.radius:g} mm, semi-minor axis at least {made.semi_minor:.0f} px; "
         f"inner/outer {ratios}, neighbours {made.code_gap:.1f} tolerances of reading apart"
     )
-    return made.target, made.precision
+    path = out / f"{made.target.name}.yaml"
+    made.target.save(path)
+    return made.target, made.precision, [path]
 
 
 def _tell_precision(target: Target, scene: _Scene, precision: Precision, need: Need | None, out: Path) -> list[Path]:
     """Tells the predicted precision of a target; paths of its table and map."""
+    from torchpose.cli.terminal import print_table
     from torchpose.design import precision_map
     from torchpose.io.writers import write_rows
     from torchpose.report.design import save_plot
 
     rows = precision.rows(need)
-    _show(rows, target.name)
+    columns = [column.replace("_", " ") for column in rows[0]]
+    print_table(f"{target.name}: predicted standard deviations", columns, [list(row.values()) for row in rows])
     typer.echo(_focus(scene))
     table, picture = out / f"{target.name}_precision.csv", out / f"{target.name}_map.png"
     write_rows(table, rows, {column: str if column in ("axis", "unit") else float for column in rows[0]})
     save_plot(precision_map(scene.camera, target, scene.volume, scene.imaging), target.name, picture)
     return [table, picture]
-
-
-def _show(rows: list[Row], name: str) -> None:
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console(width=max(Console().width, 100))
-    table = Table(box=box.SIMPLE_HEAD, title=f"{name}: predicted standard deviations")
-    for column in rows[0]:
-        table.add_column(column.replace("_", " "), justify="left" if column in ("axis", "unit") else "right")
-    for row in rows:
-        table.add_row(*("-" if v is None else v if isinstance(v, str) else f"{v:.3g}" for v in row.values()))
-    console.print(table)
 
 
 def _focus(scene: _Scene) -> str:

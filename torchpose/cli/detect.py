@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchpose.cli.common import INTERRUPTED, check_outputs, cores, report_unreadable
+from torchpose.cli.common import Overlay, Silent, Threads, check_outputs, cores, ended, interrupted
 
 if TYPE_CHECKING:  # imported where they are used: torch takes more than a second, which --help need not wait for
     import numpy as np
@@ -17,33 +17,20 @@ if TYPE_CHECKING:  # imported where they are used: torch takes more than a secon
     from torchpose.io.rows import Row
     from torchpose.io.sources import Source
 
-EPILOG = """
-Examples:
-
-`torchpose detect frames/ --out ellipses.csv`
-
-`torchpose detect picture.jpg --out shapes.csv --overlay seen/ --explain`
-
-Exit codes: 0 every frame was processed; 1 a frame could not be read; 2 a usage or configuration error.
-"""
-
 _BATCH_PIXELS = 40_000_000
 
 
+_INPUTS = "Image files, folders of them or capture manifests, of any size."
+_EXPLAIN = "Also list the ellipses that were rejected, with the reason."
+
+
 def detect(
-    inputs: Annotated[
-        list[Path],
-        typer.Argument(metavar="INPUT...", help="Image files, folders of them or capture manifests, of any size."),
-    ],
+    inputs: Annotated[list[Path], typer.Argument(metavar="INPUT...", help=_INPUTS)],
     out: Annotated[Path, typer.Option(help="Table of the shapes: .csv, .jsonl or .parquet.")],
-    overlay: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Folder for pictures of what was found, one a frame.")
-    ] = None,
-    explain: Annotated[
-        bool, typer.Option("--explain", help="Also list the ellipses that were rejected, with the reason.")
-    ] = False,
-    threads: Annotated[int | None, typer.Option(min=1, help="Threads to use; by default one a core.")] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar and no summary.")] = False,
+    overlay: Overlay = None,
+    explain: Annotated[bool, typer.Option("--explain", help=_EXPLAIN)] = False,
+    threads: Threads = None,
+    quiet: Silent = False,
 ) -> int:
     """Find ellipses, straight edges and polygons, with their numbers of false alarms. No parameter to tune.
 
@@ -56,23 +43,20 @@ def detect(
     from torchpose.io.shape_rows import SHAPE_SCHEMA
     from torchpose.io.sources import find_sources
     from torchpose.io.writers import check_table_path, write_rows
-    from torchpose.report.overlay import make_folder
+    from torchpose.report.files import make_folder
 
     check_table_path(out, "--out")
     sources = find_sources(inputs)
     check_outputs(inputs, sources, [out], overlay)
     if overlay is not None:
-        make_folder(overlay)
+        make_folder(overlay, "--overlay")
     cv2.setNumThreads(1)
     torch.set_num_threads(threads or cores())
     unreadable: dict[str, str] = {}
     rows: list[Row] = []
+    show = FrameProgress(len(sources), 0, quiet=quiet)
     try:
-        with (
-            native_stderr_silenced(),
-            FrameProgress(len(sources), 0, quiet=quiet) as progress,
-            torch.inference_mode(),
-        ):
+        with native_stderr_silenced(), show as progress, torch.inference_mode():
             for some, frames in _batches(sources, unreadable, threads or cores()):
                 found = _rows(some, frames, explain)
                 if overlay is not None:
@@ -80,16 +64,12 @@ def detect(
                 rows += found
                 progress.advance(len(some), _kinds(rows))
     except KeyboardInterrupt:
-        typer.echo("torchpose: error: interrupted: nothing was written; run again", err=True)
-        return INTERRUPTED
+        return interrupted("nothing was written; run again")
     order = {source.name: number for number, source in enumerate(sources)}
     rows.sort(key=lambda row: order[row["frame"]])
     write_rows(out, rows, SHAPE_SCHEMA)
     progress.summary(_kinds(rows), out)
-    if unreadable:
-        report_unreadable(unreadable)
-        return 1
-    return 0
+    return ended(unreadable)
 
 
 def _batches(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import astuple
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,38 +14,23 @@ if TYPE_CHECKING:
     from torchpose.analysis.evaluation import Evaluation
     from torchpose.io.truth import Truth
 
-EPILOG = """
-Examples:
-
-`torchpose evaluate poses.jsonl out/grid`
-
-`torchpose evaluate poses.csv out/grid/truth.csv --out errors.csv --plots out/plots`
-
-The NEES needs whole covariances, which .jsonl and .parquet hold; from .csv it is computed without correlations.
-
-Exit codes: 0 evaluated, whatever the errors; 2 a usage or configuration error.
-"""
+_POSES = "Table of torchpose estimate: .csv, .jsonl, .parquet."
+_TRUTH = "Folder of torchpose simulate, or its truth.csv."
+_PLOTS = "Folder for plots of errors, consistency and conditions."
 
 
 def evaluate(
-    poses: Annotated[
-        Path, typer.Argument(metavar="POSES", help="Table of torchpose estimate: .csv, .jsonl, .parquet.")
-    ],
-    truth: Annotated[
-        Path, typer.Argument(metavar="DIR_OR_TRUTH", help="Folder of torchpose simulate, or its truth.csv.")
-    ],
+    poses: Annotated[Path, typer.Argument(metavar="POSES", help=_POSES)],
+    truth: Annotated[Path, typer.Argument(metavar="DIR_OR_TRUTH", help=_TRUTH)],
     out: Annotated[Path | None, typer.Option(help="Table of the errors, one row a frame (.csv).")] = None,
-    plots: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Folder for plots of errors, consistency and conditions.")
-    ] = None,
+    plots: Annotated[Path | None, typer.Option(metavar="DIR", help=_PLOTS)] = None,
 ) -> int:
     """Compare poses with the truth: bias and spread of each axis beside its bound, success by status, NEES."""
     from torchpose.analysis.evaluation import estimates_of
     from torchpose.analysis.evaluation import evaluate as evaluate_poses
     from torchpose.io.truth import read_truth
 
-    path = truth / "truth.csv" if truth.is_dir() else truth
-    known = read_truth(path)
+    known = read_truth(truth / "truth.csv" if truth.is_dir() else truth)
     estimates = estimates_of(_rows_of(poses, known))
     result = evaluate_poses(estimates, known)
     _show(result, estimates.full_covariance)
@@ -64,7 +49,7 @@ def _rows_of(path: Path, truth: Truth) -> list[dict[str, Any]]:
 
     Names of frames may have a folder before them, as they do where the data set itself was the input.
     """
-    from torchpose.io.tables import read_table
+    from torchpose.io.writers import read_table
 
     rows = read_table(path)
     try:
@@ -87,19 +72,11 @@ def _rows_of(path: Path, truth: Truth) -> list[dict[str, Any]]:
 
 
 def _show(result: Evaluation, full_covariance: bool) -> None:
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
+    from torchpose.cli.terminal import print_table
 
-    console = Console(width=max(Console().width, 100))  # a pipe counts as 80 columns, which would cut the numbers
     columns = ("axis", "unit", "bias", "spread", "rms", "worst", "claimed sigma", "bound sigma", "rms / bound")
-    table = Table(box=box.SIMPLE_HEAD, title="estimate - truth, frames with status ok")
-    for name in columns:
-        table.add_column(name, justify="left" if name in ("axis", "unit") else "right")
-    for a in result.axes:
-        numbers: Sequence[float] = (a.bias, a.spread, a.rms, a.worst, a.predicted, a.bound, a.rms / a.bound)
-        table.add_row(a.axis, a.unit, *("-" if n != n else f"{n:.3g}" for n in numbers))
-    console.print(table)
+    rows = [(*astuple(axis), axis.rms / axis.bound) for axis in result.axes]
+    console = print_table("estimate - truth, frames with status ok", columns, rows)
     total = sum(result.counts.values())
     states = ", ".join(f"{count} {status}" for status, count in result.counts.most_common())
     console.print(f"{total} rows: {states}; of {result.visible} with the whole target in view {result.found} ok")
@@ -110,17 +87,15 @@ def _show(result: Evaluation, full_covariance: bool) -> None:
 
 
 def _write_errors(path: Path, result: Evaluation, truth: Truth, status: list[str]) -> None:
+    import torch
+
     from torchpose.analysis.evaluation import AXES, UNITS
     from torchpose.io.writers import check_table_path, write_rows
 
     check_table_path(path, "--out")
-    names = [
-        f"{kind}{axis}_{unit}" for kind in ("", "claimed_", "bound_") for axis, unit in zip(AXES, UNITS, strict=True)
-    ]
-    import torch
-
+    axes = [f"{axis}_{unit}" for axis, unit in zip(AXES, UNITS, strict=True)]
+    columns = [*(f"{kind}{axis}" for kind in ("", "claimed_", "bound_") for axis in axes), "nees"]
     values = torch.cat([result.error, result.predicted, result.bound, result.errors.nees[:, None]], 1).tolist()
-    columns = [*names, "nees"]
     rows = (
         {"frame": frame, "target": target, "status": state}
         | {name: None if number != number else number for name, number in zip(columns, numbers, strict=True)}

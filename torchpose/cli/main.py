@@ -6,24 +6,24 @@ import sys
 import traceback
 from collections.abc import Sequence
 from importlib.metadata import version
+from pathlib import Path
 from typing import Annotated, NoReturn
 
 import typer
 
-from torchpose.cli import (
-    calibrate,
-    capture,
-    common,
-    design,
-    detect,
-    estimate,
-    evaluate,
-    reproduce,
-    sensitivity,
-    simulate,
-)
+from torchpose.cli.calibrate import calibrate
+from torchpose.cli.capture import capture
+from torchpose.cli.common import INTERRUPTED
+from torchpose.cli.design import design
+from torchpose.cli.detect import detect
+from torchpose.cli.estimate import estimate
+from torchpose.cli.evaluate import evaluate
+from torchpose.cli.reproduce import reproduce
+from torchpose.cli.sensitivity import sensitivity
+from torchpose.cli.simulate import simulate
 from torchpose.errors import TorchposeError
 
+_HELP = Path(__file__).with_name("help")
 INTERNAL_ERROR = 70  # EX_SOFTWARE of sysexits.h: none of the codes that say something about the input
 
 app = typer.Typer(
@@ -50,15 +50,9 @@ def _torchpose(
     """Pose of flat concentric-ring targets from camera frames, to microns, with its uncertainty."""
 
 
-app.command(epilog=estimate.EPILOG)(estimate.estimate)
-app.command(epilog=detect.EPILOG)(detect.detect)
-app.command(epilog=simulate.EPILOG)(simulate.simulate)
-app.command(epilog=evaluate.EPILOG)(evaluate.evaluate)
-app.command(epilog=capture.EPILOG)(capture.capture)
-app.command(epilog=sensitivity.EPILOG)(sensitivity.sensitivity)
-app.command(epilog=reproduce.EPILOG)(reproduce.reproduce)
-app.command(epilog=design.EPILOG)(design.design)
-app.command(epilog=calibrate.EPILOG)(calibrate.calibrate)
+# what stands below the options: help/COMMAND.md
+for _command in (estimate, detect, simulate, evaluate, capture, sensitivity, reproduce, design, calibrate):
+    app.command(epilog=(_HELP / f"{_command.__name__}.md").read_text(encoding="utf-8"))(_command)
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
@@ -75,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     except TorchposeError as error:
         _fail(str(error))
     except (KeyboardInterrupt, typer.Abort):
-        _fail("interrupted before anything was computed", common.INTERRUPTED)
+        _fail("interrupted before anything was computed", INTERRUPTED)
     except Exception as error:
         # typer brings its own copy of click or depends on click, by version: known by what its errors can do
         if hasattr(error, "format_message"):

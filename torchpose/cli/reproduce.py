@@ -7,31 +7,18 @@ from typing import Annotated
 
 import typer
 
-from torchpose.cli.common import INTERRUPTED
+from torchpose.cli.common import Quiet, interrupted
 
-EPILOG = """
-Examples:
-
-`torchpose reproduce --out report`
-
-`torchpose reproduce --out report --full --resume`
-
-`torchpose reproduce --out report --only table03_centers --only table04_compensation`
-
-Exit codes: 0 all studies are in the report; 1 one failed (named in the report); 2 a usage or configuration error;
-130 interrupted (go on with `--resume`).
-"""
+_Full = Annotated[bool, typer.Option("--full", help="As many seeds and frames as the documented figures have: hours.")]
 
 
 def reproduce(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the report, report.html, and its tables.")],
-    full: Annotated[
-        bool, typer.Option("--full", help="As many seeds and frames as the documented figures have: hours.")
-    ] = False,
+    full: _Full = False,
     only: Annotated[list[str] | None, typer.Option(metavar="STUDY", help="This study alone; may be repeated.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Keep the studies that an earlier run finished.")] = False,
     seed: Annotated[int, typer.Option(min=0, help="Of everything random.")] = 0,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar.")] = False,
+    quiet: Quiet = False,
 ) -> int:
     """Compute every table and figure of the paper: its number, ours and the bound side by side, with plots."""
     from torchpose.cli.terminal import StudyProgress
@@ -42,8 +29,7 @@ def reproduce(
         try:
             failed = run(out, full=full, seed=seed, only=only or (), resume=resume, progress=progress.advance)
         except KeyboardInterrupt:
-            typer.echo(f"torchpose: error: interrupted: {out} keeps the finished studies; add --resume", err=True)
-            return INTERRUPTED
+            return interrupted(f"{out} keeps the finished studies; add --resume")
     for name, reason in failed.items():
         typer.echo(f"torchpose: error: {name}: {reason}", err=True)
     if not quiet:

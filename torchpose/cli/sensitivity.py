@@ -14,37 +14,25 @@ if TYPE_CHECKING:
     from torchpose.analysis.sensitivity import Uncertainty
     from torchpose.analysis.sweep import Sweep
 
-EPILOG = """
-Examples:
-
-`torchpose sensitivity --out out/fig04` (the paper's Fig. 4: 8 mm target, 12 to 32 mm)
-
-`torchpose sensitivity --camera camera.yaml --target quad40 --distance 120 200 --sigma-px 0.01
---focal-error-percent 0.05 --principal-point-px 1 --print-um 5 --tilt-deg 20 --out out/budget`
-
-docs/sensitivity.md explains tables and plots. Exit codes: 0 computed; 2 a usage or configuration error.
-"""
+_Sigmas = Annotated[
+    list[float] | None,
+    typer.Option(help="Standard deviation of a marker centre on each axis; may be repeated. By default 0.2 and 1."),
+]
+_Distances = Annotated[tuple[float, float], typer.Option(metavar="NEAR FAR", help="Working distances, mm.")]
+_DISTORTION = "Standard deviations of the camera's coefficients: 1e-3,1e-3,1e-5,1e-5."
 
 
 def sensitivity(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for tables (.csv) and plots (.png).")],
     camera: Annotated[Path | None, typer.Option(help="Camera file; by default the paper's camera.")] = None,
     target: Annotated[str, typer.Option(help="Target file, or the name of a built-in target.")] = "quad8",
-    distance: Annotated[tuple[float, float], typer.Option(metavar="NEAR FAR", help="Working distances, mm.")] = (
-        12.0,
-        32.0,
-    ),
+    distance: _Distances = (12.0, 32.0),
     steps: Annotated[int, typer.Option(min=3, max=1000, help="Number of distances.")] = 11,
     tilt_deg: Annotated[float, typer.Option(help="Tilt of the target about the x axis.")] = 0.0,
-    sigma_px: Annotated[
-        list[float] | None,
-        typer.Option(help="Standard deviation of a marker centre on each axis; may be repeated. By default 0.2 and 1."),
-    ] = None,
+    sigma_px: _Sigmas = None,
     focal_error_percent: Annotated[float, typer.Option(help="Error of the focal length.")] = 0.25,
     principal_point_px: Annotated[float, typer.Option(help="Standard deviation of cx and cy.")] = 0.0,
-    distortion: Annotated[
-        str, typer.Option(metavar="LIST", help="Standard deviations of the camera's coefficients: 1e-3,1e-3,1e-5,1e-5.")
-    ] = "",
+    distortion: Annotated[str, typer.Option(metavar="LIST", help=_DISTORTION)] = "",
     print_um: Annotated[float, typer.Option(help="Standard deviation of a printed centre, on each axis.")] = 0.0,
     flatness_um: Annotated[float, typer.Option(help="Standard deviation of a marker along its normal.")] = 0.0,
     radius_um: Annotated[float, typer.Option(help="Standard deviation of a printed radius.")] = 0.0,
@@ -53,7 +41,7 @@ def sensitivity(
     seed: Annotated[int, typer.Option(min=0, help="Of the draws.")] = 0,
 ) -> int:
     """Predict pose errors by source over the working distance, and check the prediction by Monte-Carlo."""
-    numbers = {
+    sizes = {
         "--principal-point-px": principal_point_px,
         "--print-um": print_um,
         "--flatness-um": flatness_um,
@@ -61,24 +49,17 @@ def sensitivity(
         "--scale-percent": scale_percent,
         "--focal-error-percent": focal_error_percent,
     }
-    sigmas = sigma_px or [0.2, 1.0]
-    for option, value in [*numbers.items(), *(("--sigma-px", s) for s in sigmas)]:
-        least_open = option == "--sigma-px"
-        if not (value > 0 if least_open else value >= 0) or not math.isfinite(value):
-            raise ConfigError(f"sensitivity: {option}: is {value}; give a number {'above' if least_open else 'from'} 0")
-    if not (0 < distance[0] < distance[1] < math.inf):
-        raise ConfigError(f"sensitivity: --distance: is {distance[0]} {distance[1]}; give NEAR above 0 and FAR beyond")
-    if not abs(tilt_deg) < 85:
-        raise ConfigError(f"sensitivity: --tilt-deg: is {tilt_deg}; give an angle between -85 and 85")
-
+    sigmas = list(dict.fromkeys(sigma_px or [0.2, 1.0]))
+    _check(sizes, sigmas, distance, tilt_deg)
     import torch
 
     from torchpose.analysis.sensitivity import Uncertainty
+    from torchpose.analysis.sweep import sweep
     from torchpose.camera import Camera
-    from torchpose.studies.fig04_sensitivity import paper_camera, simulate, tabulate
+    from torchpose.studies.fig04_sensitivity import cases_of, paper_camera, tabulate
     from torchpose.target import Target
 
-    lens = Camera.load(camera) if camera else paper_camera()
+    lens, printed = Camera.load(camera) if camera else paper_camera(), Target.load(target)
     size = Uncertainty(
         focal_length=focal_error_percent / 100,
         principal_point=principal_point_px,
@@ -88,24 +69,31 @@ def sensitivity(
         print_radii=radius_um / 1000,
         print_scale=scale_percent / 100,
     )
-    at = torch.linspace(*distance, steps, dtype=torch.float64)
-    cases = simulate(
-        lens,
-        Target.load(target),
-        at,
-        list(dict.fromkeys(sigmas)),
-        size,
-        tilt=math.radians(tilt_deg),
-        draws=draws,
-        seed=seed,
-    )
+    at, tilt = torch.linspace(*distance, steps, dtype=torch.float64), math.radians(tilt_deg)
+    cases = {
+        title: sweep(lens, printed, at, case, tilt=tilt, draws=draws, seed=seed)
+        for title, case in cases_of(sigmas, size).items()
+    }
     _check_view(cases)
-    result = tabulate(cases)
-    files = result.save(out)
+    files = tabulate(cases).save(out)
     _show(cases, size)
     for path in files:
         typer.echo(str(path))
     return 0
+
+
+def _check(sizes: dict[str, float], sigmas: list[float], distance: tuple[float, float], tilt_deg: float) -> None:
+    """Refuses numbers that are no sizes of errors, distances or angles."""
+    for option, value in sizes.items():
+        if not 0 <= value < math.inf:
+            raise ConfigError(f"sensitivity: {option}: is {value}; give a number from 0")
+    for value in sigmas:
+        if not 0 < value < math.inf:
+            raise ConfigError(f"sensitivity: --sigma-px: is {value}; give a number above 0")
+    if not (0 < distance[0] < distance[1] < math.inf):
+        raise ConfigError(f"sensitivity: --distance: is {distance[0]} {distance[1]}; give NEAR above 0 and FAR beyond")
+    if not abs(tilt_deg) < 85:
+        raise ConfigError(f"sensitivity: --tilt-deg: is {tilt_deg}; give an angle between -85 and 85")
 
 
 def _coefficients(text: str, count: int) -> tuple[float, ...]:
@@ -123,34 +111,28 @@ def _coefficients(text: str, count: int) -> tuple[float, ...]:
 
 
 def _check_view(cases: dict[str, Sweep]) -> None:
-    s = next(iter(cases.values()))
-    lost = [d for d, seen in zip(s.distance.tolist(), s.budget.seen.all(1).tolist(), strict=True) if not seen]
-    if lost:
-        raise ConfigError(
-            f"sensitivity: --distance: at {lost[0]:g} mm not all markers are in the frame; give distances "
-            "from which the camera sees the whole target"
-        )
+    first = next(iter(cases.values()))
+    for distance, seen in zip(first.distance.tolist(), first.budget.seen.all(1).tolist(), strict=True):
+        if not seen:
+            raise ConfigError(
+                f"sensitivity: --distance: at {distance:g} mm not all markers are in the frame; give distances "
+                "from which the camera sees the whole target"
+            )
 
 
 def _show(cases: dict[str, Sweep], size: Uncertainty) -> None:
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
+    from torchpose.analysis.evaluation import AXES, SCALE, UNITS
+    from torchpose.cli.terminal import print_table
 
-    from torchpose.report.sensitivity import AXES, SCALE, UNITS
-
-    console = Console(width=max(Console().width, 100))  # a pipe counts as 80 columns, which would cut the numbers
-    for title, s in cases.items():
-        table = Table(box=box.SIMPLE_HEAD, title=f"{title}: standard deviations by source")
-        for name in ("distance mm", "source", *(f"{a} {u}" for a, u in zip(AXES, UNITS, strict=True))):
-            table.add_column(name, justify="left" if name == "source" else "right")
-        for k in (0, len(s.distance) // 2, len(s.distance) - 1):
-            lines = {name: s.budget.std(name)[k] for name in s.budget.sources}
-            lines |= {"total": s.budget.std()[k], "drawn, rms": s.rms[k], "drawn, largest": s.largest[k]}
+    columns = ("distance mm", "source", *(f"{axis} {unit}" for axis, unit in zip(AXES, UNITS, strict=True)))
+    for title, case in cases.items():
+        rows = []
+        for k in (0, len(case.distance) // 2, len(case.distance) - 1):
+            lines = {name: case.budget.std(name)[k] for name in case.budget.sources}
+            lines |= {"total": case.budget.std()[k], "drawn, rms": case.rms[k], "drawn, largest": case.largest[k]}
             for i, (name, std) in enumerate(lines.items()):
-                values = [f * v for f, v in zip(SCALE, std.tolist(), strict=True)]
-                cells = [f"{v:.3g}" if v > 1e-9 else "0" for v in values]  # below, rounding
-                table.add_row("" if i else f"{float(s.distance[k]):g}", name.replace("_", " "), *cells)
-        console.print(table)
+                values = [value if value > 1e-9 else 0.0 for value in (SCALE * std).tolist()]  # below, rounding
+                rows.append(("" if i else f"{float(case.distance[k]):g}", name.replace("_", " "), *values))
+        console = print_table(f"{title}: standard deviations by source", columns, rows)
     if size.focal_length:
         console.print("focal length: the effect of an error of that very size")

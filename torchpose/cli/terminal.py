@@ -6,50 +6,47 @@ import contextlib
 import os
 import sys
 from collections import Counter
-from collections.abc import Iterator
-from types import TracebackType
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Self
 
+from rich import box
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-STATUS_STYLE = {"ok": "green", "ambiguous": "yellow", "no_target": "red", "too_few_markers": "red", "rejected": "red"}
+STATUS_STYLE = {"ok": "green", "ambiguous": "yellow"}  # all others are red
 
 
-class FrameProgress:
-    """Bar with frames a second and rows by status.
+class _Bar:
+    """A bar on stderr of a terminal, gone when the block ends."""
 
-    Args:
-        total: frames to come in all. done: of these, finished by an earlier run.
-        quiet: show nothing even on a terminal.
-    """
-
-    def __init__(self, total: int, done: int, *, quiet: bool) -> None:
-        console = Console(stderr=True)
-        self._shown = console.is_terminal and not quiet
-        self._console = console
-        self._progress = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[speed]}"),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[counts]}"),
-            console=console,
-            disable=not self._shown,
-            transient=True,
-        )
-        self._task = self._progress.add_task("frames", total=total, completed=done, speed="", counts="")
+    def __init__(self, columns: Sequence[str | ProgressColumn], *, quiet: bool) -> None:
+        self._console = Console(stderr=True)
+        self._shown = self._console.is_terminal and not quiet
+        self._progress = Progress(*columns, console=self._console, disable=not self._shown, transient=True)
 
     def __enter__(self) -> Self:
         self._progress.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._progress.stop()
+
+
+class FrameProgress(_Bar):
+    """Bar with frames a second and rows by status.
+
+    Args:
+        total: frames to come in all.
+        done: of these, finished by an earlier run.
+        quiet: show nothing even on a terminal.
+    """
+
+    def __init__(self, total: int, done: int, *, quiet: bool) -> None:
+        speed, counts = TextColumn("{task.fields[speed]}"), TextColumn("{task.fields[counts]}")
+        columns = (TextColumn("frames"), BarColumn(), MofNCompleteColumn(), speed, TimeRemainingColumn(), counts)
+        super().__init__(columns, quiet=quiet)
+        self._task = self._progress.add_task("frames", total=total, completed=done, speed="", counts="")
 
     def advance(self, frames: int, counts: Counter[str]) -> None:
         """Tells of ``frames`` more finished frames and of the rows so far by status."""
@@ -67,38 +64,35 @@ class FrameProgress:
         self._console.print(table)
 
 
-class StudyProgress:
+class StudyProgress(_Bar):
     """One bar over studies that run one after the other.
 
     Args:
-        names: of the studies. quiet: show nothing even on a terminal.
+        names: of the studies.
+        quiet: show nothing even on a terminal.
     """
 
     def __init__(self, names: list[str], *, quiet: bool) -> None:
-        console = Console(stderr=True)
+        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:.0f} %"))
+        super().__init__(columns, quiet=quiet)
         self._names = names
-        self._progress = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.percentage:.0f} %"),
-            console=console,
-            disable=quiet or not console.is_terminal,
-            transient=True,
-        )
         self._task = self._progress.add_task("studies", total=len(names))
-
-    def __enter__(self) -> Self:
-        self._progress.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._progress.stop()
 
     def advance(self, name: str, done: float) -> None:
         """Tells that ``done``, 0 to 1, of the study ``name`` is finished."""
         self._progress.update(self._task, description=name, completed=self._names.index(name) + done)
+
+
+def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str | float | None]]) -> Console:
+    """Prints a table, its numbers with three digits; the console, for what comes below."""
+    console = Console(width=max(Console().width, 100))  # a pipe counts as 80 columns, which would cut the numbers
+    table = Table(box=box.SIMPLE_HEAD, title=title)
+    for name in columns:
+        table.add_column(name, justify="left" if name in ("axis", "unit", "source") else "right")
+    for row in rows:
+        table.add_row(*(v if isinstance(v, str) else "-" if v is None or v != v else f"{v:.3g}" for v in row))
+    console.print(table)
+    return console
 
 
 def _coloured(counts: Counter[str]) -> list[str]:

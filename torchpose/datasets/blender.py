@@ -37,7 +37,9 @@ def blender(plan: Plan, *, samples: int = SAMPLES, threads: int = 0) -> Callable
     """Noise-free frames (B, H, W) float32 of the frames numbered (B,), rendered by Blender one after the other.
 
     Args:
-        plan: what to render. samples: paths a pixel on edges. threads: of Blender; 0 for all cores.
+        plan: what to render.
+        samples: paths a pixel on edges.
+        threads: of Blender; 0 for all cores.
 
     Raises:
         ConfigError: bpy is not installed, or the plan wants what this backend does not model.
@@ -66,7 +68,7 @@ def filter_width(psf_sigma: float) -> float:
 
 def _check(plan: Plan) -> None:
     image = plan.file.imaging
-    wanted = {
+    unknown = {
         "defocus": image.defocus is not None,
         "lighting": image.lighting is not None,
         "motion_mm": bool(plan.motion.any()),
@@ -74,12 +76,10 @@ def _check(plan: Plan) -> None:
         "covered": image.covered > 0,
         "background": image.background is not None,
     }
-    for field, present in wanted.items():
-        if present:
-            raise ConfigError(
-                f"{plan.path}: imaging.{field}: is not modelled by the Blender backend; "
-                "remove it or use the analytic one"
-            )
+    for field in (name for name, wanted in unknown.items() if wanted):
+        raise ConfigError(
+            f"{plan.path}: imaging.{field}: is not modelled by the Blender backend; remove it or use the analytic one"
+        )
     if image.plate is None:
         raise ConfigError(f"{plan.path}: imaging.plate: is missing, the Blender backend needs it; add [width, height]")
     if bool(plan.camera.distortion.any()) or plan.camera.model != "brown_conrady":
@@ -106,12 +106,14 @@ def _build(bpy: Any, plan: Plan, samples: int, threads: int) -> tuple[Any, dict[
 
     fx, fy, cx, cy = (float(camera.matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
     lens = bpy.data.cameras.new("camera")
-    lens.type, lens.sensor_fit, lens.sensor_width = "PERSP", "HORIZONTAL", _SENSOR_MM
-    lens.lens = fx * _SENSOR_MM / camera.width
+    _set(lens, type="PERSP", sensor_fit="HORIZONTAL", sensor_width=_SENSOR_MM, clip_start=1.0, clip_end=1e5)
     # pixel centres at integers: the image plane spans -0.5 .. W - 0.5; shifts are in widths, upwards
-    lens.shift_x = ((camera.width - 1) / 2 - cx) / camera.width
-    lens.shift_y = (cy - (camera.height - 1) / 2) / camera.width * (fx / fy)
-    lens.clip_start, lens.clip_end = 1.0, 1e5
+    _set(
+        lens,
+        lens=fx * _SENSOR_MM / camera.width,
+        shift_x=((camera.width - 1) / 2 - cx) / camera.width,
+        shift_y=(cy - (camera.height - 1) / 2) / camera.width * (fx / fy),
+    )
     scene.camera = bpy.data.objects.new("camera", lens)
     scene.camera.rotation_mode = "QUATERNION"
     scene.collection.objects.link(scene.camera)
@@ -121,26 +123,22 @@ def _build(bpy: Any, plan: Plan, samples: int, threads: int) -> tuple[Any, dict[
     scene.world.cycles.sampling_method = "NONE"
     levels["surround"] = scene.world.node_tree.nodes["Background"].inputs["Color"]
 
-    render = scene.render
-    render.engine = "CYCLES"
-    render.resolution_x, render.resolution_y, render.resolution_percentage = camera.width, camera.height, 100
-    render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, fy / fx), max(1.0, fx / fy)
-    render.use_border = render.use_crop_to_border = True
-    render.use_persistent_data = True
-    render.dither_intensity = 0.0
-    render.threads_mode, render.threads = ("FIXED", threads) if threads else ("AUTO", 1)
+    _set(scene.render, engine="CYCLES", use_border=True, use_crop_to_border=True, use_persistent_data=True)
+    _set(scene.render, resolution_x=camera.width, resolution_y=camera.height, resolution_percentage=100)
+    _set(scene.render, pixel_aspect_x=max(1.0, fy / fx), pixel_aspect_y=max(1.0, fx / fy), dither_intensity=0.0)
+    _set(scene.render, threads_mode="FIXED" if threads else "AUTO", threads=threads or 1)
+    _set(scene.render.image_settings, file_format="OPEN_EXR", color_mode="RGB", color_depth="32")
     scene.view_settings.view_transform = "Raw"
-    image = render.image_settings
-    image.file_format, image.color_mode, image.color_depth = "OPEN_EXR", "RGB", "32"
-    cycles = scene.cycles
-    cycles.device = "CPU"
-    cycles.samples, cycles.adaptive_min_samples = samples, min(_LEAST_SAMPLES, samples)
-    cycles.use_adaptive_sampling, cycles.adaptive_threshold = samples > _LEAST_SAMPLES, 1e-4
-    cycles.use_denoising = cycles.use_light_tree = False
-    cycles.pixel_filter_type = "BLACKMAN_HARRIS"
-    cycles.max_bounces = 0
-    cycles.sample_clamp_direct = cycles.sample_clamp_indirect = 0.0
+    _set(scene.cycles, device="CPU", samples=samples, adaptive_min_samples=min(_LEAST_SAMPLES, samples))
+    _set(scene.cycles, use_adaptive_sampling=samples > _LEAST_SAMPLES, adaptive_threshold=1e-4, max_bounces=0)
+    _set(scene.cycles, use_denoising=False, use_light_tree=False, pixel_filter_type="BLACKMAN_HARRIS")
+    _set(scene.cycles, sample_clamp_direct=0.0, sample_clamp_indirect=0.0)
     return scene, levels
+
+
+def _set(settings: Any, **values: Any) -> None:
+    for name, value in values.items():
+        setattr(settings, name, value)
 
 
 def _ring_material(bpy: Any, plan: Plan) -> tuple[Any, dict[str, Any]]:
@@ -153,10 +151,10 @@ def _ring_material(bpy: Any, plan: Plan) -> tuple[Any, dict[str, Any]]:
     new, link = tree.nodes.new, tree.links.new
     place = new("ShaderNodeTexCoord").outputs["Object"]
 
-    def math_node(operation: str, a: Any, b: Any) -> Any:
+    def math_node(operation: str, *operands: Any) -> Any:
         node = new("ShaderNodeMath")
         node.operation = operation
-        for socket, value in zip(node.inputs, (a, b), strict=False):
+        for socket, value in zip(node.inputs, operands, strict=False):
             if isinstance(value, float):
                 socket.default_value = value
             else:
@@ -185,11 +183,13 @@ def _render(bpy: Any, scene: Any, levels: dict[str, Any], plan: Plan, number: in
     from mathutils import Matrix
 
     width, height = plan.camera.width, plan.camera.height
-    c = {name: float(column[number]) / 255 for name, column in plan.conditions.items()}
-    ink, paper = (c["light"], c["dark"]) if plan.target.background == "dark" else (c["dark"], c["light"])
+    taken = plan.conditions
+    ink, paper, surround = (float(level[number]) / 255 for level in (taken.dark, taken.light, taken.surround))
+    if plan.target.background == "dark":
+        ink, paper = paper, ink
     levels["contrast"].default_value, levels["paper"].default_value = ink - paper, paper
-    levels["surround"].default_value = (c["surround"], c["surround"], c["surround"], 1.0)
-    image = torch.full((height, width), 255 * c["surround"])
+    levels["surround"].default_value = (surround, surround, surround, 1.0)
+    image = torch.full((height, width), 255 * surround)
     R, t = plan.R[number], plan.t[number]
     box = _plate_box(plan, R, t)
     if box is None:
@@ -202,7 +202,7 @@ def _render(bpy: Any, scene: Any, levels: dict[str, Any], plan: Plan, number: in
     render = scene.render  # the border is in fractions of the frame from the bottom left
     render.border_min_x, render.border_max_x = (u0 + 1e-3) / width, (u1 + 1e-3) / width
     render.border_min_y, render.border_max_y = (height - v1 + 1e-3) / height, (height - v0 + 1e-3) / height
-    scene.cycles.filter_width = filter_width(255 * c["psf_sigma"])
+    scene.cycles.filter_width = filter_width(float(taken.psf_sigma[number]))
     scene.cycles.seed = (plan.file.seed + number) % 2**31
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "tile.exr"

@@ -5,12 +5,23 @@ from __future__ import annotations
 import itertools
 import math
 import os
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, field_validator, model_validator
+from jaxtyping import Bool, Float, Int
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    field_validator,
+    model_validator,
+)
 from torch import Tensor
 
 from torchpose.camera import Camera
@@ -18,15 +29,17 @@ from torchpose.config import beside, read_yaml, validate, within
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.geometry.rotations import plane_axes
-from torchpose.io.truth import Truth, read_truth
+from torchpose.geometry.rows import Rows, shared
+from torchpose.io.sources import find_sources
+from torchpose.io.truth import read_truth
 from torchpose.sim import faults_of
 from torchpose.target import Target
 
-_FROZEN = ConfigDict(extra="forbid", frozen=True)
 _HALTON_BASES = (2, 3, 5, 7, 11, 13)
 _TRIES = 50  # random poses drawn for one that keeps the target in view
 
 Vector = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
+Pair = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
 
 
 def _range(value: Any) -> Any:
@@ -39,23 +52,42 @@ def _range(value: Any) -> Any:
     return value
 
 
+def _from(low: Callable[[float], bool], fix: str) -> AfterValidator:
+    """Refuses a range whose lower limit is not as ``low`` wants it."""
+
+    def check(value: list[float]) -> list[float]:
+        if not low(value[0]):
+            raise ValueError(f"is {value[0]:g}; {fix}")
+        return value
+
+    return AfterValidator(check)
+
+
 Range = Annotated[list[FiniteFloat], BeforeValidator(_range)]
 """[low, high], from which every frame draws its own value; a plain number stands for both."""
 
 
-class Grid(BaseModel):
+Blur = Annotated[Range, _from(lambda s: s > 0, "the blur must be above 0 px, such as 0.3 for a very sharp lens")]
+Move = Annotated[Range, _from(lambda s: s >= 0, "give the length of the move during the exposure, 0 or more")]
+Noise = Annotated[Range, _from(lambda s: s >= 0, "give the standard deviation in grey levels, 0 or more")]
+Positive = Annotated[FiniteFloat, Field(gt=0)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Grid(_Section):
     """All combinations of pitch, yaw and roll with every position: R = Rz(roll) Ry(yaw) Rx(pitch)."""
 
-    model_config = _FROZEN
     distance: FiniteFloat
     angles_deg: Annotated[list[FiniteFloat], Field(min_length=1)]
     positions: Annotated[list[Vector], Field(min_length=1)] = [[0.0, 0.0, 0.0]]
 
 
-class Random(BaseModel):
+class Random(_Section):
     """A low-discrepancy (Halton) cover of position, tilt (any direction) and roll."""
 
-    model_config = _FROZEN
     count: Annotated[int, Field(ge=1)]
     x: Range
     y: Range
@@ -64,10 +96,9 @@ class Random(BaseModel):
     roll_deg: Range = [-180.0, 180.0]
 
 
-class Axes(BaseModel):
+class Axes(_Section):
     """Moves along and turns about one camera axis at a time, from one start."""
 
-    model_config = _FROZEN
     start: Vector
     rotation_deg: Vector = [0.0, 0.0, 0.0]
     translations: list[FiniteFloat] = []
@@ -80,10 +111,9 @@ class Axes(BaseModel):
         return self
 
 
-class Poses(BaseModel):
+class Poses(_Section):
     """One of the ways to say where the target is; ``file`` names a truth file."""
 
-    model_config = _FROZEN
     grid: Grid | None = None
     random: Random | None = None
     axes: Axes | None = None
@@ -96,54 +126,37 @@ class Poses(BaseModel):
         return self
 
 
-class Lens(BaseModel):
+class Lens(_Section):
     """See `torchpose.sim.Defocus`."""
 
-    model_config = _FROZEN
-    f_number: Annotated[FiniteFloat, Field(gt=0)]
-    focal_length: Annotated[FiniteFloat, Field(gt=0)]
-    focus_distance: Annotated[FiniteFloat, Field(gt=0)]
+    f_number: Positive
+    focal_length: Positive
+    focus_distance: Positive
 
 
-class Light(BaseModel):
+class Light(_Section):
     """See `torchpose.sim.Lighting`."""
 
-    model_config = _FROZEN
-    gradient: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)] = [0.0, 0.0]
+    gradient: Pair = [0.0, 0.0]
     point: Vector | None = None
     vignetting: Annotated[FiniteFloat, Field(ge=0)] = 0.0
 
 
-class Imaging(BaseModel):
+class Imaging(_Section):
     """Conditions of the picture, before the sensor."""
 
-    model_config = _FROZEN
-    psf_sigma: Range = [0.7, 0.7]
+    psf_sigma: Blur = [0.7, 0.7]
     dark: Range = [30.0, 30.0]
     light: Range = [220.0, 220.0]
     surround: Range = [90.0, 90.0]
-    plate: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)] | None = None
+    plate: Pair | None = None
     background: str | None = None
-    motion_mm: Range = [0.0, 0.0]
-    motion_deg: Range = [0.0, 0.0]
+    motion_mm: Move = [0.0, 0.0]
+    motion_deg: Move = [0.0, 0.0]
     clutter: Annotated[int, Field(ge=0)] = 0
     covered: Annotated[FiniteFloat, Field(ge=0, le=1)] = 0.0
     defocus: Lens | None = None
     lighting: Light | None = None
-
-    @field_validator("psf_sigma")
-    @classmethod
-    def _sharp(cls, value: list[float]) -> list[float]:
-        if value[0] <= 0:
-            raise ValueError(f"is {value[0]:g}; the blur must be above 0 px, such as 0.3 for a very sharp lens")
-        return value
-
-    @field_validator("motion_mm", "motion_deg")
-    @classmethod
-    def _motion(cls, value: list[float]) -> list[float]:
-        if value[0] < 0:
-            raise ValueError(f"is {value[0]:g}; give the length of the move during the exposure, 0 or more")
-        return value
 
     @field_validator("plate")
     @classmethod
@@ -159,27 +172,18 @@ class Imaging(BaseModel):
         return self
 
 
-class Sensor(BaseModel):
+class Sensor(_Section):
     """Noise after EMVA 1288 and the stored depth."""
 
-    model_config = _FROZEN
-    noise: Range = [1.0, 1.0]
-    full_well: Annotated[FiniteFloat, Field(gt=0)] | None = None
+    noise: Noise = [1.0, 1.0]
+    full_well: Positive | None = None
     bits: Literal[8, 10, 12, 16] = 8
-    gamma: Annotated[FiniteFloat, Field(gt=0)] = 1.0
-
-    @field_validator("noise")
-    @classmethod
-    def _not_negative(cls, value: list[float]) -> list[float]:
-        if value[0] < 0:
-            raise ValueError(f"is {value[0]:g}; give the standard deviation in grey levels, 0 or more")
-        return value
+    gamma: Positive = 1.0
 
 
-class PlanFile(BaseModel):
+class PlanFile(_Section):
     """A plan file, see docs/simulation.md."""
 
-    model_config = _FROZEN
     camera: str
     target: str
     seed: int = 0
@@ -187,54 +191,58 @@ class PlanFile(BaseModel):
     imaging: Imaging = Imaging()
     sensor: Sensor = Sensor()
     faults: dict[str, dict[str, Any]] = {}
-    depth_range: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)] | None = None
+    depth_range: Pair | None = None
     out_of_view: Literal["error", "mark"] = "error"
     bounds: bool = True
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
-    """A plan that has been read: everything that the frames depend on, one row a frame.
+class Conditions(Rows):
+    """What every frame has its own value of: blur (px), read noise and grey levels of 0..255."""
+
+    psf_sigma: Float[Tensor, " N"]
+    dark: Float[Tensor, " N"]
+    light: Float[Tensor, " N"]
+    surround: Float[Tensor, " N"]
+    noise: Float[Tensor, " N"]
+
+
+@dataclass(frozen=True, eq=False)
+class Plan(Rows):
+    """A plan that has been read: everything that the frames depend on, one row a frame, float64.
 
     Attributes:
-        file: what the plan file says. path: where it lies. camera, target: the models that it names.
-        R, t: (N, 3, 3), (N, 3) float64, target to camera, mm.
-        conditions: (N,) float64 by name: psf_sigma, dark, light, surround, noise.
-        motion: (N, 6) float64, mm and rad during the exposure.
+        R: target to camera.
+        t: target to camera, mm.
+        conditions: blur, levels and noise.
+        motion: mm and rad during the exposure.
+        seen: markers that lie in the frame as a whole.
+        file: what the plan file ``path`` says, with the ``camera`` and the ``target`` that it names.
         backgrounds: pictures, in natural order; frame i takes the one of the number i modulo their count.
-        seen: (N,) int64, markers that lie in the frame as a whole.
     """
 
-    file: PlanFile
-    path: Path
-    camera: Camera
-    target: Target
-    R: Tensor
-    t: Tensor
-    conditions: dict[str, Tensor]
-    motion: Tensor
-    backgrounds: list[Path]
-    seen: Tensor
-
-    def __len__(self) -> int:
-        return len(self.t)
-
-    def rows(self, which: Tensor) -> Plan:
-        """The plan of the frames numbered ``which`` (K,) alone, which are then numbered from 0."""
-        return replace(
-            self,
-            R=self.R[which],
-            t=self.t[which],
-            conditions={name: column[which] for name, column in self.conditions.items()},
-            motion=self.motion[which],
-            seen=self.seen[which],
-        )
+    R: Float[Tensor, "N 3 3"]
+    t: Float[Tensor, "N 3"]
+    conditions: Conditions
+    motion: Float[Tensor, "N 6"]
+    seen: Int[Tensor, " N"]
+    file: PlanFile = shared()
+    path: Path = shared()
+    camera: Camera = shared()
+    target: Target = shared()
+    backgrounds: list[Path] = shared()
 
     @property
     def names(self) -> list[str]:
         """File names of the frames."""
         digits = max(4, len(str(len(self) - 1)))
         return [f"{i:0{digits}d}.png" for i in range(len(self))]
+
+    @property
+    def in_depth_range(self) -> Bool[Tensor, " N"]:
+        """Whether the target's origin lies in the plan's depth range; all do where it has none."""
+        near, far = self.file.depth_range or (0.0, math.inf)
+        return (self.t[:, 2] >= near) & (self.t[:, 2] <= far)
 
 
 def load_plan(path: str | os.PathLike[str]) -> Plan:
@@ -248,41 +256,36 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
     file = validate(PlanFile, read_yaml(path), path)
     camera = Camera.load(beside(path, file.camera))
     target = Target.load(beside(path, file.target))
-    generator = torch.Generator().manual_seed(file.seed % 2**63)
     if file.faults:
         with within(f"{path}: "):
             faults_of(file.faults)
     if file.depth_range is not None and not 0 < file.depth_range[0] < file.depth_range[1]:
         raise ConfigError(f"{path}: depth_range: {file.depth_range} is not 0 < near < far; correct it")
     R, t = _poses(path, file, camera, target)
-    count = len(t)
     image = file.imaging
-    conditions = {
-        name: _draw(value, count, generator)
-        for name, value in (
-            ("psf_sigma", image.psf_sigma),
-            ("dark", image.dark),
-            ("light", image.light),
-            ("surround", image.surround),
-            ("noise", file.sensor.noise),
-        )
-    }
-    motion = torch.cat(
-        [
-            _direction(count, generator) * _draw(image.motion_mm, count, generator)[:, None],
-            _direction(count, generator) * _draw(image.motion_deg, count, generator).deg2rad()[:, None],
-        ],
-        1,
-    )
+    generator = torch.Generator().manual_seed(file.seed % 2**63)
+
+    def draw(value: list[float]) -> Tensor:
+        return _spread(value, torch.rand(len(t), dtype=torch.float64, generator=generator))
+
+    def directions() -> Tensor:
+        vectors = torch.randn(len(t), 3, dtype=torch.float64, generator=generator)
+        return torch.nn.functional.normalize(vectors, dim=1)
+
+    conditions = Conditions(*map(draw, (image.psf_sigma, image.dark, image.light, image.surround, file.sensor.noise)))
+    shift = directions() * draw(image.motion_mm)[:, None]
+    motion = torch.cat([shift, directions() * draw(image.motion_deg).deg2rad()[:, None]], 1)
     seen = markers_in_view(camera, target, R, t)
-    plan = Plan(file, path, camera, target, R, t, conditions, motion, _backgrounds(path, image.background), seen)
+    plan = Plan(R, t, conditions, motion, seen, file, path, camera, target, _backgrounds(path, image.background))
     if file.out_of_view == "error":
         _check_view(plan)
     return plan
 
 
-def markers_in_view(camera: Camera, target: Target, R: Tensor, t: Tensor) -> Tensor:
-    """(N,) int64: how many markers lie before the camera and in the frame as a whole, for poses (N, 3, 3), (N, 3)."""
+def markers_in_view(
+    camera: Camera, target: Target, R: Float[Tensor, "N 3 3"], t: Float[Tensor, "N 3"]
+) -> Int[Tensor, " N"]:
+    """How many markers lie before the camera and in the frame as a whole."""
     e1, e2 = plane_axes(target.normals)
     angle = torch.arange(36, dtype=t.dtype) * (2 * math.pi / 36)
     rim = angle.cos()[:, None, None] * e1 + angle.sin()[:, None, None] * e2
@@ -295,32 +298,24 @@ def markers_in_view(camera: Camera, target: Target, R: Tensor, t: Tensor) -> Ten
     return inside.view(len(t), 36, -1).all(1).sum(1)
 
 
-def in_depth_range(plan: Plan) -> Tensor:
-    """(N,) bool: whether the target's origin lies in the plan's depth range; all do where it has none."""
-    near, far = plan.file.depth_range or (0.0, math.inf)
-    return (plan.t[:, 2] >= near) & (plan.t[:, 2] <= far)
-
-
 def _check_view(plan: Plan) -> None:
+    """Raises ConfigError for the first frame that is behind the camera, has lost a marker or is out of range."""
     fix = "change the poses, or write out_of_view: mark to keep such frames, marked in truth.csv"
-    behind = (plan.t[:, 2] <= 0).nonzero().flatten()
-    if len(behind):
-        z = float(plan.t[behind[0], 2])
-        raise ConfigError(f"{plan.path}: poses: frame {int(behind[0])} is behind the camera (z = {z:g} mm); {fix}")
-    lost = (plan.seen < len(plan.target)).nonzero().flatten()
-    if len(lost):
-        i = int(lost[0])
-        raise ConfigError(
-            f"{plan.path}: poses: {len(plan.target) - int(plan.seen[i])} of {len(plan.target)} markers of frame {i} "
-            f"are out of view ({len(lost)} such frames); {fix}"
-        )
-    far = (~in_depth_range(plan)).nonzero().flatten()
-    if len(far):
-        z = float(plan.t[far[0], 2])
-        raise ConfigError(
-            f"{plan.path}: poses: frame {int(far[0])} is at {z:g} mm, out of depth_range {plan.file.depth_range} "
-            f"({len(far)} such frames); {fix}"
-        )
+    behind, lost, far = (
+        fault.nonzero().flatten().tolist()
+        for fault in (plan.t[:, 2] <= 0, plan.seen < len(plan.target), ~plan.in_depth_range)
+    )
+    if behind:
+        what = f"frame {behind[0]} is behind the camera (z = {float(plan.t[behind[0], 2]):g} mm)"
+    elif lost:
+        gone = len(plan.target) - int(plan.seen[lost[0]])
+        what = f"{gone} of {len(plan.target)} markers of frame {lost[0]} are out of view ({len(lost)} such frames)"
+    elif far:
+        where = f"at {float(plan.t[far[0], 2]):g} mm, out of depth_range {plan.file.depth_range}"
+        what = f"frame {far[0]} is {where} ({len(far)} such frames)"
+    else:
+        return
+    raise ConfigError(f"{plan.path}: poses: {what}; {fix}")
 
 
 def _poses(path: Path, file: PlanFile, camera: Camera, target: Target) -> tuple[Tensor, Tensor]:
@@ -336,7 +331,7 @@ def _poses(path: Path, file: PlanFile, camera: Camera, target: Target) -> tuple[
         turns = [math.radians(angle) * eye[axis] for axis in range(3) for angle in axes.turns_deg]
         shift, turn = torch.stack(moves + [still] * len(turns)), torch.stack([still] * len(moves) + turns)
         return rotations.exp(turn) @ _euler(_floats([axes.rotation_deg]).deg2rad())[0], _floats(axes.start) + shift
-    listed: Truth = read_truth(beside(path, str(file.poses.file)))
+    listed = read_truth(beside(path, str(file.poses.file)))
     return listed.R, listed.t
 
 
@@ -382,16 +377,8 @@ def _euler(angles: Tensor) -> Tensor:
     return roll @ yaw @ pitch
 
 
-def _draw(value: list[float], count: int, generator: torch.Generator) -> Tensor:
-    return _spread(value, torch.rand(count, dtype=torch.float64, generator=generator))
-
-
 def _spread(value: list[float], u: Tensor) -> Tensor:
     return value[0] + (value[1] - value[0]) * u
-
-
-def _direction(count: int, generator: torch.Generator) -> Tensor:
-    return torch.nn.functional.normalize(torch.randn(count, 3, dtype=torch.float64, generator=generator), dim=1)
 
 
 def _floats(values: Any) -> Tensor:
@@ -399,8 +386,4 @@ def _floats(values: Any) -> Tensor:
 
 
 def _backgrounds(path: Path, name: str | None) -> list[Path]:
-    if name is None:
-        return []
-    from torchpose.io.sources import find_sources
-
-    return [source.path for source in find_sources([Path(beside(path, name))])]
+    return [] if name is None else [source.path for source in find_sources([Path(beside(path, name))])]

@@ -82,12 +82,12 @@ class Page:
         lines = [
             f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}mm" height="{height}mm" '
             f'viewBox="0 0 {width} {height}">',
-            f"<title>{escape(self.title)}</title>",
-            f'<rect width="{width}" height="{height}" fill="#ffffff"/>',
+            _element("title", self.title),
+            _element("rect", width=self.width, height=self.height, fill="#ffffff"),
             *map(_svg, self.shapes),
-            "</svg>",
+            "</svg>\n",
         ]
-        return "\n".join(lines) + "\n"
+        return "\n".join(lines)
 
     def pdf(self) -> bytes:
         """The page as PDF 1.6, with the trim box of the printer's trade and the wish not to be scaled."""
@@ -113,12 +113,12 @@ class Page:
             offsets.append(len(file))
             file += b"%d 0 obj\n%s\nendobj\n" % (number, body)
         table = b"".join(b"%010d 00000 n \n" % offset for offset in offsets)
-        size = len(objects) + 1
-        return (
-            file
-            + b"xref\n0 %d\n0000000000 65535 f \n%s" % (size, table)
-            + b"trailer\n<< /Size %d /Root 1 0 R /Info %d 0 R >>\nstartxref\n%d\n" % (size, size - 1, len(file))
-            + b"%%EOF\n"
+        size, start = len(objects) + 1, len(file)
+        file += b"xref\n0 %d\n0000000000 65535 f \n%s" % (size, table)
+        return file + b"trailer\n<< /Size %d /Root 1 0 R /Info %d 0 R >>\nstartxref\n%d\n%%%%EOF\n" % (
+            size,
+            size - 1,
+            start,
         )
 
 
@@ -130,37 +130,37 @@ def _numbers(*values: float) -> str:
     return " ".join(map(_number, values))
 
 
+def _element(name: str, text: str | None = None, /, **attributes: float | str) -> str:
+    values = {key.replace("_", "-"): v if isinstance(v, str) else _number(v) for key, v in attributes.items()}
+    start = " ".join([name, *(f'{key}="{value}"' for key, value in values.items())])
+    return f"<{start}/>" if text is None else f"<{start}>{escape(text)}</{name}>"
+
+
 def _svg(shape: Shape) -> str:
     if isinstance(shape, Text):
-        anchor = ' text-anchor="middle"' if shape.number else ""
-        return (
-            f'<text x="{_number(shape.x)}" y="{_number(shape.y)}" font-size="{_number(shape.size)}" '
-            f'font-family="Helvetica, Arial, sans-serif"{anchor}>{escape(shape.text)}</text>'
-        )
-    level = round(255 * shape.grey)
-    colour = f"#{level:02x}{level:02x}{level:02x}"
+        family, anchor = "Helvetica, Arial, sans-serif", {"text_anchor": "middle"} if shape.number else {}
+        return _element("text", shape.text, x=shape.x, y=shape.y, font_size=shape.size, font_family=family, **anchor)
+    colour = f"#{round(255 * shape.grey):02x}" + 2 * f"{round(255 * shape.grey):02x}"
     if isinstance(shape, Circle):
-        place = f'cx="{_number(shape.x)}" cy="{_number(shape.y)}" r="{_number(shape.radius)}"'
-        return f'<circle {place} fill="{colour}"/>'
+        return _element("circle", cx=shape.x, cy=shape.y, r=shape.radius, fill=colour)
     if isinstance(shape, Rectangle):
-        place = f'x="{_number(shape.x)}" y="{_number(shape.y)}"'
-        size = f'width="{_number(shape.width)}" height="{_number(shape.height)}"'
-        return f'<rect {place} {size} fill="{colour}"/>'
-    ends = " ".join(f'{name}="{_number(getattr(shape, name))}"' for name in ("x1", "y1", "x2", "y2"))
-    return f'<line {ends} stroke="{colour}" stroke-width="{_number(shape.width)}"/>'
+        return _element("rect", x=shape.x, y=shape.y, width=shape.width, height=shape.height, fill=colour)
+    return _element("line", x1=shape.x1, y1=shape.y1, x2=shape.x2, y2=shape.y2, stroke=colour, stroke_width=shape.width)
 
 
 def _pdf(shape: Shape) -> str:
     if isinstance(shape, Text):
         x = shape.x - (_DIGIT * shape.size * len(shape.text) / 2 if shape.number else 0)
-        place = f"1 0 0 -1 {_numbers(x, shape.y)} Tm"
-        return f"BT /F {_number(shape.size)} Tf 0 g {place} ({_pdf_string(shape.text)}) Tj ET"
+        return (
+            f"BT /F {_numbers(shape.size)} Tf 0 g 1 0 0 -1 {_numbers(x, shape.y)} Tm ({_pdf_string(shape.text)}) Tj ET"
+        )
+    grey = _number(shape.grey)
     if isinstance(shape, Circle):
-        return f"{_number(shape.grey)} g {_pdf_circle(shape)} f"
+        return f"{grey} g {_pdf_circle(shape)} f"
     if isinstance(shape, Rectangle):
-        return f"{_number(shape.grey)} g {_numbers(shape.x, shape.y, shape.width, shape.height)} re f"
+        return f"{grey} g {_numbers(shape.x, shape.y, shape.width, shape.height)} re f"
     path = f"{_numbers(shape.x1, shape.y1)} m {_numbers(shape.x2, shape.y2)} l S"
-    return f"{_number(shape.grey)} G {_number(shape.width)} w {path}"
+    return f"{grey} G {_number(shape.width)} w {path}"
 
 
 def _pdf_circle(circle: Circle) -> str:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.camera import Camera
@@ -14,6 +16,8 @@ from torchpose.detect.reduce import reduction_factor
 from torchpose.identify.markers import ratio_tolerance
 from torchpose.target import MIN_RATIO_GAP
 
+Size = tuple[float, float]
+"""Width and height, mm."""
 # columns, rows (columns along the longer side) and whether the places within the rim are used
 ARRANGEMENTS = {
     4: (2, 2, True),
@@ -35,16 +39,12 @@ _SHUFFLES = 3000  # orders of codes tried where all are too many
 
 @dataclass(frozen=True)
 class Limits:
-    """What the stages need of a ring, for one camera, in px of its semi-minor axis in the worst view.
+    """What the stages need of a ring, for one camera, in px of its semi-minor axis in the worst view."""
 
-    Attributes:
-        outer, inner: least semi-minor axes. width: least difference of both. scale: px a mm in the worst view.
-    """
-
-    outer: float
-    inner: float
-    width: float
-    scale: float
+    outer: float  # least semi-minor axis
+    inner: float  # the same of the inner circle
+    width: float  # least difference of both
+    scale: float  # px a mm in the worst view
 
     @classmethod
     def of(cls, camera: Camera, scale: float) -> Limits:
@@ -56,8 +56,8 @@ class Limits:
         """Width in mm of the zone around a ring of ``radius`` mm that stays free."""
         return max(_QUIET * radius, _QUIET_PX / self.scale)
 
-    def ratios(self, count: int, radius: float) -> Tensor | None:
-        """Inner/outer ratios (count,), rising, as far apart as the ring allows; None where it cannot hold so many.
+    def ratios(self, count: int, radius: float) -> Float[Tensor, " count"] | None:
+        """Inner/outer ratios, rising, as far apart as the ring allows; None where it cannot hold so many.
 
         Neighbours differ by at least twice the tolerance of `torchpose.identify.markers`, so that a reading within the
         tolerance of one code is outside that of every other.
@@ -70,24 +70,20 @@ class Limits:
         gap = (high - low) / (count - 1)
         if gap < max(MIN_RATIO_GAP, 2 * ratio_tolerance(semi_minor)):
             return None
-        return torch.linspace(low, high, count, dtype=torch.float64)
+        return torch.linspace(low, high, count, dtype=torch.float64, device="cpu")
 
-    def largest_radius(self, count: int, plate: tuple[float, float]) -> float:
+    def largest_radius(self, count: int, plate: Size) -> float:
         """Largest outer radius in mm that leaves the quiet zones of ``count`` rings on a plate; 0 where none does."""
-        low, high = 0.0, min(plate) / 2
-        for _ in range(50):
-            middle = (low + high) / 2
-            low, high = (middle, high) if self._fits(count, plate, middle) else (low, middle)
-        return low
 
-    def _fits(self, count: int, plate: tuple[float, float], radius: float) -> bool:
-        half = [side / 2 - self.quiet(radius) - radius for side in plate]
-        if min(half) <= 0:
-            return False
-        return bool(torch.pdist(self.places(count, plate, radius)).min() >= 2 * radius + self.quiet(radius))
+        def fits(radius: float) -> bool:
+            quiet = self.quiet(radius)
+            apart = torch.pdist(self.places(count, plate, radius)).min()
+            return min(plate) / 2 - quiet - radius > 0 and bool(apart >= 2 * radius + quiet)
 
-    def places(self, count: int, plate: tuple[float, float], radius: float) -> Tensor:
-        """Centres (count, 2) in mm: the outermost rings leave just their quiet zone to the plate's rim."""
+        return largest(fits, min(plate) / 2)
+
+    def places(self, count: int, plate: Size, radius: float) -> Float[Tensor, "count 2"]:
+        """Centres in mm: the outermost rings leave just their quiet zone to the plate's rim."""
         columns, rows, whole = ARRANGEMENTS[count]
         if plate[1] > plate[0]:
             columns, rows = rows, columns
@@ -98,11 +94,20 @@ class Limits:
             for i in range(columns)
             if whole or i in (0, columns - 1) or k in (0, rows - 1)
         ]
-        return torch.tensor(grid, dtype=torch.float64)
+        return torch.tensor(grid, dtype=torch.float64, device="cpu")
 
 
-def assign_codes(places: Tensor, ratios: Tensor) -> Tensor:
-    """Ratios (M,) by place (M, 2): the order that differs most from itself under every symmetry of the places.
+def largest(fits: Callable[[float], bool], most: float) -> float:
+    """Largest number from 0 to ``most`` that fits, where all below it do."""
+    low, high = 0.0, most
+    for _ in range(50):
+        middle = (low + high) / 2
+        low, high = (middle, high) if fits(middle) else (low, middle)
+    return low
+
+
+def assign_codes(places: Float[Tensor, "M 2"], ratios: Float[Tensor, " M"]) -> Float[Tensor, " M"]:
+    """Ratios by place: the order that differs most from itself under every symmetry of the places.
 
     Codes that rise along a row would look alike in a target turned or mirrored: each ring would show its neighbour's.
     The score of an order is the mean difference of codes between a place and its image, for the worst symmetry.
@@ -110,10 +115,10 @@ def assign_codes(places: Tensor, ratios: Tensor) -> Tensor:
     images = _symmetries(places)
     count = len(places)
     if math.factorial(count) <= _SHUFFLES:
-        orders = torch.tensor(list(itertools.permutations(range(count))))
+        orders = torch.tensor(list(itertools.permutations(range(count))), device=ratios.device)
     else:
-        draw = torch.rand(_SHUFFLES, count, generator=torch.Generator().manual_seed(count))
-        orders = draw.argsort(1)
+        draw = torch.rand(_SHUFFLES, count, generator=torch.Generator().manual_seed(count), device="cpu")
+        orders = draw.argsort(1).to(ratios.device)
     by_order = ratios[orders]  # (P, M)
     if not images:
         return by_order[0]
@@ -123,10 +128,10 @@ def assign_codes(places: Tensor, ratios: Tensor) -> Tensor:
 
 def _symmetries(places: Tensor) -> list[Tensor]:
     """Permutations (M,) of the places by the turns and mirror images of the plane that map them onto themselves."""
-    found = []
-    for swap, sx, sy in itertools.product((False, True), (1.0, -1.0), (1.0, -1.0)):
-        image = (places.flip(1) if swap else places) * torch.tensor([sx, sy], dtype=places.dtype)
+    found, still = [], torch.arange(len(places), device=places.device)
+    for swap, *signs in itertools.product((False, True), (1.0, -1.0), (1.0, -1.0)):
+        image = (places.flip(1) if swap else places) * places.new_tensor(signs)
         distance, index = torch.cdist(image, places).min(1)
-        if bool((distance < 1e-6 * places.abs().max()).all()) and bool((index != torch.arange(len(places))).any()):
+        if bool((distance < 1e-6 * places.abs().max()).all()) and not torch.equal(index, still):
             found.append(index)
     return found

@@ -6,13 +6,15 @@ import math
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.analysis.evaluation import AXES, UNITS
 from torchpose.camera import Camera
 from torchpose.design.predict import Imaging, deviations, edge_covariance, in_view, outlines, predicted_covariance
-from torchpose.design.volume import WorkingVolume
+from torchpose.design.volume import Offsets, Poses, WorkingVolume
 from torchpose.errors import ConfigError
+from torchpose.geometry.rows import Rows
 from torchpose.io.rows import Row
 from torchpose.target import Target
 
@@ -20,8 +22,8 @@ FRAME_MARGIN_PX = 10.0  # between rings and the border of the frame
 _TILTS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the largest one
 _DIRECTIONS = 8  # of the tilt, and turns about the axis, among which the weakest pose is searched
 _STEPS = 4  # of distance and tilt in a map
-_AZIMUTHS = 8  # directions of the tilt in a map
 _PLACES = 3  # across the offset, along x and y
+_COLUMNS = ["axis", "unit", "needed", "middle", "worst", "worst_x_mm", "worst_y_mm", "worst_z_mm", "worst_tilt_deg"]
 
 
 @dataclass(frozen=True)
@@ -46,52 +48,37 @@ class Need:
     def excess(self, deviation: Tensor) -> Tensor:
         """How many times (...) the deviations (..., 6) of `deviations` exceed the need; up to 1 is good."""
         allowed = [math.inf if value is None else value for value in self.allowed]
-        return (deviation / torch.tensor(allowed, dtype=deviation.dtype)).amax(-1)
+        return (deviation / deviation.new_tensor(allowed)).amax(-1)
 
 
 @dataclass(frozen=True, eq=False)
-class Precision:
-    """Predicted standard deviations over a working volume.
+class Precision(Rows):
+    """Predicted standard deviations over a working volume, a row an axis, in the units of `deviations`."""
 
-    Attributes:
-        middle: (6,) facing the camera in the middle. worst: (6,) the largest of every axis; units of `deviations`.
-        R, t: (6, 3, 3), (6, 3) where the largest ones were found.
-    """
-
-    middle: Tensor
-    worst: Tensor
-    R: Tensor
-    t: Tensor
+    middle: Float[Tensor, " 6"]  # facing the camera in the middle
+    worst: Float[Tensor, " 6"]  # the largest
+    R: Float[Tensor, "6 3 3"]  # where it was found
+    t: Float[Tensor, "6 3"]
 
     def rows(self, need: Need | None = None) -> list[Row]:
         """One row an axis: what is needed, the deviation in the middle, the largest one, and where that is."""
         tilt = self.R[:, 2, 2].clamp(max=1).acos().rad2deg()
         columns = (self.middle, self.worst, *self.t.unbind(1), tilt)
-        rows: list[Row] = []
-        for i, values in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
-            row: Row = {"axis": AXES[i], "unit": UNITS[i], "needed": None if need is None else need.allowed[i]}
-            row |= zip(
-                ("middle", "worst", "worst_x_mm", "worst_y_mm", "worst_z_mm", "worst_tilt_deg"), values, strict=True
-            )
-            rows.append(row)
-        return rows
+        needed = [None] * len(AXES) if need is None else need.allowed
+        rows = zip(AXES, UNITS, needed, *(column.tolist() for column in columns), strict=True)
+        return [dict(zip(_COLUMNS, row, strict=True)) for row in rows]
 
 
 @dataclass(frozen=True, eq=False)
 class PrecisionMap:
-    """Largest predicted deviations: across (um), along (um) and about any (mdeg) axis, on two grids.
+    """Largest predicted deviations: across (um), along (um) and about any (mdeg) axis, on two grids."""
 
-    Attributes:
-        distance: (D,) mm. tilt: (T,) rad. by_tilt: (D, T, 3), on the optical axis, over all directions of the tilt.
-        x: (X,), y: (Y,) mm. by_place: (Y, X, 3), at the farthest distance, over tilts of 0 and the largest.
-    """
-
-    distance: Tensor
-    tilt: Tensor
-    by_tilt: Tensor
-    x: Tensor
-    y: Tensor
-    by_place: Tensor
+    distance: Float[Tensor, " D"]  # mm
+    tilt: Float[Tensor, " T"]  # rad
+    by_tilt: Float[Tensor, "D T 3"]  # on the optical axis, over all directions of the tilt
+    x: Float[Tensor, " X"]  # mm
+    y: Float[Tensor, " Y"]  # mm
+    by_place: Float[Tensor, "Y X 3"]  # at the farthest distance, over tilts of 0 and the largest
 
 
 def predict_volume(camera: Camera, target: Target, volume: WorkingVolume, imaging: Imaging) -> Precision:
@@ -100,23 +87,16 @@ def predict_volume(camera: Camera, target: Target, volume: WorkingVolume, imagin
     Raises:
         ConfigError: a ring leaves the frame somewhere in the volume.
     """
-    R, t = volume.extremes()
-    if not in_view(camera, outlines(target), R, t, FRAME_MARGIN_PX):
+    if not in_view(camera, outlines(target), *on_device(volume.extremes(), camera), FRAME_MARGIN_PX):
         raise ConfigError(
             f"{target.name}: rings leave the frame within the working volume; narrow offset, tilt or roll, or keep "
             "farther away"
         )
     # the closed form finds the weakest pose of every axis at each tilt; the full prediction compares the tilts
     tilts = [volume.tilt * part for part in _TILTS] if volume.tilt else [0.0]
-    chosen = [volume.middle]
+    chosen = [on_device(volume.middle, camera)]
     for tilt in tilts:
-        R, t = volume.poses(
-            distances=sorted(set(volume.distance)),
-            tilts=[tilt],
-            azimuths=_DIRECTIONS,
-            rolls=_DIRECTIONS if volume.roll else 1,
-            offsets=volume.corners,
-        )
+        R, t = on_device(volume.borders([tilt], _DIRECTIONS), camera)
         weakest = deviations(edge_covariance(camera, target, R, t, imaging)).argmax(0).unique()
         chosen.append((R[weakest], t[weakest]))
     R, t = (torch.cat(parts) for parts in zip(*chosen, strict=True))
@@ -130,23 +110,26 @@ def precision_map(camera: Camera, target: Target, volume: WorkingVolume, imaging
     distance, tilt = _steps(*volume.distance), _steps(0.0, volume.tilt)
     x, y = (_steps(-half, half, _PLACES) for half in volume.offset)
 
-    def largest(tilts: Tensor, distances: Tensor, places: list[tuple[float, float]]) -> Tensor:
+    def largest(tilts: Tensor, distances: Tensor, places: Offsets) -> Tensor:
         """Largest deviations (distances * places, tilts, 3)."""
         columns = []
         for angle in tilts.tolist():
-            R, t = volume.poses(
-                distances=distances.tolist(), tilts=[angle], azimuths=_AZIMUTHS, rolls=1, offsets=places
-            )
-            found = deviations(predicted_covariance(camera, target, R, t, imaging))
+            poses = volume.poses(distances=distances.tolist(), tilts=[angle], azimuths=_DIRECTIONS, offsets=places)
+            found = deviations(predicted_covariance(camera, target, *on_device(poses, camera), imaging))
             found = found.unflatten(0, (len(distances) * len(places), -1)).amax(1)
             columns.append(torch.stack([found[:, :2].amax(1), found[:, 2], found[:, 3:].amax(1)], 1))
         return torch.stack(columns, 1)
 
     by_tilt = largest(tilt, distance, [(0.0, 0.0)])
-    grid = [(a, b) for b in y.tolist() for a in x.tolist()]
+    grid = [(across, down) for down in y.tolist() for across in x.tolist()]
     by_place = largest(tilt[[0, -1]], distance[-1:], grid).amax(1).view(len(y), len(x), 3)
     return PrecisionMap(distance, tilt, by_tilt, x, y, by_place)
 
 
 def _steps(low: float, high: float, count: int = _STEPS) -> Tensor:
-    return torch.linspace(low, high, count if high > low else 1, dtype=torch.float64)
+    return torch.linspace(low, high, count if high > low else 1, dtype=torch.float64, device="cpu")
+
+
+def on_device(poses: Poses, camera: Camera) -> Poses:
+    """Poses where the camera is."""
+    return poses[0].to(camera.matrix), poses[1].to(camera.matrix)

@@ -7,12 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchpose import ellipse
+from torchpose.analysis.sensitivity import around, ring_edges
 from torchpose.camera import Camera
 from torchpose.errors import ConfigError
-from torchpose.geometry.rotations import plane_axes
+from torchpose.geometry.projection import by_pose
 from torchpose.refine import Sight, refine_photometric
 from torchpose.sim import Defocus, add_noise, render
 from torchpose.target import Target
@@ -28,8 +30,11 @@ class Imaging:
     """Conditions of the frames.
 
     Attributes:
-        psf_sigma: blur of the lens in focus, px, Gaussian. noise: grey levels of 0..255, Gaussian and white.
-        dark, light: grey levels of print and paper. lens: for the blur out of focus; None: sharp everywhere.
+        psf_sigma: blur of the lens in focus, px, Gaussian.
+        noise: grey levels of 0..255, Gaussian and white.
+        dark: grey level of the print.
+        light: grey level of the paper.
+        lens: for the blur out of focus; None: sharp everywhere.
 
     Raises:
         ConfigError: a number is out of range.
@@ -50,16 +55,13 @@ class Imaging:
             raise ConfigError(f"levels: {self.dark:g} {self.light:g}; give dark and light, 0 <= dark < light <= 255")
 
     def blur(self, camera: Camera, depth: Tensor) -> Tensor:
-        """Standard deviation (...) in px at depths (...) in mm.
-
-        A disc of radius rho has the variance rho^2 / 4 along any axis.
-        """
+        """Standard deviation (...) in px at depths (...) in mm; a disc has the variance radius^2 / 4 along any axis."""
         rho = torch.zeros_like(depth) if self.lens is None else self.lens.radius(camera, depth)
         return (self.psf_sigma**2 + rho.square() / 4).sqrt()
 
     def blur_at(self, camera: Camera, depths: Sequence[float]) -> list[float]:
         """`blur` at numbers."""
-        return self.blur(camera, torch.tensor(depths, dtype=torch.float64)).tolist()
+        return self.blur(camera, camera.matrix.new_tensor(depths)).tolist()
 
 
 def best_focus(near: float, far: float) -> float:
@@ -78,7 +80,7 @@ def sharp_range(camera: Camera, lens: Defocus, psf_sigma: float) -> tuple[float,
     return 1 / (focus + reach), 1 / (focus - reach) if focus > reach else math.inf
 
 
-def edge_covariance(camera: Camera, target: Target, R: Tensor, t: Tensor, imaging: Imaging) -> Tensor:
+def edge_covariance(camera: Camera, target: Target, R: Tensor, t: Tensor, imaging: Imaging) -> Float[Tensor, "B 6 6"]:
     """Covariance of the pose from the position of every bit of edge along its normal, grey levels and blur known.
 
     A straight blurred edge of contrast h and length L px fixes its offset with the information
@@ -87,39 +89,32 @@ def edge_covariance(camera: Camera, target: Target, R: Tensor, t: Tensor, imagin
     but with no derivative besides those by the pose, for searches.
 
     Args:
-        camera, target: taken for exact. R, t: (B, 3, 3), (B, 3), target to camera, mm.
+        R: (B, 3, 3), target to camera.
+        t: (B, 3), target to camera, mm.
 
     Returns:
-        (B, 6, 6) float64, mm and rad, translation first, rotation multiplied from the left.
+        float64, mm and rad, translation first, rotation multiplied from the left.
     """
-    arm = (rims(target) @ R[:, None].mT).flatten(1, 2)  # (B, 2 M S, 3), camera axes, about the origin
-    point = arm + t[:, None]
-    z = point[..., 2:]
-    xy = point[..., :2] / z
-    eye = torch.eye(3, dtype=R.dtype)
-    by_point = camera.J_distort(xy) @ ((eye[:2] - xy[..., None] * eye[2]) / z[..., None])  # (B, P, 2, 3)
-    pixel = camera.distort(xy).unflatten(1, (-1, _SAMPLES))
-    tangent = (pixel.roll(-1, 2) - pixel.roll(1, 2)).flatten(1, 2) / 2  # px for a step along the circle
-    length = tangent.norm(dim=-1)
-    normal = torch.stack([tangent[..., 1], -tangent[..., 0]], -1) / length[..., None]
-    by_shift = (normal[..., None, :] @ by_point).squeeze(-2)  # (B, P, 3)
-    jacobian = torch.cat([by_shift, torch.linalg.cross(arm, by_shift)], -1)
-    blur = (imaging.blur(camera, z[..., 0]).square() + _PIXEL_VARIANCE).sqrt()
-    weight = length / blur * (imaging.light - imaging.dark) ** 2 / (2 * math.sqrt(math.pi))
-    information = jacobian.mT @ (jacobian * weight[..., None]) / (imaging.noise**2 + _QUANTISATION)
-    return torch.linalg.inv(information)
+    edge = ring_edges(camera, target, R, t, _SAMPLES)
+    jacobian = by_pose(edge.by_point, edge.arm)
+    blur = (imaging.blur(camera, edge.depth).square() + _PIXEL_VARIANCE).sqrt()
+    weight = (imaging.light - imaging.dark) ** 2 / (2 * math.sqrt(math.pi) * (imaging.noise**2 + _QUANTISATION)) / blur
+    weighted = weight[..., None, None] * (edge.information @ jacobian)
+    return torch.linalg.inv(jacobian.flatten(1, 3).mT @ weighted.flatten(1, 3))
 
 
-def predicted_covariance(camera: Camera, target: Target, R: Tensor, t: Tensor, imaging: Imaging) -> Tensor:
+def predicted_covariance(
+    camera: Camera, target: Target, R: Tensor, t: Tensor, imaging: Imaging
+) -> Float[Tensor, "B 6 6"]:
     """Covariance that the estimator (``method="photometric"``) states for a target at every pose.
 
     One simulated frame a pose, cropped to the target, refined from the true pose: the covariance holds whatever the
     refinement leaves out or adds as unknowns. The frame's noise scatters it by about a percent.
 
-    Args and returns: as `edge_covariance`. NaN where the refinement fails.
+    Arguments and result as of `edge_covariance`; NaN where the refinement fails.
     """
-    rings = rims(target)
-    out = []
+    rings, out = rims(target), []
+    index = torch.arange(len(rings), device=t.device).repeat_interleave(_SAMPLES)
     for i in range(len(t)):
         pixel = camera.project(rings @ R[i].T + t[i])  # (2 M, S, 2)
         low = (pixel.flatten(0, 1).amin(0) - _MARGIN_PX).floor()
@@ -128,7 +123,7 @@ def predicted_covariance(camera: Camera, target: Target, R: Tensor, t: Tensor, i
         matrix[:2, 2] -= low
         crop = replace(camera, width=width, height=height, matrix=matrix)
         pose = R[i : i + 1], t[i : i + 1]
-        frame = render(
+        levels = render(
             crop,
             target,
             *pose,
@@ -137,31 +132,27 @@ def predicted_covariance(camera: Camera, target: Target, R: Tensor, t: Tensor, i
             light=imaging.light,
             defocus=imaging.lens,
         )
-        index = torch.arange(len(pixel)).repeat_interleave(_SAMPLES)
+        noisy = add_noise(levels, imaging.noise, index=index.new_tensor([i]))
         seen = ellipse.fit((pixel - low).flatten(0, 1), index, len(pixel)).view(1, len(target), 2, 5)
-        noisy = add_noise(frame, imaging.noise, index=torch.tensor([i]))
-        sight = Sight.of(noisy, crop, target, torch.zeros(1, dtype=torch.int64), seen)
-        refined = refine_photometric(sight, *pose)
+        refined = refine_photometric(Sight.of(noisy, crop, target, index.new_zeros(1), seen), *pose)
         out.append(torch.where(refined.good[:, None, None], refined.covariance, torch.nan))
     return torch.cat(out) if out else t.new_zeros(0, 6, 6)
 
 
-def rims(target: Target) -> Tensor:
-    """Points (2 M, S, 3) on the outer and inner circle of every marker, in turn, mm."""
-    angle = torch.arange(_SAMPLES, dtype=torch.float64) * (2 * math.pi / _SAMPLES)
-    one, two = plane_axes(target.normals)
-    circle = angle.cos()[:, None] * one[:, None] + angle.sin()[:, None] * two[:, None]  # (M, S, 3)
-    return (target.centers[:, None, None] + target.radii[:, :, None, None] * circle[:, None]).flatten(0, 1)
+def rims(target: Target) -> Float[Tensor, "circles samples 3"]:
+    """Points on the outer and inner circle of every marker, in turn, mm."""
+    circle = target.radii[..., None, None] * around(target, _SAMPLES)[0][:, None]
+    return (target.centers[:, None, None] + circle).flatten(0, 1)
 
 
-def deviations(covariance: Tensor) -> Tensor:
-    """Standard deviations (B, 6) of covariances (B, 6, 6): x, y, z in um, then about x, y, z in mdeg."""
+def deviations(covariance: Float[Tensor, "B 6 6"]) -> Float[Tensor, "B 6"]:
+    """Standard deviations of covariances: x, y, z in um, then about x, y, z in mdeg."""
     std = covariance.diagonal(dim1=-2, dim2=-1).sqrt() * 1e3
     return torch.cat([std[:, :3], std[:, 3:].rad2deg()], 1)
 
 
-def outlines(target: Target) -> Tensor:
-    """Points (12 M, 3) on the outer circles of a target, mm."""
+def outlines(target: Target) -> Float[Tensor, "points 3"]:
+    """Points on the outer circles of a target, 12 each, mm."""
     return rims(target)[::2, :: _SAMPLES // 12].flatten(0, 1)
 
 
@@ -169,6 +160,6 @@ def in_view(camera: Camera, points: Tensor, R: Tensor, t: Tensor, margin: float)
     """Whether points (P, 3) of the target lie ``margin`` px inside the frame at all poses (B, 3, 3), (B, 3)."""
     seen = points @ R.mT + t[:, None]
     pixel = camera.project(seen)
-    last = torch.tensor([camera.width - 1, camera.height - 1], dtype=t.dtype) - margin
+    last = t.new_tensor([camera.width - 1, camera.height - 1]) - margin
     inside = ((pixel >= margin) & (pixel <= last)).all()
     return bool(inside & ((seen[..., :2] / seen[..., 2:]).norm(dim=-1) < camera.fold_radius).all())

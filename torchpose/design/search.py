@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import TypedDict, Unpack
 
 import torch
 from torch import Tensor
 
 from torchpose.camera import Camera
-from torchpose.design.layout import ARRANGEMENTS, Limits, assign_codes
-from torchpose.design.precision import FRAME_MARGIN_PX, Need, Precision, predict_volume
+from torchpose.design.layout import ARRANGEMENTS, Limits, Size, assign_codes, largest
+from torchpose.design.precision import FRAME_MARGIN_PX, Need, Precision, on_device, predict_volume
 from torchpose.design.predict import Imaging, deviations, edge_covariance, in_view, outlines
 from torchpose.design.volume import WorkingVolume
 from torchpose.errors import ConfigError
@@ -23,12 +25,12 @@ _MICRON = 1e-2  # mm, to which radii and places are rounded: a target file that 
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """A target and what it promises. plate: width and height in mm. limits: of its rings."""
+    """A target and what it promises."""
 
     target: Target
-    plate: tuple[float, float]
-    limits: Limits
-    precision: Precision
+    plate: Size
+    limits: Limits  # of its rings
+    precision: Precision  # over the working volume
 
     @property
     def radius(self) -> float:
@@ -47,16 +49,16 @@ class Design:
         return float(gap) / ratio_tolerance(self.semi_minor)
 
 
+class Choice(TypedDict, total=False):
+    """What may be chosen of a target."""
+
+    name: str | None  # by default number of rings and size
+    background: str  # light (by default) or dark
+    markers: int | None  # number of rings; by default the fewest that do
+
+
 def design_target(
-    camera: Camera,
-    volume: WorkingVolume,
-    plate: tuple[float, float],
-    need: Need,
-    imaging: Imaging,
-    *,
-    name: str | None = None,
-    background: str = "light",
-    markers: int | None = None,
+    camera: Camera, volume: WorkingVolume, plate: Size, need: Need, imaging: Imaging, **choice: Unpack[Choice]
 ) -> Design:
     """The target with the fewest rings whose predicted standard deviations meet the need everywhere in the volume.
 
@@ -65,8 +67,8 @@ def design_target(
     `predicted_covariance`.
 
     Args:
-        plate: width and height, mm. name: of the target; by default its number of rings and size.
-        markers: number of rings; by default the fewest that do.
+        plate: width and height, mm.
+        choice: ``name``, ``background`` and ``markers``, see `Choice`.
 
     Raises:
         ConfigError: the rings are out of view or too small, or the accuracy is out of reach; with the figure that can
@@ -74,18 +76,18 @@ def design_target(
     """
     if not all(0 < side < math.inf for side in plate):
         raise ConfigError(f"plate: {plate[0]:g} x {plate[1]:g} mm; give two positive lengths")
+    markers, background = choice.get("markers"), choice.get("background", "light")
     if markers is not None and markers not in ARRANGEMENTS:
         raise ConfigError(f"markers: {markers}; there are layouts of {', '.join(map(str, ARRANGEMENTS))} rings")
-    label = name or "rings{count}" + f"_{plate[0]:g}x{plate[1]:g}"
     limits = Limits.of(camera, volume.least_scale(camera, (plate[0] / 2, plate[1] / 2)))
     best: tuple[float, Design] | None = None
     counts = list(ARRANGEMENTS) if markers is None else [markers]
     for count in counts:
-        target = _best_radius(
-            camera, volume, plate, need, imaging, limits, count, label.format(count=count), background
-        )
+        target = _best(camera, volume, need, imaging, _targets(limits, count, plate, camera.matrix.device))
         if target is None:
             continue
+        name = choice.get("name") or f"rings{count}_{plate[0]:g}x{plate[1]:g}"
+        target = replace(target, name=name, background=background)  # type: ignore[arg-type]  # it checks
         precision = predict_volume(camera, target, volume, imaging)
         excess = float(need.excess(precision.worst).nan_to_num(nan=math.inf))
         if best is None or excess < best[0]:
@@ -99,52 +101,39 @@ def design_target(
     return best[1]
 
 
-def _best_radius(
-    camera: Camera,
-    volume: WorkingVolume,
-    plate: tuple[float, float],
-    need: Need,
-    imaging: Imaging,
-    limits: Limits,
-    count: int,
-    name: str,
-    background: str,
+def _best(
+    camera: Camera, volume: WorkingVolume, need: Need, imaging: Imaging, targets: Iterable[Target]
 ) -> Target | None:
-    """The target of ``count`` rings with the smallest excess over the need; None where none fits."""
-    least, most = limits.outer / limits.scale, limits.largest_radius(count, plate)
-    if most < least:
-        return None
-    R, t = volume.extremes()
+    """The target with the smallest excess over the need; None where none is in view."""
+    R, t = on_device(volume.extremes(), camera)
     some = slice(None, None, 7)  # 7 and the turns of the volume have no common factor: all of them are met
-    best: tuple[float, Target] | None = None
-    for radius in torch.linspace(least, most, _RADII).tolist():
+
+    def excess(target: Target) -> float:
+        return float(need.excess(deviations(edge_covariance(camera, target, R[some], t[some], imaging))).max())
+
+    seen = (one for one in targets if in_view(camera, outlines(one), R, t, FRAME_MARGIN_PX))
+    return min(seen, key=excess, default=None)
+
+
+def _targets(limits: Limits, count: int, plate: Size, device: torch.device) -> Iterator[Target]:
+    """Targets of ``count`` rings of all radii that fit."""
+    least, most = limits.outer / limits.scale, limits.largest_radius(count, plate)
+    for radius in torch.linspace(least, most, _RADII, device="cpu").tolist() if most >= least else []:
         radius = math.floor(radius / _MICRON) * _MICRON
         ratios = limits.ratios(count, radius)
         if ratios is None:
             continue
-        target = _target(limits.places(count, plate, radius), radius, ratios, name, background)
-        if not in_view(camera, outlines(target), R, t, FRAME_MARGIN_PX):
-            continue
-        found = deviations(edge_covariance(camera, target, R[some], t[some], imaging))
-        excess = float(need.excess(found).max())
-        if best is None or excess < best[0]:
-            best = excess, target
-    return None if best is None else best[1]
-
-
-def _target(places: Tensor, radius: float, ratios: Tensor, name: str, background: str) -> Target:
-    ordered = assign_codes(places, ratios)
-    count = len(places)
-    radii = torch.stack([torch.full_like(ordered, radius), radius * ordered], 1)
-    centers = torch.cat([places, places.new_zeros(count, 1)], 1)
-    return Target(
-        name=name,
-        background=background,  # type: ignore[arg-type]  # it checks
-        ids=torch.arange(count),
-        centers=_rounded(centers),
-        normals=torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64).expand(count, 3).contiguous(),
-        radii=_rounded(radii),
-    )
+        places = limits.places(count, plate, radius).to(device)
+        ordered = assign_codes(places, ratios.to(device))
+        centers = torch.nn.functional.pad(places, (0, 1))
+        yield Target(
+            name="rings",
+            background="light",
+            ids=torch.arange(count, device=places.device),
+            centers=_rounded(centers),
+            normals=centers.new_tensor([0.0, 0.0, 1.0]).repeat(count, 1),
+            radii=_rounded(torch.stack([torch.full_like(ordered, radius), radius * ordered], 1)),
+        )
 
 
 def _rounded(length: Tensor) -> Tensor:
@@ -152,17 +141,11 @@ def _rounded(length: Tensor) -> Tensor:
     return (length / _MICRON).round() / round(1 / _MICRON) + 0.0
 
 
-def _no_room(
-    camera: Camera, volume: WorkingVolume, plate: tuple[float, float], limits: Limits, count: int
-) -> ConfigError:
+def _no_room(camera: Camera, volume: WorkingVolume, plate: Size, limits: Limits, count: int) -> ConfigError:
     """Why no layout of ``count`` rings was found: they are out of view, or too small."""
-    R, t = volume.extremes()
-    corners = torch.tensor([[x, y, 0.0] for x in (-0.5, 0.5) for y in (-0.5, 0.5)], dtype=torch.float64)
-    corners = corners * torch.tensor([*plate, 0.0], dtype=torch.float64)
-    low, high = 0.0, 1.0
-    for _ in range(40):
-        middle = (low + high) / 2
-        low, high = (middle, high) if in_view(camera, middle * corners, R, t, FRAME_MARGIN_PX) else (low, middle)
+    R, t = on_device(volume.extremes(), camera)
+    corners = t.new_tensor([[x * plate[0], y * plate[1], 0.0] for x in (-0.5, 0.5) for y in (-0.5, 0.5)])
+    low = largest(lambda share: in_view(camera, share * corners, R, t, FRAME_MARGIN_PX), 1.0)
     if low < 0.999:
         return ConfigError(
             f"plate: {plate[0]:g} x {plate[1]:g} mm is larger than what is in view everywhere in the working volume, "

@@ -37,13 +37,11 @@ class Sheet:
         Raises:
             ConfigError: the folder cannot be written.
         """
-        paths = []
-        for suffix, data in ((".svg", self.page.svg().encode()), (".pdf", self.page.pdf())):
-            path = folder / (name + suffix)
+        files = {folder / f"{name}.svg": self.page.svg().encode(), folder / f"{name}.pdf": self.page.pdf()}
+        for path, data in files.items():
             with atomic_path(path) as temporary:
                 temporary.write_bytes(data)
-            paths.append(path)
-        return paths
+        return list(files)
 
 
 def plate_around(target: Target) -> tuple[float, float]:
@@ -88,9 +86,12 @@ def make_sheet(target: Target, plate: tuple[float, float]) -> Sheet:
 def _plate(target: Target, x: float, y: float, plate: tuple[float, float]) -> list[Shape]:
     if target.background == "dark":
         return [Rectangle(x - _BLEED, y - _BLEED, plate[0] + 2 * _BLEED, plate[1] + 2 * _BLEED, 0.0)]
-    right, bottom = x + plate[0], y + plate[1]
-    corners = [(x, y), (right, y), (right, bottom), (x, bottom), (x, y)]
-    return [Line(*a, *b, width=0.1, grey=0.7) for a, b in itertools.pairwise(corners)]
+    return _outline(x, y, *plate, grey=0.7)
+
+
+def _outline(x: float, y: float, width: float, height: float, grey: float = 0.0) -> list[Shape]:
+    corners = [(x, y), (x + width, y), (x + width, y + height), (x, y + height), (x, y)]
+    return [Line(*start, *end, grey=grey) for start, end in itertools.pairwise(corners)]
 
 
 def _rings(target: Target, origin: tuple[float, float]) -> list[Shape]:
@@ -123,8 +124,8 @@ def _bar_length(side: float) -> float:
 def _bar(x: float, y: float, length: float, *, upright: bool) -> list[Shape]:
     """Ruler from x, y with a tick every 10 mm. The middles of its ticks count, which spreading ink does not move."""
 
-    def line(a: float, b: float, c: float, d: float) -> Line:
-        return Line(x - b, y + a, x - d, y + c, 0.15) if upright else Line(x + a, y + b, x + c, y + d, 0.15)
+    def line(u1: float, v1: float, u2: float, v2: float) -> Line:
+        return Line(x - v1, y + u1, x - v2, y + u2, 0.15) if upright else Line(x + u1, y + v1, x + u2, y + v2, 0.15)
 
     shapes: list[Shape] = [line(0, 0, length, 0)]
     for k in range(round(length / 10) + 1):
@@ -140,22 +141,17 @@ def _legend(target: Target, plate: tuple[float, float], page_width: float, botto
     left, top = 6.0, bottom + _BAR_AWAY + 8
     bars = f"{_bar_length(plate[0]):g} mm (x), {_bar_length(plate[1]):g} mm (y)"
     ids = target.ids.tolist()
-    shapes: list[Shape] = [
-        Text(left, top + 3, 4.0, target.name),
-        Text(
-            left,
-            top + 8,
-            2.5,
-            f"plate {plate[0]:g} x {plate[1]:g} mm, {len(ids)} rings, {target.background} background",
-        ),
-        Text(left, top + 12, 2.5, f"ids {' '.join(map(str, ids))}, see the plan (side that the camera sees)"),
-        Text(left, top + 16, 2.5, f"Print at 100 % (actual size); the bars must be {bars}."),
-    ]
+    words = (
+        f"plate {plate[0]:g} x {plate[1]:g} mm, {len(ids)} rings, {target.background} background",
+        f"ids {' '.join(map(str, ids))}, see the plan (side that the camera sees)",
+        f"Print at 100 % (actual size); the bars must be {bars}.",
+    )
+    shapes: list[Shape] = [Text(left, top + 3, 4.0, target.name)]
+    shapes += [Text(left, top + 8 + 4 * k, 2.5, line) for k, line in enumerate(words)]
     scale = min((_KEY - 6) / max(plate), 1.0)
     width, height = scale * plate[0], scale * plate[1]
     x, y = page_width - 6 - width, top
-    corners = [(x, y), (x + width, y), (x + width, y + height), (x, y + height), (x, y)]
-    shapes += [Line(*a, *b) for a, b in itertools.pairwise(corners)]
+    shapes += _outline(x, y, width, height)
     for marker, (cx, cy) in zip(ids, target.centers[:, :2].tolist(), strict=True):
         at = x + width / 2 + scale * cx, y + height / 2 + scale * cy + 0.8
         shapes.append(Text(*at, 2.2, str(marker), number=True))

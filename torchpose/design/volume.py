@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
+from torchpose.geometry.projection import image_by_point
 
 _TURNS = 12  # rolls and directions of the tilt that stand for a whole turn
+
+Poses = tuple[Float[Tensor, "N 3 3"], Float[Tensor, "N 3"]]
+"""R and t, target to camera, mm; from here in float64 on the host."""
+Offsets = Sequence[tuple[float, float]]
+"""x and y, mm."""
+_AXIS = ((0.0, 0.0),)
 
 
 @dataclass(frozen=True)
@@ -50,44 +59,27 @@ class WorkingVolume:
             raise ConfigError(f"roll: {math.degrees(self.roll):g} degrees; give 0 to 180, where 180 is any")
 
     @property
-    def middle(self) -> tuple[Tensor, Tensor]:
-        """R (1, 3, 3), t (1, 3): facing the camera at the nominal distance, on the optical axis."""
+    def middle(self) -> Poses:
+        """One pose: facing the camera at the nominal distance, on the optical axis."""
         z = sum(self.distance) / 2 if self.nominal is None else self.nominal
-        return torch.eye(3, dtype=torch.float64)[None], torch.tensor([[0.0, 0.0, z]], dtype=torch.float64)
+        return self.poses(distances=[z], tilts=[0.0])
 
-    @property
-    def corners(self) -> list[tuple[float, float]]:
-        """x, y of the corners of the offset, mm, each once."""
-        return _signs(self.offset)
-
-    def extremes(self) -> tuple[Tensor, Tensor]:
-        """R (N, 3, 3), t (N, 3): no and the largest tilt in all directions, at all rolls, at the borders of the volume.
+    def extremes(self) -> Poses:
+        """No and the largest tilt in all directions, at all rolls, at the borders of the volume.
 
         What a target needs of every view (all rings in the frame, large enough) holds within if it holds here.
         """
-        return self.poses(
-            distances=sorted(set(self.distance)),
-            tilts=sorted({0.0, self.tilt}),
-            azimuths=_TURNS,
-            rolls=_TURNS if self.roll else 1,
-            offsets=self.corners,
-        )
+        return self.borders(sorted({0.0, self.tilt}), _TURNS)
+
+    def borders(self, tilts: list[float], turns: int) -> Poses:
+        """Tilts in as many directions as rolls, at the borders of distance and offset."""
+        distances, rolls = sorted(set(self.distance)), turns if self.roll else 1
+        return self.poses(distances=distances, tilts=tilts, azimuths=turns, rolls=rolls, offsets=_signs(self.offset))
 
     def poses(
-        self,
-        *,
-        distances: list[float],
-        tilts: list[float],
-        azimuths: int,
-        rolls: int,
-        offsets: list[tuple[float, float]],
-    ) -> tuple[Tensor, Tensor]:
-        """All combinations: R (N, 3, 3), t (N, 3).
-
-        Args:
-            distances, tilts: mm, rad. azimuths: directions of each tilt but 0. rolls: over -roll..roll.
-            offsets: x and y, mm.
-        """
+        self, *, distances: list[float], tilts: list[float], azimuths: int = 1, rolls: int = 1, offsets: Offsets = _AXIS
+    ) -> Poses:
+        """All combinations of distances, offsets, tilts in a number of directions (azimuths) and rolls."""
         leans = [
             (tilt * math.cos(2 * math.pi * k / azimuths), tilt * math.sin(2 * math.pi * k / azimuths))
             for tilt in tilts
@@ -95,38 +87,36 @@ class WorkingVolume:
         ]
         turns = _turns(self.roll, rolls)
         rows = [(*lean, turn, x, y, z) for z in distances for x, y in offsets for lean in leans for turn in turns]
-        ax, ay, turn, x, y, z = torch.tensor(rows, dtype=torch.float64).unbind(1)
-        zero = torch.zeros_like(ax)
-        R = rotations.exp(torch.stack([ax, ay, zero], 1)) @ rotations.exp(torch.stack([zero, zero, turn], 1))
-        return R, torch.stack([x, y, z], 1)
+        return _posed(torch.tensor(rows, dtype=torch.float64, device="cpu"))
 
-    def random(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """R (count, 3, 3), t (count, 3) drawn evenly in distance, offset, tilt, its direction and roll."""
-        u = torch.rand(6, count, dtype=torch.float64, generator=generator)
-        lean, azimuth = self.tilt * u[0], 2 * math.pi * u[1]
-        zero = torch.zeros_like(lean)
-        R = rotations.exp(torch.stack([lean * azimuth.cos(), lean * azimuth.sin(), zero], 1))
-        R = R @ rotations.exp(torch.stack([zero, zero, self.roll * (2 * u[2] - 1)], 1))
-        near, far = self.distance
-        x, y = (half * (2 * v - 1) for half, v in zip(self.offset, u[3:5], strict=True))
-        return R, torch.stack([x, y, near + (far - near) * u[5]], 1)
+    def random(self, count: int, generator: torch.Generator) -> Poses:
+        """Drawn evenly in distance, offset, tilt, its direction and roll, on the generator's device."""
+        drawn = torch.rand(6, count, dtype=torch.float64, generator=generator, device=generator.device)
+        lean, azimuth = self.tilt * drawn[0], 2 * math.pi * drawn[1]
+        roll, x, y = (half * (2 * u - 1) for half, u in zip((self.roll, *self.offset), drawn[2:5], strict=True))
+        z = self.distance[0] + (self.distance[1] - self.distance[0]) * drawn[5]
+        return _posed(torch.stack([lean * azimuth.cos(), lean * azimuth.sin(), roll, x, y, z], 1))
 
     def least_scale(self, camera: Camera, reach: tuple[float, float]) -> float:
         """Smallest px a mm of the target takes, in any direction, at any extreme, within ``reach`` (half sides, mm).
 
         A small ring of radius r mm has there a semi-minor axis of that many r px.
         """
-        R, t = self.extremes()
-        corner = torch.tensor([(x, y, 0.0) for x, y in [*_signs(reach), (0.0, 0.0)]], dtype=torch.float64)
+        R, t = (part.to(camera.matrix) for part in self.extremes())
+        corner = t.new_tensor([(x, y, 0.0) for x, y in [*_signs(reach), (0.0, 0.0)]])
         point = corner @ R.mT + t[:, None]  # (N, 5, 3)
         xy = point[..., :2] / point[..., 2:]
-        # d(x, y) by a move in the target's plane, then d(u, v)
-        in_plane = R[:, None, :, :2]
-        ray = (in_plane[..., :2, :] - xy[..., None] * in_plane[..., 2:, :]) / point[..., 2:, None]
-        return float(torch.linalg.svdvals(camera.J_distort(xy) @ ray)[..., -1].min())
+        by_place = camera.J_distort(xy) @ image_by_point(xy, point[..., 2]) @ R[:, None, :, :2]
+        return float(torch.linalg.svdvals(by_place)[..., -1].min())
 
 
-def _signs(half: tuple[float, float]) -> list[tuple[float, float]]:
+def _posed(rows: Tensor) -> Poses:
+    """Poses of a lean about x and y, a roll, and x y z: (N, 6)."""
+    lean, roll = (torch.nn.functional.pad(part, pad) for part, pad in ((rows[:, :2], (0, 1)), (rows[:, 2:3], (2, 0))))
+    return rotations.exp(lean) @ rotations.exp(roll), rows[:, 3:]
+
+
+def _signs(half: tuple[float, float]) -> Offsets:
     x, y = half
     return sorted({(sx * x + 0.0, sy * y + 0.0) for sx in (-1, 1) for sy in (-1, 1)})  # no -0
 

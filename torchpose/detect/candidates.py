@@ -6,18 +6,27 @@ import math
 from dataclasses import replace
 
 import torch
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from torchpose import ellipse
 from torchpose.detect.arcs import chain_pairs, describe_arcs, fit_joint, follow
-from torchpose.detect.exclusion import explain_once
 from torchpose.detect.finer import SIDE, cut_outs, promising_places
 from torchpose.detect.partial import free_of_stumps
 from torchpose.detect.reduce import area_reduce, reduction_factor
 from torchpose.detect.regions import Gradient, Regions, gradient, level_line_regions, region_polarity, strong_cells
-from torchpose.detect.validation import SAME, WHOLE, Candidates, Verdict, accepted, merge_duplicates, score
+from torchpose.detect.validation import (
+    SAME,
+    WHOLE,
+    Candidates,
+    Verdict,
+    accepted,
+    explain_once,
+    merge_duplicates,
+    score,
+)
 from torchpose.geometry import conics
-from torchpose.geometry.segments import positions, ragged_arange, segment_mean
+from torchpose.geometry.segments import marked, members, positions, segment_mean
 
 MIN_PIXELS = 10
 _SECTORS = 8  # arcs turn by up to 45 degrees
@@ -31,33 +40,29 @@ _ON_ELLIPSE = 1.5  # reduced px
 _TAPER = 3.0  # reduced px, where the weight of a cell in the second fit has fallen to 0
 _FLANK, _FLANK_COS = 4.0, 0.8  # reduced px, and of the gradient with the normal: a blurred edge of a whole ellipse
 _ARC_RMS = 1.2  # reduced px, of the cells of an arc, which is a few cells wide
-_OCTAVES = 2
 
 
-def find_candidates(frames: Tensor, factor: int | None = None, *, explain: bool = False) -> Candidates:
-    """Ellipses in grey frames (B, H, W), one pass for the whole batch.
+def find_candidates(frames: Shaped[Tensor, "B H W"], factor: int | None = None, *, explain: bool = False) -> Candidates:
+    """Ellipses in grey frames, one pass for the whole batch.
 
     Args:
-        frames: any real dtype, in grey levels: 0..255 for float frames, up to 65535 for uint16. Steps below 1.5 levels
-            are taken for quantisation. NaN pixels are ignored.
+        frames: in grey levels: 0..255 for float frames, up to 65535 for uint16. Steps below 1.5 levels are taken for
+            quantisation. NaN pixels are ignored.
         factor: integer reduction before the search; by default the smallest that gives at most 1.3 megapixels. The
             smallest semi-minor axis found is 2 reduced pixels. The same is looked for once more at twice the
             reduction, where blurred and noisy edges stand out four times as much.
         explain: also return what was looked at and rejected, see `Candidates.verdict`.
     """
     factor = reduction_factor(*frames.shape[-2:]) if factor is None else factor
-    found, reduced, scale = [], area_reduce(frames, factor), factor
-    known = None
-    for octave in range(_OCTAVES):
-        if octave:
-            reduced, scale = area_reduce(reduced, 2, exact=True), 2 * scale
-        grad = gradient(reduced)
-        some = find_ellipses(grad, known, explain=True)
-        if octave == 0 and factor > 1:
-            found.append(find_finer(frames, factor, grad.threshold, some))
-        found.append(replace(some, ellipse=full_frame(some.ellipse, scale)))
-        known = accepted(some)
-        known = replace(known, ellipse=half_frame(known.ellipse))
+    reduced = area_reduce(frames, factor)
+    grad = gradient(reduced)
+    coarse = find_ellipses(grad)
+    found = [find_finer(frames, factor, grad.threshold, coarse)] if factor > 1 else []
+    known = accepted(coarse)
+    known = replace(known, ellipse=rescaled(known.ellipse, 0.5))
+    blurred = find_ellipses(gradient(area_reduce(reduced, 2, exact=True)), known)
+    for scale, some in ((factor, coarse), (2 * factor, blurred)):
+        found.append(replace(some, ellipse=rescaled(some.ellipse, scale)))
     every = Candidates.cat(found)
     return merge_duplicates(every if explain else accepted(every), explain=explain)
 
@@ -65,9 +70,7 @@ def find_candidates(frames: Tensor, factor: int | None = None, *, explain: bool 
 def find_finer(frames: Tensor, factor: int, threshold: Tensor, coarse: Candidates) -> Candidates:
     """Small ellipses of a finer scale, full px, where the coarse one has something round that is no whole ellipse.
 
-    Args:
-        frames: (B, H, W). factor: of the coarse scale. threshold: (B,), of its gradient. coarse: what was looked at
-            there, in its pixels.
+    ``factor``, ``threshold`` (B,) of the gradient and what was looked at are of the coarse scale.
     """
     fine = factor // 2
     whole = (coarse.verdict == Verdict.ACCEPTED) & (coarse.cover > WHOLE)
@@ -76,12 +79,12 @@ def find_finer(frames: Tensor, factor: int, threshold: Tensor, coarse: Candidate
     if place.numel() == 0 or min(height, width) < SIDE * fine:
         return coarse[place[:0]]
     frame = coarse.frame[place]
-    cut, corner = cut_outs(frames, frame, full_frame(coarse.ellipse[place], factor)[:, :2], fine)
+    cut, corner = cut_outs(frames, frame, rescaled(coarse.ellipse[place], factor)[:, :2], fine)
     grad = gradient(cut)
     # where edges fill most of a cut-out, the noise of the whole frame tells more than the median of their gradients
     grad = replace(grad, threshold=torch.minimum(grad.threshold, factor / fine * threshold[frame]))
-    found = find_ellipses(grad)
-    ellipses = full_frame(found.ellipse, fine)
+    found = accepted(find_ellipses(grad))
+    ellipses = rescaled(found.ellipse, fine)
     ellipses = torch.cat([ellipses[:, :2] + corner[found.frame], ellipses[:, 2:]], -1)
     # the ellipses that might have been tried are those of the frame, not those of the cut-out
     more = 2.5 * math.log10(height * width / (SIDE * fine) ** 2)
@@ -89,42 +92,35 @@ def find_finer(frames: Tensor, factor: int, threshold: Tensor, coarse: Candidate
     return found[found.log10_nfa < 0]
 
 
-def full_frame(ellipses: Tensor, factor: int) -> Tensor:
-    """Ellipses (M, 5) of a frame reduced by ``factor`` in the pixels of the frame itself."""
+def rescaled(ellipses: Float[Tensor, "M 5"], factor: int | float) -> Float[Tensor, "M 5"]:
+    """Ellipses of a frame reduced by ``factor`` in the pixels of the frame itself."""
     center = factor * ellipses[:, :2] + 0.5 * (factor - 1)
     return torch.cat([center, factor * ellipses[:, 2:4], ellipses[:, 4:]], -1)
 
 
-def half_frame(ellipses: Tensor) -> Tensor:
-    """Ellipses (M, 5) in the pixels of the frame reduced by 2."""
-    return torch.cat([0.5 * ellipses[:, :2] - 0.25, 0.5 * ellipses[:, 2:4], ellipses[:, 4:]], -1)
+def find_ellipses(grad: Gradient, known: Candidates | None = None) -> Candidates:
+    """Ellipses of one scale, in its own pixels, with what became of them.
 
-
-def find_ellipses(grad: Gradient, known: Candidates | None = None, explain: bool = False) -> Candidates:
-    """Validated ellipses of one scale, in its own pixels; with ``explain`` the rejected ones, too.
-
-    Args:
-        known: accepted ellipses of a finer scale in the pixels of this one, which may explain edges better.
+    ``known`` are accepted ellipses of a finer scale in the pixels of this one, which may explain edges better.
     """
     regions = level_line_regions(grad, strong_cells(grad), MIN_PIXELS)
-    whole, explained = fit_regions(grad, regions, explain)
+    whole, explained = fit_regions(grad, regions)
     rest = regions.cell[~explained].sort().values
     pieces = fit_arcs(grad, level_line_regions(grad, rest, MIN_PIXELS, _SECTORS, _PHASE))
-    found = merge_duplicates(Candidates.cat([whole, pieces]), explain=explain)
-    valid = (found.verdict == Verdict.ACCEPTED).nonzero()[:, 0]
+    found = merge_duplicates(Candidates.cat([whole, pieces]), explain=True)
+    valid = positions(found.verdict == Verdict.ACCEPTED)
     some = found[valid]
     freed = free_of_stumps(grad, some.frame, some.ellipse, some.polarity)
     moved = positions((freed != some.ellipse).any(-1) & (plausible(grad, freed) == Verdict.ACCEPTED))
     if moved.numel():
         again = score(grad, some.frame[moved], freed[moved], some.polarity[moved])
         found = found.replaced(valid[moved], again)
-    found = explain_once(grad, merge_duplicates(found if explain else accepted(found), explain=explain), known)
-    return found if explain else accepted(found)
+    return explain_once(grad, merge_duplicates(found, explain=True), known)
 
 
-def fit_regions(grad: Gradient, regions: Regions, explain: bool = False) -> tuple[Candidates, Tensor]:
+def fit_regions(grad: Gradient, regions: Regions) -> tuple[Candidates, Tensor]:
     """Ellipses that single regions follow, and which of the cells (P,) bool of the regions they explain."""
-    xy = cell_centers(grad, regions.cell)
+    xy = grad.centers(regions.cell)
     count = regions.frame.numel()
     gx, gy = regions.gradient.unbind(-1)
     magnitude = (gx * gx + gy * gy).sqrt().double()
@@ -139,37 +135,38 @@ def fit_regions(grad: Gradient, regions: Regions, explain: bool = False) -> tupl
     verdict = plausible(grad, params)
     elsewhere = length < _MIN_CELLS * conics.perimeter(params)
     verdict = torch.where((verdict == Verdict.ACCEPTED) & elsewhere, int(Verdict.OFF_ELLIPSE), verdict)
-    good = (verdict == Verdict.ACCEPTED).nonzero()[:, 0]
+    good = positions(verdict == Verdict.ACCEPTED)
     found = score(grad, regions.frame[good], params[good], polarity[good])
     # a region that is not a whole ellipse runs along something else as well: only what lies along the ellipse counts
     beyond = edge < WHOLE * torch.bincount(regions.region, minlength=count)
     part = positions((found.cover <= WHOLE) | beyond[good])
     if part.numel():
-        some = found[part]
-        refit = follow(grad, some.frame, some.ellipse, some.polarity, _PART_ROUNDS)
-        sound = positions(plausible(grad, refit) == Verdict.ACCEPTED)
-        again = score(grad, some.frame[sound], refit[sound], some.polarity[sound])
+        again, sound = _followed(grad, found[part], _PART_ROUNDS)
         found = found.replaced(part[sound], again)
-    whole = torch.zeros(count, dtype=torch.bool, device=xy.device)
-    whole[good[(found.verdict == Verdict.ACCEPTED) & (found.cover > WHOLE)]] = True
+    whole = marked(good[(found.verdict == Verdict.ACCEPTED) & (found.cover > WHOLE)], count)
     explained = along & whole.index_select(0, regions.region)
-    if not explain:
-        return accepted(found), explained
-    bad = ((verdict != Verdict.ACCEPTED) & params.isfinite().all(-1)).nonzero()[:, 0]
+    bad = positions((verdict != Verdict.ACCEPTED) & params.isfinite().all(-1))
     unknown = torch.full((bad.numel(),), torch.nan, dtype=params.dtype, device=params.device)
     rejected = Candidates(regions.frame[bad], params[bad], polarity[bad], unknown, unknown, verdict[bad])
     return Candidates.cat([found, rejected]), explained
+
+
+def _followed(grad: Gradient, found: Candidates, rounds: int) -> tuple[Candidates, Tensor]:
+    """Those that are still ellipses when they have been followed along their edge, and their indices (K,)."""
+    refit = follow(grad, found.frame, found.ellipse, found.polarity, rounds)
+    sound = positions(plausible(grad, refit) == Verdict.ACCEPTED)
+    return score(grad, found.frame[sound], refit[sound], found.polarity[sound]), sound
 
 
 def _on_ellipses(
     regions: Regions, xy: Tensor, params: Tensor, polarity: Tensor, magnitude: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Which cells (P,) lie on the ellipse of their region, and which belong to its edge, a blurred one included."""
-    conic = conics.conic_from_ellipse(params)
-    each = [v.contiguous().index_select(0, regions.region) for v in (*conic.unbind(-1), polarity)]
-    off, (nx, ny) = conics.conic_distance(tuple(each[:6]), xy.unbind(-1))
+    each = (*conics.conic_from_ellipse(params).unbind(-1), polarity)
+    *conic, outwards = (v.contiguous().index_select(0, regions.region) for v in each)
+    off, nx, ny = conics.signed_distance(conic, *xy.unbind(-1))
     gx, gy = regions.gradient.unbind(-1)
-    rise = (nx * gx + ny * gy) * each[6]
+    rise = (nx * gx + ny * gy) * outwards
     off = off.abs()
     follows = off < _ON_ELLIPSE
     return follows, follows | ((off < _FLANK) & (rise > _FLANK_COS * magnitude))
@@ -177,46 +174,33 @@ def _on_ellipses(
 
 def fit_arcs(grad: Gradient, arcs: Regions) -> Candidates:
     """Ellipses of pairs of arcs, followed along their whole perimeter."""
-    xy = cell_centers(grad, arcs.cell)
+    xy = grad.centers(arcs.cell)
     about = describe_arcs(arcs, xy)
-    pair = torch.stack(chain_pairs(about), -1)
-    count = pair.shape[0]
+    pair = chain_pairs(about)
+    count = len(pair)
     if count == 0:
         return score(grad, about.frame[:0], xy.new_zeros(0, 5), xy.new_zeros(0))
     # the cells of both members, flat
-    order = torch.argsort(arcs.region, stable=True)
-    start = about.size.cumsum(0) - about.size
-    member = pair.flatten()
-    which, offset = ragged_arange(about.size[member])
-    cell = order[start[member[which]] + offset]
+    which, cell = members(about.size, pair.flatten())
+    cell = torch.argsort(arcs.region, stable=True)[cell]
     index = which // 2
     xy, gradient = xy[cell], arcs.gradient[cell]
     weight = torch.linalg.vector_norm(gradient, dim=-1)
     params = fit_joint(xy, gradient, index, count, weight)
     r = ellipse.distance(xy, index, params)
     rms = segment_mean(r.square(), index, count, weight.double()).sqrt()
-    good = ((plausible(grad, params) == Verdict.ACCEPTED) & (rms < _ARC_RMS)).nonzero()[:, 0]
+    good = positions((plausible(grad, params) == Verdict.ACCEPTED) & (rms < _ARC_RMS))
     frame, polarity = about.frame[pair[good, 0]], about.curvature[pair[good, 0]].sign()
     found = score(grad, frame, params[good], polarity)
     for least_cover, rounds in _FOLLOW:
         found = merge_duplicates(found[found.cover > least_cover], 2 * SAME)
-        params = follow(grad, found.frame, found.ellipse, found.polarity, rounds)
-        good = plausible(grad, params) == Verdict.ACCEPTED
-        found = score(grad, found.frame[good], params[good], found.polarity[good])
+        found, _ = _followed(grad, found, rounds)
     return accepted(found)
 
 
-def plausible(grad: Gradient, ellipses: Tensor) -> Tensor:
-    """Verdict (M,) int64 on the size and shape of ellipses (M, 5); `Verdict.TOO_LARGE` for NaN."""
+def plausible(grad: Gradient, ellipses: Float[Tensor, "M 5"]) -> Int[Tensor, " M"]:
+    """Verdict on the size and shape of ellipses; `Verdict.TOO_LARGE` for NaN."""
     a, b = ellipses[:, 2], ellipses[:, 3]
     verdict = torch.where(a <= 0.5 * max(grad.shape[1:]), int(Verdict.ACCEPTED), int(Verdict.TOO_LARGE))
     verdict = torch.where(b < _MIN_ASPECT * a, int(Verdict.TOO_FLAT), verdict)
     return torch.where(b < _MIN_SEMI_MINOR, int(Verdict.TOO_SMALL), verdict)
-
-
-def cell_centers(grad: Gradient, cell: Tensor) -> Tensor:
-    """Positions (P, 2) float64 of flat cells in reduced px."""
-    _, height, width = grad.shape
-    row = torch.div(cell, width, rounding_mode="floor")
-    x, y = cell - row * width, row % height
-    return torch.stack([x.double() + 0.5, y.double() + 0.5]).mT

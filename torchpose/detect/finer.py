@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.detect.reduce import area_reduce
-from torchpose.geometry.segments import pairs_in_group, rank_in_group
+from torchpose.geometry.segments import earlier_in_group, marked, pairs_in_group, positions, rank_in_group
 
 SIDE = 64  # px of a cut-out
 _LARGEST = 10.0  # reduced px of semi-major axis: whatever is larger needs no finer look
@@ -16,41 +17,32 @@ _SAME_PLACE = 3.0  # reduced px
 _MOST_PLACES = 160  # in a frame, the largest
 
 
-def promising_places(frame: Tensor, ellipses: Tensor, whole: Tensor) -> Tensor:
-    """Indices (P,) int64 of the small ellipses worth a finer look.
+def promising_places(
+    frame: Int[Tensor, " M"], ellipses: Float[Tensor, "M 5"], whole: Bool[Tensor, " M"]
+) -> Int[Tensor, " P"]:
+    """Indices of the small ellipses, of whatever verdict, worth a finer look; ellipses are sorted by frame.
 
-    Those within a whole ellipse that is known already are not, nor those beside a larger one of the same place.
-
-    Args:
-        frame: (M,) int64. ellipses: (M, 5), reduced px, of whatever verdict, NaN allowed. whole: (M,) bool, accepted
-            with nearly all of its perimeter.
+    Those within one that was seen whole are not, nor those beside a larger one of the same place.
     """
     a, b = ellipses[:, 2], ellipses[:, 3]
-    small = (a < _LARGEST) & (b > _SMALLEST) & (b > _LEAST_ASPECT * a) & ~whole
-    place = small.nonzero()[:, 0]
+    place = positions((a < _LARGEST) & (b > _SMALLEST) & (b > _LEAST_ASPECT * a) & ~whole)
     place = place[torch.argsort(a[place], descending=True, stable=True)]
     place = place[torch.argsort(frame[place], stable=True)]
-    frames = int(frame.max()) + 1 if frame.numel() else 0
-    known = whole.nonzero()[:, 0]
-    known = known[torch.argsort(frame[known], stable=True)]
+    known = positions(whole)
     i, j = pairs_in_group(frame[place], frame[known])
     apart = torch.linalg.vector_norm(ellipses[place[i], :2] - ellipses[known[j], :2], dim=-1)
-    inside = torch.zeros_like(place, dtype=torch.bool)
-    inside[i[apart < 0.5 * b[known[j]]]] = True
-    place = place[~inside]
-    i, j = pairs_in_group(frame[place], frame[place])
+    place = place[~marked(i[apart < 0.5 * b[known[j]]], len(place))]
+    i, j = earlier_in_group(frame[place])
     apart = torch.linalg.vector_norm(ellipses[place[i], :2] - ellipses[place[j], :2], dim=-1)
-    again = torch.zeros_like(place, dtype=torch.bool)
-    again[i[(apart < _SAME_PLACE) & (j < i)]] = True
-    place = place[~again]
-    return place[rank_in_group(frame[place], frames) < _MOST_PLACES]
+    place = place[~marked(i[apart < _SAME_PLACE], len(place))]
+    return place[rank_in_group(frame[place]) < _MOST_PLACES]
 
 
 def cut_outs(frames: Tensor, frame: Tensor, center: Tensor, factor: int) -> tuple[Tensor, Tensor]:
-    """Square cut-outs of frames reduced by ``factor``: (P, 64, 64) float32, and their corners (P, 2) int64 in full px.
+    """Square cut-outs about centres (P, 2), in full px, of frames of at least 64 ``factor`` px on each side.
 
-    Args:
-        frames: (B, H, W), at least 64 ``factor`` px on each side. frame: (P,) int64. center: (P, 2), full px.
+    Returns:
+        (P, 64, 64), reduced by ``factor``, and their corners (P, 2) int64 in full px.
     """
     height, width = frames.shape[-2:]
     side = SIDE * factor

@@ -13,8 +13,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Float, Int, Real
 from torch import Tensor
 
+from torchpose.geometry.rows import Rows, shared
 from torchpose.geometry.segments import positions, segment_sum
 
 # neighbours join within 37 degrees: a circle of 3 px turns 19 to 27 degrees from pixel to pixel. Not 0.8, which whole
@@ -28,27 +30,19 @@ _PART_PIXELS = 300_000  # of the frames whose gradients are formed at a time
 
 
 @dataclass(frozen=True, eq=False)
-class Gradient:
-    """2 x 2 gradient of (B, h, w) frames, formed where it is asked for; cell (x, y) is centred at (x + 0.5, y + 0.5).
+class Gradient(Rows):
+    """2 x 2 gradient of frames, formed where it is asked for; cell (x, y) is centred at (x + 0.5, y + 0.5)."""
 
-    Attributes:
-        frames: (B, h, w) uint8 or float32, contiguous.
-        threshold: (B,) float32, magnitude that pure white noise exceeds in one cell of a thousand at most.
-    """
-
-    frames: Tensor
-    threshold: Tensor
+    frames: Real[Tensor, "B h w"]  # uint8 or float32, contiguous
+    threshold: Float[Tensor, " B"]  # magnitude that pure white noise exceeds in one cell of a thousand at most
 
     @property
     def shape(self) -> torch.Size:
         """(B, h, w)."""
         return self.frames.shape
 
-    def components(self, cells: Tensor) -> tuple[Tensor, Tensor]:
-        """Gradients gx, gy (P,) float32 at flat cell indices (P,); zero at NaN pixels.
-
-        Cells are not of the last row or column of a frame, which have no gradient.
-        """
+    def components(self, cells: Int[Tensor, " P"]) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"]]:
+        """Gradients gx, gy at flat cells, which are not of the last row or column of a frame; zero at NaN pixels."""
         flat, width = self.frames.view(-1), self.shape[2]
         # index_select of single numbers: advanced indexing, or rows of two, cost several times as much
         a, b, c, d = (flat.index_select(0, cells + step).float() for step in (0, 1, width, width + 1))
@@ -59,32 +53,26 @@ class Gradient:
             gx, gy = gx.masked_fill_(bad, 0.0), gy.masked_fill_(bad, 0.0)
         return gx, gy
 
-    def at(self, cells: Tensor) -> Tensor:
-        """The same as (..., 2) for any cells (...); zero in the last row and column as well."""
+    def centers(self, cells: Int[Tensor, " P"]) -> Float[Tensor, "P 2"]:
+        """Positions of flat cells in reduced px."""
         _, height, width = self.shape
-        flat = cells.flatten()
-        inside = (flat % width < width - 1) & ((flat // width) % height < height - 1)
-        gx, gy = self.components(torch.where(inside, flat, 0))
-        return torch.where(inside[:, None], torch.stack([gx, gy], -1), 0.0).view(*cells.shape, 2)
+        row = torch.div(cells, width, rounding_mode="floor")
+        x, y = cells - row * width, row % height
+        return torch.stack([x.double() + 0.5, y.double() + 0.5]).mT
 
 
 @dataclass(frozen=True, eq=False)
-class Regions:
-    """Pixels of the regions, flat.
+class Regions(Rows):
+    """Cells of R regions."""
 
-    Attributes:
-        cell: (P,) int64, flat index into (B, h, w). region: (P,) int64 in [0, count).
-        gradient: (P, 2) float32. frame: (count,) int64, the frame of each region.
-    """
-
-    cell: Tensor
-    region: Tensor
-    gradient: Tensor
-    frame: Tensor
+    cell: Int[Tensor, " P"]  # flat index into (B, h, w)
+    region: Int[Tensor, " P"]
+    gradient: Float[Tensor, "P 2"]
+    frame: Int[Tensor, " R"] = shared()  # of each region
 
 
-def gradient(frames: Tensor) -> Gradient:
-    """Gradient and noise threshold of frames (B, h, w), uint8 or float32 in grey levels (0..255 or more).
+def gradient(frames: Real[Tensor, "B h w"]) -> Gradient:
+    """Gradient and noise threshold of frames, uint8 or float32 in grey levels (0..255 or more).
 
     The noise is estimated from the median squared gradient of a sample of the cells, which edges hardly touch; pixels
     that are NaN or infinite do not count.
@@ -107,8 +95,8 @@ def gradient(frames: Tensor) -> Gradient:
     return Gradient(frames, threshold)
 
 
-def strong_cells(grad: Gradient) -> Tensor:
-    """Flat indices (P,) int64, rising, of the cells whose gradient is above their frame's threshold."""
+def strong_cells(grad: Gradient) -> Int[Tensor, " P"]:
+    """Flat indices, rising, of the cells whose gradient is above their frame's threshold."""
     _, height, width = grad.shape
     if grad.frames.numel() == 0 or min(height, width) < 2:
         return torch.zeros(0, dtype=torch.int64, device=grad.frames.device)
@@ -153,14 +141,14 @@ def _steep(frames: Tensor, threshold: Tensor) -> Tensor:
     return (steep > threshold[:, None, None]).flatten().nonzero()[:, 0]
 
 
-def level_line_regions(grad: Gradient, cell: Tensor, min_pixels: int, sectors: int = 0, phase: float = 0.0) -> Regions:
-    """Connected components of cells with agreeing gradient directions, of at least ``min_pixels``.
+def level_line_regions(
+    grad: Gradient, cell: Int[Tensor, " P"], min_pixels: int, sectors: int = 0, phase: float = 0.0
+) -> Regions:
+    """Connected components of rising flat cells with agreeing gradient directions, of at least ``min_pixels``.
 
-    Args:
-        cell: (P,) int64, flat indices of the cells to join, rising.
-        sectors: 0 joins neighbours whose directions are close to each other, so that whole curves hold together. With
-            n sectors neighbours join if their directions fall into the same n-th of the circle: curves break into arcs
-            of known turn, and corners part from what they join. phase: fraction of a sector that the first starts at.
+    Without ``sectors`` neighbours join whose directions are close to each other, so that whole curves hold together.
+    With n sectors, the first of which starts at a fraction ``phase`` of one, neighbours join if their directions fall
+    into the same n-th of the circle: curves break into arcs of known turn, and corners part from what they join.
     """
     _, height, width = grad.shape
     gx, gy = grad.components(cell)
@@ -176,8 +164,7 @@ def level_line_regions(grad: Gradient, cell: Tensor, min_pixels: int, sectors: i
     joined = positions(agree)
     label = connected_components(a.index_select(0, joined), b.index_select(0, joined), cell.numel())
 
-    size = torch.bincount(label, minlength=cell.numel())
-    large = size >= min_pixels
+    large = torch.bincount(label, minlength=cell.numel()) >= min_pixels
     number = large.cumsum(0) - 1
     keep = positions(large.index_select(0, label))
     region = number.index_select(0, label.index_select(0, keep))
@@ -212,23 +199,25 @@ def _search(rising: Tensor, values: Tensor) -> Tensor:
     return torch.searchsorted(rising, values)
 
 
-def connected_components(a: Tensor, b: Tensor, count: int) -> Tensor:
-    """Smallest member (count,) int64 of each node's component in the graph with edges (a_i, b_i)."""
-    parent = torch.arange(count, device=a.device)
-    while a.numel():
-        first, second = parent.index_select(0, a), parent.index_select(0, b)
+def connected_components(one: Int[Tensor, " E"], other: Int[Tensor, " E"], count: int) -> Int[Tensor, " count"]:
+    """Smallest member of each node's component in the graph whose edges join ``one`` and ``other``."""
+    parent = torch.arange(count, device=one.device)
+    while one.numel():
+        first, second = parent.index_select(0, one), parent.index_select(0, other)
         low = torch.minimum(first, second)
         parent = parent.scatter_reduce(0, first, low, "amin").scatter_reduce_(0, second, low, "amin")
         while not torch.equal(shorter := parent.index_select(0, parent), parent):
             parent = shorter
         # what is joined stays so
         apart = positions(parent.index_select(0, first) != parent.index_select(0, second))
-        a, b = first.index_select(0, apart), second.index_select(0, apart)
+        one, other = first.index_select(0, apart), second.index_select(0, apart)
     return parent
 
 
-def region_polarity(regions: Regions, center: Tensor, cells_xy: Tensor) -> Tensor:
-    """Mean cosine (count,) of the gradient with the way out of ``center`` (count, 2): +1 dark inside, -1 light."""
+def region_polarity(
+    regions: Regions, center: Float[Tensor, "R 2"], cells_xy: Float[Tensor, "P 2"]
+) -> Float[Tensor, " R"]:
+    """Mean cosine of the gradient with the way out of each region's centre: +1 dark inside, -1 light."""
     index, count = regions.region, center.shape[0]
     (x, y), (gx, gy) = cells_xy.unbind(-1), regions.gradient.unbind(-1)
     x, y = x - center[:, 0].index_select(0, index), y - center[:, 1].index_select(0, index)

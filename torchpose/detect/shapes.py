@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Shaped
 from torch import Tensor
 
 from torchpose import ellipse
@@ -14,7 +15,7 @@ from torchpose.detect.reduce import area_reduce, reduction_factor
 from torchpose.detect.regions import gradient, strong_cells
 from torchpose.detect.validation import Candidates, Verdict
 from torchpose.geometry import conics
-from torchpose.geometry.segments import ragged_arange, segment_sum
+from torchpose.geometry.segments import marked, pairs_in_group, positions, segment_sum
 
 _NEAR = 2.0  # reduced px between a line and the ellipse that explains it
 _MOSTLY = 0.7  # of the samples of a line, or of the perimeter of an ellipse
@@ -30,14 +31,16 @@ class Shapes:
     segments: Segments
 
 
-def find_shapes(frames: Tensor, factor: int | None = None, *, explain: bool = False) -> Shapes:
-    """Ellipses, segments and polygons of grey frames (B, H, W); where two explain the same edge, the likelier one.
+def find_shapes(frames: Shaped[Tensor, "B H W"], factor: int | None = None, *, explain: bool = False) -> Shapes:
+    """Ellipses, segments and polygons of grey frames; where two explain the same edge, the likelier one.
 
     That is the one with fewer false alarms (Patraucean, Gurdjos, Grompone von Gioi 2017): a hexagon is no circle though
     an ellipse passes near its sides, and a circle is no polygon with many sides.
 
     Args:
-        frames, factor, explain: as for `find_candidates`.
+        frames: as for `find_candidates`.
+        factor: likewise.
+        explain: likewise.
     """
     factor = reduction_factor(*frames.shape[-2:]) if factor is None else factor
     ellipses = find_candidates(frames, factor, explain=explain)
@@ -45,7 +48,7 @@ def find_shapes(frames: Tensor, factor: int | None = None, *, explain: bool = Fa
     segments = find_segments(grad, strong_cells(grad))
     segments = replace(segments, ends=factor * segments.ends + 0.5 * (factor - 1))
 
-    valid = (ellipses.verdict == Verdict.ACCEPTED).nonzero()[:, 0]
+    valid = positions(ellipses.verdict == Verdict.ACCEPTED)
     line, owner = _explained(segments, ellipses[valid], _NEAR * factor)
     likelihood = torch.where(segments.chain >= 0, segments.chain_log10_nfa, segments.log10_nfa)
     beaten = ellipses.log10_nfa[valid[owner]] > likelihood[line]
@@ -53,10 +56,8 @@ def find_shapes(frames: Tensor, factor: int | None = None, *, explain: bool = Fa
     polygon = segments.chain[line] >= 0
     length = torch.linalg.vector_norm(segments.ends[:, 1] - segments.ends[:, 0], dim=-1)
     along = segment_sum(length[line] * (beaten & polygon), owner, valid.numel())
-    lost = torch.zeros(len(ellipses), dtype=torch.bool, device=frames.device)
-    lost[valid] = along > _MOSTLY * conics.perimeter(ellipses.ellipse[valid])
-    explained = torch.zeros(len(segments), dtype=torch.bool, device=frames.device)
-    explained[line[~lost[valid[owner]]]] = True
+    lost = marked(valid[along > _MOSTLY * conics.perimeter(ellipses.ellipse[valid])], len(ellipses))
+    explained = marked(line[~lost[valid[owner]]], len(segments))
     segments = segments[~explained]
     if explain:
         verdict = torch.where(lost, int(Verdict.POLYGON), ellipses.verdict)
@@ -66,12 +67,7 @@ def find_shapes(frames: Tensor, factor: int | None = None, *, explain: bool = Fa
 
 def _explained(segments: Segments, ellipses: Candidates, tolerance: float) -> tuple[Tensor, Tensor]:
     """Pairs of a segment and an ellipse of its frame that runs along it: indices (Q,), (Q,) int64."""
-    order = torch.argsort(ellipses.frame, stable=True)
-    frames = int(torch.cat([segments.frame, ellipses.frame, segments.frame.new_zeros(1)]).max()) + 1
-    per_frame = torch.bincount(ellipses.frame, minlength=frames)
-    start = per_frame.cumsum(0) - per_frame
-    line, offset = ragged_arange(per_frame[segments.frame])
-    owner = order[start[segments.frame[line]] + offset]
+    line, owner = pairs_in_group(segments.frame, ellipses.frame)
     fraction = torch.linspace(0, 1, _SAMPLES, dtype=torch.float64, device=line.device)
     ends = segments.ends[line]
     at = ends[:, :1] + fraction[:, None] * (ends[:, 1:] - ends[:, :1])

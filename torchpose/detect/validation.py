@@ -1,24 +1,32 @@
-"""What became of the ellipses that were looked at: false alarms, duplicates, and edges that others explain better."""
+"""What became of the ellipses that were looked at: false alarms, duplicates, and edges that others explain better.
+
+An edge is explained once, after the exclusion principle of a-contrario detection (Desolneux, Moisan and Morel 2008):
+what is seen belongs to its best interpretation, the one with the fewest false alarms, and the others are judged by what
+is left. Two circles side by side have arcs that a third ellipse joins, too long to be an accident, and yet it is none.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Self
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchpose.detect.arcs import cells_at, perimeter_samples
 from torchpose.detect.regions import Gradient
 from torchpose.geometry import conics
-from torchpose.geometry.segments import ragged_arange, segment_sum
+from torchpose.geometry.rows import Rows
+from torchpose.geometry.segments import earlier_in_group, marked, members, pairs_in_group, positions, segment_sum
 
 WHOLE = 0.9  # cover from which on an ellipse is seen whole
 SAME = 0.08  # of the semi-minor axis, plus a pixel: ellipses nearer than that are one
 LEAST_COVER = 0.58  # a circle in a square is covered by 0.5
+_NEAR = 1.5  # cells between an edge and the ellipse that explains it
+_COS = 0.8  # of the edge's gradient with the normal of that ellipse: 37 degrees
+_ROUNDS = 4
 _COVER_ERROR = 0.125  # 22.5 degrees in units of pi: a sample with a smaller error belongs to the arc
 
 
@@ -38,39 +46,23 @@ class Verdict(IntEnum):
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates:
-    """Ellipses found in B frames, flat, in full-frame pixels (pixel centre at integer coordinates).
+class Candidates(Rows):
+    """Ellipses found in a batch of frames, in full-frame pixels (pixel centre at integer coordinates).
 
     Attributes:
-        frame: (M,) int64. ellipse: (M, 5) float64, cx, cy, a, b, theta.
-        polarity: (M,) float64, +1 where the inside is darker than the outside, -1 where lighter.
-        log10_nfa: (M,) float64, log10 of the number of false alarms, negative for each candidate.
-        cover: (M,) float64, fraction of the perimeter with the gradient of the ellipse.
-        verdict: (M,) int64, `Verdict`.
+        ellipse: cx, cy, a, b, theta.
+        polarity: +1 where the inside is darker than the outside, -1 where lighter.
+        log10_nfa: log10 of the number of false alarms, negative for each accepted candidate.
+        cover: fraction of the perimeter with the gradient of the ellipse.
+        verdict: `Verdict`.
     """
 
-    frame: Tensor
-    ellipse: Tensor
-    polarity: Tensor
-    log10_nfa: Tensor
-    cover: Tensor
-    verdict: Tensor
-
-    def __len__(self) -> int:
-        return self.frame.shape[0]
-
-    def __getitem__(self, index: Tensor) -> Candidates:
-        return Candidates(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
-
-    def replaced(self, index: Tensor, other: Candidates) -> Candidates:
-        """These candidates, with the rows ``index`` taken from ``other``."""
-        names = self.__dataclass_fields__
-        return Candidates(*(getattr(self, name).index_copy(0, index, getattr(other, name)) for name in names))
-
-    @classmethod
-    def cat(cls, parts: Sequence[Self]) -> Self:
-        """The candidates of all parts."""
-        return cls(*(torch.cat([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
+    frame: Int[Tensor, " M"]
+    ellipse: Float[Tensor, "M 5"]
+    polarity: Float[Tensor, " M"]
+    log10_nfa: Float[Tensor, " M"]
+    cover: Float[Tensor, " M"]
+    verdict: Int[Tensor, " M"]
 
 
 def accepted(found: Candidates) -> Candidates:
@@ -79,82 +71,119 @@ def accepted(found: Candidates) -> Candidates:
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
-    """What lies along the perimeters of M ellipses, one sample a pixel.
+class Samples(Rows):
+    """What lies along curves, one sample a pixel."""
 
-    Attributes:
-        of: (S,) int64, the ellipse. xy: (S, 2) float64, cells. gradient: (S, 2) float64, in the cell there.
-        error: (S,) float64 in [0, 1], angle between gradient and normal, divided by pi; 0.5 beyond the frame.
-    """
-
-    of: Tensor
-    xy: Tensor
-    gradient: Tensor
-    error: Tensor
+    of: Int[Tensor, " S"]  # the curve
+    xy: Float[Tensor, "S 2"]  # cells
+    gradient: Float[Tensor, "S 2"]  # in the cell there
+    error: Float[Tensor, " S"]  # angle between gradient and normal, divided by pi; 0.5 beyond the frame
 
 
 def sample_edges(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> Samples:
     """Samples of ellipses (M, 5), cells, of frames (M,) int64 and polarities (M,) +1 or -1."""
-    which, xy, normal, _ = perimeter_samples(ellipses)
-    cell, on_frame = cells_at(grad, frame.index_select(0, which), xy)
+    at = perimeter_samples(ellipses)
+    return edges_at(grad, frame, at.of, at.xy, at.normal * polarity.index_select(0, at.of)[:, None])
+
+
+def edges_at(grad: Gradient, frame: Tensor, of: Tensor, xy: Tensor, normal: Tensor) -> Samples:
+    """Samples at positions (S, 2) of the curves ``of`` (S,) of frames (M,), where edges rise along normals (S, 2)."""
+    cell, _, _, on_frame = cells_at(grad, frame.index_select(0, of), *xy.unbind(-1))
     gx, gy = (g.double() for g in grad.components(cell))
     nx, ny = normal.unbind(-1)
-    length = (gx * gx + gy * gy).sqrt().clamp_min(1e-6)
-    cos = (gx * nx + gy * ny) * polarity.index_select(0, which) / length
+    cos = (gx * nx + gy * ny) / (gx * gx + gy * gy).sqrt().clamp_min(1e-6)
     error = torch.where(on_frame, cos.clamp(-1, 1).acos() / torch.pi, 0.5)  # 0.5: neither for nor against
-    return Samples(which, xy, torch.stack([gx, gy]).mT, error)
+    return Samples(of, xy, torch.stack([gx, gy]).mT, error)
 
 
 def score(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> Candidates:
     """Ellipses with their numbers of false alarms, of which noise gives less than one a frame below 1."""
     samples = sample_edges(grad, frame, ellipses, polarity)
-    log10_nfa, cover = false_alarms(grad, samples.error, samples.of, ellipses.shape[0])
-    verdict = torch.where(log10_nfa < 0, int(Verdict.ACCEPTED), int(Verdict.FALSE_ALARM))
-    verdict = torch.where((log10_nfa < 0) & (cover < LEAST_COVER), int(Verdict.FRAGMENT), verdict)
-    return Candidates(frame, ellipses, polarity, log10_nfa, cover, verdict)
+    nfa, cover = false_alarms(grad, samples.error, samples.of, ellipses.shape[0])
+    verdict = torch.where(nfa < 0, int(Verdict.ACCEPTED), int(Verdict.FALSE_ALARM))
+    verdict = torch.where((nfa < 0) & (cover < LEAST_COVER), int(Verdict.FRAGMENT), verdict)
+    return Candidates(frame, ellipses, polarity, nfa, cover, verdict)
 
 
 def false_alarms(grad: Gradient, error: Tensor, of: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """log10 of the number of false alarms (count,) of samples with errors (S,), and the share that is on the arc.
 
-    Under the null hypothesis the angle error of a sample, divided by pi, is uniform in [0, 1], and the sum k of n of
-    them is below its value with probability at most k^n / n!. The number of tests is the number of distinguishable
-    ellipses, (h w)^(5/2): five parameters, each with as many values as the frame has pixels on a side.
+    The number of tests is the number of distinguishable ellipses, (h w)^(5/2): five parameters, each with as many
+    values as the frame has pixels on a side.
     """
     _, height, width = grad.shape
     size = torch.bincount(of, minlength=count).double()
     k, on_arc = segment_sum(error, of, count), segment_sum((error < _COVER_ERROR).double(), of, count)
-    log_tests = 2.5 * math.log10(max(1, height * width))
-    log10_nfa = log_tests + size * k.clamp_min(1e-12).log10() - torch.lgamma(size + 1) / math.log(10)
-    return log10_nfa, on_arc / size.clamp_min(1)
+    return log10_nfa(2.5 * math.log10(max(1, height * width)), size, k), on_arc / size.clamp_min(1)
+
+
+def log10_nfa(log_tests: float | Tensor, size: Tensor, total: Tensor) -> Tensor:
+    """log10 of the number of false alarms of so many tests, of ``size`` samples whose errors sum to ``total``.
+
+    Under the null hypothesis the angle error of a sample, divided by pi, is uniform in [0, 1], and the sum k of n of
+    them is below its value with probability at most k^n / n!.
+    """
+    return log_tests + size * total.clamp_min(1e-12).log10() - torch.lgamma(size + 1) / math.log(10)
 
 
 def merge_duplicates(found: Candidates, tolerance: float = SAME, *, explain: bool = False) -> Candidates:
     """Of candidates that are the same ellipse the one with the fewest false alarms, sorted by frame and false alarms.
 
     Two are the same if neither centre nor shape differ by more than a pixel plus ``tolerance`` of the semi-minor axis.
-
-    Args:
-        explain: mark the others as `Verdict.DUPLICATE` instead of leaving them out; what was rejected before stays as
-            it is and never counts as better.
+    With ``explain`` the others are marked as `Verdict.DUPLICATE` instead of left out; what was rejected before stays as
+    it is and never counts as better.
     """
     order = torch.argsort(found.log10_nfa, stable=True)  # NaN, of those rejected without a score, comes last
     found = found[order[torch.argsort(found.frame[order], stable=True)]]
-    frames = int(found.frame[-1]) + 1 if len(found) else 0
-    per_frame = torch.bincount(found.frame, minlength=frames)
-    start = (per_frame.cumsum(0) - per_frame)[found.frame]
-    position = torch.arange(len(found), device=start.device) - start
     # each against those before it in its frame, which have fewer false alarms
-    later, rank = ragged_arange(position)
-    better = start[later] + rank
+    later, better = earlier_in_group(found.frame)
     p, q = found.ellipse[later], found.ellipse[better]
     shape = (conics.shape_matrix(p) - conics.shape_matrix(q)).flatten(1).abs().amax(-1)
     apart = torch.maximum(torch.linalg.vector_norm(p[:, :2] - q[:, :2], dim=-1), shape)
     same = (found.polarity[later] == found.polarity[better]) & (apart < 1.0 + tolerance * q[:, 3])
     if explain:
         same &= (found.verdict[later] == Verdict.ACCEPTED) & (found.verdict[better] == Verdict.ACCEPTED)
-    again = torch.zeros(len(found), dtype=torch.bool, device=start.device)
-    again[later[same]] = True
+    again = marked(later[same], len(found))
     if not explain:
         return found[~again]
     return replace(found, verdict=torch.where(again, int(Verdict.DUPLICATE), found.verdict))
+
+
+def explain_once(grad: Gradient, found: Candidates, known: Candidates | None = None) -> Candidates:
+    """The same candidates; those of which too little remains without the edges of better ones become `EXPLAINED`.
+
+    Ellipses that are seen whole stay as they are. All are in cells; ``known`` are accepted ellipses of a finer scale.
+    """
+    part = positions((found.verdict == Verdict.ACCEPTED) & (found.cover <= WHOLE))
+    if part.numel() == 0:
+        return found
+    weak, every = found[part], found if known is None else Candidates.cat([found, known])
+    samples = sample_edges(grad, weak.frame, weak.ellipse, weak.polarity)
+    sample, other = _explained(samples, weak, every)
+    # who explains must be kept itself: the rounds close in, from below and above, on the choice made one by one in the
+    # order of false alarms
+    kept = torch.ones(len(every), dtype=torch.bool, device=part.device)
+    for _ in range(_ROUNDS):
+        free = ~marked(sample[kept[other]], len(samples))
+        nfa, cover = false_alarms(grad, samples.error[free], samples.of[free], part.numel())
+        kept[part] = (nfa < 0) & (cover >= LEAST_COVER)
+    return replace(found, verdict=torch.where(kept[: len(found)], found.verdict, int(Verdict.EXPLAINED)))
+
+
+def _explained(samples: Samples, weak: Candidates, every: Candidates) -> tuple[Tensor, Tensor]:
+    """Which of the samples of ``weak`` (Q,) lie on the edges of which better ones of ``every`` (Q,)."""
+    best = positions(every.verdict == Verdict.ACCEPTED)
+    best = best[torch.argsort(every.frame[best], stable=True)]
+    i, j = pairs_in_group(weak.frame, every.frame[best])
+    j = best[j]
+    apart = torch.linalg.vector_norm(weak.ellipse[i, :2] - every.ellipse[j, :2], dim=-1)
+    meet = (every.log10_nfa[j] < weak.log10_nfa[i]) & (apart < weak.ellipse[i, 2] + every.ellipse[j, 2] + _NEAR)
+    i, j = i[meet], j[meet]
+    pair, sample = members(torch.bincount(samples.of, minlength=len(weak)), i)
+    other = j[pair]
+    conic = conics.conic_from_ellipse(every.ellipse[other]).unbind(-1)
+    off, nx, ny = conics.signed_distance(conic, *samples.xy[sample].unbind(-1))
+    gradient = samples.gradient[sample]
+    rise = (gradient[:, 0] * nx + gradient[:, 1] * ny) * every.polarity[other]
+    on = (off.abs() < _NEAR) & (rise > _COS * torch.linalg.vector_norm(gradient, dim=-1))
+    return sample[on], other[on]

@@ -14,42 +14,49 @@ from __future__ import annotations
 import math
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 _STEP = 1.0  # standard deviations of the blur from node to node: an error below 1e-8
 
 
-def nodes_needed(semi_major: Tensor, sigma: Tensor) -> int:
-    """Number of nodes for the most demanding of K ellipses with semi-major axis (K,) and blur (K,)."""
+def nodes_needed(semi_major: Float[Tensor, " K"], sigma: Float[Tensor, " K"]) -> int:
+    """Number of nodes for the most demanding of K ellipses with these semi-major axes and blurs."""
     # equal steps of the eccentric anomaly are longest at the ends of the minor axis
     return max(8, int((2 * math.pi / _STEP * semi_major / sigma).max().ceil()))
 
 
 def blurred_ellipse(
-    xy: Tensor, center: Tensor, shape: Tensor, scale: Tensor, sigma: Tensor, nodes: int
-) -> tuple[Tensor, Tensor]:
-    """Blurred indicators of K ellipses at P points each, and their derivatives.
+    xy: Float[Tensor, "K P 2"],
+    center: Float[Tensor, "K 2"],
+    shape: Float[Tensor, "K 2 2"],
+    scale: Float[Tensor, " K"],
+    sigma: Float[Tensor, " K"],
+    nodes: int,
+) -> tuple[Float[Tensor, "K P"], Float[Tensor, "K P 7"]]:
+    """Blurred indicators, in [0, 1], of K ellipses at P points each, and their derivatives.
 
     Args:
-        xy: (K, P, 2). center: (K, 2). shape: (K, 2, 2), symmetric, see `conics.shape_matrix`.
-        scale: (K,), factor on the shape. sigma: (K,), standard deviation of the blur.
+        shape: symmetric, see `conics.shape_matrix`.
+        scale: factor on the shape.
+        sigma: standard deviation of the blur.
         nodes: of the trapezoidal rule, see `nodes_needed`.
 
     Returns:
-        value (K, P) in [0, 1], and derivative (K, P, 7) by centre (2), shape s11, s12, s22, scale and sigma.
+        Values, and derivatives by centre (2), shape s11, s12, s22, scale and sigma.
     """
     angle = torch.arange(nodes, dtype=xy.dtype, device=xy.device) * (2 * math.pi / nodes)
-    e = torch.stack([angle.cos(), angle.sin()])  # (2, M)
-    turn = torch.stack([-e[1], e[0]]) * (2 * math.pi / nodes)
-    rim = scale[:, None, None] * (shape @ e)  # (K, 2, M), from the centre
+    unit = torch.stack([angle.cos(), angle.sin()])  # (2, M)
+    turn = torch.stack([-unit[1], unit[0]]) * (2 * math.pi / nodes)
+    rim = scale[:, None, None] * (shape @ unit)  # (K, 2, M), from the centre
     tangent = scale[:, None, None] * (shape @ turn)
     nx, ny = tangent[:, 1], -tangent[:, 0]  # outward, times the length of a step
     outward = rim[:, 0] * nx + rim[:, 1] * ny
     from_center = xy - center[:, None]
     square = torch.baddbmm(rim.square().sum(1)[:, None], from_center, rim, alpha=-2)
     square = square.add_(from_center.square().sum(-1, keepdim=True)).clamp_min_(1e-6)
-    q = scale[:, None]
-    columns = torch.stack([nx, ny, q * e[0] * nx, q * (e[1] * nx + e[0] * ny), q * e[1] * ny, outward / q, outward], -1)
+    (ex, ey), q = unit, scale[:, None]
+    columns = torch.stack([nx, ny, q * ex * nx, q * (ey * nx + ex * ny), q * ey * ny, outward / q, outward], -1)
     variance = sigma.square()[:, None, None]
     fall = (square * (-0.5 / variance)).expm1_()  # the Gaussian, less one
     flux = (fall / square) @ columns[..., (0, 1, 6)] / (-2 * math.pi)  # (K, P, 3)

@@ -7,27 +7,34 @@ A conic is the coefficient vector (A, B, C, D, E, F) of A x^2 + B xy + C y^2 + D
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
+Ellipse = Float[Tensor, "*#N 5"]
+Conic = Float[Tensor, "*#N 6"]
+Matrix = Float[Tensor, "*#N 3 3"]
+Vector = Float[Tensor, "*#N 3"]
+Scalar = Float[Tensor, "*#N"]
 
-def to_matrix(conic: Tensor) -> Tensor:
-    """Symmetric matrices (..., 3, 3) of conic coefficients (..., 6)."""
+
+def to_matrix(conic: Conic) -> Matrix:
+    """Symmetric matrices of conic coefficients."""
     a, b, c, d, e, f = conic.unbind(-1)
     b, d, e = b / 2, d / 2, e / 2
     return torch.stack([a, b, d, b, c, e, d, e, f], -1).unflatten(-1, (3, 3))
 
 
-def from_matrix(matrix: Tensor) -> Tensor:
-    """Conic coefficients (..., 6) of symmetric matrices (..., 3, 3)."""
-    m = matrix
-    return torch.stack(
-        [m[..., 0, 0], 2 * m[..., 0, 1], m[..., 1, 1], 2 * m[..., 0, 2], 2 * m[..., 1, 2], m[..., 2, 2]], -1
-    )
+def from_matrix(matrix: Matrix) -> Conic:
+    """Conic coefficients of symmetric matrices."""
+    a, b, d, _, c, e, *_, f = matrix.flatten(-2).unbind(-1)
+    return torch.stack([a, 2 * b, c, 2 * d, 2 * e, f], -1)
 
 
-def ellipse_from_conic(conic: Tensor) -> Tensor:
-    """Ellipses (..., 5) of conic coefficients (..., 6); NaN where the conic is no real ellipse."""
+def ellipse_from_conic(conic: Conic) -> Ellipse:
+    """Ellipses of conic coefficients; NaN where the conic is no real ellipse."""
     a, b, c, d, e, f = conic.unbind(-1)
     disc = 4 * a * c - b * b
     cx, cy = (b * e - 2 * c * d) / disc, (b * d - 2 * a * e) / disc
@@ -48,8 +55,8 @@ def ellipse_from_conic(conic: Tensor) -> Tensor:
     return torch.where(valid[..., None], ellipse, torch.nan)
 
 
-def conic_from_ellipse(ellipse: Tensor) -> Tensor:
-    """Conic coefficients (..., 6), negative inside, of ellipses (..., 5); scaled to -1 at the centre."""
+def conic_from_ellipse(ellipse: Ellipse) -> Conic:
+    """Conic coefficients, negative inside, of ellipses; scaled to -1 at the centre."""
     cx, cy, a, b, theta = ellipse.unbind(-1)
     cos, sin = theta.cos(), theta.sin()
     p, q = (cos / a).square() + (sin / b).square(), (sin / a).square() + (cos / b).square()
@@ -59,27 +66,31 @@ def conic_from_ellipse(ellipse: Tensor) -> Tensor:
     return torch.stack([p, r, q, d, e, f], -1)
 
 
-def shape_matrix(ellipse: Tensor) -> Tensor:
-    """Symmetric (..., 2, 2) S = R diag(a, b) R^T: the ellipse is centre + S (cos s, sin s). Smooth also at a circle."""
+def shape_matrix(ellipse: Ellipse) -> Float[Tensor, "*N 2 2"]:
+    """Symmetric S = R diag(a, b) R^T: the ellipse is centre + S (cos s, sin s). Smooth also at a circle."""
     _, _, a, b, theta = ellipse.unbind(-1)
     mean, diff = 0.5 * (a + b), 0.5 * (a - b)
     c, s = diff * (2 * theta).cos(), diff * (2 * theta).sin()
     return torch.stack([mean + c, s, s, mean - c], -1).unflatten(-1, (2, 2))
 
 
-def points_on(ellipse: Tensor, angle: Tensor) -> Tensor:
-    """Points (..., 2) of ellipses (..., 5) at eccentric anomaly ``angle`` (...), counted from the major axis."""
+def points_on(ellipse: Ellipse, angle: Scalar) -> Float[Tensor, "*N 2"]:
+    """Points of ellipses at eccentric anomaly ``angle``, counted from the major axis."""
     cx, cy, a, b, theta = ellipse.unbind(-1)
     x, y = a * angle.cos(), b * angle.sin()
     cos, sin = theta.cos(), theta.sin()
     return torch.stack([cx + cos * x - sin * y, cy + sin * x + cos * y], -1)
 
 
-def boundary(ellipses: Tensor, index: Tensor, angle: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Points x, y (S,) of ellipses (M, 5) and the outward unit normals nx, ny (S,) there, for samples of them.
+def boundary(
+    ellipses: Float[Tensor, "M 5"], index: Int[Tensor, " S"], angle: Float[Tensor, " S"]
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Points x, y of ellipses and the outward unit normals nx, ny there, (S,) each.
 
     Args:
-        index: (S,) int64, whose sample. angle: (S,), eccentric anomaly, counted from the major axis.
+        ellipses: of which samples are wanted.
+        index: whose sample each is.
+        angle: eccentric anomaly, counted from the major axis.
     """
     theta = ellipses[:, 4]
     each = (*ellipses[:, :4].unbind(-1), theta.cos(), theta.sin())
@@ -91,40 +102,36 @@ def boundary(ellipses: Tensor, index: Tensor, angle: Tensor) -> tuple[Tensor, Te
     return cx + cos * x - sin * y, cy + sin * x + cos * y, cos * p - sin * q, sin * p + cos * q
 
 
-def signed_distance(ellipse: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
-    """First-order (Sampson's) distances (...) of points (..., 2) outside ellipses (..., 5), and unit normals (..., 2).
+def signed_distance(conic: Sequence[Tensor], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """First-order (Sampson's) distances (...) of points outside conics, and unit normals nx, ny outwards.
 
-    The normals point outwards, across the conic of the same centre and proportions through each point.
+    The conic is given by its six coefficients (...), negative inside. The normals are those of the conic of the same
+    centre and proportions through each point.
     """
-    value, normal = conic_distance(conic_from_ellipse(ellipse).unbind(-1), points.unbind(-1))
-    return value, torch.stack(normal, -1)
-
-
-def conic_distance(conic: tuple[Tensor, ...], point: tuple[Tensor, ...]) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-    """The same from the six coefficients (...) of conics, negative inside, and the two coordinates (...) of points."""
     a, b, c, d, e, f = conic
-    x, y = point
     px, py = 2 * a * x + b * y + d, b * x + 2 * c * y + e
     steep = torch.sqrt(px * px + py * py)
     value = 0.5 * ((px + d) * x + (py + e) * y) + f
-    return value / steep, (px / steep, py / steep)
+    return value / steep, px / steep, py / steep
 
 
-def perimeter(ellipse: Tensor) -> Tensor:
-    """Perimeters (...) of ellipses (..., 5) (Ramanujan's second formula; relative error below 4e-4 at b/a = 0.1)."""
+def perimeter(ellipse: Ellipse) -> Scalar:
+    """Perimeters of ellipses (Ramanujan's second formula; relative error below 4e-4 at b/a = 0.1)."""
     a, b = ellipse[..., 2], ellipse[..., 3]
     h = ((a - b) / (a + b)).square()
     return torch.pi * (a + b) * (1 + 3 * h / (10 + (4 - 3 * h).sqrt()))
 
 
-def circle_image(rotation: Tensor, center: Tensor, normal: Tensor, radius: Tensor) -> Tensor:
-    """Image conic matrix (..., 3, 3) on the normalised plane of a circle in space.
+def circle_image(rotation: Matrix, center: Vector, normal: Vector, radius: Scalar) -> Matrix:
+    """Image conic matrix on the normalised plane of a circle in space.
 
     Q = H^-T diag(1, 1, -r^2) H^-1 with H = [e1 e2 c], written without the inverse through the adjugate of H.
 
     Args:
-        rotation: (..., 3, 3), target to camera. center: (..., 3), circle centre in the camera frame.
-        normal: (..., 3), unit normal in the target frame. radius: (...).
+        rotation: target to camera.
+        center: in the camera frame.
+        normal: of unit length, in the target frame.
+        radius: in the unit of the centre.
     """
     n = (rotation @ normal[..., None]).squeeze(-1)
     # any unit vector not near n starts the in-plane basis
@@ -137,20 +144,19 @@ def circle_image(rotation: Tensor, center: Tensor, normal: Tensor, radius: Tenso
     return adj.mT @ (weight[..., None] * adj)
 
 
-def circle_ellipse(matrix: Tensor, rotation: Tensor, center: Tensor, normal: Tensor, radius: Tensor) -> Tensor:
-    """Ellipses (..., 5) in px of circles seen by a pinhole of this matrix (3, 3); the rest as for `circle_image`."""
+def circle_ellipse(
+    matrix: Float[Tensor, "3 3"], rotation: Matrix, center: Vector, normal: Vector, radius: Scalar
+) -> Ellipse:
+    """Ellipses in px of circles seen by a pinhole of this matrix; the rest as for `circle_image`."""
     to_ray = torch.linalg.inv(matrix)
     return ellipse_from_conic(from_matrix(to_ray.mT @ circle_image(rotation, center, normal, radius) @ to_ray))
 
 
-def circle_poses(conic: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
+def circle_poses(conic: Matrix, radius: Scalar) -> tuple[Float[Tensor, "*N 2 3"], Float[Tensor, "*N 2 3"]]:
     """Both poses of a circle of known radius from its image (Forsyth et al. 1991, by the cone's eigenvectors).
 
-    Args:
-        conic: (..., 3, 3) symmetric, on the normalised plane. radius: (...).
-
-    Returns:
-        centers (..., 2, 3) in front of the camera and unit normals (..., 2, 3) that point away from it.
+    From a symmetric matrix on the normalised plane the centres in front of the camera, and unit normals that point away
+    from it.
     """
     # orient so that two eigenvalues are positive; eigh sorts ascending: l3 < 0 < l2 <= l1
     det_sign = torch.linalg.det(conic).sign()

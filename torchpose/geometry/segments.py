@@ -6,32 +6,40 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float32, Int, Real, Shaped
 from torch import Tensor
 
 
-def values_at(frames: Tensor, cell: Tensor) -> Tensor:
-    """float32 values, of the shape of ``cell``, at flat positions of contiguous frames; a third of `frames[cell]`."""
+def values_at(frames: Real[Tensor, "B H W"], cell: Int[Tensor, "*S"]) -> Float32[Tensor, "*S"]:
+    """Values at flat positions of contiguous frames, in a third of the time of `frames[cell]`."""
     flat = frames.reshape(-1)
     wide = flat.dtype == torch.uint16  # which index_select does not know
     found = (flat.view(torch.int16) if wide else flat).index_select(0, cell.flatten())
     return (found.view(torch.uint16) if wide else found).view_as(cell).float()
 
 
-def positions(mask: Tensor) -> Tensor:
-    """Indices (K,) int64, rising, where a flat mask (E,) is True; NumPy searches several times as fast as torch."""
+def positions(mask: Bool[Tensor, " E"]) -> Int[Tensor, " K"]:
+    """Where a mask is True, rising; NumPy searches several times as fast as torch."""
     if mask.device.type == "cpu":
         return torch.from_numpy(np.flatnonzero(mask.numpy()))
     return mask.nonzero()[:, 0]
 
 
-def segment_sum(values: Tensor, index: Tensor, count: int) -> Tensor:
-    """Sums (count, ...) of the rows of ``values`` (E, ...) that share an ``index`` (E,) in [0, count)."""
+def marked(index: Int[Tensor, " K"], count: int) -> Bool[Tensor, " count"]:
+    """The mask that is True at these positions, which may repeat."""
+    return torch.zeros(count, dtype=torch.bool, device=index.device).index_fill_(0, index, True)
+
+
+def segment_sum(values: Shaped[Tensor, "E ..."], index: Int[Tensor, " E"], count: int) -> Shaped[Tensor, "count ..."]:
+    """Sums of the rows of ``values`` that share an ``index`` in [0, count)."""
     out = torch.zeros(count, *values.shape[1:], dtype=values.dtype, device=values.device)
     return out.index_add(0, index, values)
 
 
-def segment_mean(values: Tensor, index: Tensor, count: int, weights: Tensor | None = None) -> Tensor:
-    """Weighted means (count, ...) of the groups; NaN for an empty group. ``weights`` is (E,)."""
+def segment_mean(
+    values: Shaped[Tensor, "E ..."], index: Int[Tensor, " E"], count: int, weights: Shaped[Tensor, " E"] | None = None
+) -> Shaped[Tensor, "count ..."]:
+    """Weighted means of the groups; NaN for an empty group."""
     w = torch.ones_like(index, dtype=values.dtype) if weights is None else weights
     w_column = w.reshape(-1, *[1] * (values.ndim - 1))
     total = segment_sum(w, index, count).reshape(-1, *[1] * (values.ndim - 1))
@@ -43,22 +51,17 @@ class Tiles:
     """Flat values laid out in K tiles of one group each, padded: sums of many columns become small matrix products.
 
     `segment_sum` adds row by row, which costs most where the columns are many and the groups few.
-
-    Attributes:
-        order: (E,) int64, which value comes first, second, ...; None where they are sorted by group already.
-        place: (E,) int64, where in the tiles each goes. group: (K,) int64, the group of each tile.
-        count: number of groups. size: places of a tile.
     """
 
-    order: Tensor | None
-    place: Tensor
-    group: Tensor
-    count: int
-    size: int
+    order: Int[Tensor, " E"] | None  # which value comes first, second, ...; None where they are sorted by group already
+    place: Int[Tensor, " E"]  # where in the tiles each value goes
+    group: Int[Tensor, " K"]  # of each tile
+    count: int  # of groups
+    size: int  # places of a tile
 
     @classmethod
-    def of(cls, index: Tensor, count: int, size: int = 32) -> Tiles:
-        """Tiles for the groups ``index`` (E,) in [0, count)."""
+    def of(cls, index: Int[Tensor, " E"], count: int, size: int = 32) -> Tiles:
+        """Tiles for the groups ``index`` in [0, count)."""
         order = None
         if bool((index[1:] < index[:-1]).any()):
             index, order = index.sort(stable=True)
@@ -85,27 +88,42 @@ class Tiles:
         return segment_sum(values, self.group, self.count)
 
 
-def ragged_arange(counts: Tensor) -> tuple[Tensor, Tensor]:
-    """Flat enumeration of groups of the given sizes (K,) int64: group index (E,) and position in the group (E,)."""
-    total = counts.sum()
-    group = torch.repeat_interleave(counts, output_size=int(total))
+def ragged_arange(counts: Int[Tensor, " K"]) -> tuple[Int[Tensor, " E"], Int[Tensor, " E"]]:
+    """Flat enumeration of groups of the given sizes: the group of each element and its position in the group."""
+    total = int(counts.sum())
+    group = torch.repeat_interleave(counts, output_size=total)
     starts = counts.cumsum(0) - counts
-    return group, torch.arange(int(total), device=counts.device) - starts[group]
+    return group, torch.arange(total, device=counts.device) - starts[group]
 
 
-def rank_in_group(group: Tensor, count: int) -> Tensor:
-    """Position (E,) of each element among those of its group, in order of appearance; ``group`` need not be sorted."""
-    order = torch.argsort(group, stable=True)
+def rank_in_group(
+    group: Int[Tensor, " E"], count: int = 0, *, by: Real[Tensor, " E"] | None = None
+) -> Int[Tensor, " E"]:
+    """Position of each element among those of its group, by rising ``by`` and then in order of appearance."""
+    order = torch.argsort(group if by is None else by, stable=True)
+    if by is not None:
+        order = order[torch.argsort(group[order], stable=True)]
     sizes = torch.bincount(group, minlength=count)
     starts = sizes.cumsum(0) - sizes
-    rank = torch.empty_like(group)
-    rank[order] = torch.arange(group.numel(), device=group.device) - starts[group[order]]
-    return rank
+    return torch.empty_like(group).scatter_(
+        0, order, torch.arange(group.numel(), device=group.device) - starts[group[order]]
+    )
 
 
-def pairs_in_group(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """All pairs (i, j) int64 of the same group: first[i] == second[j]; ``second`` is sorted."""
-    sizes = torch.bincount(second, minlength=int(first.max()) + 1 if first.numel() else 0)
-    starts = sizes.cumsum(0) - sizes
-    i, offset = ragged_arange(sizes[first])
-    return i, starts[first[i]] + offset
+def members(size: Int[Tensor, " K"], group: Int[Tensor, " P"]) -> tuple[Int[Tensor, " E"], Int[Tensor, " E"]]:
+    """Elements of the groups asked for, all sorted by group: for each its place in ``group`` and its own index."""
+    which, offset = ragged_arange(size[group])
+    return which, (size.cumsum(0) - size)[group][which] + offset
+
+
+def pairs_in_group(first: Int[Tensor, " E"], second: Int[Tensor, " F"]) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"]]:
+    """All pairs (i, j) of the same group: first[i] == second[j]; ``second`` is sorted."""
+    return members(torch.bincount(second, minlength=int(first.max()) + 1 if first.numel() else 0), first)
+
+
+def earlier_in_group(group: Int[Tensor, " E"]) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"]]:
+    """All pairs (i, j) of the same group with j < i; ``group`` is sorted."""
+    size = torch.bincount(group)
+    start = (size.cumsum(0) - size)[group]
+    i, offset = ragged_arange(torch.arange(len(group), device=group.device) - start)
+    return i, start[i] + offset

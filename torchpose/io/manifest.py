@@ -17,28 +17,51 @@ stopped; it is dropped unless it is whole. Image and robot pose are joined by th
 from __future__ import annotations
 
 import json
-import math
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
 
 from torchpose.errors import ConfigError
 
-_MILLIMETRES = {"mm": 1.0, "m": 1000.0}
+
+class _Record(BaseModel):
+    model_config = ConfigDict(strict=True)
 
 
-@dataclass(frozen=True)
-class ManifestFrame:
+RecordT = TypeVar("RecordT", bound=_Record)
+
+
+class _Units(_Record):
+    length: Literal["mm", "m"]
+
+
+class _Session(_Record):
+    units: _Units | None = None
+
+
+class ManifestFrame(_Record):
     """One image of a manifest: path relative to its folder, and the tool in the robot base (mm, rad) if recorded."""
 
-    image: str
-    robot_pose: tuple[float, ...] | None
+    id: int | str
+    image: Annotated[str, Field(min_length=1)]
+    camera: Annotated[str, BeforeValidator(str)] = ""
+    robot_pose: Annotated[tuple[FiniteFloat, ...], Field(min_length=6, max_length=6, strict=False)] | None = None
+
+
+_WRONG = {
+    "units": '{!r} is not known; write {{"length": "mm"}} or {{"length": "m"}}',
+    "id": "missing or not a number or a text; give every frame its own",
+    "image": "missing or not a text; give the image's path relative to the manifest",
+    "robot_pose": "{!r}; give six finite numbers x, y, z, rx, ry, rz",
+}
 
 
 def read_manifest(path: Path, camera: str | None = None) -> list[ManifestFrame]:
-    """Frames of a capture manifest in the order of capture.
+    """Frames of a capture manifest in the order of capture, robot poses in mm and rad.
 
     Args:
+        path: the manifest.
         camera: only frames of the camera of this name; required where there are several, which have little in common.
 
     Raises:
@@ -46,35 +69,36 @@ def read_manifest(path: Path, camera: str | None = None) -> list[ManifestFrame]:
             image occurs twice, or it has frames of several cameras or none of the named one.
     """
     frames: list[ManifestFrame] = []
-    cameras: list[str] = []
-    ids: set[Any] = set()
+    ids: set[int | str] = set()
     images: set[str] = set()
-    millimetres: float | None = None
+    units: _Units | None = None
     for number, record in read_records(path):
         where = f"{path}: line {number}"
         if record.get("record") == "session":
-            millimetres = _unit(record, where)
+            units = _checked(_Session, record, where).units
         if record.get("record") != "frame" or ("image" in record and record["image"] is None):
             continue
-        identifier, image = record.get("id"), record.get("image")
-        if not isinstance(identifier, int | str):
-            raise ConfigError(f"{where}: id: missing or not a number or a text; give every frame its own")
-        if not isinstance(image, str) or not image:
-            raise ConfigError(f"{where}: image: missing or not a text; give the image's path relative to the manifest")
-        if identifier in ids:
-            raise ConfigError(f"{where}: id: {identifier!r} occurs twice; give every frame its own")
-        if image in images:
-            raise ConfigError(f"{where}: image: {image!r} occurs twice; one record for every image")
-        ids.add(identifier)
-        images.add(image)
-        cameras.append(str(record.get("camera", "")))
-        frames.append(ManifestFrame(image, _robot_pose(record.get("robot_pose"), millimetres, where)))
-    known = sorted(set(cameras))
+        frame = _checked(ManifestFrame, record, where)
+        if frame.id in ids:
+            raise ConfigError(f"{where}: id: {frame.id!r} occurs twice; give every frame its own")
+        if frame.image in images:
+            raise ConfigError(f"{where}: image: {frame.image!r} occurs twice; one record for every image")
+        ids.add(frame.id)
+        images.add(frame.image)
+        if frame.robot_pose is not None:
+            if units is None:
+                fix = 'write "units": {"length": "mm"} (or "m") in the session record'
+                raise ConfigError(f"{where}: robot_pose: in unknown units; {fix}")
+            scale = {"mm": 1.0, "m": 1000.0}[units.length]
+            pose = (*(scale * value for value in frame.robot_pose[:3]), *frame.robot_pose[3:])
+            frame = frame.model_copy(update={"robot_pose": pose})
+        frames.append(frame)
+    known = sorted({frame.camera for frame in frames})
     if camera is None and len(known) > 1:
         raise ConfigError(f"{path}: INPUT: has frames of {len(known)} cameras; pick one: {path.name}#{known[0]}")
     if camera is not None and camera not in known:
         raise ConfigError(f"{path}: INPUT: has no frame of camera {camera!r}; known are {', '.join(known)}")
-    return [frame for frame, name in zip(frames, cameras, strict=True) if camera in (None, name)]
+    return [frame for frame in frames if camera in (None, frame.camera)]
 
 
 def read_records(path: Path) -> list[tuple[int, dict[str, Any]]]:
@@ -103,27 +127,10 @@ def read_records(path: Path) -> list[tuple[int, dict[str, Any]]]:
     return records
 
 
-def _unit(session: dict[str, Any], where: str) -> float | None:
-    """Millimetres per length unit of a session record, None where it names none."""
-    units = session.get("units")
-    if units is None:
-        return None
-    length = units.get("length") if isinstance(units, dict) else None
-    if not isinstance(length, str) or length not in _MILLIMETRES:
-        raise ConfigError(f'{where}: units: {units!r} is not known; write {{"length": "mm"}} or {{"length": "m"}}')
-    return _MILLIMETRES[length]
-
-
-def _robot_pose(value: Any, millimetres: float | None, where: str) -> tuple[float, ...] | None:
-    """The pose in mm and rad, or None where the record has none."""
-    if value is None:
-        return None
-    numbers = value if isinstance(value, list) else []
-    finite = all(isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in numbers)
-    if len(numbers) != 6 or not finite:
-        raise ConfigError(f"{where}: robot_pose: {value!r}; give six finite numbers x, y, z, rx, ry, rz")
-    if millimetres is None:
-        raise ConfigError(
-            f'{where}: robot_pose: in unknown units; write "units": {{"length": "mm"}} (or "m") in the session record'
-        )
-    return (*(float(v) * millimetres for v in numbers[:3]), *(float(v) for v in numbers[3:]))
+def _checked(model: type[RecordT], record: dict[str, Any], where: str) -> RecordT:
+    """A record as an instance of its model."""
+    try:
+        return model.model_validate(record)
+    except ValidationError as caught:
+        field = str(caught.errors()[0]["loc"][0])
+        raise ConfigError(f"{where}: {field}: {_WRONG[field].format(record.get(field))}") from None

@@ -5,10 +5,11 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
+from jaxtyping import Shaped
 from torch import Tensor
 
 from torchpose.io.images import UnreadableImageError, decode
@@ -35,14 +36,14 @@ class Batch:
     Attributes:
         sources: the sources of the batch, in order.
         faults: position in ``sources`` to fault, for those without a frame.
-        groups: pairs of positions (n,) and frames (n, H, W), one pair for each pixel type (uint8, uint16) that occurs.
-            Every position is in ``faults`` or in exactly one group. The frames are views of a buffer that is
-            overwritten once the next-but-one batch is asked for.
+        groups: positions and their frames, for each pixel type (uint8, uint16) that occurs. Every position is in
+            ``faults`` or in exactly one group. The frames are views of a buffer that is overwritten once the
+            next-but-one batch is asked for.
     """
 
     sources: Sequence[Source]
     faults: dict[int, Fault]
-    groups: list[tuple[list[int], Tensor]]
+    groups: list[tuple[list[int], Shaped[Tensor, "n H W"]]]
 
 
 def default_batch(width: int, height: int) -> int:
@@ -55,36 +56,38 @@ def in_batches(sources: Sequence[Source], size: int) -> list[Sequence[Source]]:
     return [sources[i : i + size] for i in range(0, len(sources), size)]
 
 
+@dataclass(frozen=True)
 class FrameReader:
     """Iterates over `Batch` in the order given.
 
     Two buffers take turns: while one batch is worked on, threads decode the next one into the other.
 
-    Args:
+    Attributes:
         batches: what to read, see `in_batches`.
-        width, height: of the camera, px. Frames of another size are `Status.WRONG_SIZE`.
+        width: of the camera, px. Frames of another size are `Status.WRONG_SIZE`.
+        height: of the camera, px.
         threads: decoding threads.
     """
 
-    def __init__(self, batches: Sequence[Sequence[Source]], width: int, height: int, *, threads: int) -> None:
-        self._batches = batches
-        self._shape = (height, width)
-        self._threads = threads
+    batches: Sequence[Sequence[Source]]
+    width: int
+    height: int
+    threads: int = field(kw_only=True)
 
     def __iter__(self) -> Iterator[Batch]:
-        largest = max((len(batch) for batch in self._batches), default=0)
-        buffers = [_Buffer(largest, self._shape, self._threads) for _ in range(2)]
-        pool = ThreadPoolExecutor(self._threads, thread_name_prefix="decode")
+        largest = max((len(batch) for batch in self.batches), default=0)
+        buffers = [_Buffer(largest, (self.height, self.width), self.threads) for _ in range(2)]
+        pool = ThreadPoolExecutor(self.threads, thread_name_prefix="decode")
 
         def submit(number: int) -> list[Future[Fault | np.dtype]]:
             buffer = buffers[number % 2]
-            return [pool.submit(buffer.load, slot, source) for slot, source in enumerate(self._batches[number])]
+            return [pool.submit(buffer.load, slot, source) for slot, source in enumerate(self.batches[number])]
 
         try:
-            ahead = submit(0) if self._batches else []
-            for number, sources in enumerate(self._batches):
+            ahead = submit(0) if self.batches else []
+            for number, sources in enumerate(self.batches):
                 outcomes = [future.result() for future in ahead]
-                if number + 1 < len(self._batches):
+                if number + 1 < len(self.batches):
                     ahead = submit(number + 1)
                 yield buffers[number % 2].batch(sources, outcomes)
         finally:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from torchpose.geometry import rotations
@@ -53,38 +54,24 @@ def pose_rows(poses: Poses, frames: Sequence[str], targets: Sequence[str]) -> li
     """Rows of `POSE_SCHEMA` in the order of the poses.
 
     Args:
-        poses: N poses. frames: name of each frame of the batch. targets: name of each target.
+        poses: N poses.
+        frames: name of each frame of the batch.
+        targets: name of each target.
     """
     poses = poses.cpu()
     own = _solutions(poses.R, poses.t, poses.rms, poses.chi2)
     other = _solutions(poses.R_alt, poses.t_alt, poses.rms_alt, poses.chi2_alt)
-    rows = []
-    for frame, target, status, reason, markers, pose, cells, first, second in zip(
-        poses.frame.tolist(),
-        poses.target.tolist(),
-        poses.status.tolist(),
-        poses.reason.tolist(),
-        poses.markers.tolist(),
-        own,
-        _pose_cells(poses, ""),
-        own,
-        other,
-        strict=True,
-    ):
-        rows.append(
-            {
-                "frame": frames[frame],
-                "target": targets[target],
-                "status": Status(status).name.lower(),
-                **cells,
-                "rms_px": None if pose is None else pose["rms_px"],
-                "markers": markers,
-                "reason": Reason(reason).name.lower() if reason else None,
-                "quaternion": None if pose is None else pose["quaternion"],
-                "solutions": None if first is None else [first, *([second] if second else [])],
-            }
-        )
-    return rows
+    rest = table(
+        frame=[frames[frame] for frame in poses.frame.tolist()],
+        target=[targets[target] for target in poses.target.tolist()],
+        status=[Status(status).name.lower() for status in poses.status.tolist()],
+        rms_px=[pose and pose["rms_px"] for pose in own],
+        markers=poses.markers.tolist(),
+        reason=[Reason(reason).name.lower() if reason else None for reason in poses.reason.tolist()],
+        quaternion=[pose and pose["quaternion"] for pose in own],
+        solutions=[a and [a, *([b] if b else [])] for a, b in zip(own, other, strict=True)],
+    )
+    return [row | cells for row, cells in zip(rest, _pose_cells(poses, ""), strict=True)]
 
 
 def base_cells(poses: Poses) -> list[Row]:
@@ -92,7 +79,7 @@ def base_cells(poses: Poses) -> list[Row]:
     return list(_pose_cells(poses.cpu(), "base_"))
 
 
-def fault_row(frame: str, target: str, status: Status, reason: str) -> Row:
+def fault_row(frame: str, target: str, status: Status, reason: str | None) -> Row:
     """The row of a target in a frame that could not be read or used."""
     row: Row = dict.fromkeys(POSE_SCHEMA)
     return row | {"frame": frame, "target": target, "status": status.name.lower(), "markers": 0, "reason": reason}
@@ -102,57 +89,47 @@ def detection_rows(detections: Detections, frames: Sequence[str], targets: Seque
     """Rows of `DETECTION_SCHEMA`, frame by frame, target by target, in the order of the marker ids."""
     found = detections.cpu()
     std = found.center_cov.diagonal(dim1=-2, dim2=-1).sqrt()
-    rows = sorted(
-        zip(
-            found.frame.tolist(),
-            found.target.tolist(),
-            found.marker.tolist(),
-            found.center.tolist(),
-            std.tolist(),
-            found.outer[:, 2:].tolist(),
-            found.inner[:, 2:].tolist(),
-            strict=True,
-        )
-    )
-    columns = list(DETECTION_SCHEMA)[3:]
+    numbers = torch.cat([found.center, std, found.outer[:, 2:], found.inner[:, 2:]], 1)
+    keys = torch.stack([found.frame, found.target, found.marker], 1).tolist()
     return [
-        {"frame": frames[frame], "target": targets[target], "marker": marker}
-        | dict(zip(columns, map(_finite, (*center, *sigma, *outer, *inner)), strict=True))
-        for frame, target, marker, center, sigma, outer, inner in rows
+        dict(zip(DETECTION_SCHEMA, (frames[frame], targets[target], marker, *map(finite, cells)), strict=True))
+        for (frame, target, marker), cells in sorted(zip(keys, numbers.tolist(), strict=True))
     ]
+
+
+def table(**columns: Sequence[Any]) -> list[Row]:
+    """Rows of columns of the same length."""
+    return [dict(zip(columns, cells, strict=True)) for cells in zip(*columns.values(), strict=True)]
+
+
+def finite(value: float) -> float | None:
+    """The number as a cell."""
+    return value if math.isfinite(value) else None
 
 
 def _pose_cells(poses: Poses, prefix: str) -> list[Row]:
     """Pose, standard deviations and covariance of each pose as cells."""
-    columns = [prefix + c for c in (*_POSE, *_STD)]
-    values = zip(poses.t.tolist(), poses.rotation_vector.tolist(), poses.std.tolist(), strict=True)
-    return [
-        dict(zip(columns, map(_finite, (*t, *r, *s)), strict=True)) | {f"{prefix}covariance": _matrix(covariance)}
-        for (t, r, s), covariance in zip(values, poses.covariance.tolist(), strict=True)
-    ]
+    numbers = torch.cat([poses.t, poses.rotation_vector, poses.std], 1)
+    columns = {f"{prefix}{name}": column for name, column in zip((*_POSE, *_STD), _columns(numbers), strict=True)}
+    whole = poses.covariance.isfinite().flatten(1).all(1).tolist()
+    covariance = [c if ok else None for c, ok in zip(poses.covariance.tolist(), whole, strict=True)]
+    return table(**columns, **{f"{prefix}covariance": covariance})
+
+
+def _columns(numbers: Tensor) -> list[list[float | None]]:
+    return [[finite(value) for value in column] for column in numbers.T.tolist()]
 
 
 def _solutions(rotation: Tensor, translation: Tensor, rms: Tensor, chi2: Tensor) -> list[Row | None]:
     """Each pose as an object of `solutions`, None where there is none."""
-    columns = zip(
-        translation.tolist(),
-        rotations.log(rotation).tolist(),
-        rotations.quaternion(rotation).tolist(),
-        rms.tolist(),
-        chi2.tolist(),
-        strict=True,
+    vector = rotations.log(rotation)
+    there = torch.cat([translation, vector], 1).isfinite().all(1).tolist()
+    error, distance = _columns(torch.stack([rms, chi2], 1))
+    rows = table(
+        translation=translation.tolist(),
+        rotation=vector.tolist(),
+        quaternion=rotations.quaternion(rotation).tolist(),
+        rms_px=error,
+        chi2=distance,
     )
-    return [
-        {"translation": t, "rotation": r, "quaternion": q, "rms_px": _finite(e), "chi2": _finite(c)}
-        if all(map(math.isfinite, (*t, *r)))
-        else None
-        for t, r, q, e, c in columns
-    ]
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def _matrix(values: list[list[float]]) -> list[list[float]] | None:
-    return values if all(math.isfinite(v) for row in values for v in row) else None
+    return [row if ok else None for row, ok in zip(rows, there, strict=True)]

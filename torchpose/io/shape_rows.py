@@ -6,10 +6,11 @@ import math
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.detect import Candidates, Segments, Shapes, Verdict
-from torchpose.io.rows import Row, Schema
+from torchpose.io.rows import Row, Schema, finite, table
 
 SHAPE_SCHEMA: Schema = {
     "frame": str,
@@ -26,44 +27,29 @@ and polygon: middle of the vertices, vertices as ``u v u v ...`` (px), for a seg
 direction, light on the left hand. verdict: accepted, or with --explain why not."""
 
 
-def shape_rows(shapes: Shapes, ratios: Tensor, frames: Sequence[str]) -> list[Row]:
+def shape_rows(shapes: Shapes, ratios: Float[Tensor, " M"], frames: Sequence[str]) -> list[Row]:
     """Rows of `SHAPE_SCHEMA`, frame by frame: ellipses, then polygons, then segments, the surest first.
 
     Args:
-        shapes: of a batch. ratios: (M,) inner to outer radius of its ellipses, NaN where there is no inner circle.
+        shapes: of a batch.
+        ratios: inner to outer radius of its ellipses, NaN where there is no inner circle.
         frames: name of each frame of the batch.
     """
-    rows = [*_ellipse_rows(shapes.ellipses, ratios), *_line_rows(shapes.segments)]
-    rows.sort(key=lambda pair: pair[0])
+    ellipses = zip(shapes.ellipses.frame.tolist(), _ellipse_rows(shapes.ellipses, ratios), strict=True)
+    rows = sorted([*ellipses, *_line_rows(shapes.segments)], key=lambda pair: pair[0])
     return [{"frame": frames[frame], **row} for frame, row in rows]
 
 
-def _ellipse_rows(found: Candidates, ratios: Tensor) -> list[tuple[int, Row]]:
-    columns = ("cx", "cy", "a", "b", "theta")
-    return [
-        (
-            frame,
-            {
-                "kind": "ellipse",
-                **dict(zip(columns, params, strict=True)),
-                "arc": _finite(2 * math.pi * cover),
-                "log10_nfa": _finite(nfa),
-                "polarity": int(polarity),
-                "verdict": Verdict(verdict).name.lower(),
-                "ring_ratio": _finite(ratio),
-            },
-        )
-        for frame, params, cover, nfa, polarity, verdict, ratio in zip(
-            found.frame.tolist(),
-            found.ellipse.tolist(),
-            found.cover.tolist(),
-            found.log10_nfa.tolist(),
-            found.polarity.tolist(),
-            found.verdict.tolist(),
-            ratios.tolist(),
-            strict=True,
-        )
-    ]
+def _ellipse_rows(found: Candidates, ratios: Tensor) -> list[Row]:
+    return table(
+        kind=["ellipse"] * len(found),
+        **dict(zip(("cx", "cy", "a", "b", "theta"), found.ellipse.T.tolist(), strict=True)),
+        arc=[finite(2 * math.pi * cover) for cover in found.cover.tolist()],
+        log10_nfa=[finite(nfa) for nfa in found.log10_nfa.tolist()],
+        polarity=[int(polarity) for polarity in found.polarity.tolist()],
+        verdict=[Verdict(verdict).name.lower() for verdict in found.verdict.tolist()],
+        ring_ratio=[finite(ratio) for ratio in ratios.tolist()],
+    )
 
 
 def _line_rows(found: Segments) -> list[tuple[int, Row]]:
@@ -87,17 +73,6 @@ def _line_rows(found: Segments) -> list[tuple[int, Row]]:
 
 
 def _line(kind: str, vertices: Tensor, nfa: float) -> Row:
-    center = vertices.mean(0).tolist()
+    cx, cy = vertices.mean(0).tolist()
     text = " ".join(f"{value:.3f}" for value in vertices.flatten().tolist())
-    return {
-        "kind": kind,
-        "cx": center[0],
-        "cy": center[1],
-        "log10_nfa": nfa,
-        "vertices": text,
-        "verdict": "accepted",
-    }
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+    return {"kind": kind, "cx": cx, "cy": cy, "log10_nfa": nfa, "vertices": text, "verdict": "accepted"}

@@ -9,13 +9,19 @@ line torn; a resumed one drops that line and goes on. A finished table is resume
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import json
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from io import FileIO
+from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, BinaryIO
+
+from filelock import lock_descriptor
+from pydantic import BaseModel, Field, ValidationError
 
 from torchpose.errors import ConfigError
 from torchpose.io.rows import DETECTION_SCHEMA, Row, Schema
@@ -25,11 +31,20 @@ Origin = Mapping[str, Any]
 """What rows are made from (versions, digests of the files, inputs), as JSON values by name."""
 
 
+class _Record(BaseModel):
+    """A line of a journal behind the first, as `ResultStore.append` takes it."""
+
+    frame: str
+    rows: Annotated[list[dict[str, Any]], Field(min_length=1)]
+    detections: list[dict[str, Any]]
+
+
 class ResultStore:
     """Collects the rows of a run frame by frame and writes its tables.
 
     Args:
-        out: table of the poses. detections: table of the markers, or None.
+        out: table of the poses.
+        detections: table of the markers, or None.
         schema: columns of ``out``.
         targets: rows that every frame has in ``out``.
         origin: what the rows are made from; a resumed run must agree.
@@ -62,23 +77,18 @@ class ResultStore:
         self._places: dict[str, tuple[int, int]] = {}  # frame -> offset and length of its line in the journal
         resumable = resume and self._journal_path.exists()
         finished = list(self._finished()) if resume and not resumable and out.exists() else []
-        try:
-            # unbuffered: what a full disk refuses must not be tried again when the file is closed
-            self._journal: FileIO = self._journal_path.open("ab", buffering=0)
-        except OSError as error:
-            raise self._unwritable(error) from None
-        try:
-            _lock(self._journal, self._journal_path)
-            if not (resumable and self._load()):
-                self._journal.truncate(0)
-                self._write([{"origin": self._origin}])
-                self.append(finished)
-        except OSError as error:
-            self.close()
-            raise self._unwritable(error) from None
-        except ConfigError:
-            self.close()
-            raise
+        with contextlib.ExitStack() as stack:
+            try:
+                # unbuffered: what a full disk refuses must not be tried again when the file is closed
+                self._journal: FileIO = stack.enter_context(self._journal_path.open("a+b", buffering=0))
+                self._lock()
+                if not (resumable and self._load()):
+                    self._journal.truncate(0)
+                    self._write([{"origin": self._origin}])
+                    self.append(finished)
+            except OSError as error:
+                raise self._unwritable(error) from None
+            stack.pop_all()  # nothing went wrong: it stays open
 
     def __contains__(self, frame: str) -> bool:
         return frame in self._places
@@ -129,18 +139,32 @@ class ResultStore:
             "place, with --resume to keep what is there"
         )
 
+    def _lock(self) -> None:
+        """Keeps a second run from writing the same journal; the system releases it however the run ends."""
+        try:
+            locked = lock_descriptor(self._journal.fileno(), blocking=False)
+        except OSError as error:
+            if error.errno != errno.ENOSYS:
+                raise
+            return  # a file system without locks, where this guard is missing
+        if not locked:
+            raise ConfigError(
+                f"{self._journal_path}: --out: another run is writing it; wait for it or choose another file"
+            )
+
+    def _reader(self) -> BinaryIO:
+        """The journal to read from, by its own descriptor: elsewhere than on POSIX the lock keeps others out."""
+        self._journal.seek(0)
+        return open(self._journal.fileno(), "rb", closefd=False)
+
     def _write(self, records: Sequence[Row]) -> list[tuple[int, int]]:
         lines = [json.dumps(record, allow_nan=False).encode() + b"\n" for record in records]
-        offset = self._journal.seek(0, os.SEEK_END)
+        starts = accumulate(map(len, lines), initial=self._journal.seek(0, os.SEEK_END))
         rest = memoryview(b"".join(lines))
         while rest:
             rest = rest[self._journal.write(rest) :]
         os.fsync(self._journal.fileno())
-        places = []
-        for line in lines:
-            places.append((offset, len(line)))
-            offset += len(line)
-        return places
+        return [(start, len(line)) for start, line in zip(starts, lines, strict=False)]
 
     def _note(self, record: Row, place: tuple[int, int]) -> None:
         self._places[record["frame"]] = place
@@ -151,7 +175,7 @@ class ResultStore:
     def _load(self) -> bool:
         """Reads the journal of a killed run and drops a torn end; False if not even its first line is whole."""
         offset = 0
-        with self._journal_path.open("rb") as lines:
+        with self._reader() as lines:
             for line in lines:
                 if not line.endswith(b"\n"):
                     break
@@ -160,15 +184,18 @@ class ResultStore:
                 except ValueError:  # a crash of the machine may leave blocks of zeros
                     break
                 if offset == 0:
-                    self._check_origin(record.get("origin"), self._journal_path)
+                    self._check_origin(record.get("origin") if isinstance(record, dict) else None, self._journal_path)
                 else:
-                    self._note(record, (offset, len(line)))
+                    try:
+                        self._note(_Record.model_validate(record).model_dump(), (offset, len(line)))
+                    except (ValidationError, KeyError):
+                        raise self._foreign(self._journal_path) from None
                 offset += len(line)
         self._journal.truncate(offset)
         return offset > 0
 
     def _records(self, frames: Sequence[str]) -> Iterator[Row]:
-        with self._journal_path.open("rb") as journal:
+        with self._reader() as journal:
             for frame in frames:
                 offset, length = self._places[frame]
                 journal.seek(offset)
@@ -194,24 +221,15 @@ class ResultStore:
                     records[row["frame"]]["detections"].append(row)
         yield from (record for record in records.values() if len(record["rows"]) == self._targets)
 
+    def _foreign(self, path: Path) -> ConfigError:
+        return ConfigError(f"{path}: --resume: not written by torchpose; run without --resume")
+
     def _check_origin(self, origin: Any, path: Path) -> None:
         if not isinstance(origin, dict):
-            raise ConfigError(f"{path}: --resume: not written by torchpose; run without --resume")
+            raise self._foreign(path)
         changed = [name for name in self._origin if origin.get(name) != self._origin[name]]
         if changed:
             raise ConfigError(
                 f"{path}: --resume: the rows there were made with another {' and '.join(changed)}; "
                 "run without --resume to start over"
             )
-
-
-def _lock(file: FileIO, path: Path) -> None:
-    """Keeps a second run from writing the same journal; the system releases it however the run ends."""
-    try:
-        import fcntl
-    except ImportError:  # not on Windows, where this guard is missing
-        return
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise ConfigError(f"{path}: --out: another run is writing it; wait for it or choose another file") from None

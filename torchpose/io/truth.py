@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import os
 from dataclasses import dataclass, field
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.config import format_number, read_text, write_text
@@ -23,25 +25,26 @@ class Truth:
     """Known poses of N frame-target pairs.
 
     Attributes:
-        frame: N paths relative to the folder of frames. target: N names of targets.
-        t: (N, 3) float64, mm, target to camera.
-        rotation_vector: (N, 3) float64, rad, target to camera.
-        extra: further columns by name, (N,) float64 each. Their names carry the unit where it is not mm, rad, px or
-            grey levels; ``sx sy sz srx sry srz`` are the Cramer-Rao standard deviations of `torchpose.analysis`.
+        frame: paths relative to the folder of frames.
+        target: names of targets.
+        t: float64, mm, target to camera.
+        rotation_vector: float64, rad, target to camera.
+        extra: further columns by name, float64. Their names carry the unit where it is not mm, rad, px or grey levels;
+            ``sx sy sz srx sry srz`` are the Cramer-Rao standard deviations of `torchpose.analysis`.
     """
 
     frame: list[str]
     target: list[str]
-    t: Tensor
-    rotation_vector: Tensor
-    extra: dict[str, Tensor] = field(default_factory=dict)
+    t: Float[Tensor, "N 3"]
+    rotation_vector: Float[Tensor, "N 3"]
+    extra: dict[str, Float[Tensor, " N"]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.frame)
 
     @property
-    def R(self) -> Tensor:
-        """(N, 3, 3) float64, target to camera."""
+    def R(self) -> Float[Tensor, "N 3 3"]:
+        """Target to camera, float64."""
         return rotations.exp(self.rotation_vector)
 
 
@@ -78,22 +81,17 @@ def read_truth(path: str | os.PathLike[str]) -> Truth:
     for line, row in enumerate(rows, 2):
         if len(row) != len(header):
             raise ConfigError(f"{path}: line {line}: has {len(row)} fields; give {len(header)}, as in the header")
-    text = dict(zip(header, zip(*rows, strict=True), strict=True)) if rows else dict.fromkeys(header, ())
-    columns = {name: _numbers(path, name, text[name]) for name in header if name not in NAMES}
-    return Truth(
-        frame=list(text["frame"]),
-        target=list(text["target"]),
-        t=torch.stack([columns.pop(name) for name in POSE[:3]], 1),
-        rotation_vector=torch.stack([columns.pop(name) for name in POSE[3:]], 1),
-        extra=columns,
-    )
+    cells = dict(zip(header, zip(*rows, strict=True) if rows else itertools.repeat(()), strict=False))
+    columns = {name: _numbers(path, name, cells[name]) for name in header if name not in NAMES}
+    pose = torch.stack([columns.pop(name) for name in POSE], 1)
+    return Truth(list(cells["frame"]), list(cells["target"]), pose[:, :3], pose[:, 3:], columns)
 
 
-def _numbers(path: str | os.PathLike[str], name: str, values: tuple[str, ...]) -> Tensor:
+def _numbers(path: str | os.PathLike[str], name: str, cells: tuple[str, ...]) -> Tensor:
     numbers = []
-    for line, value in enumerate(values, 2):
+    for line, cell in enumerate(cells, 2):
         try:
-            numbers.append(float(value))
+            numbers.append(float(cell))
         except ValueError:
-            raise ConfigError(f"{path}: {name}: {value!r} in line {line} is not a number; write one") from None
+            raise ConfigError(f"{path}: {name}: {cell!r} in line {line} is not a number; write one") from None
     return torch.tensor(numbers, dtype=torch.float64)

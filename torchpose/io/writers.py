@@ -9,7 +9,6 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 from torchpose.errors import ConfigError
 from torchpose.io.rows import Row, Schema
@@ -52,29 +51,51 @@ def read_rows(path: Path, schema: Schema) -> Iterator[Row]:
     Raises:
         ConfigError: the file is not such a table.
     """
+    columns = _cells(schema) if path.suffix.lower() == ".csv" else list(schema)
     try:
-        yield from _READERS[path.suffix.lower()](path, schema)
+        for row in _READERS[path.suffix.lower()](path):
+            if list(row) != columns:
+                raise ValueError("columns")
+            yield {column: None if cell is None else schema[column](cell) for column, cell in row.items()}
     except (ValueError, KeyError, TypeError, OSError, csv.Error):
         raise ConfigError(
             f"{path}: --resume: not a table that torchpose wrote for these options; run without --resume"
         ) from None
 
 
-@contextlib.contextmanager
-def atomic_path(path: Path) -> Iterator[Path]:
-    """A place beside ``path`` to write to. It is moved to ``path`` when the block ends, removed when it fails.
+def read_table(path: Path) -> list[Row]:
+    """Rows of the POSES table of a command; the cells of a CSV are text, None where empty.
 
     Raises:
-        ConfigError: an operating-system error on the way.
+        ConfigError: the file cannot be read or is of another kind.
+    """
+    if path.suffix not in _READERS:
+        raise ConfigError(f"{path}: POSES: of an unknown type; give .csv, .jsonl or .parquet")
+    try:
+        return list(_READERS[path.suffix](path))
+    except (OSError, ValueError, TypeError) as error:
+        detail = getattr(error, "strerror", None) or str(error).splitlines()[0]
+        raise ConfigError(f"{path}: POSES: cannot be read ({detail}); give what torchpose estimate wrote") from None
+
+
+@contextlib.contextmanager
+def atomic_path(
+    path: Path, *, option: str = "", fix: str = "free some space or choose another", sync: bool = True
+) -> Iterator[Path]:
+    """A place beside ``path`` to write to. It is moved to ``path`` when the block ends, removed when it fails.
+
+    With ``sync`` it survives a crash of the machine. An operating-system error is a ConfigError with ``option`` (such
+    as ``--out: ``) and ``fix``.
     """
     temporary = _temporary(path)
     try:
         yield temporary
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
+        if sync:
+            with temporary.open("rb") as file:
+                os.fsync(file.fileno())
         temporary.replace(path)
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be written ({error.strerror}); free some space or choose another") from None
+        raise ConfigError(f"{path}: {option}cannot be written ({error.strerror}); {fix}") from None
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -96,14 +117,12 @@ def _write_csv(path: Path, rows: Iterable[Row], schema: Schema) -> None:
         writer.writerows([row.get(column) for column in columns] for row in rows)
 
 
-def _read_csv(path: Path, schema: Schema) -> Iterator[Row]:
-    columns = _cells(schema)
+def _read_csv(path: Path) -> Iterator[Row]:
     with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.reader(file)
-        if next(reader, None) != columns:
-            raise ValueError("columns")
-        for cells in reader:
-            yield {c: schema[c](v) if v else None for c, v in zip(columns, cells, strict=True)}
+        for row in csv.DictReader(file):
+            if None in row or None in row.values():
+                raise ValueError("a row has another number of cells than the header")
+            yield {column: cell or None for column, cell in row.items()}
 
 
 def _write_jsonl(path: Path, rows: Iterable[Row], schema: Schema) -> None:
@@ -113,33 +132,27 @@ def _write_jsonl(path: Path, rows: Iterable[Row], schema: Schema) -> None:
         )
 
 
-def _read_jsonl(path: Path, schema: Schema) -> Iterator[Row]:
+def _read_jsonl(path: Path) -> Iterator[Row]:
     with path.open(encoding="utf-8") as file:
         for line in file:
-            row = json.loads(line)
-            yield {column: row[column] for column in schema}
+            if not isinstance(row := json.loads(line), dict):
+                raise ValueError("a line is not an object")
+            yield row
 
 
 def _write_parquet(path: Path, rows: Iterable[Row], schema: Schema) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    solution = pa.struct(
-        {
-            "translation": pa.list_(pa.float64(), 3),
-            "rotation": pa.list_(pa.float64(), 3),
-            "quaternion": pa.list_(pa.float64(), 4),
-            "rms_px": pa.float64(),
-            "chi2": pa.float64(),
-        }
-    )
-    plain = {str: pa.string(), int: pa.int64(), float: pa.float64()}
+    number = pa.float64()
+    parts = {"translation": pa.list_(number, 3), "rotation": pa.list_(number, 3), "quaternion": pa.list_(number, 4)}
     nested = {
-        "covariance": pa.list_(pa.list_(pa.float64())),
-        "base_covariance": pa.list_(pa.list_(pa.float64())),
-        "quaternion": pa.list_(pa.float64()),
-        "solutions": pa.list_(solution),
+        "covariance": pa.list_(pa.list_(number)),
+        "base_covariance": pa.list_(pa.list_(number)),
+        "quaternion": pa.list_(number),
+        "solutions": pa.list_(pa.struct(parts | {"rms_px": number, "chi2": number})),
     }
+    plain = {str: pa.string(), int: pa.int64(), float: number}
     arrow = pa.schema({c: nested[c] if kind is list else plain[kind] for c, kind in schema.items()})
     remaining = iter(rows)
     with pq.ParquetWriter(path, arrow) as writer:
@@ -147,12 +160,10 @@ def _write_parquet(path: Path, rows: Iterable[Row], schema: Schema) -> None:
             writer.write_table(pa.Table.from_pylist(group, arrow))
 
 
-def _read_parquet(path: Path, schema: Schema) -> Iterator[Row]:
+def _read_parquet(path: Path) -> Iterator[Row]:
     import pyarrow.parquet as pq
 
     with pq.ParquetFile(path) as file:
-        if file.schema_arrow.names != list(schema):
-            raise ValueError("columns")
         for group in file.iter_batches(_ROW_GROUP):
             yield from group.to_pylist()
 
@@ -162,7 +173,7 @@ _WRITERS: dict[str, Callable[[Path, Iterable[Row], Schema], None]] = {
     ".jsonl": _write_jsonl,
     ".parquet": _write_parquet,
 }
-_READERS: dict[str, Callable[[Path, Schema], Iterator[dict[str, Any]]]] = {
+_READERS: dict[str, Callable[[Path], Iterator[Row]]] = {
     ".csv": _read_csv,
     ".jsonl": _read_jsonl,
     ".parquet": _read_parquet,

@@ -2,6 +2,7 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <type_traits>
 #ifdef _OPENMP
 #include <omp.h>
 #endif
@@ -53,14 +54,17 @@ template <class S, class T> INLINE void scatter(S* p, int64_t stride, T x) {
 INLINE void scatter(uint8_t* p, int64_t stride, M x) { scatter<uint8_t, M>(p, stride, x & 1); }
 INLINE void store(uint8_t* p, M x) { store(p, __builtin_convertvector(x & 1, B)); }
 
-template <class T, class S> INLINE T to(S x) { return __builtin_convertvector(x, T); }
-template <class T> INLINE T of_mask(M x) { return __builtin_convertvector(x & 1, T); }
-
 #define COMPARE(name, op) \
     INLINE M name(F x, F y) { return x op y; } \
     INLINE M name(D x, D y) { return __builtin_convertvector(x op y, M); } \
     INLINE M name(J x, J y) { return __builtin_convertvector(x op y, M); }
 COMPARE(eq, ==) COMPARE(ne, !=) COMPARE(lt, <) COMPARE(le, <=) COMPARE(gt, >) COMPARE(ge, >=)
+
+template <class T, class S> INLINE T to(S x) {
+    if constexpr (std::is_same_v<S, M>) return __builtin_convertvector(x & 1, T);
+    else if constexpr (std::is_same_v<T, M>) return ne(x, S{});
+    else return __builtin_convertvector(x, T);
+}
 
 INLINE F select(M m, F x, F y) { return m ? x : y; }
 INLINE M select(M m, M x, M y) { return m ? x : y; }
@@ -79,7 +83,39 @@ template <class T> INLINE T most(T x, T y) { return select(gt(x, y) | ne(x, x), 
 
 template <class T> INLINE T magnitude(T x) { return select(lt(x, T{}), -x, x); }
 
+template <class T> INLINE T inverse(T x) { return (T{} + 1) / x; }
+
 #define EACH(name, function) \
     INLINE F name(F x) { for (int l = 0; l < LANES; ++l) x[l] = std::function(x[l]); return x; } \
     INLINE D name(D x) { for (int l = 0; l < LANES; ++l) x[l] = std::function(x[l]); return x; }
-EACH(root, sqrt) EACH(arctangent, atan)
+EACH(root, sqrt) EACH(arctangent, atan) EACH(sine, sin) EACH(cosine, cos)
+
+#define PAIRS(name, function) \
+    INLINE F name(F x, F y) { for (int l = 0; l < LANES; ++l) x[l] = function(x[l], y[l]); return x; } \
+    INLINE D name(D x, D y) { for (int l = 0; l < LANES; ++l) x[l] = function(x[l], y[l]); return x; }
+// of the sign of the divisor, as in Python
+template <class S> INLINE S modulus(S x, S y) {
+    const S rest = std::fmod(x, y);
+    return rest != 0 && (rest < 0) != (y < 0) ? rest + y : rest;
+}
+PAIRS(angle, std::atan2) PAIRS(length, std::hypot) PAIRS(power, std::pow) PAIRS(modulo, modulus)
+
+// of the blocks of LANES problems, from the first up to the last: what is made for every function follows this file
+static void solve(void* const* data, const int64_t* strides, int64_t batch, int64_t limit,
+                  int64_t first, int64_t last);
+
+extern "C" void kernel(void* const* data, const int64_t* strides, int64_t batch, int64_t limit,
+                       int threads) {
+    const int64_t blocks = (batch + LANES - 1) / LANES;
+#ifdef _OPENMP
+    if (threads > 1) {
+#pragma omp parallel num_threads(threads)
+        {
+            const int64_t k = omp_get_thread_num(), n = omp_get_num_threads();
+            solve(data, strides, batch, limit, blocks * k / n, blocks * (k + 1) / n);
+        }
+        return;
+    }
+#endif
+    solve(data, strides, batch, limit, 0, blocks);
+}

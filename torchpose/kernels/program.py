@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
 from typing import NamedTuple
 
-import numpy as np
 import torch
+from torch import Tensor
 
 # vector of lanes.h, and what it is in memory
 TYPES = {
@@ -18,10 +20,11 @@ TYPES = {
 }
 
 
-class Array(NamedTuple):
-    """A tensor of one problem: which numbers of the program it consists of, int, and their dtype."""
+@dataclass(frozen=True, eq=False)
+class Array:
+    """A tensor of one problem: which numbers of the program it consists of, int64, and their dtype."""
 
-    numbers: np.ndarray
+    numbers: Tensor
     dtype: torch.dtype
 
 
@@ -32,7 +35,7 @@ class _Operation(NamedTuple):
     invariant: bool
 
 
-class Rows(NamedTuple):
+class Layout(NamedTuple):
     """A tensor in memory: (*shape, B), or (*shape, 1) where it is ``shared`` by all problems.
 
     Where it is ``strided``, it is not contiguous along the batch.
@@ -50,7 +53,7 @@ class Program:
     def __init__(self) -> None:
         self._operations: list[_Operation] = []
         self._known: dict[_Operation, int] = {}
-        self._tensors: list[Rows] = []
+        self._tensors: list[Layout] = []
         self._loads: dict[int, tuple[int, tuple[int, ...]]] = {}  # number: tensor, index
         self._stores: list[tuple[int, tuple[int, ...], int]] = []  # tensor, index, number
         self._carried: dict[int, int] = {}  # number: number that takes its place in the next round
@@ -63,43 +66,45 @@ class Program:
             self._operations.append(operation)
         return self._known[operation]
 
-    def input(self, rows: Rows) -> Array:
+    def input(self, layout: Layout) -> Array:
         """The next tensor of the call, to be read."""
-        if rows.dtype not in TYPES:
-            raise NotImplementedError(f"{rows.dtype} in a compiled function")
+        if layout.dtype not in TYPES:
+            raise NotImplementedError(f"{layout.dtype} in a compiled function")
         tensor = len(self._tensors)
-        self._tensors.append(rows)
-        step = f"strides[{self._strides(tensor) + len(rows.shape)}]"
-        read = "all(*{})" if rows.shared else f"gather({{0}} + b * {step}, {step})" if rows.strided else "load({} + b)"
-        numbers = np.empty((*rows.shape, 1), int)
-        for index in np.ndindex(rows.shape):
+        self._tensors.append(layout)
+        step = f"strides[{self._strides(tensor) + len(layout.shape)}]"
+        read = f"gather({{0}} + b * {step}, {step})" if layout.strided else "load({} + b)"
+        read = "all(*{})" if layout.shared else read
+        numbers = []
+        for index in product(*map(range, layout.shape)):
             text = read.format(_pointer(tensor, index))
-            numbers[index] = number = self._number(text, (), rows.dtype, rows.shared)
-            self._loads[number] = tensor, index
-        return Array(numbers, rows.dtype)
+            numbers.append(self._number(text, (), layout.dtype, layout.shared))
+            self._loads[numbers[-1]] = tensor, index
+        return Array(torch.tensor(numbers, dtype=torch.int64).view(*layout.shape, 1), layout.dtype)
 
-    def repeat(self, state: Sequence[Array], after: Sequence[Array], going: Array) -> list[Rows]:
+    def repeat(self, state: Sequence[Array], after: Sequence[Array], going: Array) -> list[Layout]:
         """Makes the program one round of a loop, which ends for a vector of problems when none is ``going``.
 
         Inputs ``state`` are, in the next round, what they are ``after`` this; in the end they are results.
         """
         for old, new in zip(state, after, strict=True):
-            new = Array(np.broadcast_to(self.array(new, old.dtype).numbers, old.numbers.shape), old.dtype)
-            self._carried.update(zip(old.numbers.ravel().tolist(), new.numbers.ravel().tolist(), strict=True))
+            numbers = self.array(new, old.dtype).numbers.expand_as(old.numbers)
+            self._carried.update(zip(old.numbers.flatten().tolist(), numbers.flatten().tolist(), strict=True))
         self._going = int(going.numbers[0])
         return [self.output(array) for array in state]
 
-    def output(self, array: Array) -> Rows:
+    def output(self, array: Array) -> Layout:
         """Makes numbers (*shape, 1) the next tensor of the call."""
-        rows = Rows(array.numbers.shape[:-1], array.dtype)
-        self._tensors.append(rows)
+        layout = Layout(array.numbers.shape[:-1], array.dtype)
+        self._tensors.append(layout)
         self.write(array, len(self._tensors) - 1)
-        return rows
+        return layout
 
     def write(self, array: Array, tensor: int) -> None:
         """Writes numbers (*shape, 1) to a tensor, which must not be read."""
-        numbers = np.broadcast_to(array.numbers, (*self._tensors[tensor].shape, 1))
-        self._stores += [(tensor, index, int(numbers[(*index, 0)])) for index in np.ndindex(numbers.shape[:-1])]
+        shape = self._tensors[tensor].shape
+        numbers = array.numbers.expand(*shape, 1).flatten().tolist()
+        self._stores += [(tensor, index, k) for index, k in zip(product(*map(range, shape)), numbers, strict=True)]
 
     def constant(self, value: float, dtype: torch.dtype) -> int:
         if dtype.is_floating_point:
@@ -112,30 +117,26 @@ class Program:
     def array(self, value: Array | float, dtype: torch.dtype) -> Array:
         """As numbers of this dtype."""
         if not isinstance(value, Array):
-            return Array(np.array(self.constant(value, dtype)), dtype)
+            return Array(torch.tensor(self.constant(value, dtype)), dtype)
         if value.dtype == dtype:
             return value
-        convert = f"of_mask<{TYPES[dtype][0]}>({{}})" if value.dtype == torch.bool else f"to<{TYPES[dtype][0]}>({{}})"
-        if dtype == torch.bool:
-            return self.each("ne({}, {})", dtype, value, self.array(0, value.dtype))
-        return self.each(convert, dtype, value)
+        return self.each(f"to<{TYPES[dtype][0]}>({{}})", dtype, value)
 
     def each(self, text: str, dtype: torch.dtype, *operands: Array) -> Array:
         """An operation on every element; operands broadcast against each other."""
-        numbers = np.broadcast_arrays(*(v.numbers for v in operands))
-        columns = zip(*(n.ravel().tolist() for n in numbers), strict=True)
-        result = np.array([self._number(text, column, dtype) for column in columns], int)
-        return Array(result.reshape(numbers[0].shape), dtype)
+        numbers = torch.broadcast_tensors(*(v.numbers for v in operands))
+        columns = zip(*(n.flatten().tolist() for n in numbers), strict=True)
+        result = [self._number(text, column, dtype) for column in columns]
+        return Array(torch.tensor(result, dtype=torch.int64).view(numbers[0].shape), dtype)
 
-    def fold(self, text: str, array: Array, dims: Sequence[int], keep: bool = False) -> Array:
-        """An operation along dimensions, one element after the other."""
-        ndim = array.numbers.ndim
-        dims = tuple(d % ndim for d in dims) if dims else tuple(range(ndim))
-        first = np.moveaxis(array.numbers, dims, range(len(dims)))
-        result, *others = first.reshape(-1, *first.shape[len(dims) :])
+    def fold(self, text: str, array: Array, dims: int | Sequence[int], shape: Sequence[int]) -> Array:
+        """An operation along dimensions (none: all), one element after the other; ``shape`` is that of the result."""
+        dims = (dims,) if isinstance(dims, int) else dims or range(array.numbers.ndim)
+        first = array.numbers.movedim(tuple(dims), tuple(range(len(dims))))
+        result, *others = (Array(n, array.dtype) for n in first.flatten(0, len(dims) - 1))
         for other in others:
-            result = self.each(text, array.dtype, Array(result, array.dtype), Array(other, array.dtype)).numbers
-        return Array(np.expand_dims(result, dims) if keep else result, array.dtype)
+            result = self.each(text, array.dtype, result, other)
+        return Array(result.numbers.reshape(shape), array.dtype)
 
     def source(self) -> str:
         """C++, to follow lanes.h. Its ``kernel`` takes the data and the strides of every tensor."""
@@ -195,7 +196,7 @@ class Program:
 
     def _strides(self, tensor: int) -> int:
         """Where the strides of a tensor begin."""
-        return sum(len(rows.shape) + 1 for rows in self._tensors[:tensor])
+        return sum(len(layout.shape) + 1 for layout in self._tensors[:tensor])
 
     def _needed(self, number: int, done: set[int]) -> Iterator[int]:
         """What is not yet ``done`` of all that a number depends on, operands first, and the number itself."""
@@ -232,21 +233,5 @@ for (int64_t block = first; block < last; ++block) {{
 const int64_t b = block * LANES < batch - LANES ? block * LANES : batch - LANES;
 {work}
 }}
-}}
-
-extern "C" void kernel(void* const* data, const int64_t* strides, int64_t batch, int64_t limit,
-                       int threads) {{
-    const int64_t blocks = (batch + LANES - 1) / LANES;
-#ifdef _OPENMP
-    if (threads > 1) {{
-#pragma omp parallel num_threads(threads)
-        {{
-            const int64_t k = omp_get_thread_num(), n = omp_get_num_threads();
-            solve(data, strides, batch, limit, blocks * k / n, blocks * (k + 1) / n);
-        }}
-        return;
-    }}
-#endif
-    solve(data, strides, batch, limit, 0, blocks);
 }}
 """

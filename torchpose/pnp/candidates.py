@@ -27,6 +27,19 @@ class Candidates(NamedTuple):
     rms: Tensor
 
 
+def expect(name: str, value: Tensor, *shapes: tuple[int, ...]) -> None:
+    """Raises ValueError where a tensor has none of the shapes."""
+    if value.shape not in shapes:
+        raise ValueError(f"{name} has shape {tuple(value.shape)}; expected {' or '.join(map(str, shapes))}")
+
+
+def expect_pixels(image_points: Tensor) -> tuple[int, int]:
+    """B and N of image points (B, N, 2)."""
+    if image_points.ndim != 3 or image_points.shape[-1] != 2:
+        raise ValueError(f"image_points has shape {tuple(image_points.shape)}; expected (B, N, 2)")
+    return image_points.shape[0], image_points.shape[1]
+
+
 def batch_last(
     object_points: Tensor, image_points: Tensor, mask: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -37,15 +50,10 @@ def batch_last(
     Raises:
         ValueError: the shapes do not fit (N, 3) or (B, N, 3), (B, N, 2) and (B, N).
     """
-    if image_points.ndim != 3 or image_points.shape[-1] != 2:
-        raise ValueError(f"image_points has shape {tuple(image_points.shape)}; expected (B, N, 2)")
-    batch, count = image_points.shape[:2]
-    if object_points.shape not in ((count, 3), (batch, count, 3)):
-        raise ValueError(
-            f"object_points has shape {tuple(object_points.shape)}; expected ({count}, 3) or ({batch}, {count}, 3)"
-        )
-    if mask is not None and mask.shape != (batch, count):
-        raise ValueError(f"mask has shape {tuple(mask.shape)}; expected ({batch}, {count})")
+    batch, count = expect_pixels(image_points)
+    expect("object_points", object_points, (count, 3), (batch, count, 3))
+    if mask is not None:
+        expect("mask", mask, (batch, count))
     # closed forms square their condition numbers: float32 input is exact in float64, so is the arithmetic
     xy = image_points.double().permute(2, 1, 0).contiguous()
     points = object_points.to(xy).reshape(-1, count, 3).permute(2, 1, 0)
@@ -62,23 +70,16 @@ def weighted_mean(x: Tensor, weight: Tensor | None) -> Tensor:
 
 def rank(r: Tensor, t: Tensor, points: Tensor, xy: Tensor, weight: Tensor | None) -> Candidates:
     """Sorts poses R (3, 3, S, B), t (3, S, B) by their reprojection error; poses with a point behind become NaN."""
-    s, b = r.shape[2:]
     x, y, z = points[:, :, None]
     camera = r[:, 0, None] * x + r[:, 1, None] * y + r[:, 2, None] * z + t[:, None]  # (3, N, S, B)
-    error = (camera[:2] / camera[2] - xy[:, :, None]).square().sum(0)
-    ahead = camera[2] > 0
+    error, ahead = (camera[:2] / camera[2] - xy[:, :, None]).square().sum(0), camera[2] > 0
     if weight is not None:
         error, ahead = error * weight[:, None], ahead | (weight[:, None] == 0)
-        rms = (error.sum(0) / weight.sum(0)).sqrt()
-    else:
-        rms = error.mean(0).sqrt()
-    valid = ahead.all(0) & rms.isfinite()
-    rms = torch.where(valid, rms, torch.inf)
-    if s > 1:
-        order = rms.argsort(0)
-        rms = rms.gather(0, order)
-        r = r.gather(2, order.expand(3, 3, s, b))
-        t = t.gather(1, order.expand(3, s, b))
+    rms = (error.mean(0) if weight is None else error.sum(0) / weight.sum(0)).sqrt()
+    rms = torch.where(ahead.all(0) & rms.isfinite(), rms, torch.inf)
+    if len(rms) > 1:
+        rms, order = rms.sort(0)
+        r, t = (v.gather(v.ndim - 2, order.expand_as(v)) for v in (r, t))
     valid = rms.isfinite()
     r, t, rms = (torch.where(valid, v, torch.nan) for v in (r, t, rms))
     return Candidates(r.permute(3, 2, 0, 1), t.permute(2, 1, 0), rms.T)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchpose.pnp.candidates import Candidates, batch_last, rank
-from torchpose.pnp.planar import FLATNESS, plane_frame, translation
+from torchpose.pnp.planar import plane_frame, translation
 
 
 def dlt(object_points: Tensor, image_points: Tensor, mask: Tensor | None = None) -> Candidates:
@@ -24,8 +24,8 @@ def dlt(object_points: Tensor, image_points: Tensor, mask: Tensor | None = None)
         ValueError: the shapes do not fit.
     """
     points, xy, weight = batch_last(object_points, image_points, mask)
-    _, center, extent = plane_frame(points, weight)
-    local = (points - center[:, None]) / extent[2]
+    frame = plane_frame(points, weight)
+    local = (points - frame.center[:, None]) / frame.extent[2]
     ones = torch.ones_like(xy[0])
     homogeneous = torch.cat([local.expand(3, *ones.shape), ones[None]])
     if weight is not None:
@@ -42,23 +42,26 @@ def dlt(object_points: Tensor, image_points: Tensor, mask: Tensor | None = None)
     # the centroid is in front of the camera
     p = p * torch.where(p[:, 2:, 3:] < 0, -1.0, 1.0)
     r = nearest_rotation(p[:, :, :3]).permute(1, 2, 0)[:, :, None]
-    r = torch.where(extent[0] > FLATNESS * extent[2], r, torch.nan)
-    return rank(r, translation(r, points, xy, weight, center), points, xy, weight)
+    r = torch.where(frame.flat, torch.nan, r)
+    return rank(r, translation(r, points, xy, weight, frame.center), points, xy, weight)
 
 
 def least_eigenvectors(matrix: Tensor) -> Tensor:
     """Eigenvectors (B, n, n) as columns, by ascending eigenvalue, of symmetric matrices (n, n, B), NaN if infinite."""
-    matrix = matrix.permute(2, 0, 1)
-    finite = matrix.isfinite().flatten(1).all(1)[:, None, None]
-    eye = torch.eye(matrix.shape[1], dtype=matrix.dtype, device=matrix.device)
-    return torch.where(finite, torch.linalg.eigh(torch.where(finite, matrix, eye)).eigenvectors, torch.nan)
+    finite, matrix = _made_finite(matrix.permute(2, 0, 1))
+    return torch.where(finite, torch.linalg.eigh(matrix).eigenvectors, torch.nan)
 
 
 def nearest_rotation(matrix: Tensor) -> Tensor:
     """The rotation (B, 3, 3) nearest to a matrix (B, 3, 3) in the Frobenius norm (Kabsch 1976); NaN if not finite."""
-    finite = matrix.isfinite().flatten(1).all(1)[:, None, None]
-    eye = torch.eye(3, dtype=matrix.dtype, device=matrix.device)
-    u, _, vh = torch.linalg.svd(torch.where(finite, matrix, eye))
+    finite, matrix = _made_finite(matrix)
+    u, _, vh = torch.linalg.svd(matrix)
     sign = torch.linalg.det(u @ vh)
     u = torch.cat([u[..., :2], u[..., 2:] * sign[:, None, None]], -1)
     return torch.where(finite, u @ vh, torch.nan)
+
+
+def _made_finite(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """(B, 1, 1) bool, are matrices (B, n, n) finite? And these, the identity where they are not."""
+    finite = matrix.isfinite().flatten(1).all(1)[:, None, None]
+    return finite, torch.where(finite, matrix, torch.eye(matrix.shape[1], dtype=matrix.dtype, device=matrix.device))

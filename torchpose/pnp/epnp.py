@@ -7,13 +7,15 @@ paper's approximations, then by Gauss-Newton. The pose with the least reprojecti
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import torch
 from torch import Tensor
 
 from torchpose.geometry.small_linalg import solve_spd
 from torchpose.pnp.candidates import Candidates, batch_last, rank
 from torchpose.pnp.dlt import least_eigenvectors, nearest_rotation
-from torchpose.pnp.planar import COLLINEARITY, FLATNESS, plane_frame, translation
+from torchpose.pnp.planar import Frame, plane_frame, translation
 
 _STEPS = 10
 # products of factors that each linear start solves for; the first of them is a square
@@ -39,32 +41,31 @@ def epnp(object_points: Tensor, image_points: Tensor, mask: Tensor | None = None
         ValueError: the shapes do not fit.
     """
     points, xy, weight = batch_last(object_points, image_points, mask)
-    frame, center, extent = plane_frame(points, weight)
     batch = xy.shape[2]
-    flat = (extent[0] <= FLATNESS * extent[2]).expand(batch)
-    usable = extent[1] > COLLINEARITY * extent[2]
-    frame, center, extent = (v.expand(*v.shape[:-1], batch) for v in (frame, center, extent))
+    shared = plane_frame(points, weight)
+    flat = shared.flat.expand(batch)
+    frame = Frame(*(v.expand(*v.shape[:-1], batch) for v in shared))
     points = points.expand(-1, -1, batch)
     r = points.new_full((3, 3, 3, batch), torch.nan)
     for controls, rows in ((3, flat.nonzero().squeeze(1)), (4, (~flat).nonzero().squeeze(1))):
         if len(rows):
-            part = [v[..., rows] for v in (points, xy, frame, center, extent)]
-            found = _rotations(controls, None if weight is None else weight[:, rows], *part)
+            part = Frame(*(v[..., rows] for v in frame))
+            found = _rotations(
+                controls, None if weight is None else weight[:, rows], points[..., rows], xy[..., rows], part
+            )
             r[:, :, : found.shape[2], rows] = found
-    r = torch.where(usable, r, torch.nan)
-    solutions = rank(r, translation(r, points, xy, weight, center), points, xy, weight)
+    r = torch.where(frame.wide, r, torch.nan)
+    solutions = rank(r, translation(r, points, xy, weight, frame.center), points, xy, weight)
     return Candidates(*(v[:, :1] for v in solutions))
 
 
-def _rotations(
-    controls: int, weight: Tensor | None, points: Tensor, xy: Tensor, frame: Tensor, center: Tensor, extent: Tensor
-) -> Tensor:
+def _rotations(controls: int, weight: Tensor | None, points: Tensor, xy: Tensor, frame: Frame) -> Tensor:
     """R (3, 3, S, B), one of each approximation."""
     # control points: the centroid and one standard deviation along each principal axis
     axes = controls - 1
-    sizes = extent.flip(0)[:axes]  # the normal comes first in extent, last in frame
-    offset = points - center[:, None]
-    local = torch.stack([(frame[i, :, None] * offset).sum(0) / sizes[i] for i in range(axes)])
+    sizes = frame.extent.flip(0)[:axes]  # the normal comes first in extent, last in the axes
+    offset = points - frame.center[:, None]
+    local = frame.local(offset)[:axes] / sizes[:, None]
     alpha = torch.cat([1 - local.sum(0, keepdim=True), local])  # (C, N, B)
     if weight is not None:
         alpha = torch.where(weight > 0, alpha, 0.0)
@@ -76,7 +77,7 @@ def _rotations(
     normal = (u[:, None] * u).sum(2) + (v[:, None] * v).sum(2)
     kernel = least_eigenvectors(normal)[:, :, : axes + 1].permute(2, 1, 0).unflatten(1, (controls, 3))  # (K, C, 3, B)
 
-    pairs = [(i, j) for i in range(controls) for j in range(i + 1, controls)]
+    pairs = list(combinations(range(controls), 2))
     d = torch.stack([kernel[:, i] - kernel[:, j] for i, j in pairs], 1)  # (K, P, 3, B)
     # squared distances of the control points in the object frame
     rho = torch.stack([sizes[j - 1] ** 2 + (sizes[i - 1] ** 2 if i else 0) for i, j in pairs])  # (P, B)
@@ -113,12 +114,12 @@ def _least_squares(columns: Tensor, rhs: Tensor) -> Tensor:
     return solve_spd(damped, (columns * rhs).sum(1)[:, None])[0].squeeze(1)
 
 
-def _gauss_newton(beta: Tensor, d: Tensor, rho: Tensor) -> Tensor:
-    """Factors (K, B) that make the distances |sum_k beta_k d_k|^2 equal to rho (P, B), for d (K, P, 3, B)."""
+def _gauss_newton(beta: Tensor, apart: Tensor, rho: Tensor) -> Tensor:
+    """Factors (K, B) that make the distances |sum_k beta_k apart_k|^2 equal to rho (P, B), for apart (K, P, 3, B)."""
     for _ in range(_STEPS):
-        difference = (beta[:, None, None] * d).sum(0)  # (P, 3, B)
+        difference = (beta[:, None, None] * apart).sum(0)  # (P, 3, B)
         residual = rho - difference.square().sum(1)
-        step = _least_squares(2 * (d * difference).sum(2), residual)
-        better = (rho - ((beta + step)[:, None, None] * d).sum(0).square().sum(1)).square().sum(0)
+        step = _least_squares(2 * (apart * difference).sum(2), residual)
+        better = (rho - ((beta + step)[:, None, None] * apart).sum(0).square().sum(1)).square().sum(0)
         beta = torch.where(better < residual.square().sum(0), beta + step, beta)
     return beta

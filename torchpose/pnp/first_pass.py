@@ -16,14 +16,7 @@ from torch import Tensor
 
 from torchpose.geometry.small_linalg import orthonormalise
 from torchpose.pnp.iterative import RESERVE, Estimate, not_above, rounding, settled
-from torchpose.pnp.normal_equations import (
-    COST,
-    STARTS,
-    Observations,
-    damped_step,
-    moved,
-    normal_equations,
-)
+from torchpose.pnp.normal_equations import COST, STARTS, Observations, damped_step, moved, normal_equations
 from torchpose.pnp.verdict import Minima, relevant
 
 EVALUATIONS = 3
@@ -32,38 +25,36 @@ _RTOL = 1e-12
 
 
 class Rest(NamedTuple):
-    """What `second_pass` has to know.
+    """What `second_pass` has to know of poses.
 
     Attributes:
-        open: (B,) bool, is there a start that has not led to all that is wanted?
-        done: (B,) bool, has the better one arrived?
-        onward: (B,) bool, is it at ``pose`` (3, 4, B), or has to go on there? Else at ``start`` (3, 4, B), float32.
-        cost: (B,), what is known of it.
-        other: (3, 4, B), the other start. other_cost: (B,), infinite where there is none.
-        decided: (B,) bool, is enough known of the other one?
+        pose: (3, 4, B) of the better minimum, or from where to go on. other: of the other one, the same, in float32.
+        cost, other_cost: (B,), what is known of both; infinite where there is no other minimum.
+        arrived: (2, B) bool, is enough known of this minimum?
     """
 
-    open: Tensor
-    done: Tensor
-    onward: Tensor
     pose: Tensor
-    start: Tensor
-    cost: Tensor
     other: Tensor
+    cost: Tensor
     other_cost: Tensor
-    decided: Tensor
+    arrived: Tensor
 
 
-def first_pass(single: Observations, double: Observations, final: Observations, start: Tensor) -> tuple[Minima, Rest]:
-    """From starts (3, 4, S, B), S one or two; the observations without distortion in both dtypes, and as they are."""
+def first_pass(
+    single: Observations, double: Observations, final: Observations, start: Tensor
+) -> tuple[Minima, Rest, Tensor]:
+    """From starts (3, 4, S, B), S one or two; the observations without distortion in both dtypes, and as they are.
+
+    The minima, what a second pass would have to know, and (B,) which poses need one: those with a start that has not
+    led to all that is wanted.
+    """
     better, pose, least, other, other_cost, bound = _begin(single.each(), start)
     pose, newton = _improve(single, double, pose)
-    found, normal, done, onward, trial, known, different, decided, count = _finish(
-        final, pose, newton, least, other_cost, bound
-    )
-    cost, unfinished = torch.where(done, normal[COST], known), (least < torch.inf) & ~(done & decided)
-    rest = Rest(unfinished, done, onward, trial, better, cost, other, other_cost, decided)
-    return Minima(Estimate(found, normal, count, done), other, other_cost, different, decided), rest
+    minima, onward, known, decided = _finish(final, pose, newton, least, other, other_cost, bound, better)
+    done = minima.best.converged
+    cost = torch.where(done, minima.best.normal[COST], known)
+    rest = Rest(onward, other, cost, other_cost.to(cost), torch.stack([done, decided]))
+    return minima, rest, (least < torch.inf) & ~(done & decided)
 
 
 def _begin(obs: Observations, start: Tensor) -> tuple[Tensor, ...]:
@@ -90,12 +81,19 @@ def _improve(single: Observations, double: Observations, pose: Tensor) -> tuple[
 
 
 def _finish(
-    obs: Observations, pose: Tensor, newton: Tensor, least: Tensor, other_cost: Tensor, bound: Tensor
-) -> tuple[Tensor, ...]:
+    obs: Observations,
+    pose: Tensor,
+    newton: Tensor,
+    least: Tensor,
+    other: Tensor,
+    other_cost: Tensor,
+    bound: Tensor,
+    start: Tensor,
+) -> tuple[Minima, Tensor, Tensor, Tensor]:
     """The last evaluation; its step takes the matrix of the one before, which has hardly changed.
 
-    Pose, normal equations, has it arrived? Is the next pose any good, which is it, and the least cost known; is there
-    another minimum, and is enough known of it? Iterations.
+    The minima; from where a pose would have to go on (3, 4, B), which is from its start if the steps were no good; the
+    least cost known (B,), and is enough known of the other minimum?
     """
     normal = normal_equations(obs, pose)
     rows = [v for a, b in pairwise(STARTS) for v in (newton[a : b - 1], normal[b - 1 : b].to(newton))]
@@ -110,7 +108,8 @@ def _finish(
     different = other_cost < torch.inf
     decided = ~different | (bound > relevant(known))
     count = torch.full_like(done, EVALUATIONS, dtype=torch.int64)
-    return found, normal, done, sane & definite, trial, known, different, decided, count
+    minima = Minima(Estimate(found, normal, count, done), other, other_cost, different, decided)
+    return minima, torch.where(sane & definite, trial, start.to(trial)), known, decided
 
 
 def upright(pose: Tensor) -> Tensor:

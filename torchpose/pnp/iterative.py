@@ -13,13 +13,7 @@ import torch
 from torch import Tensor
 
 from torchpose.kernels import repeated, tracing
-from torchpose.pnp.normal_equations import (
-    COST,
-    Observations,
-    damped_step,
-    moved,
-    normal_equations,
-)
+from torchpose.pnp.normal_equations import COST, Observations, damped_step, moved, normal_equations
 
 # promised decreases by which the cost of a second minimum may yet fall: 2.9 at most in 564,000 cases but for one
 # (scripts/pnp_statistics.py, seeds 0 to 5); a start from which it falls by more mostly ends in the best minimum
@@ -156,24 +150,21 @@ def minimise(
     state = _State(pose, unknown, lam, pose, lam, none, none, torch.zeros_like(none, dtype=torch.int64))
     if compile:
         return _ended(repeated(_advance)(max_iterations, state, obs, rtol, floor, enough))
-    result: Estimate | None = None
-    index: Tensor | None = None  # of the poses still under way; None: all
-
+    result, index = None, torch.arange(pose.shape[-1], device=pose.device)  # of the poses still under way
     for iteration in range(1, max_iterations + 1):
         state, going = _advance(state, obs, rtol, floor, enough)
         remaining = going.nonzero().squeeze(1)
         last = iteration == max_iterations or len(remaining) == 0
         if last or (len(going) > 64 and 4 * len(remaining) <= 3 * len(going)):
             ended = _ended(state)
-            if result is None or index is None:
+            if result is None:
                 result = ended
             else:
                 for whole, part in zip(result, ended, strict=True):
                     whole.index_copy_(-1, index, part)
             if last:
                 return result
-            index = remaining if index is None else index[remaining]
-            obs, floor, enough = obs.select(remaining), floor[remaining], enough[remaining]
+            obs, floor, enough, index = obs.select(remaining), floor[remaining], enough[remaining], index[remaining]
             state = _State(*(v.index_select(-1, remaining) for v in state))
     raise AssertionError("unreachable: the last iteration returns")
 

@@ -9,6 +9,7 @@ points, the sums over the points are one matrix product.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 from itertools import pairwise
 from typing import NamedTuple
@@ -53,7 +54,7 @@ class Observations(NamedTuple):
         whitening: (2, N, B) or broadcastable to it, or (2, 2, N, B): takes a difference of ``xy`` to units of its
             standard deviation; zero for a point that was not seen.
         camera: distorted camera through which the poses are projected; None: the pinhole of normalised coordinates.
-        huber: residual in standard deviations above which the cost grows linearly; inf: least squares.
+        huber: residual in standard deviations above which the cost grows linearly; None: least squares.
         sums: `Sums` of the points where all poses share them, None otherwise.
     """
 
@@ -61,26 +62,24 @@ class Observations(NamedTuple):
     xy: Tensor
     whitening: Tensor
     camera: Camera | None = None
-    huber: float = float("inf")
+    huber: float | None = None
     sums: Sums | None = None
 
     def select(self, index: Tensor) -> Observations:
         """The poses ``index``."""
-
-        def pick(x: Tensor) -> Tensor:
-            return x if x.shape[-1] == 1 else x.index_select(-1, index)
-
-        return self._replace(points=pick(self.points), xy=pick(self.xy), whitening=pick(self.whitening))
+        return self._each(lambda x: x if x.shape[-1] == 1 else x.index_select(-1, index))
 
     def each(self) -> Observations:
         """With a dimension of one before the batch, for several poses of the same points."""
-        points, xy, whitening = (v.unsqueeze(-2) for v in (self.points, self.xy, self.whitening))
-        return self._replace(points=points, xy=xy, whitening=whitening)
+        return self._each(lambda x: x.unsqueeze(-2))
 
     def to(self, dtype: torch.dtype) -> Observations:
-        points, xy, whitening = (v.to(dtype) for v in (self.points, self.xy, self.whitening))
         sums = None if self.sums is None else Sums(*(v.to(dtype) for v in self.sums))
-        return self._replace(points=points, xy=xy, whitening=whitening, sums=sums)
+        return self._each(lambda x: x.to(dtype))._replace(sums=sums)
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> Observations:
+        points, xy, whitening = map(change, self[:3])
+        return self._replace(points=points, xy=xy, whitening=whitening)
 
 
 class Derivatives(NamedTuple):
@@ -118,9 +117,18 @@ def residuals(obs: Observations, uv: Tensor) -> Tensor:
     return obs.whitening[:, 0] * difference[0] + obs.whitening[:, 1] * difference[1]
 
 
-def product2(a: Tensor, b: Tensor) -> Tensor:
-    """Products of matrices (2, 2, ...)."""
-    return a[:, 0, None] * b[0] + a[:, 1, None] * b[1]
+def robust(square: Tensor, huber: float) -> tuple[Tensor, Tensor]:
+    """Huber's cost of squared residuals, linear in the residual above ``huber``, and the weight of their squares."""
+    outside = square > huber**2
+    length = torch.where(outside, square, 1).sqrt()
+    return torch.where(outside, huber * (2 * length - huber), square), torch.where(outside, huber / length, 1)
+
+
+def product2(left: Tensor, right: Tensor) -> Tensor:
+    """Products of matrices (2, 2, N, ...), one of which may be diagonal, (2, N, ...)."""
+    if left.ndim != right.ndim:
+        return (left[:, None] if left.ndim < right.ndim else left) * right
+    return left[:, 0, None] * right[0] + left[:, 1, None] * right[1]
 
 
 def differentiate(obs: Observations, pose: Tensor, fine: Observations | None = None) -> Derivatives:
@@ -141,7 +149,7 @@ def differentiate(obs: Observations, pose: Tensor, fine: Observations | None = N
     weight = obs.whitening
     if obs.camera is not None:
         slope = obs.camera.J_distort(uv.movedim(0, -1)).movedim((-2, -1), (0, 1))
-        weight = weight[:, None] * slope if weight.ndim == uv.ndim else product2(weight, slope)
+        weight = product2(weight, slope)
     if weight.ndim == uv.ndim:
         b.mul_(weight * d)
     else:
@@ -149,11 +157,9 @@ def differentiate(obs: Observations, pose: Tensor, fine: Observations | None = N
         b.copy_(weight[:, 0] * b[:, 0, None] + weight[:, 1] * b[:, 1, None])
     rows[3] = residual
     cost = residual[0].square().addcmul_(residual[1], residual[1])
-    if obs.huber != float("inf"):
-        length = cost.sqrt()
-        outside = length > obs.huber
-        rows *= torch.where(outside, obs.huber / torch.where(outside, length, 1), 1).sqrt()
-        cost = torch.where(outside, obs.huber * (2 * length - obs.huber), cost)
+    if obs.huber is not None:
+        cost, robust_weight = robust(cost, obs.huber)
+        rows *= robust_weight.sqrt()
     return Derivatives(z, rows, cost)
 
 
@@ -169,12 +175,8 @@ def normal_equations(obs: Observations, pose: Tensor, newton: bool = False, fine
     products = torch.empty((_PRODUCTS, *cost.shape), dtype=cost.dtype, device=cost.device)
     depth = pose[2, :3, None].to(z) / z if newton else None
     gradient = [products[k] for k in _BR]
-    start = 0
-    for m in range(3):
-        part = products[start : start + 4 - m]
-        torch.mul(u[m], u[m:], out=part)
-        part.addcmul_(v[m], v[m:])
-        start += 4 - m
+    for m, part in enumerate(products[:9].split([4, 3, 2])):
+        torch.mul(u[m], u[m:], out=part).addcmul_(v[m], v[m:])
     if depth is not None:
         for m in range(3):
             for k in range(m, 3):

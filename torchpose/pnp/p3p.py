@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchpose.geometry.small_linalg import cross, det3, inverse3, matmul3
+from torchpose.geometry.small_linalg import cofactors3, cross, det, inverse3, matmul3
 from torchpose.pnp.candidates import Candidates, batch_last, rank
 
 _PAIRS = ((0, 1), (0, 2), (1, 2))
@@ -52,9 +52,9 @@ def widest_triple(points: Tensor, weight: Tensor | None) -> Tensor:
     def far(measure: Tensor) -> Tensor:
         return (measure if weight is None else torch.where(weight > 0, measure, -1.0)).argmax(0)
 
-    def at(k: Tensor) -> Tensor:
-        spread = points.expand(-1, -1, k.shape[-1])
-        return spread.gather(1, k.expand(3, 1, -1))
+    def at(index: Tensor) -> Tensor:
+        spread = points.expand(-1, -1, index.shape[-1])
+        return spread.gather(1, index.expand(3, 1, -1))
 
     count = points.shape[1] if weight is None else weight.sum(0)
     first = far((points - points.sum(1, keepdim=True) / count).square().sum(0))
@@ -76,7 +76,9 @@ def _distances(corners: Tensor, rays: Tensor) -> Tensor:
     m23 = torch.stack([zero, zero, zero, zero, one, -b23, zero, -b23, one]).unflatten(0, (3, 3))
     d1 = m12 * squares[2] - m23 * squares[0]
     d2 = m13 * squares[2] - m23 * squares[1]
-    gamma = _cubic_root(det3(d2), _mixed(d2, d1), _mixed(d1, d2), det3(d1))
+    # det(d1 + gamma d2): its coefficients are traces of adj(a) b
+    mixed = [(cofactors3(a) * b).sum((0, 1)) for a, b in ((d2, d1), (d1, d2))]
+    gamma = _cubic_root(det(d2), *mixed, det(d1))
     lines = _split(d1 + gamma * d2)  # (3, 2, B)
     other = gamma * d1 - d2
 
@@ -121,15 +123,10 @@ def _distances(corners: Tensor, rays: Tensor) -> Tensor:
     return torch.where(positive & exact, x, torch.nan) * unit.sqrt()
 
 
-def _mixed(a: Tensor, b: Tensor) -> Tensor:
-    """trace(adj(a) b): the coefficient of s in det(a + s b)."""
-    cofactors = torch.stack([cross(a[1], a[2]), cross(a[2], a[0]), cross(a[0], a[1])])
-    return (cofactors * b).sum((0, 1))
-
-
-def _cubic_root(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
-    """A real root (B,) of a x^3 + b x^2 + c x + d, by the trigonometric formulas and Newton steps."""
-    scale = torch.where(a.abs() > 1e-14 * (b.abs() + c.abs() + d.abs()), a, torch.full_like(a, 1e-14))
+def _cubic_root(cubic: Tensor, *lower: Tensor) -> Tensor:
+    """A real root x (B,) of a cubic polynomial, from its leading coefficient down, by trigonometry and Newton steps."""
+    b, c, d = lower
+    scale = torch.where(cubic.abs() > 1e-14 * (b.abs() + c.abs() + d.abs()), cubic, 1e-14)
     b, c, d = b / scale, c / scale, d / scale
     shift = b / 3
     p = c / 3 - shift * shift
@@ -155,8 +152,8 @@ def _cubic_root(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
 
 def _split(conic: Tensor) -> Tensor:
     """The two lines (3, 2, B) of degenerate conics (3, 3, B); NaN where they are not real."""
-    adjugate = torch.stack([cross(conic[1], conic[2]), cross(conic[2], conic[0]), cross(conic[0], conic[1])])
-    diagonal = torch.stack([adjugate[0, 0], adjugate[1, 1], adjugate[2, 2]])
+    adjugate = cofactors3(conic)
+    diagonal = adjugate.diagonal(dim1=0, dim2=1).T
     k = diagonal.argmin(0)
     column = adjugate.gather(1, k.expand(3, 1, -1)).squeeze(1)
     p = column / (-diagonal.gather(0, k[None])).sqrt()

@@ -7,6 +7,8 @@ centroid: it fixes the depth, and the rotation up to the two-fold ambiguity of a
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -14,9 +16,37 @@ from torchpose.geometry.small_linalg import cross, matmul3
 from torchpose.pnp.candidates import Candidates, batch_last, rank, weighted_mean
 
 # thickness over extent (standard deviations) above which points are no plane
-FLATNESS = 1e-2
+_FLATNESS = 1e-2
 # width over length (standard deviations) below which points are a line
-COLLINEARITY = 1e-4
+_COLLINEARITY = 1e-4
+
+
+class Frame(NamedTuple):
+    """Frame of points' best plane; B is 1 where the points are shared by all poses and none is missing.
+
+    Attributes:
+        axes: (3, 3, B), as rows, the last one normal to the plane.
+        center: (3, B), centroid.
+        extent: (3, B), standard deviations of the points along the normal, the second and the first axis.
+    """
+
+    axes: Tensor
+    center: Tensor
+    extent: Tensor
+
+    @property
+    def flat(self) -> Tensor:
+        """(B,) bool, do the points lie in a plane?"""
+        return self.extent[0] <= _FLATNESS * self.extent[2]
+
+    @property
+    def wide(self) -> Tensor:
+        """(B,) bool, do they fill more than a line?"""
+        return self.extent[1] > _COLLINEARITY * self.extent[2]
+
+    def local(self, offset: Tensor) -> Tensor:
+        """Offsets (3, N, B) from the centre along the axes."""
+        return torch.stack([(axis[:, None] * offset).sum(0) for axis in self.axes])
 
 
 def planar(object_points: Tensor, image_points: Tensor, mask: Tensor | None = None) -> Candidates:
@@ -36,20 +66,13 @@ def planar(object_points: Tensor, image_points: Tensor, mask: Tensor | None = No
         ValueError: the shapes do not fit.
     """
     points, xy, weight = batch_last(object_points, image_points, mask)
-    frame, center, extent = plane_frame(points, weight)
-    usable = (extent[0] <= FLATNESS * extent[2]) & (extent[1] > COLLINEARITY * extent[2])
-    r, t = ippe(points, xy, weight, frame, center)
-    return rank(torch.where(usable, r, torch.nan), t, points, xy, weight)
+    frame = plane_frame(points, weight)
+    r, t = ippe(points, xy, weight, frame.axes, frame.center)
+    return rank(torch.where(frame.flat & frame.wide, r, torch.nan), t, points, xy, weight)
 
 
-def plane_frame(points: Tensor, weight: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Frame of the best plane of points (3, N, B) with weights (N, B).
-
-    Returns:
-        Axes as rows (3, 3, B), the last one normal to the plane; centroid (3, B); and the standard deviations (3, B)
-        of the points along the normal, the second and the first axis. B is 1 where the points are shared by all poses
-        and none is missing.
-    """
+def plane_frame(points: Tensor, weight: Tensor | None) -> Frame:
+    """`Frame` of points (3, N, B) with weights (N, B)."""
     center = weighted_mean(points, weight)
     offset = points - center[:, None]
     if weight is not None:
@@ -63,7 +86,7 @@ def plane_frame(points: Tensor, weight: Tensor | None) -> tuple[Tensor, Tensor, 
     x, y = vectors[..., 2].T, vectors[..., 1].T
     frame = torch.stack([x, y, cross(x, y)]).to(points)
     extent = torch.where(finite, values.T.clamp_min(0).sqrt(), torch.nan).to(points)
-    return frame, center, extent
+    return Frame(frame, center, extent)
 
 
 def ippe(points: Tensor, xy: Tensor, weight: Tensor | None, frame: Tensor, center: Tensor) -> tuple[Tensor, Tensor]:
@@ -135,11 +158,7 @@ def ray_frame(xy: Tensor) -> Tensor:
 
 
 def translation(r: Tensor, points: Tensor, xy: Tensor, weight: Tensor | None, center: Tensor) -> Tensor:
-    """Linear least-squares translation t (3, S, B) of R (3, 3, S, B): minimises sum |(x, y) Z - (X, Y)|^2.
-
-    Args:
-        points: (3, N, B). xy: (2, N, B). weight: (N, B) or None. center: (3, B), centroid of the points.
-    """
+    """Translations t (3, S, B) of R (3, 3, S, B) of least |(x, y) Z - (X, Y)|^2, summed; ``center`` is the centroid."""
     offset = points - center[:, None]
     mean = weighted_mean(xy, weight)  # (2, B)
     xy_offset = xy - mean[:, None]

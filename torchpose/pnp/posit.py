@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchpose.geometry.small_linalg import cross, inverse3, matmul3
 from torchpose.pnp.candidates import Candidates, batch_last, rank, weighted_mean
-from torchpose.pnp.planar import COLLINEARITY, FLATNESS, plane_frame, ray_frame
+from torchpose.pnp.planar import plane_frame, ray_frame
 
 _ITERATIONS = 60
 
@@ -35,10 +35,9 @@ def posit(object_points: Tensor, image_points: Tensor, mask: Tensor | None = Non
         ValueError: the shapes do not fit.
     """
     points, xy, weight = batch_last(object_points, image_points, mask)
-    frame, center, extent = plane_frame(points, weight)
-    flat = extent[0] <= FLATNESS * extent[2]
-    offset = points - center[:, None]
-    local = torch.stack([(frame[i, :, None] * offset).sum(0) for i in range(3)]) / extent[2]
+    frame = plane_frame(points, weight)
+    flat, unit = frame.flat, frame.extent[2]
+    local = frame.local(points - frame.center[:, None]) / unit
     if weight is not None:
         local = local * weight
     scatter = (local[:, None] * local).sum(2)
@@ -54,23 +53,21 @@ def posit(object_points: Tensor, image_points: Tensor, mask: Tensor | None = Non
     x, y, z = turn[0, :, None] * xy[0] + turn[1, :, None] * xy[1] + turn[2, :, None]
     turned = torch.stack([x, y]) / z
 
-    points_s, basis_s, xy_s = (
-        local[:, :, None],
-        basis[:, :, None],
-        turned[:, :, None],
-    )  # one more dimension for branches
-    weight_s = None if weight is None else weight[:, None]
-    r, t = _linear_poses(basis_s, xy_s, weight_s, flat)
+    # one more dimension for branches
+    local, basis, image = (v.unsqueeze(-2) for v in (local, basis, turned))
+    share = None if weight is None else weight.unsqueeze(-2)
+    r, t = _linear_poses(basis, image, share, flat)
     r, t = r[..., 0, :], t[..., 0, :]  # (3, 3, 2, B), (3, 2, B): both poses of scaled orthography
     for _ in range(_ITERATIONS):
-        r, t = _linear_poses(basis_s, xy_s * _depth(r, t, points_s), weight_s, flat)  # two descendants a branch
-        error = torch.stack([_error(r[:, :, k], t[:, k], points_s, xy_s, weight_s) for k in (0, 1)])
+        depth = 1 + (r[2, :, None] * local).sum(0) / t[2]  # (N, S, B), over that of the centroid
+        r, t = _linear_poses(basis, image * depth, share, flat)  # two descendants a branch
+        error = torch.stack([_error(r[:, :, k], t[:, k], local, image, share) for k in (0, 1)])
         first = error[0] <= error[1]
         r, t = torch.where(first, r[:, :, 0], r[:, :, 1]), torch.where(first, t[:, 0], t[:, 1])
     second = flat | (torch.arange(2, device=xy.device) == 0)[:, None]
-    r = torch.where(second & (extent[1] > COLLINEARITY * extent[2]), r, torch.nan)
-    r, t = matmul3(matmul3(turn[:, :, None], r), frame[:, :, None]), matmul3(turn[:, :, None], t[:, None])[:, 0]
-    t = t * extent[2] - (r * center[:, None]).sum(1)
+    r = torch.where(second & frame.wide, r, torch.nan)
+    r, t = matmul3(matmul3(turn[:, :, None], r), frame.axes[:, :, None]), matmul3(turn[:, :, None], t[:, None])[:, 0]
+    t = t * unit - (r * frame.center[:, None]).sum(1)
     return rank(r, t, points, xy, weight)
 
 
@@ -96,12 +93,8 @@ def _linear_poses(basis: Tensor, scaled: Tensor, weight: Tensor | None, flat: Te
     return torch.stack([x, cross(z, x), z]), torch.cat([mean * depth, depth[None]])
 
 
-def _depth(r: Tensor, t: Tensor, points: Tensor) -> Tensor:
-    """Depth (N, S, B) of the points (3, N, 1, B) over that of the centroid."""
-    return 1 + (r[2, :, None] * points).sum(0) / t[2]
-
-
 def _error(r: Tensor, t: Tensor, points: Tensor, xy: Tensor, weight: Tensor | None) -> Tensor:
+    """Sums (S, B) of squared distances from the image points."""
     x, y, z = r[:, 0, None] * points[0] + r[:, 1, None] * points[1] + r[:, 2, None] * points[2] + t[:, None]
     square = (x / z - xy[0]).square() + (y / z - xy[1]).square()
     return (square if weight is None else square * weight).sum(0)

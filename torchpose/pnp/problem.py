@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.pnp.normal_equations import Observations, Sums, product2, sums_of
-from torchpose.pnp.planar import COLLINEARITY, FLATNESS, plane_frame
+from torchpose.pnp.planar import plane_frame
 
 
 class Body(NamedTuple):
@@ -43,8 +43,15 @@ class Inputs:
     covariances: Tensor | None
     weights: Tensor | None
     mask: Tensor | None
-    huber: float
+    huber: float | None
     body: Body | None = None
+
+    @property
+    def requires_grad(self) -> bool:
+        """Is a gradient wanted by points, pixels or camera?"""
+        camera = self.camera
+        lens = (camera.matrix, camera.distortion) if isinstance(camera, Camera) else (camera,)
+        return any(v.requires_grad for v in (self.points, self.pixels, *lens))
 
     def rows(self, rows: slice | Tensor) -> Inputs:
         """Those of some poses."""
@@ -54,13 +61,11 @@ class Inputs:
 
         points, camera = part(self.points, 2), self.camera
         assert points is not None
-        if isinstance(camera, Tensor) and camera.ndim == 3:
-            camera = camera[rows]
         return replace(
             self,
             points=points,
             pixels=self.pixels[rows],
-            camera=camera,
+            camera=camera if isinstance(camera, Camera) or camera.ndim == 2 else camera[rows],
             covariances=part(self.covariances, 3),
             weights=part(self.weights, 1),
             mask=part(self.mask, 1),
@@ -130,12 +135,7 @@ def prepare(inputs: Inputs) -> Problem:
     image = pixels.permute(2, 1, 0).contiguous()
     keep, whitening = inputs.keep(), inputs.whitening()
     xy, slope = _rays(camera, pixels, image)
-    if slope.ndim == 3 and whitening.shape[0] == 1:
-        linear = whitening * slope
-    else:
-        full = slope if slope.ndim == 4 else torch.stack([slope, slope]) * torch.eye(2).to(slope)[..., None, None]
-        linear = whitening * full if whitening.ndim == 3 else product2(whitening, full)
-
+    linear = whitening * slope if whitening.ndim == slope.ndim == 3 else product2(whitening, slope)
     finite = _all_finite(xy, keep) & _all_finite(linear, keep)
     points = None
     if inputs.body is None:
@@ -161,7 +161,7 @@ def prepare(inputs: Inputs) -> Problem:
     if isinstance(camera, Camera) and bool(camera.distortion.any()):
         final = observed._replace(xy=image, whitening=whitening, camera=camera)
     pixel: Observations | float = inputs.sigma_px
-    if inputs.covariances is not None or inputs.weights is not None or inputs.huber != float("inf"):
+    if inputs.covariances is not None or inputs.weights is not None or inputs.huber is not None:
         pixel = final._replace(whitening=torch.ones_like(whitening) if final is not observed else slope)
     calibration = None
     if isinstance(camera, Camera) and camera.covariance is not None:
@@ -171,14 +171,13 @@ def prepare(inputs: Inputs) -> Problem:
 
 
 def _body(points: Tensor, weight: Tensor | None) -> Body:
-    frame, center, extent = plane_frame(points, weight)
-    unit = torch.where(extent[2] > 0, extent[2], 1)
-    local = (points - center[:, None]) / unit
+    frame = plane_frame(points, weight)
+    unit = torch.where(frame.extent[2] > 0, frame.extent[2], 1)
+    local = (points - frame.center[:, None]) / unit
     if weight is not None:
         local = torch.where(weight > 0, local, 0.0)
-    flat = extent[0] <= FLATNESS * extent[2]
-    line = (extent[1] <= COLLINEARITY * extent[2]) | (extent[2] <= 1e-12 * center.abs().amax(0))
-    return Body(local, None, frame, center, unit, flat, line)
+    spot = frame.extent[2] <= 1e-12 * frame.center.abs().amax(0)
+    return Body(local, None, frame.axes, frame.center, unit, frame.flat, ~frame.wide | spot)
 
 
 def _rays(camera: Camera | Tensor, pixels: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:

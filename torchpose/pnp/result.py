@@ -8,6 +8,7 @@ from enum import IntEnum
 from torch import Tensor
 
 from torchpose.errors import TorchposeError
+from torchpose.geometry.rows import Rows
 
 
 class PnPCode(IntEnum):
@@ -27,7 +28,7 @@ class PnPError(TorchposeError):
 
 
 @dataclass(frozen=True, eq=False)
-class PnPResult:
+class PnPResult(Rows):
     """B poses. Where ``code`` is neither CONVERGED nor AMBIGUOUS, every float is NaN.
 
     Attributes:
@@ -56,9 +57,6 @@ class PnPResult:
     rms_alt: Tensor
     chi2_alt: Tensor
     ratio: Tensor
-
-    def __len__(self) -> int:
-        return self.code.shape[0]
 
     @property
     def converged(self) -> Tensor:

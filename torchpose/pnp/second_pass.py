@@ -6,10 +6,7 @@ neither does it matter to the last digit.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
-from torch import Tensor
 
 from torchpose.kernels import padded
 from torchpose.pnp.first_pass import EVALUATIONS, Rest, upright
@@ -24,40 +21,9 @@ _SINGLE = 8
 _FEW = 512
 
 
-class Late(NamedTuple):
-    """Poses that the first pass has left over.
-
-    Attributes:
-        which: (L,) int64.
-        pose: (3, 4, L) of the better minimum, or from where to go on. other: of the other one, the same, in float32.
-        cost, other_cost: (L,), what is known of both; infinite where there is no other minimum.
-        arrived: (2, L) bool, is enough known of this minimum?
-    """
-
-    which: Tensor
-    pose: Tensor
-    other: Tensor
-    cost: Tensor
-    other_cost: Tensor
-    arrived: Tensor
-
-
-def left_over(rest: Rest, compile: bool) -> Late | None:
-    """What is not finished."""
-    which = rest.open.nonzero().squeeze(1)
-    if len(which) == 0:
-        return None
-    which = padded(which) if compile else which
-    pose, start = rest.pose[..., which], rest.start[..., which]
-    pose = torch.where(rest.onward[which], pose, start.to(pose))
-    cost, other_cost = rest.cost[which], rest.other_cost[which]
-    arrived = torch.stack([rest.done[which], rest.decided[which]])
-    return Late(which, pose, rest.other[..., which], cost, other_cost.to(cost), arrived)
-
-
-def second_pass(problem: Problem, late: Late, max_iterations: int, compile: bool) -> Minima:
+def second_pass(problem: Problem, late: Rest, max_iterations: int, compile: bool) -> Minima:
     """The minima of all that is left over."""
-    batch, known = len(late.which), late.cost
+    batch, known = len(late.cost), late.cost
     bound = relevant(known)
     other, other_cost, enough = late.other.to(late.pose), late.other_cost.clone(), late.arrived[1].clone()
     index = (~enough).nonzero().squeeze(1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 from typing import Literal
 
@@ -12,8 +13,7 @@ from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.kernels import LEAST, compiled, padded
-from torchpose.pnp._memory import keep_memory
-from torchpose.pnp.candidates import Candidates
+from torchpose.pnp.candidates import Candidates, expect, expect_pixels
 from torchpose.pnp.dlt import dlt
 from torchpose.pnp.epnp import epnp
 from torchpose.pnp.first_pass import EVALUATIONS, Rest, first_pass, upright
@@ -25,9 +25,9 @@ from torchpose.pnp.planar import planar
 from torchpose.pnp.posit import posit
 from torchpose.pnp.problem import Inputs, Problem, prepare
 from torchpose.pnp.result import PnPCode, PnPError, PnPResult
-from torchpose.pnp.second_pass import Late, left_over, second_pass
+from torchpose.pnp.second_pass import second_pass
 from torchpose.pnp.starts import batch_first, of_planes, planes, starts
-from torchpose.pnp.verdict import Found, Table, choose, write
+from torchpose.pnp.verdict import Bad, Found, Minima, Table, choose, write
 
 Method = Literal["iterative", "planar", "dlt", "p3p", "epnp", "posit"]
 _CLOSED_FORMS: dict[str, Callable[[Tensor, Tensor, Tensor | None], Candidates]] = {
@@ -69,8 +69,7 @@ def solve(
         image_points: (B, N, 2) px.
         camera: `Camera`, or the pinhole matrix (3, 3) or (B, 3, 3).
         method: "iterative" is the maximum-likelihood estimate (Levenberg-Marquardt through the full camera model from
-            every start that a closed form finds); the others return their closed form as it is, with the covariance
-            that the maximum-likelihood estimate would have there.
+            every start that a closed form finds); the others return their closed form, with its covariance there.
         sigma_px: standard deviation of the image points, per axis.
         covariances: (N, 2, 2) or (B, N, 2, 2) px^2, of the image points; replace ``sigma_px``.
         weights: (N,) or (B, N), factors on the information of the points.
@@ -79,8 +78,7 @@ def solve(
             only their own minima are then found.
         huber: residual, in standard deviations, above which the cost of a point grows linearly.
         max_iterations: of Levenberg-Marquardt, float32 and float64 together about.
-        compile: have a C++ compiler make one loop of it (`torchpose.kernels`; the first call with another number of
-            points takes seconds). Without effect on other devices than the CPU, and for more than 128 points.
+        compile: one C++ loop (`torchpose.kernels`), made in seconds for each number of points; on the CPU, up to 128.
         raise_on_failure: raise instead of returning codes other than CONVERGED and AMBIGUOUS.
 
     Returns:
@@ -92,77 +90,93 @@ def solve(
         PnPError: with ``raise_on_failure``.
         ConfigError: ``compile`` without a C++ compiler.
     """
-    if image_points.ndim != 3 or image_points.shape[-1] != 2:
-        raise ValueError(f"image_points has shape {tuple(image_points.shape)}; expected (B, N, 2)")
-    batch, count = image_points.shape[:2]
-    pixels = image_points.double()
-    points = object_points.to(pixels)
-    _expect("object_points", points, (count, 3), batch)
-    options = {"covariances": ((count, 2, 2), covariances), "weights": ((count,), weights), "mask": ((count,), mask)}
-    for name, (shape, value) in options.items():
-        if value is not None:
-            _expect(name, value, shape, batch)
-    if method not in _LEAST:
-        raise ValueError(f"method is {method!r}; choose one of {', '.join(_LEAST)}")
-    if initial is not None and method != "iterative":
-        raise ValueError(f"initial is for method 'iterative'; method {method!r} needs no start")
-    if initial is not None:
-        rotation, translation = initial
-        if rotation.shape[0] != batch or rotation.shape[-2:] != (3, 3) or translation.shape != rotation.shape[:-1]:
-            shapes = [tuple(v.shape) for v in initial]
-            raise ValueError(
-                f"initial has shapes {shapes}; expected (B, 3, 3) and (B, 3), or (B, S, 3, 3) and (B, S, 3)"
-            )
+    inputs, starts = _checked(
+        Inputs(object_points, image_points, camera, sigma_px, covariances, weights, mask, huber), method, initial
+    )
     if max_iterations < 1:
         raise ValueError(f"max_iterations is {max_iterations}; expected 1 or more")
-    if isinstance(camera, Tensor):
-        camera = camera.to(pixels)
-        _expect("camera", camera, (3, 3), batch)
-
-    inputs = Inputs(points, pixels, camera, sigma_px, covariances, weights, mask, huber)
-    given = None if initial is None else tuple(v.to(pixels) for v in initial)
-    compile = compile and pixels.device.type == "cpu" and count <= _COMPILED_POINTS
+    compile = compile and inputs.pixels.device.type == "cpu" and inputs.pixels.shape[1] <= _COMPILED_POINTS
     with torch.no_grad():
-        result = _solve(inputs, method, given, max_iterations, compile)
-    tensors = [points, pixels, *([camera] if isinstance(camera, Tensor) else [camera.matrix, camera.distortion])]
-    if torch.is_grad_enabled() and method == "iterative" and any(v.requires_grad for v in tensors):
-        result = _with_gradient(result, inputs)
-    if raise_on_failure:
-        failed = result.code > PnPCode.AMBIGUOUS
-        if bool(failed.any()):
-            first = int(failed.nonzero()[0])
-            code = PnPCode(int(result.code[first])).name
-            raise PnPError(f"pose {first}: {code}; {int(failed.sum())} of {batch} poses failed")
+        result = _solve(inputs, method, starts, max_iterations, compile)
+    if torch.is_grad_enabled() and method == "iterative" and inputs.requires_grad:
+        result = attach_gradient(result, inputs)
+    failed = result.code > PnPCode.AMBIGUOUS
+    if raise_on_failure and bool(failed.any()):
+        first = int(failed.nonzero()[0])
+        code = PnPCode(int(result.code[first])).name
+        raise PnPError(f"pose {first}: {code}; {int(failed.sum())} of {len(failed)} poses failed")
     return result
 
 
+def _checked(
+    given: Inputs, method: Method, initial: tuple[Tensor, Tensor] | None
+) -> tuple[Inputs, tuple[Tensor, Tensor] | None]:
+    """The arguments in float64, and the starts R (B, S, 3, 3), t (B, S, 3); raises ValueError where one is wrong."""
+    batch, count = expect_pixels(given.pixels)
+    pixels, camera = given.pixels.double(), given.camera
+    shapes = {"object_points": (given.points, (count, 3)), "covariances": (given.covariances, (count, 2, 2))}
+    shapes |= {"weights": (given.weights, (count,)), "mask": (given.mask, (count,))}
+    if isinstance(camera, Tensor):
+        camera = camera.to(pixels)
+        shapes["camera"] = camera, (3, 3)
+    for name, (value, shape) in shapes.items():
+        if value is not None:
+            expect(name, value, shape, (batch, *shape))
+    if method not in _LEAST:
+        raise ValueError(f"method is {method!r}; choose one of {', '.join(_LEAST)}")
+    if initial is not None:
+        if method != "iterative":
+            raise ValueError(f"initial is for method 'iterative'; method {method!r} needs no start")
+        rotation, translation = initial
+        if rotation.shape[0] != batch or rotation.shape[-2:] != (3, 3) or translation.shape != rotation.shape[:-1]:
+            raise ValueError(
+                f"initial has shapes {[tuple(v.shape) for v in initial]}; expected (B, 3, 3) and (B, 3), or "
+                "(B, S, 3, 3) and (B, S, 3)"
+            )
+        initial = rotation.to(pixels), translation.to(pixels)
+    huber = None if given.huber == float("inf") else given.huber
+    return replace(given, points=given.points.to(pixels), pixels=pixels, camera=camera, huber=huber), initial
+
+
+@cache
+def _keep_memory() -> None:
+    """Lets the process keep what chunks free.
+
+    glibc gives freed memory above a threshold back to the system, and every chunk would fault it in again, which takes
+    as long as its arithmetic. Freeing one large block (the most that the threshold grows to is 32 MiB) raises it to its
+    size for good; not touched, the block costs nothing.
+    """
+    torch.empty(30 << 20, dtype=torch.uint8)
+
+
 def _solve(
-    inputs: Inputs, method: Method, initial: tuple[Tensor, ...] | None, max_iterations: int, compile: bool
+    inputs: Inputs, method: Method, initial: tuple[Tensor, Tensor] | None, max_iterations: int, compile: bool
 ) -> PnPResult:
     """Chunk by chunk; whenever a chunk's worth of poses is left over by the first pass, they have their second one."""
-    keep_memory()
+    _keep_memory()
     inputs, asked = inputs.with_body(sums=not compile), len(inputs.pixels)
     if compile and asked < LEAST:
         index = padded(torch.arange(asked))
-        inputs, initial = inputs.rows(index), None if initial is None else tuple(v[index] for v in initial)
+        inputs, initial = inputs.rows(index), None if initial is None else (initial[0][index], initial[1][index])
     batch = len(inputs.pixels)
     table = Table.empty(batch, inputs.pixels, compile)
-    pending: list[Late] = []
+    pending: list[tuple[Tensor, Rest]] = []
     # a chunk of its own for the last few would be too small to be compiled
     firsts = range(0, max(batch - LEAST, min(batch, 1)), _CHUNK)
     for start, stop in pairwise((*firsts, batch)):
         rows = slice(start, stop)
         given = None if initial is None else (initial[0][rows], initial[1][rows])
-        late = _solve_chunk(inputs.rows(rows), method, given, max_iterations, compile, table.columns(rows))
-        if late is not None:
-            pending.append(late._replace(which=late.which + start))
-        if pending and (stop == batch or sum(len(part.which) for part in pending) >= _CHUNK):
-            late = Late(*(torch.cat(parts, -1) for parts in zip(*pending, strict=True)))
-            problem, columns = prepare(inputs.rows(late.which)), Table.empty(len(late.which), inputs.pixels, compile)
-            minima = second_pass(problem, late, max_iterations, compile)
-            finish = compiled(write) if compile else write
-            finish(problem, minima, _bad(problem, late.pose[:, :, None], 0), columns)
-            table.replace(late.which, columns)
+        which, rest = _solve_chunk(inputs.rows(rows), method, given, max_iterations, compile, table.columns(rows))
+        if rest is not None and len(which):
+            which = padded(which) if compile else which
+            pending.append((which + start, Rest(*(v[..., which] for v in rest))))
+        if pending and (stop == batch or sum(len(which) for which, _ in pending) >= _CHUNK):
+            which = torch.cat([which for which, _ in pending])
+            rest = Rest(*(torch.cat(parts, -1) for parts in zip(*(rest for _, rest in pending), strict=True)))
+            problem, columns = prepare(inputs.rows(which)), Table.empty(len(which), inputs.pixels, compile)
+            minima = second_pass(problem, rest, max_iterations, compile)
+            _finish(problem, minima, _bad(problem, rest.pose[:, :, None], 0), columns, compile)
+            table.replace(which, columns)
             pending = []
     return table.columns(slice(asked)).result()
 
@@ -174,17 +188,17 @@ def _solve_chunk(
     max_iterations: int,
     compile: bool,
     table: Table,
-) -> Late | None:
-    """Writes the results of a chunk; returns what is left over."""
+) -> tuple[Tensor, Rest | None]:
+    """Writes the results of a chunk; returns which poses are left over (L,), and what is known of all."""
     problem = prepare(inputs)
-    body, least = problem.body, _LEAST[method]
+    body, least, none = problem.body, _LEAST[method], inputs.pixels.new_zeros(0, dtype=torch.int64)
     if method != "iterative":
         found = _CLOSED_FORMS[method](*batch_first(problem.observed, problem.weight))
         closed = torch.cat([found.R, found.t[..., None]], 3).permute(2, 3, 1, 0)
         cost = normal_equations(problem.final.each(), closed)[COST]
         solutions = Found(closed, cost, torch.zeros_like(cost, dtype=torch.int64), cost.isfinite())
         write(problem, choose(problem.final, solutions), _bad(problem, closed, least), table)
-        return None
+        return none, None
     poses: Tensor | None = None
     if initial is not None:
         least = _LEAST_STARTED
@@ -199,28 +213,31 @@ def _solve_chunk(
         poses = starts(problem) if poses is None else poses
         options, batch = poses.shape[2:]
         every = problem.final.select(torch.arange(batch, device=poses.device).repeat(options))
-        flat = minimise(every, upright(poses.double()).flatten(2), max_iterations=max_iterations)
+        flat = minimise(every, upright(poses.double()).flatten(2), max_iterations=max_iterations, compile=compile)
         ends = (flat.pose, flat.normal[COST], flat.iterations, flat.converged)
-        minima = choose(problem.final, Found(*(v.unflatten(-1, (options, batch)) for v in ends)))
-        write(problem, minima, _bad(problem, poses, least), table)
-        return None
-    attempt = compiled(_attempt) if compile else _attempt
-    return left_over(attempt(problem, poses, least, table), compile)
+        minima = choose(problem.final, Found(*(v.unflatten(-1, (options, batch)) for v in ends)), compile)
+        _finish(problem, minima, _bad(problem, poses, least), table, compile)
+        return none, None
+    rest, unfinished = (compiled(_attempt) if compile else _attempt)(problem, poses, least, table)
+    return unfinished.nonzero().squeeze(1), rest
 
 
-def _attempt(problem: Problem, poses: Tensor | None, least: int, table: Table) -> Rest:
-    """The first pass from poses (3, 4, S, B), or from those of planes; writes its results."""
+def _attempt(problem: Problem, poses: Tensor | None, least: int, table: Table) -> tuple[Rest, Tensor]:
+    """The first pass from poses (3, 4, S, B), or from those of planes; writes its results. Which are left over (B,)?"""
     poses = of_planes(problem) if poses is None else poses.float()
     bad = _bad(problem, poses, least)
-    minima, rest = first_pass(problem.observed.to(torch.float32), problem.observed, problem.final, poses)
-    unfinished = rest.open
+    minima, rest, unfinished = first_pass(problem.observed.to(torch.float32), problem.observed, problem.final, poses)
     for flag, _ in bad:  # an answer that will not change
         unfinished = unfinished & ~flag
     write(problem, minima, bad, table, again=unfinished)
-    return rest._replace(open=unfinished)
+    return rest, unfinished
 
 
-def _bad(problem: Problem, poses: Tensor, least: int) -> tuple[tuple[Tensor, PnPCode], ...]:
+def _finish(problem: Problem, minima: Minima, bad: Bad, table: Table, compile: bool) -> None:
+    (compiled(write) if compile else write)(problem, minima, bad, table)
+
+
+def _bad(problem: Problem, poses: Tensor, least: int) -> Bad:
     """Poses that have no answer and why; of several reasons the last one counts."""
     numbers = (0 * poses.sum((0, 1)) == 0).any(0)
     return (
@@ -230,25 +247,3 @@ def _bad(problem: Problem, poses: Tensor, least: int) -> tuple[tuple[Tensor, PnP
         (~problem.finite, PnPCode.NOT_FINITE),
         (problem.seen < least, PnPCode.TOO_FEW),
     )
-
-
-def _with_gradient(result: PnPResult, inputs: Inputs) -> PnPResult:
-    """The result with R and t as differentiable functions of points, pixels and camera, where there is a pose."""
-    count = inputs.pixels.shape[1]
-    good = (result.code <= PnPCode.AMBIGUOUS).nonzero().squeeze(1)
-    part = inputs.rows(good)
-    root = part.whitening()
-    if root.ndim == 3:
-        root = root * torch.eye(2, dtype=root.dtype, device=root.device)[..., None, None]
-    root = root.expand(2, 2, count, len(good)).permute(3, 2, 0, 1)
-    image, model = part.pixels, part.points
-    if (keep := part.keep()) is not None:
-        seen = keep.T[..., None]
-        image, model = torch.where(seen, image, 0.0), torch.where(seen, model, 0.0)
-    r, t = attach_gradient(result.R[good], result.t[good], model, image, part.camera, root.mT @ root, inputs.huber)
-    return replace(result, R=result.R.index_copy(0, good, r), t=result.t.index_copy(0, good, t))
-
-
-def _expect(name: str, value: Tensor, shape: tuple[int, ...], batch: int) -> None:
-    if value.shape not in (shape, (batch, *shape)):
-        raise ValueError(f"{name} has shape {tuple(value.shape)}; expected {shape} or {(batch, *shape)}")

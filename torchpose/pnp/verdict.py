@@ -32,6 +32,8 @@ COINCIDENCE = 1.0
 # least 1 - (multiple correlation)^2 of a parameter below which the points do not fix the pose
 INDEPENDENCE = 1e-11
 
+Bad = tuple[tuple[Tensor, PnPCode], ...]  # (B,) bool, and why these poses have no answer
+
 
 class Found(NamedTuple):
     """Minima found: [R | t] (3, 4, ...), cost, iterations and converged (...)."""
@@ -109,12 +111,11 @@ def choose(obs: Observations, found: Found, compile: bool = False) -> Minima:
     options, batch = found.converged.shape
     chi2, order = found.cost.nan_to_num(nan=torch.inf, posinf=torch.inf).sort(0)
 
-    def pick(k: int) -> Found:
-        return Found(*(v.gather(-2, order[k].expand(*v.shape[:-2], 1, batch)).squeeze(-2) for v in found))
+    def pick(rank: int) -> Found:
+        return Found(*(v.gather(-2, order[rank].expand(*v.shape[:-2], 1, batch)).squeeze(-2) for v in found))
 
     pose, cost, iterations, converged = pick(0)
-    equations = compiled(normal_equations) if compile else normal_equations
-    normal = equations(obs, pose)
+    normal = (compiled(normal_equations) if compile else normal_equations)(obs, pose)
     # a minimum is known by the cost that its last step promised; one behind the camera from the start by none
     normal[COST] = cost
     best = Estimate(pose, normal, iterations, converged)
@@ -130,26 +131,18 @@ def choose(obs: Observations, found: Found, compile: bool = False) -> Minima:
     return Minima(best, other, cost, different, reached)
 
 
-def _coincide(a: Estimate, b: Tensor) -> Tensor:
+def _coincide(best: Estimate, pose: Tensor) -> Tensor:
     """(B,): is a pose (3, 4, B) within a standard deviation of the estimate, by its information?"""
-    back = a.pose[:, :3].transpose(0, 1)
-    relative = matmul3(back, torch.cat([b[:, :3], (b[:, 3] - a.pose[:, 3])[:, None]], 1))
-    axis = torch.stack(
-        [relative[2, 1] - relative[1, 2], relative[0, 2] - relative[2, 0], relative[1, 0] - relative[0, 1]]
-    )
+    back = best.pose[:, :3].transpose(0, 1)
+    relative = matmul3(back, torch.cat([pose[:, :3], (pose[:, 3] - best.pose[:, 3])[:, None]], 1))
+    axis = torch.stack([relative[i, k] - relative[k, i] for i, k in ((2, 1), (0, 2), (1, 0))])
     trace = relative[0, 0] + relative[1, 1] + relative[2, 2]
     # twice the tangent of half the angle; Cayley's vector, as in the steps of the minimiser
     step = torch.cat([relative[:, 3], 2 * axis / (1 + trace).clamp_min(1e-12)])
-    return distance(a.normal, step) < COINCIDENCE
+    return distance(best.normal, step) < COINCIDENCE
 
 
-def write(
-    problem: Problem,
-    minima: Minima,
-    bad: tuple[tuple[Tensor, PnPCode], ...],
-    table: Table,
-    again: Tensor | None = None,
-) -> None:
+def write(problem: Problem, minima: Minima, bad: Bad, table: Table, again: Tensor | None = None) -> None:
     """Writes the columns of ``table``; ``bad`` are the codes of poses without a sensible problem, the last one wins.
 
     Poses that will be written ``again`` (B,) need not be made NaN.
@@ -238,10 +231,10 @@ def covariance(best: Estimate, center: Tensor, unit: Tensor, mixed: Tensor | Non
     return (pivots / torch.stack([row[0] for row in rows])).amin(0)
 
 
-def _sum_of_products(a: Sequence[Tensor], b: Sequence[Tensor], out: Tensor) -> None:
+def _sum_of_products(left: Sequence[Tensor], right: Sequence[Tensor], out: Tensor) -> None:
     """Without a tensor for each product."""
-    torch.mul(a[0], b[0], out=out)
-    for x, y in zip(a[1:], b[1:], strict=True):
+    torch.mul(left[0], right[0], out=out)
+    for x, y in zip(left[1:], right[1:], strict=True):
         out.addcmul_(x, y)
 
 

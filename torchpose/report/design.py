@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from matplotlib.figure import Figure
+from torch import Tensor
 
 from torchpose.design import PrecisionMap
-from torchpose.io.writers import atomic_path
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-    from torch import Tensor
+from torchpose.report.figures import COLOURS, subplots
+from torchpose.report.files import save_figures
 
 _PANELS = ("across the optical axis, um", "along the optical axis, um", "rotation, mdeg")
+_Axis = tuple[str, Tensor]  # label and values
 
 
 def plot_precision(found: PrecisionMap, title: str) -> Figure:
@@ -20,52 +21,38 @@ def plot_precision(found: PrecisionMap, title: str) -> Figure:
 
     A dimension of the volume without extent is left out: what remains is a curve.
     """
-    from matplotlib.figure import Figure
-
-    by_tilt = found.by_tilt.transpose(0, 1)
-    rows = [(found.distance, found.tilt.rad2deg(), by_tilt, "distance, mm", "tilt, degrees")]
-    if len(found.x) * len(found.y) > 1:
-        rows.append((found.x, found.y, found.by_place, "x, mm", "y, mm"))
-    figure = Figure((13, 3.9 * len(rows)), layout="constrained")
-    axes = figure.subplots(len(rows), 3, squeeze=False)
-    for line, (across, up, values, name_across, name_up) in zip(axes, rows, strict=True):
-        for k, panel in enumerate(line):
-            _panel(figure, panel, across, up, values[..., k], name_across, name_up, _PANELS[k])
-            if name_up == "y, mm":
-                panel.set_title(f"at {float(found.distance[-1]):g} mm, all tilts", fontsize=10)
-                if len(found.y) > 1 and len(found.x) > 1:
-                    panel.invert_yaxis()  # as in the frame
+    by_tilt = ("distance, mm", found.distance), ("tilt, degrees", found.tilt.rad2deg())
+    by_place = ("x, mm", found.x), ("y, mm", found.y)
+    with_places = len(found.x) * len(found.y) > 1
+    figure, axes = subplots(1 + with_places, 3, (13, 3.9 * (1 + with_places)))
+    for k, panel in enumerate(axes[0]):
+        _plot(panel, *by_tilt, found.by_tilt[..., k].T, _PANELS[k])
+    for k, panel in enumerate(axes[1] if with_places else ()):
+        _plot(panel, *by_place, found.by_place[..., k], _PANELS[k])
+        panel.set_title(f"at {float(found.distance[-1]):g} mm, all tilts", fontsize=10)
+        if len(found.x) > 1 and len(found.y) > 1:
+            panel.invert_yaxis()  # as in the frame
     figure.suptitle(f"{title}: predicted standard deviation (one sigma, largest axis)", fontsize=11)
     return figure
 
 
-def _panel(figure: Figure, panel: Any, x: Tensor, y: Tensor, values: Tensor, of_x: str, of_y: str, name: str) -> None:
-    """A map of values (Y, X), or a curve where one of the axes has a single point."""
+def _plot(panel: Any, across: _Axis, up: _Axis, values: Tensor, name: str) -> None:
+    """A map of values (up, across), or a curve where one of the axes has a single point."""
+    (label_x, x), (label_y, y) = across, up
     if len(x) == 1 or len(y) == 1:
-        along, label, other = (
-            (y, of_y, f"{of_x} {float(x[0]):g}") if len(x) == 1 else (x, of_x, f"{of_y} {float(y[0]):g}")
-        )
-        panel.plot(along.tolist(), values.flatten().tolist(), "o-", color="#0072b2", ms=4)
-        panel.set_xlabel(f"{label} ({other})")
-        panel.set_ylabel(name)
-        panel.set_ylim(0, 1.15 * float(values.max()))
-        panel.grid(alpha=0.25, lw=0.5)
-        panel.spines[["top", "right"]].set_visible(False)
+        (label, along), (other, at) = (up, across) if len(x) == 1 else (across, up)
+        panel.plot(along.tolist(), values.flatten().tolist(), "o-", color=COLOURS[0], ms=4)
+        panel.set(xlabel=f"{label} ({other} {float(at[0]):g})", ylabel=name, ylim=(0, 1.15 * float(values.max())))
         return
     filled = panel.contourf(x.tolist(), y.tolist(), values.tolist(), 12, cmap="viridis")
     lines = panel.contour(x.tolist(), y.tolist(), values.tolist(), 5, colors="white", linewidths=0.6)
     panel.clabel(lines, fontsize=8)
-    figure.colorbar(filled, ax=panel, label=name)
-    panel.set_xlabel(of_x)
-    panel.set_ylabel(of_y)
+    panel.figure.colorbar(filled, ax=panel, label=name)
+    panel.grid(False)
+    panel.spines[["top", "right"]].set_visible(True)
+    panel.set(xlabel=label_x, ylabel=label_y)
 
 
 def save_plot(found: PrecisionMap, title: str, path: Path) -> None:
-    """Writes `plot_precision` as PNG.
-
-    Raises:
-        ConfigError: the file cannot be written.
-    """
-    figure = plot_precision(found, title)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=120)
+    """Writes `plot_precision` as PNG. ConfigError: the file cannot be written."""
+    save_figures({path.name: plot_precision(found, title)}, path.parent)

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
+from matplotlib.figure import Figure
 
 from torchpose.analysis.evaluation import AXES, UNITS, Evaluation
-from torchpose.errors import ConfigError
-from torchpose.report.figures import COLOURS, GREY, subplots
+from torchpose.io.truth import Truth
+from torchpose.report.figures import COLOURS, GREY, band, subplots
+from torchpose.report.files import make_folder, save_figures
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from torchpose.io.truth import Truth
+_MOST_NEES = 25.0  # shown; larger ones in the last bin
 
 
 def plot_errors(evaluation: Evaluation, title: str) -> Figure:
@@ -24,17 +22,16 @@ def plot_errors(evaluation: Evaluation, title: str) -> Figure:
     number = torch.arange(len(evaluation.error))
     for i, panel in enumerate(axes.flat):
         error, claimed = evaluation.error[:, i], evaluation.predicted[:, i]
-        panel.fill_between(number, -2 * claimed, 2 * claimed, color="#e6e6e6", lw=0)
+        band(panel, number, 2 * claimed)
         if bool(evaluation.bound[:, i].isfinite().any()):
             for sign in (-2, 2):
                 panel.plot(number, sign * evaluation.bound[:, i], color=GREY, lw=0.6, ls="--")
         panel.plot(number, error, ".", ms=3, color=COLOURS[i % 3])
         axis = evaluation.axes[i]
-        panel.set_title(f"{AXES[i]}: bias {axis.bias:.3g}, spread {axis.spread:.3g} {UNITS[i]}", fontsize=10)
-        panel.set_ylabel(UNITS[i])
-        panel.axhline(0, color=GREY, lw=0.6)
         limit = 1.15 * max(_largest(error), 2.2 * _largest(claimed.nanmedian()[None]))
-        panel.set_ylim(-limit, limit)
+        panel.set(ylabel=UNITS[i], ylim=(-limit, limit))
+        panel.set_title(f"{AXES[i]}: bias {axis.bias:.3g}, spread {axis.spread:.3g} {UNITS[i]}", fontsize=10)
+        panel.axhline(0, color=GREY, lw=0.6)
     for panel in axes[1]:
         panel.set_xlabel("frame")
     figure.suptitle(
@@ -48,23 +45,19 @@ def plot_consistency(evaluation: Evaluation, title: str) -> Figure:
     figure, (axes,) = subplots(1, 3, (13, 4.2))
     z = evaluation.error / evaluation.predicted
     x = torch.linspace(-5, 5, 200, dtype=torch.float64)
-    count = max(12, min(40, int(2 * math.sqrt(len(z)))))
-    bins = torch.linspace(-5, 5, count + 1).tolist()
+    bins = max(12, min(40, int(2 * math.sqrt(len(z)))))
     for panel, first, name in ((axes[0], 0, "translation"), (axes[1], 3, "rotation")):
         for i in range(first, first + 3):
             values = z[:, i][z[:, i].isfinite()].clamp(-5, 5)
-            density = torch.histc(values, count, -5, 5) * (count / 10 / max(len(values), 1))
-            panel.stairs(density.tolist(), bins, lw=1.5, color=COLOURS[i % 3], label=AXES[i])
+            panel.stairs(*_density(values, bins, -5, 5), lw=1.5, color=COLOURS[i % 3], label=AXES[i])
         panel.plot(x, (-0.5 * x.square()).exp() / math.sqrt(2 * math.pi), color=GREY, lw=1, label="ideal")
         panel.set_xlabel(f"{name} error / claimed sigma")
         panel.legend(frameon=False, fontsize=9)
     axes[0].set_ylabel("density")
-    nees = evaluation.errors.nees[evaluation.error[:, 0].isfinite()]
-    top = 25.0
-    density = torch.histc(nees.nan_to_num(top).clamp(max=top), count, 0, top) * (count / top / max(len(nees), 1))
-    axes[2].stairs(density.tolist(), torch.linspace(0, top, count + 1).tolist(), fill=True, color="#b3cde3")
-    s = torch.linspace(0.01, top, 300, dtype=torch.float64)
-    axes[2].plot(s, s.square() * (-s / 2).exp() / 16, color=GREY, lw=1)  # chi-squared, 6 degrees of freedom
+    nees = evaluation.errors.nees[evaluation.error[:, 0].isfinite()].nan_to_num(_MOST_NEES).clamp(max=_MOST_NEES)
+    axes[2].stairs(*_density(nees, bins, 0, _MOST_NEES), fill=True, color="#b3cde3")
+    x = torch.linspace(0.01, _MOST_NEES, 300, dtype=torch.float64)
+    axes[2].plot(x, x.square() * (-x / 2).exp() / 16, color=GREY, lw=1)  # chi-squared, 6 degrees of freedom
     low, high = evaluation.nees_interval
     axes[2].set_title(f"mean {evaluation.nees:.2f}; {low:.2f} to {high:.2f} if the covariance is right", fontsize=10)
     axes[2].set_xlabel("NEES (larger ones in the last bin)")
@@ -85,33 +78,26 @@ def plot_conditions(evaluation: Evaluation, truth: Truth, title: str) -> Figure:
     for row, (name, condition) in zip(axes, (("distance, mm", truth.t[:, 2]), ("tilt, degrees", tilt)), strict=True):
         for panel, (label, value), colour in zip(row, values, COLOURS[:3], strict=True):
             panel.semilogy(condition[ok], value[ok], ".", ms=4, color=colour)
-            panel.set_xlabel(name)
-            panel.set_ylabel(label)
+            panel.set(xlabel=name, ylabel=label)
     figure.suptitle(f"{title}: where the errors are", fontsize=11)
     return figure
 
 
 def save_plots(evaluation: Evaluation, truth: Truth, folder: Path, title: str) -> list[Path]:
-    """Writes errors.png, consistency.png and conditions.png; the paths.
-
-    Raises:
-        ConfigError: the folder cannot be written.
-    """
-    made = {
+    """Writes errors.png, consistency.png and conditions.png; the paths. ConfigError: the folder cannot be written."""
+    make_folder(folder, "--plots")
+    figures = {
         "errors.png": plot_errors(evaluation, title),
         "consistency.png": plot_consistency(evaluation, title),
         "conditions.png": plot_conditions(evaluation, truth, title),
     }
-    paths = []
-    for name, figure in made.items():
-        path = folder / name
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            figure.savefig(path, dpi=120)
-        except OSError as error:
-            raise ConfigError(f"{path}: --plots: cannot be written ({error.strerror}); choose another folder") from None
-        paths.append(path)
-    return paths
+    return save_figures(figures, folder)
+
+
+def _density(values: torch.Tensor, bins: int, low: float, high: float) -> tuple[list[float], list[float]]:
+    """Histogram of unit area: heights, and edges of the bins."""
+    density = torch.histc(values, bins, low, high) * (bins / (high - low) / max(len(values), 1))
+    return density.tolist(), torch.linspace(low, high, bins + 1).tolist()
 
 
 def _largest(values: torch.Tensor) -> float:

@@ -2,55 +2,50 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
+from matplotlib.figure import Figure
 
-from torchpose.report.figures import COLOURS, GREY, subplots
-from torchpose.rig.experiment import AXES, Experiment, unit
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from torchpose.analysis import rms
+from torchpose.report.figures import COLOURS, GREY, band, subplots
+from torchpose.rig.experiment import AXES, Experiment, Moves, Static, unit
 
 
-def plot_experiment(e: Experiment, title: str) -> Figure:
+def plot_experiment(experiment: Experiment, title: str) -> Figure:
     """Static deviations over the frames on top, errors over the moves and turns below; bands: 2 sigma claimed."""
     figure, panels = subplots(4, 3, (13, 12))
     for k, axis in enumerate(AXES):
-        name, scale = unit(axis)
-        panel = panels[k // 3, k % 3]
-        if e.static is not None:
-            number = torch.arange(len(e.static.deviation))
-            sigma = 2 * scale * e.static.sigma[:, k]
-            panel.fill_between(number, (-sigma).tolist(), sigma.tolist(), color="#e6e6e6", lw=0)
-            panel.plot(number, scale * e.static.deviation[:, k], "o-", ms=3, lw=0.7, color=COLOURS[k % 3])
-            spread, claimed = scale * float(e.static.spread[k]), scale * float(e.static.claimed[k])
-            panel.set_title(f"static, {_camera_axis(k)}: {spread:.3g} {name}, claimed {claimed:.3g}", fontsize=10)
-        panel.set(xlabel="frame", ylabel=name)
-        panel.axhline(0, color=GREY, lw=0.6)
-    for k, axis in enumerate(AXES):
-        name, scale = unit(axis)
-        panel = panels[2 + k // 3, k % 3]
-        for moves in (m for m in e.moves if m.axis == axis):
-            _plot_moves(panel, moves, COLOURS[k % 3], name, scale)
-        panel.set(xlabel=f"robot, {'degrees' if k > 2 else 'mm'}", ylabel=name)
-        panel.axhline(0, color=GREY, lw=0.6)
-    robot = "emulated rig" if e.emulated else "robot and camera"
+        turn, (name, _) = k > 2, unit(axis)
+        resting, moving = panels[k // 3, k % 3], panels[2 + k // 3, k % 3]
+        if experiment.static is not None:
+            _plot_static(resting, experiment.static, k)
+        for moves in (m for m in experiment.moves if m.axis == axis):
+            _plot_moves(moving, moves, COLOURS[k % 3])
+        resting.set(xlabel="frame", ylabel=name)
+        moving.set(xlabel=f"robot, {'degrees' if turn else 'mm'}", ylabel=name)
+        for panel in (resting, moving):
+            panel.axhline(0, color=GREY, lw=0.6)
+    robot = "emulated rig" if experiment.emulated else "robot and camera"
     figure.suptitle(f"{title} ({robot}): camera - robot; bands: 2 sigma claimed by the poses", fontsize=11)
     return figure
 
 
-def _camera_axis(k: int) -> str:
-    return f"{'rotation about' if k > 2 else ''} {'xyz'[k % 3]}".strip()
+def _plot_static(panel: Any, static: Static, axis: int) -> None:
+    name, scale = unit(AXES[axis])
+    number = torch.arange(len(static.deviation))
+    band(panel, number, 2 * scale * static.sigma[:, axis])
+    panel.plot(number, scale * static.deviation[:, axis], "o-", ms=3, lw=0.7, color=COLOURS[axis % 3])
+    words = f"{'rotation about ' if axis > 2 else ''}{'xyz'[axis % 3]}"
+    spread, claimed = scale * float(static.spread[axis]), scale * float(static.claimed[axis])
+    panel.set_title(f"static, {words}: {spread:.3g} {name}, claimed {claimed:.3g}", fontsize=10)
 
 
-def _plot_moves(panel: Any, moves: Any, colour: str, name: str, scale: float) -> None:
+def _plot_moves(panel: Any, moves: Moves, colour: str) -> None:
+    name, scale = unit(moves.axis)
     order = moves.value.argsort()
-    at = moves.robot[order]
-    at = (at.rad2deg() if moves.turn else at).tolist()
-    error, sigma = scale * moves.error[order], 2 * scale * moves.sigma[order]
-    panel.fill_between(at, (-sigma).tolist(), sigma.tolist(), color="#e6e6e6", lw=0)
+    at = (moves.robot.rad2deg() if moves.turn else moves.robot)[order].tolist()
+    error, sigma = scale * moves.error[order], scale * moves.sigma[order]
+    band(panel, at, 2 * sigma)
     panel.plot(at, error.tolist(), "o-", ms=3, lw=0.7, color=colour)
-    rms = float(error.square().mean().sqrt())
-    claimed = 0.5 * float(sigma.square().mean().sqrt())
-    panel.set_title(f"{moves.axis}: RMS {rms:.3g} {name}, claimed {claimed:.3g}", fontsize=10)
+    panel.set_title(f"{moves.axis}: RMS {rms(error):.3g} {name}, claimed {rms(sigma):.3g}", fontsize=10)

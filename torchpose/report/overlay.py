@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.errors import ConfigError
+from torchpose.report.files import make_folder
 from torchpose.results import Poses, Reason, Status
 from torchpose.target import Target
 
@@ -20,14 +21,12 @@ Colour = tuple[int, int, int]
 
 _GREEN, _AMBER, _RED = (60, 170, 40), (0, 150, 240), (50, 50, 220)  # blue, green, red, as OpenCV has them
 _STATUS_COLOUR: dict[Status, Colour] = {Status.OK: _GREEN, Status.AMBIGUOUS: _AMBER}
+_WHITE = (255, 255, 255)
 _OUTER, _INNER, _CENTRE = (255, 200, 0), (255, 0, 220), (0, 230, 255)
 _AXES: tuple[Colour, ...] = ((40, 40, 255), (40, 220, 40), (255, 110, 30))
 _AXIS_POINTS = 33  # along an axis, so that distortion bends it
 _SHIFT = 6  # OpenCV draws at 1/64 px
-_PNG = (
-    cv2.IMWRITE_PNG_COMPRESSION,
-    1,
-)  # lossless, so that a line of a pixel stays one; low effort, as noise packs badly
+_PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # lossless, so that a line of a pixel stays one; low effort: noise packs badly
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
@@ -36,27 +35,8 @@ def picture_path(folder: Path, frame: str) -> Path:
     return folder / (frame if frame.lower().endswith(".png") else f"{frame}.png")
 
 
-def make_folder(folder: Path) -> None:
-    """Makes the folder of the pictures.
-
-    Raises:
-        ConfigError: it cannot be created or written.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / ".probe.tmp"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise ConfigError(f"{folder}: --overlay: cannot be written ({error.strerror}); choose another place") from None
-
-
 def write_picture(path: Path, picture: np.ndarray) -> None:
-    """Writes a PNG file whole or not at all.
-
-    Raises:
-        ConfigError: it cannot be written.
-    """
+    """Writes a PNG file whole or not at all. ConfigError: it cannot be written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.with_name(f".{path.name}.tmp")
@@ -70,17 +50,21 @@ class Overlay:
     """Draws and writes the picture of each frame.
 
     Args:
-        camera, targets: as for `PoseEstimator`. folder: where the pictures go, created if missing.
+        camera: as for `PoseEstimator`.
+        targets: as for `PoseEstimator`.
+        folder: where the pictures go, created if missing; only `write` needs it.
         threads: pictures that are drawn and written side by side.
 
     Raises:
         ConfigError: the folder cannot be created or written.
     """
 
-    def __init__(self, camera: Camera, targets: Sequence[Target], folder: Path, *, threads: int = 1) -> None:
+    def __init__(
+        self, camera: Camera, targets: Sequence[Target], folder: Path | None = None, *, threads: int = 1
+    ) -> None:
         self._camera = camera
         self._names = [target.name for target in targets]
-        self._folder = folder
+        self._folder = folder or Path()
         self._threads = threads
         centers = [target.centers for target in targets]
         middle = torch.stack([c.mean(0) for c in centers])
@@ -88,21 +72,28 @@ class Overlay:
         steps = torch.linspace(0, 1, _AXIS_POINTS, dtype=torch.float64)
         # (T, 3 axes, points, 3): from the target's origin, about as long as the target is wide
         self._axes = extent[:, None, None, None] * torch.eye(3, dtype=torch.float64)[:, None] * steps[:, None]
-        make_folder(folder)
+        if folder is not None:
+            make_folder(folder, "--overlay")
 
     def write(self, frames: Tensor, poses: Poses, names: Sequence[str]) -> None:
         """Writes one picture a frame.
 
         Args:
-            frames: (B, H, W) uint8 or uint16. poses: of these frames, targets to camera. names: of the frames.
+            frames: (B, H, W) uint8 or uint16.
+            poses: of these frames, targets to camera.
+            names: of the frames.
 
         Raises:
             ConfigError: a picture cannot be written.
         """
         lines = self._project_axes(poses)
+
+        def write_one(index: int) -> None:
+            picture = self._draw(frames[index], index, poses, lines, names[index])
+            write_picture(picture_path(self._folder, names[index]), picture)
+
         with ThreadPoolExecutor(self._threads) as pool:
-            for _ in pool.map(lambda b: self._write_one(frames[b], b, poses, lines, names[b]), range(len(names))):
-                pass
+            list(pool.map(write_one, range(len(names))))
 
     def draw(self, frame: Tensor, poses: Poses, name: str) -> np.ndarray:
         """Picture (H, W, 3) uint8, blue-green-red, of one frame (H, W) with the poses of a batch of one."""
@@ -114,21 +105,12 @@ class Overlay:
         pixels = self._camera.project(points)
         return torch.where(points[..., 2:] > 0, pixels, torch.nan).numpy()
 
-    def _write_one(self, frame: Tensor, index: int, poses: Poses, lines: np.ndarray, name: str) -> None:
-        write_picture(picture_path(self._folder, name), self._draw(frame, index, poses, lines, name))
-
     def _draw(self, frame: Tensor, index: int, poses: Poses, lines: np.ndarray, name: str) -> np.ndarray:
         picture = cv2.cvtColor(eight_bit(frame.numpy()), cv2.COLOR_GRAY2BGR)
         unit = max(picture.shape[:2]) / 1000  # everything is drawn in thousandths of the picture's longer side
         found = poses.detections[poses.detections.frame == index]
-        for outer, inner, center, marker, target in zip(
-            found.outer.tolist(),
-            found.inner.tolist(),
-            found.center.tolist(),
-            found.marker.tolist(),
-            found.target.tolist(),
-            strict=True,
-        ):
+        columns = (found.outer, found.inner, found.center, found.marker, found.target)
+        for outer, inner, center, marker, target in zip(*(column.tolist() for column in columns), strict=True):
             draw_ellipse(picture, outer, _OUTER)
             draw_ellipse(picture, inner, _INNER)
             _cross(picture, center, max(0.4 * inner[3], 3.0))
@@ -150,10 +132,10 @@ class Overlay:
             words.append(f"({Reason(int(poses.reason[row])).name.lower().replace('_', ' ')})")
         words.append(f" {int(poses.markers[row])} markers")
         if bool(poses.t[row].isfinite().all()):
-            t, r, s = poses.t[row].tolist(), poses.rotation_vector[row].rad2deg().tolist(), poses.std[row].tolist()
-            words.append("  t " + " ".join(f"{v:.3f}" for v in t) + " mm")
-            words.append("  +- " + " ".join(f"{1000 * v:.1f}" for v in s[:3]) + " um")
-            words.append("  r " + " ".join(f"{v:.3f}" for v in r) + " deg")
+            turn = poses.rotation_vector[row].rad2deg().tolist()
+            words.append("  t " + " ".join(f"{v:.3f}" for v in poses.t[row].tolist()) + " mm")
+            words.append("  +- " + " ".join(f"{1000 * v:.1f}" for v in poses.std[row, :3].tolist()) + " um")
+            words.append("  r " + " ".join(f"{v:.3f}" for v in turn) + " deg")
             words.append(f"  rms {float(poses.rms[row]):.4f} px")
         return " ".join(words), _STATUS_COLOUR.get(status, _RED)
 
@@ -210,16 +192,7 @@ def _banners(picture: np.ndarray, banners: Sequence[tuple[str, Colour]], name: s
         fit = min(1.0, 0.97 * picture.shape[1] / wide)
         size, line = size * fit, round((high + below) * 1.7)
         cv2.rectangle(picture, (0, top), (picture.shape[1] - 1, top + line), colour, cv2.FILLED)
-        baseline = top + round((line + high * fit) / 2)
-        cv2.putText(
-            picture,
-            text,
-            (round(6 * unit), baseline),
-            _FONT,
-            size,
-            (255, 255, 255),
-            max(1, round(1.4 * size)),
-            cv2.LINE_AA,
-        )
+        place = (round(6 * unit), top + round((line + high * fit) / 2))
+        cv2.putText(picture, text, place, _FONT, size, _WHITE, max(1, round(1.4 * size)), cv2.LINE_AA)
         top += line + 1
-    draw_text(picture, name, (6 * unit, picture.shape[0] - 8 * unit), 0.5 * unit, (255, 255, 255))
+    draw_text(picture, name, (6 * unit, picture.shape[0] - 8 * unit), 0.5 * unit, _WHITE)

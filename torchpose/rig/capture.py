@@ -6,25 +6,17 @@ import contextlib
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
-import torch
-
-from torchpose.geometry import rotations
 from torchpose.rig.cameras import Cameras, Frame
-from torchpose.rig.faults import RigFault
+from torchpose.rig.faults import RigFault, RobotFault, RobotReason
 from torchpose.rig.plan import CapturePlan, Waypoint
-from torchpose.rig.robot import Robot, difference
-from torchpose.rig.robot_faults import RobotFault, RobotReason
-from torchpose.rig.robot_settings import Pose, RobotReading, Settle
+from torchpose.rig.poses import Pose, difference, middle
+from torchpose.rig.robot import Robot, RobotReading
 from torchpose.rig.session import Session
 from torchpose.rig.settings import Rig
-
-COMPLETE = "complete"
-INTERRUPTED = "interrupted"
 
 OnFrame = Callable[[Waypoint, Frame], None]
 
@@ -61,6 +53,9 @@ def capture(
     is written. While this runs, SIGINT and SIGTERM stop the robot at once.
 
     Args:
+        plan: where to take frames.
+        rig: with what.
+        session: where to, entered.
         scene: what emulated cameras see, see `Cameras`.
         on_frame: called for every frame once it is stored.
         notes: further entries of the session record.
@@ -70,26 +65,31 @@ def capture(
         KeyboardInterrupt: after SIGINT or SIGTERM.
     """
     robot = Robot(rig.robot)
-    sizes = {camera.name: camera.width * camera.height * camera.dtype().itemsize for camera in rig.cameras}
+    sizes = {camera.name: camera.width * camera.height * camera.dtype.itemsize for camera in rig.cameras}
     try:
         session.check_space(sum(sizes[name] for _, names in missing(plan, rig, session.done) for name in names))
         with stopped_by_signals(robot), Cameras(rig.cameras, scene) as cameras, robot:
             preflight = robot.preflight([waypoint.pose for waypoint in plan.waypoints])
             described = cameras.descriptions
-            emulated = scene is not None or bool(preflight.get("emulated")) or any(c["emulated"] for c in described)
-            record = {"plan": plan.name, "waypoints": len(plan.waypoints), "robot": preflight, "cameras": described}
-            session.begin(emulated=emulated, record=record | dict(notes or {}))
+            session.begin(
+                emulated=scene is not None or preflight["emulated"] or any(c["emulated"] for c in described),
+                plan=plan.name,
+                waypoints=len(plan.waypoints),
+                robot=preflight,
+                cameras=described,
+                **(notes or {}),
+            )
             _take_all(plan, rig, session, robot, cameras, on_frame)
     except RigFault as fault:
         session.end(fault.reason.value, str(fault))
         raise
     except KeyboardInterrupt:
-        session.end(INTERRUPTED)
+        session.end("interrupted")
         raise
     except BaseException as error:
         session.end("internal_error", f"{type(error).__name__}: {error}")
         raise
-    session.end(COMPLETE)
+    session.end("complete")
 
 
 def _take_all(
@@ -104,8 +104,20 @@ def _take_all(
             time.sleep(rig.dwell_s)
         before, frames, after = _expose(waypoint, names, rig, robot, cameras)
         for frame in frames:
-            record = _record(waypoint, frame, before, after)
-            session.write(frame_id(waypoint, frame.camera, rig), frame.image, record)
+            session.write(
+                frame_id(waypoint, frame.camera, rig),
+                frame.image,
+                camera=frame.camera,
+                waypoint=waypoint,
+                commanded_pose=waypoint.pose,
+                robot_pose=middle(before.pose, after.pose),
+                before=before,
+                after=after,
+                trigger_time_s=frame.trigger_time_s,
+                camera_time=frame.camera_time,
+                attempts=frame.attempts,
+                failures=frame.failures,
+            )
             if on_frame is not None:
                 on_frame(waypoint, frame)
 
@@ -114,72 +126,33 @@ def _expose(
     waypoint: Waypoint, names: list[str], rig: Rig, robot: Robot, cameras: Cameras
 ) -> tuple[RobotReading, list[Frame], RobotReading]:
     """Frames of the named cameras between two fresh readings of the robot at rest on the waypoint."""
-    settle = rig.robot.settle
-    before = robot.read(fresh=2)
-    _check_rest(waypoint, before, waypoint.pose, settle)
+
+    def read_at(pose: Pose) -> RobotReading:
+        reading, settle = robot.read(fresh=2), rig.robot.settle
+        distance, angle = difference(reading.pose, pose)
+        if distance > settle.tolerance_mm or angle > settle.tolerance_deg:
+            why = f"moved by {distance:.3f} mm and {angle:.3f} deg around the exposure of waypoint {waypoint}"
+            fix = "look for vibration, or raise robot.settle of the rig file"
+            raise RobotFault(RobotReason.NOT_SETTLED, f"robot: {why}; {fix}")
+        return reading
+
+    before = read_at(waypoint.pose)
     frames = cameras.grab(names)
-    after = robot.read(fresh=2)
-    _check_rest(waypoint, after, before.pose, settle)
-    return before, frames, after
-
-
-def _check_rest(waypoint: Waypoint, reading: RobotReading, pose: Pose, settle: Settle) -> None:
-    """Raises a RobotFault when the robot is not where it was."""
-    distance, angle = difference(reading.pose, pose)
-    if distance > settle.tolerance_mm or angle > settle.tolerance_deg:
-        raise RobotFault(
-            RobotReason.NOT_SETTLED,
-            f"robot: moved by {distance:.3f} mm and {angle:.3f} deg around the exposure of waypoint {waypoint.label}; "
-            "look for vibration, or raise robot.settle of the rig file",
-        )
-
-
-def middle(a: Pose, b: Pose) -> Pose:
-    """The pose half-way between two near ones, whichever of the equivalent rotation vectors they have."""
-    first, second = (torch.tensor(pose, dtype=torch.float64) for pose in (a, b))
-    turn = rotations.log(rotations.exp(second[3:]) @ rotations.exp(first[3:]).mT)
-    rotation = rotations.log(rotations.exp(0.5 * turn) @ rotations.exp(first[3:]))
-    x, y, z = (0.5 * (first[:3] + second[:3])).tolist()
-    rx, ry, rz = rotation.tolist()
-    return x, y, z, rx, ry, rz
-
-
-def _record(waypoint: Waypoint, frame: Frame, before: RobotReading, after: RobotReading) -> dict[str, Any]:
-    """What the manifest says of a frame besides its image."""
-    return {
-        "camera": frame.camera,
-        "waypoint": {
-            "kind": waypoint.kind,
-            "axis": waypoint.axis,
-            "value": waypoint.value,
-            "origin": waypoint.origin,
-            "id": waypoint.id,
-        },
-        "commanded_pose": list(waypoint.pose),
-        "robot_pose": list(middle(before.pose, after.pose)),
-        "before": asdict(before),
-        "after": asdict(after),
-        "trigger_time_s": frame.trigger_time_s,
-        "camera_time": frame.camera_time,
-        "attempts": frame.attempts,
-        "failures": list(frame.failures),
-    }
+    return before, frames, read_at(before.pose)
 
 
 @contextlib.contextmanager
 def stopped_by_signals(robot: Robot) -> Iterator[None]:
-    """While the block runs, the first SIGINT or SIGTERM stops the robot and raises KeyboardInterrupt; later ones wait.
+    """While the block runs, SIGINT or SIGTERM stops the robot and raises KeyboardInterrupt; further ones are ignored.
 
     In a thread that is not the main one, which gets no signals, this does nothing.
     """
-    caught = False
 
     def stop(_number: int, _frame: FrameType | None) -> None:
-        nonlocal caught
-        if not caught:
-            caught = True
-            robot.stop()
-            raise KeyboardInterrupt
+        for number in previous:
+            signal.signal(number, signal.SIG_IGN)
+        robot.stop()
+        raise KeyboardInterrupt
 
     previous: dict[signal.Signals, Any] = {}
     with contextlib.suppress(ValueError):  # not the main thread

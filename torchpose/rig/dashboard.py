@@ -13,36 +13,30 @@ PORT = 29999
 
 
 def ask(host: str, commands: Sequence[str], timeout_s: float) -> list[str]:
-    """The answers to the commands, over one new connection.
-
-    Args:
-        timeout_s: for all of it.
+    """The answers to the commands, over one new connection, all within `timeout_s`.
 
     Raises:
         TimeoutError: no complete answer within the time.
         OSError: no connection.
     """
     deadline = time.monotonic() + timeout_s
-    answers = []
     with socket.create_connection((host, PORT), timeout_s) as connection:
-        _read_line(connection, deadline)  # greeting
+        answers = [_read_line(connection, deadline)]  # greeting
         for command in commands:
             connection.sendall(command.encode("ascii") + b"\n")
             answers.append(_read_line(connection, deadline))
-    return answers
+    return answers[1:]
 
 
 def _read_line(connection: socket.socket, deadline: float) -> str:
     line = b""
     while not line.endswith(b"\n"):
-        left = deadline - time.monotonic()
-        if left <= 0:
+        if (left := deadline - time.monotonic()) <= 0:
             raise TimeoutError
         connection.settimeout(left)
-        chunk = connection.recv(1)  # lines are short, and nothing of the next answer may be taken
-        if not chunk:
+        line += (byte := connection.recv(1))  # lines are short, and nothing of the next answer may be taken
+        if not byte:
             raise ConnectionResetError("the dashboard server closed the connection")
-        line += chunk
     return line.decode("utf-8", errors="replace").strip()
 
 

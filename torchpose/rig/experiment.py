@@ -9,76 +9,71 @@ the robot carries. A robot pose that is off counts as an error of the camera her
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose.config import validate
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
+from torchpose.geometry.rows import Rows
 from torchpose.io.manifest import read_manifest, read_records
-from torchpose.io.tables import read_table
+from torchpose.io.writers import read_table
+from torchpose.rig.plan import Label
+from torchpose.rig.poses import to_transform
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
-_COLUMNS = ("frame", "target", "status", "tx", "ty", "tz", "rx", "ry", "rz", "sx", "sy", "sz", "srx", "sry", "srz")
+_POSE = ("tx", "ty", "tz", "rx", "ry", "rz")
+_SIGMA = ("sx", "sy", "sz", "srx", "sry", "srz")
 _USED = ("ok", "ambiguous")  # status of the rows that have a pose
-_KINDS = ("static", "translation", "rotation")
+_GROUPS = (("static", None), *(("rotation" if k > 2 else "translation", axis) for k, axis in enumerate(AXES)))
 
 
 @dataclass(frozen=True, eq=False)
-class Static:
-    """N frames of a target at rest.
+class Static(Rows):
+    """N frames of a target at rest, mm and rad along and about the camera's axes."""
 
-    Attributes:
-        deviation: (N, 6) from their mean, mm and rad along and about the camera's axes.
-        sigma: (N, 6) standard deviations that the poses claim.
-    """
-
-    deviation: Tensor
-    sigma: Tensor
+    deviation: Float[Tensor, "N 6"]  # from their mean
+    sigma: Float[Tensor, "N 6"]  # standard deviations that the poses claim
 
     @property
-    def spread(self) -> Tensor:
-        """(6,) standard deviation of the frames, mm and rad."""
-        return (self.deviation.square().sum(0) / (len(self.deviation) - 1)).sqrt()
+    def spread(self) -> Float[Tensor, " 6"]:
+        """Standard deviation of the frames, mm and rad."""
+        return (self.deviation.square().sum(0) / (len(self) - 1)).sqrt()
 
     @property
-    def claimed(self) -> Tensor:
-        """(6,) root mean square of ``sigma``."""
+    def claimed(self) -> Float[Tensor, " 6"]:
+        """Root mean square of ``sigma``."""
         return self.sigma.square().mean(0).sqrt()
 
 
 @dataclass(frozen=True, eq=False)
 class Moves:
-    """N moves along, or turns about, one axis, all from one origin.
+    """N moves along, or turns about, one axis, all from one origin; mm or rad."""
 
-    Attributes:
-        axis: one of `AXES`. value: (N,) commanded, mm or rad; its sign is that of ``robot`` and ``camera``.
-        robot, camera: (N,) distance or angle from the origin, mm or rad.
-        covariance: (N, N) of the camera's, from the poses' covariances; they share their origin.
-    """
-
-    axis: str
-    value: Tensor
-    robot: Tensor
-    camera: Tensor
-    covariance: Tensor
+    axis: str  # one of `AXES`
+    value: Float[Tensor, " N"]  # commanded; its sign is that of the next two
+    robot: Float[Tensor, " N"]  # distance or angle from the origin
+    camera: Float[Tensor, " N"]
+    covariance: Float[Tensor, "N N"]  # of the camera's, from the poses' covariances; they share their origin
 
     @property
     def turn(self) -> bool:
         return self.axis in AXES[3:]
 
     @property
-    def error(self) -> Tensor:
-        """(N,) camera - robot."""
+    def error(self) -> Float[Tensor, " N"]:
+        """camera - robot."""
         return self.camera - self.robot
 
     @property
-    def sigma(self) -> Tensor:
-        """(N,) standard deviation of the error, for an exact robot."""
+    def sigma(self) -> Float[Tensor, " N"]:
+        """Standard deviation of the error, for an exact robot."""
         return self.covariance.diagonal().sqrt()
 
     @property
@@ -99,38 +94,28 @@ class Moves:
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """What `evaluate_experiment` found.
+    """What `evaluate_experiment` found."""
 
-    Attributes:
-        static: None where there are fewer than three frames of it. moves: by axis, those that were captured.
-        distance: mean of the target's depth, mm. emulated: whether any part of the rig was.
-        unused: images without a pose.
-        bound: the same with the bound of every pose in place of its covariance, where one was given.
-    """
-
-    static: Static | None
-    moves: list[Moves]
-    distance: float
-    emulated: bool
-    unused: list[str]
-    bound: Experiment | None = None
+    static: Static | None  # None where there are fewer than three frames of it
+    moves: list[Moves]  # by axis, those that were captured
+    distance: float  # mean of the target's depth, mm
+    emulated: bool = False  # whether any part of the rig was
+    unused: tuple[str, ...] = ()  # images without a pose
+    bound: Experiment | None = None  # with the bound of every pose in place of its covariance, where one was given
 
 
 @dataclass(frozen=True, eq=False)
-class _Frames:
-    """Frames with a pose: waypoints, poses of camera and robot, covariance (N, 6, 6)."""
+class _Frames(Rows):
+    """Frames with a pose of camera and robot."""
 
-    waypoints: list[dict[str, Any]]
-    R: Tensor
-    t: Tensor
-    covariance: Tensor
-    robot_R: Tensor
-    robot_t: Tensor
-
-    def __getitem__(self, index: Sequence[int]) -> _Frames:
-        at = list(index)
-        tensors = (self.R[at], self.t[at], self.covariance[at], self.robot_R[at], self.robot_t[at])
-        return _Frames([self.waypoints[k] for k in at], *tensors)
+    group: Int[Tensor, " N"]  # place in `_GROUPS`
+    value: Float[Tensor, " N"]  # commanded, mm or deg
+    origin: Bool[Tensor, " N"]
+    R: Float[Tensor, "N 3 3"]
+    t: Float[Tensor, "N 3"]
+    covariance: Float[Tensor, "N 6 6"]
+    robot_R: Float[Tensor, "N 3 3"]
+    robot_t: Float[Tensor, "N 3"]
 
 
 def evaluate_experiment(
@@ -139,9 +124,10 @@ def evaluate_experiment(
     """Joins a capture manifest with the poses that ``torchpose estimate`` found in its frames, by image, and evaluates.
 
     Args:
-        manifest: with waypoints of the kinds static, translation and rotation. poses: .csv, .jsonl or .parquet; a CSV
-            holds no correlations, which count for tilted targets. Estimate with a camera file without
-            ``camera_matrix_covariance``: errors of the camera are common to all frames and cancel in differences.
+        manifest: with waypoints of the kinds static, translation and rotation.
+        poses: .csv, .jsonl or .parquet; a CSV holds no correlations, which count for tilted targets. Estimate with a
+            camera file without ``camera_matrix_covariance``: errors of the camera are common to all frames and cancel
+            in differences.
         bound: covariance (N, 6, 6) that poses R (N, 3, 3), t (N, 3) could have at best.
 
     Raises:
@@ -149,47 +135,37 @@ def evaluate_experiment(
             common with the other.
     """
     frames, unused, emulated = _join(manifest, poses)
-    if not frames.waypoints:
-        raise ConfigError(f"{poses}: frame: no pose of a static, translation or rotation frame of {manifest}")
-    where = f"{manifest}: waypoint"
-    limit = None
-    if bound is not None:
-        limit = _evaluate(replace(frames, covariance=bound(frames.R, frames.t)), where)
-    return replace(_evaluate(frames, where), emulated=emulated, unused=unused, bound=limit)
+    limit = None if bound is None else _evaluate(replace(frames, covariance=bound(frames.R, frames.t)), manifest)
+    return replace(_evaluate(frames, manifest), emulated=emulated, unused=unused, bound=limit)
 
 
-def _evaluate(frames: _Frames, where: str) -> Experiment:
-    groups: dict[tuple[str, str | None], list[int]] = {}
-    for k, waypoint in enumerate(frames.waypoints):
-        groups.setdefault((str(waypoint.get("kind")), waypoint.get("axis")), []).append(k)
-    moves = []
-    for axis in AXES:
-        members = groups.get(("rotation" if axis in AXES[3:] else "translation", axis))
-        if members:
-            moves.append(_moves(frames[members], axis, f"{where}: {axis}"))
-    resting = groups.get(("static", None), [])
-    static = _static(frames[resting]) if len(resting) > 2 else None
-    return Experiment(static, moves, float(frames.t[:, 2].mean()), False, [])
+def _evaluate(frames: _Frames, manifest: Path) -> Experiment:
+    rest, *groups = (frames[frames.group == number] for number in range(len(_GROUPS)))
+    values = torch.cat([rest.t, rotations.log(rest.R @ rest.R[:1].mT)], -1)
+    static = Static(values - values.mean(0), rest.covariance.diagonal(dim1=-2, dim2=-1).sqrt())
+    moves = [_moves(group, axis, manifest) for axis, group in zip(AXES, groups, strict=True) if len(group)]
+    return Experiment(static if len(rest) > 2 else None, moves, float(frames.t[:, 2].mean()))
 
 
-def _join(manifest: Path, poses: Path) -> tuple[_Frames, list[str], bool]:
-    robot = {frame.image: frame.robot_pose for frame in read_manifest(manifest)}
+def _join(manifest: Path, poses: Path) -> tuple[_Frames, tuple[str, ...], bool]:
+    """The frames of both files, the images without a pose, and whether the rig was emulated."""
     table = read_table(poses)
-    missing = [name for name in _COLUMNS if table and name not in table[0]]
-    if missing:
-        raise ConfigError(f"{poses}: {missing[0]}: column is missing; give what torchpose estimate wrote")
+    for name in ("frame", "target", "status", *_POSE, *_SIGMA):
+        if table and name not in table[0]:
+            raise ConfigError(f"{poses}: {name}: column is missing; give what torchpose estimate wrote")
     targets = sorted({str(row["target"]) for row in table})
     if len(targets) > 1:
         raise ConfigError(f"{poses}: target: holds {', '.join(targets)}; estimate the experiment with one --target")
     by_frame = {str(row["frame"]): row for row in table}
-    rows, tool, waypoints, unused = [], [], [], []
-    emulated = False
+    robot = {frame.image: frame.robot_pose for frame in read_manifest(manifest)}
+    rows, tool, labels, unused, emulated = [], [], [], [], False
     for number, record in read_records(manifest):
         emulated = emulated or bool(record.get("emulated"))
-        image, waypoint = record.get("image"), record.get("waypoint")
-        if record.get("record") != "frame" or image not in by_frame or not isinstance(waypoint, dict):
+        image = record.get("image")
+        if record.get("record") != "frame" or image not in by_frame or not record.get("waypoint"):
             continue
-        if waypoint.get("kind") not in _KINDS:
+        label = validate(Label, record["waypoint"], f"{manifest}: line {number}: waypoint")
+        if (label.kind, label.axis) not in _GROUPS:
             continue
         if by_frame[image]["status"] not in _USED:
             unused.append(str(image))
@@ -198,54 +174,43 @@ def _join(manifest: Path, poses: Path) -> tuple[_Frames, list[str], bool]:
             raise ConfigError(f"{manifest}: line {number}: robot_pose: is missing; capture with the robot")
         rows.append(by_frame[image])
         tool.append(robot[image])
-        waypoints.append(waypoint)
-    pose = torch.tensor([[float(row[c]) for c in _COLUMNS[3:9]] for row in rows], dtype=torch.float64).reshape(-1, 6)
-    base = torch.tensor(tool, dtype=torch.float64).reshape(-1, 6)
-    covariance = torch.tensor([_covariance(row) for row in rows], dtype=torch.float64).reshape(-1, 6, 6)
+        labels.append(label)
+    if not rows:
+        raise ConfigError(f"{poses}: frame: no pose of a static, translation or rotation frame of {manifest}")
     frames = _Frames(
-        waypoints, rotations.exp(pose[:, 3:]), pose[:, :3], covariance, rotations.exp(base[:, 3:]), base[:, :3]
+        torch.tensor([_GROUPS.index((label.kind, label.axis)) for label in labels]),
+        torch.tensor([label.value for label in labels], dtype=torch.float64),
+        torch.tensor([label.origin for label in labels]),
+        *to_transform([[float(row[column]) for column in _POSE] for row in rows]),
+        torch.stack([_covariance(row) for row in rows]),
+        *to_transform(tool),
     )
-    return frames, unused, emulated
+    return frames, tuple(unused), emulated
 
 
-def _covariance(row: dict[str, Any]) -> list[list[float]]:
+def _covariance(row: dict[str, Any]) -> Float[Tensor, "6 6"]:
     if row.get("covariance") is not None:
-        return [list(map(float, line)) for line in row["covariance"]]
-    sigma = [float(row[c]) for c in _COLUMNS[9:]]
-    return [[s * s if i == j else 0.0 for j in range(6)] for i, s in enumerate(sigma)]
+        return torch.tensor([list(map(float, line)) for line in row["covariance"]], dtype=torch.float64)
+    return torch.tensor([float(row[column]) for column in _SIGMA], dtype=torch.float64).square().diag()
 
 
-def _static(f: _Frames) -> Static:
-    turn = rotations.log(f.R @ f.R[:1].mT)
-    values = torch.cat([f.t, turn], -1)
-    return Static(values - values.mean(0), f.covariance.diagonal(dim1=-2, dim2=-1).sqrt())
-
-
-def _moves(f: _Frames, axis: str, where: str) -> Moves:
-    origin = [k for k, waypoint in enumerate(f.waypoints) if waypoint.get("origin")]
-    away = [k for k, waypoint in enumerate(f.waypoints) if not waypoint.get("origin")]
-    if not origin or not away:
-        raise ConfigError(f"{where}: has no frame {'at the origin' if not origin else 'away from it'}; capture it")
-    start, rest = f[origin[:1]], f[away]
+def _moves(frames: _Frames, axis: str, manifest: Path) -> Moves:
+    start, rest = frames[frames.origin][:1], frames[~frames.origin]
+    if not len(start) or not len(rest):
+        lacking = "at the origin" if not len(start) else "away from it"
+        raise ConfigError(f"{manifest}: waypoint: {axis}: has no frame {lacking}; capture it")
     if axis in AXES[3:]:
         camera, robot = rotations.log(rest.R @ start.R.mT), rotations.log(rest.robot_R @ start.robot_R.mT)
-        block = slice(3, 6)
+        value, block = rest.value.deg2rad(), slice(3, 6)
     else:
         camera, robot = rest.t - start.t, rest.robot_t - start.robot_t
-        block = slice(0, 3)
-    value = torch.tensor([float(waypoint["value"]) for waypoint in rest.waypoints], dtype=torch.float64)
+        value, block = rest.value, slice(0, 3)
     sign = value.sign()
     along = torch.nn.functional.normalize(camera, dim=-1) * sign[:, None]
     # every difference has the noise of its own frame and that of the origin, which all share
-    shared = along @ start.covariance[0, block, block] @ along.T
+    common = along @ start.covariance[0, block, block] @ along.T
     own = (along[:, None] @ rest.covariance[:, block, block] @ along[..., None]).flatten()
-    return Moves(
-        axis,
-        value.deg2rad() if axis in AXES[3:] else value,
-        sign * robot.norm(dim=-1),
-        sign * camera.norm(dim=-1),
-        shared + torch.diag(own),
-    )
+    return Moves(axis, value, sign * robot.norm(dim=-1), sign * camera.norm(dim=-1), common + own.diag())
 
 
 def unit(axis: str) -> tuple[str, float]:

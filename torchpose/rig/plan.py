@@ -11,64 +11,81 @@ import json
 import math
 import os
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import torch
+from jaxtyping import Float
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator, model_validator
 from torch import Tensor
 
 from torchpose.config import read_yaml, validate
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
-from torchpose.rig.robot_settings import Pose, Workspace
+from torchpose.rig.poses import Pose, as_pose, from_transform, to_transform
+from torchpose.rig.settings import SixNumbers, Strict, Workspace
 from torchpose.target import RigidTransformFile, Vector
 
-_FROZEN = ConfigDict(extra="forbid", frozen=True)
-_AXES = {"x": 0, "y": 1, "z": 2, "pitch": 0, "yaw": 1, "roll": 2}
+_AXES = {"x": 0, "y": 1, "z": 2, "pitch": 3, "yaw": 4, "roll": 5}  # places in a move
+_F64 = torch.float64
 
-_Numbers = Annotated[list[FiniteFloat], Field(min_length=1)]
 _Range = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
+_NONE = [0.0, 0.0]
 _Count = Annotated[int, Field(ge=1, le=10000)]
+# shift in mm and rotation vector in rad along the plan's axes; what the waypoint's label says besides its kind
+Moves = Iterator[tuple[Float[Tensor, " 6"], dict[str, Any]]]
 
 
-class Static(BaseModel):
+class Static(Strict):
     """Frames at the origin, the robot at rest."""
 
-    model_config = _FROZEN
     repeats: _Count
 
+    def moves(self) -> Moves:
+        yield from [(torch.zeros(6, dtype=_F64), {"origin": True})] * self.repeats
 
-class Translation(BaseModel):
+
+class Translation(Strict):
     """The origin and moves away from it, axis by axis; ``repeats`` frames at each pose."""
 
-    model_config = _FROZEN
-    axes: Annotated[list[Literal["x", "y", "z"]], Field(min_length=1)] = ["x", "y", "z"]
-    values_mm: _Numbers
+    axes: list[Literal["x", "y", "z"]] = Field(default=["x", "y", "z"], min_length=1)
+    values_mm: list[FiniteFloat] = Field(min_length=1)
     repeats: _Count = 1
 
+    def moves(self) -> Moves:
+        return _sweep(self.axes, self.values_mm, self.repeats)
 
-class Rotation(BaseModel):
+
+class Rotation(Strict):
     """The origin and turns there, axis by axis; ``repeats`` frames at each pose."""
 
-    model_config = _FROZEN
-    axes: Annotated[list[Literal["roll", "pitch", "yaw"]], Field(min_length=1)] = ["roll", "pitch", "yaw"]
-    values_deg: _Numbers
+    axes: list[Literal["roll", "pitch", "yaw"]] = Field(default=["roll", "pitch", "yaw"], min_length=1)
+    values_deg: list[FiniteFloat] = Field(min_length=1)
     repeats: _Count = 1
 
+    def moves(self) -> Moves:
+        return _sweep(self.axes, self.values_deg, self.repeats)
 
-class Spread(BaseModel):
+
+def _sweep(axes: Sequence[str], values: Sequence[float], repeats: int) -> Moves:
+    for axis in axes:
+        for value in [0.0, *(value for value in values if value != 0)]:  # the origin comes first, and once
+            move = torch.zeros(6, dtype=_F64)
+            move[_AXES[axis]] = value if axis in "xyz" else math.radians(value)
+            yield from [(move, {"axis": axis, "value": value, "origin": value == 0})] * repeats
+
+
+class Spread(Strict):
     """Poses that cover the given ranges around the origin evenly (scrambled Sobol points), tilted in all directions."""
 
-    model_config = _FROZEN
     count: _Count
-    x_mm: _Range = [0.0, 0.0]
-    y_mm: _Range = [0.0, 0.0]
-    z_mm: _Range = [0.0, 0.0]
-    tilt_deg: _Range = [0.0, 0.0]
-    roll_deg: _Range = [0.0, 0.0]
-    seed: Annotated[int, Field(ge=0)] = 0
+    x_mm: _Range = _NONE
+    y_mm: _Range = _NONE
+    z_mm: _Range = _NONE
+    tilt_deg: _Range = _NONE
+    roll_deg: _Range = _NONE
+    seed: int = Field(default=0, ge=0)
 
     @field_validator("x_mm", "y_mm", "z_mm", "tilt_deg", "roll_deg")
     @classmethod
@@ -77,17 +94,27 @@ class Spread(BaseModel):
             raise ValueError(f"has the limits {value[0]:g} > {value[1]:g}; swap them")
         return value
 
+    def moves(self) -> Moves:
+        engine = torch.quasirandom.SobolEngine(6, scramble=True, seed=self.seed)
+        ranges = (self.x_mm, self.y_mm, self.z_mm, self.tilt_deg, self.roll_deg)
+        for *points, around in engine.draw(self.count, dtype=_F64).tolist():
+            x, y, z, tilt, roll = (low + (high - low) * p for (low, high), p in zip(ranges, points, strict=True))
+            azimuth, tilt = 2 * math.pi * around, math.radians(tilt)
+            lean = torch.tensor([tilt * math.cos(azimuth), tilt * math.sin(azimuth), 0], dtype=_F64)
+            spin = torch.tensor([0, 0, math.radians(roll)], dtype=_F64)
+            turn = rotations.log(rotations.exp(lean) @ rotations.exp(spin))
+            yield torch.cat([torch.tensor([x, y, z], dtype=_F64), turn]), {}
 
-class Step(BaseModel):
+
+class Step(Strict):
     """One of the kinds. ``poses`` are tool poses in the base, six numbers each, whatever the origin."""
 
-    model_config = _FROZEN
     static: Static | None = None
     translation: Translation | None = None
     rotation: Rotation | None = None
     handeye: Spread | None = None
     calibration: Spread | None = None
-    poses: list[Annotated[list[FiniteFloat], Field(min_length=6, max_length=6)]] | None = None
+    poses: list[SixNumbers] | None = None
 
     @model_validator(mode="after")
     def _one(self) -> Step:
@@ -97,37 +124,32 @@ class Step(BaseModel):
         return self
 
 
-class PlanFile(BaseModel):
+class PlanFile(Strict):
     """A capture plan, see docs/rig.md."""
 
-    model_config = _FROZEN
     name: str
     origin: RigidTransformFile
     axes: Literal["tool", "base"] | Vector = "tool"
-    steps: Annotated[list[Step], Field(min_length=1)]
+    steps: list[Step] = Field(min_length=1)
 
 
-@dataclass(frozen=True)
-class Waypoint:
-    """One frame (of every camera) of a plan.
+class Label(BaseModel):
+    """What a frame is for; part of its record in the manifest."""
 
-    Attributes:
-        id: in frame ids and image names. pose: of the tool in the base.
-        kind: static, translation, rotation, handeye, calibration or pose.
-        axis: x, y, z, roll, pitch or yaw of a translation or rotation, else None. value: along or about it, mm or deg.
-        origin: whether it is the reference of its axis, or a static frame.
-    """
+    model_config = ConfigDict(frozen=True)
+    id: str = ""  # of the waypoint, in frame ids and image names
+    kind: str  # static, translation, rotation, handeye, calibration or pose
+    axis: str | None = None  # x, y, z, roll, pitch or yaw of a translation or rotation
+    value: float = 0.0  # along or about the axis, mm or deg
+    origin: bool = False  # the reference of its axis, or a static frame
 
-    id: str
+
+class Waypoint(Label):
+    """One frame (of every camera) of a plan; `pose` is that of the tool in the base."""
+
     pose: Pose
-    kind: str
-    axis: str | None = None
-    value: float = 0.0
-    origin: bool = False
 
-    @property
-    def label(self) -> str:
-        """In words, for messages."""
+    def __str__(self) -> str:
         unit = "" if self.axis is None else f" {self.axis} {self.value:g} {'mm' if self.axis in 'xyz' else 'deg'}"
         return f"{self.id} ({self.kind}{unit})"
 
@@ -147,103 +169,54 @@ class CapturePlan:
         rows = [[w.id, *w.pose, w.kind, w.axis, w.value, w.origin] for w in self.waypoints]
         return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
 
-    def positions(self) -> Tensor:
-        """(N, 3) mm."""
-        return torch.tensor([w.pose[:3] for w in self.waypoints], dtype=torch.float64)
+    def positions(self) -> Float[Tensor, "N 3"]:
+        """Of the tool, mm."""
+        return to_transform([waypoint.pose for waypoint in self.waypoints])[1]
 
-    def turns(self) -> Tensor:
-        """(N,) angles in rad from the origin."""
-        vectors = torch.tensor([w.pose[3:] for w in self.waypoints], dtype=torch.float64)
-        return rotations.angle_between(rotations.exp(vectors), rotations.exp(vectors.new_tensor(self.origin[3:])))
+    def turns(self) -> Float[Tensor, " N"]:
+        """Angles in rad from the origin."""
+        R, _ = to_transform([self.origin, *(waypoint.pose for waypoint in self.waypoints)])
+        return rotations.angle_between(R[1:], R[0])
 
     def summary(self, workspace: Workspace) -> list[str]:
         """Lines about its size: waypoints by kind, bounds beside the workspace, angles, length."""
         positions, turns = self.positions(), self.turns().rad2deg()
         low, high = positions.amin(0).tolist(), positions.amax(0).tolist()
-        steps = positions.diff(dim=0).norm(dim=1)
+        moves = [0.0, *positions.diff(dim=0).norm(dim=1).tolist()]
         kinds = Counter(waypoint.kind for waypoint in self.waypoints)
         lines = ["  " + ", ".join(f"{kind} {count}" for kind, count in kinds.items())]
         for name, *numbers in zip("xyz", low, high, workspace.min, workspace.max, strict=True):
             lines.append("  {}: {:.1f} to {:.1f} mm in the base, workspace {:g} to {:g}".format(name, *numbers))
         lines.append(f"  turns up to {float(turns.max()):.1f} deg from the origin")
-        longest = float(steps.max()) if len(steps) else 0.0
-        lines.append(f"  path {float(steps.sum()):.0f} mm, longest move {longest:.1f} mm")
+        lines.append(f"  path {sum(moves):.0f} mm, longest move {max(moves):.1f} mm")
         return lines
 
     def check(self, workspace: Workspace) -> None:
         """Raises ConfigError where a waypoint lies outside of the box; straight moves between others stay inside."""
         for waypoint in self.waypoints:
-            for name, value, low, high in zip("xyz", waypoint.pose[:3], workspace.min, workspace.max, strict=True):
-                if not low <= value <= high:
-                    raise ConfigError(
-                        f"{self.path}: steps: waypoint {waypoint.label} has {name} = {value:.1f} mm, outside of the "
-                        f"workspace [{low:g}, {high:g}]; change the plan, or the rig's robot.workspace if it is safe"
-                    )
+            if left := workspace.left_by(waypoint.pose):
+                axis, value, low, high = left
+                problem = f"waypoint {waypoint} has {axis} = {value:.1f} mm, outside of the workspace"
+                fix = f"[{low:g}, {high:g}]; change the plan, or the rig's robot.workspace if it is safe"
+                raise ConfigError(f"{self.path}: steps: {problem} {fix}")
 
 
 def load_plan(path: str | os.PathLike[str]) -> CapturePlan:
-    """Reads a capture plan and expands it.
-
-    Raises:
-        ConfigError: one line ``FILE: FIELD: what is wrong; the fix``.
-    """
+    """Reads a capture plan and expands it. Raises ConfigError: one line ``FILE: FIELD: what is wrong; the fix``."""
     file = validate(PlanFile, read_yaml(path), path)
-    (x, y, z), (rx, ry, rz) = file.origin.translation, file.origin.rotation
-    rotation = rotations.exp(torch.tensor(file.origin.rotation, dtype=torch.float64))
-    if file.axes == "tool":
-        axes = rotation
-    elif file.axes == "base":
-        axes = torch.eye(3, dtype=torch.float64)
+    origin = as_pose([*file.origin.translation, *file.origin.rotation])
+    R, t = to_transform(origin)
+    if file.axes == "base":
+        axes = torch.eye(3, dtype=_F64)
     else:
-        axes = rotations.exp(torch.tensor(file.axes, dtype=torch.float64))
-    start = (rotation, torch.tensor(file.origin.translation, dtype=torch.float64))
+        axes = R if file.axes == "tool" else rotations.exp(torch.tensor(file.axes, dtype=_F64))
     waypoints: list[Waypoint] = []
     for step in file.steps:
-        for pose, labels in _expand(step, start, axes):
-            waypoints.append(Waypoint(id=f"{len(waypoints):04d}", pose=pose, **labels))
-    return CapturePlan(file.name, os.fspath(path), (x, y, z, rx, ry, rz), tuple(waypoints))
-
-
-def _expand(step: Step, start: tuple[Tensor, Tensor], axes: Tensor) -> Iterator[tuple[Pose, dict[str, Any]]]:
-    """Poses and labels of one step."""
-    still = torch.zeros(3, dtype=torch.float64)
-    if step.static is not None:
-        for _ in range(step.static.repeats):
-            yield _moved(start, axes, still, still), {"kind": "static", "origin": True}
-    elif (sweep := step.translation or step.rotation) is not None:
-        kind = "rotation" if step.translation is None else "translation"
-        values = sweep.values_mm if isinstance(sweep, Translation) else sweep.values_deg
-        for axis in sweep.axes:
-            for value in [0.0, *(v for v in values if v != 0)]:  # the origin comes first, and once
-                along = value * torch.eye(3, dtype=torch.float64)[_AXES[axis]]
-                move = (along, still) if kind == "translation" else (still, along.deg2rad())
-                labels = {"kind": kind, "axis": axis, "value": value, "origin": value == 0}
-                for _ in range(sweep.repeats):
-                    yield _moved(start, axes, *move), labels
-    elif (spread := step.handeye or step.calibration) is not None:
-        for shift, turn in _spread(spread):
-            yield _moved(start, axes, shift, turn), {"kind": "handeye" if step.handeye else "calibration"}
-    else:
-        for given in step.poses or []:
-            x, y, z, rx, ry, rz = given
-            yield (x, y, z, rx, ry, rz), {"kind": "pose"}
-
-
-def _spread(spread: Spread) -> Iterator[tuple[Tensor, Tensor]]:
-    """Shifts (3,) in mm and rotation vectors (3,) in rad along the plan's axes."""
-    engine = torch.quasirandom.SobolEngine(6, scramble=True, seed=spread.seed)
-    for u in engine.draw(spread.count, dtype=torch.float64):
-        ranges = (spread.x_mm, spread.y_mm, spread.z_mm, spread.tilt_deg, spread.roll_deg)
-        x, y, z, tilt, roll = (low + (high - low) * float(p) for (low, high), p in zip(ranges, u, strict=False))
-        azimuth = 2 * math.pi * float(u[5])
-        lean = math.radians(tilt) * torch.tensor([math.cos(azimuth), math.sin(azimuth), 0], dtype=torch.float64)
-        spin = torch.tensor([0, 0, math.radians(roll)], dtype=torch.float64)
-        yield torch.tensor([x, y, z], dtype=torch.float64), rotations.log(rotations.exp(lean) @ rotations.exp(spin))
-
-
-def _moved(start: tuple[Tensor, Tensor], axes: Tensor, shift: Tensor, turn: Tensor) -> Pose:
-    """The start shifted along and turned about the axes (columns in the base), about the tool's point."""
-    rotation = axes @ rotations.exp(turn) @ axes.mT @ start[0]
-    x, y, z = (start[1] + axes @ shift).tolist()
-    rx, ry, rz = rotations.log(rotation).tolist()
-    return x, y, z, rx, ry, rz
+        for given in step.poses or ():
+            waypoints.append(Waypoint(id=f"{len(waypoints):04d}", pose=as_pose(given), kind="pose"))
+        for kind in step.model_fields_set - {"poses"}:
+            for move, label in getattr(step, kind).moves():
+                # along and about the axes (columns in the base), about the tool's point
+                pose = from_transform(axes @ rotations.exp(move[3:]) @ axes.mT @ R, t + axes @ move[:3])
+                waypoints.append(Waypoint(id=f"{len(waypoints):04d}", pose=pose, kind=kind, **label))
+    return CapturePlan(file.name, os.fspath(path), origin, tuple(waypoints))

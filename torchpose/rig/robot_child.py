@@ -1,22 +1,20 @@
 """The process that holds the connection to the robot, and the only file that imports ur-rtde.
 
 ur-rtde's constructors hold the interpreter and never time out, its calls can hang, and a flapping link can abort the
-whole process. So it runs here, alone: requests come as JSON lines on standard input, one answer a line goes back, and
-the parent (`torchpose.rig.robot_link`) ends this process when an answer is late. mm and rad outside, m and rad towards
-ur-rtde. When standard input closes, the parent is gone: the robot is stopped.
+whole process. So it runs here, alone, and the parent ends this process when an answer is late. mm and rad outside, m
+and rad towards ur-rtde. When the parent is done or gone, the robot is stopped.
 """
 
 from __future__ import annotations
 
-import json
 import os
-import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from torchpose.rig import dashboard
+from torchpose.rig.child import ChildError, serve
 
 STALE_S = 0.5  # a stream of 10 Hz or more that brings nothing new for so long has stopped
 STOP_S = 1.0
@@ -24,10 +22,6 @@ VARIABLES = [
     "timestamp", "actual_TCP_pose", "actual_q", "robot_mode", "safety_mode", "safety_status_bits", "runtime_state",
     "target_speed_fraction",
 ]  # fmt: skip
-
-
-class StreamError(Exception):
-    """Its text is the name of a `RobotReason`."""
 
 
 class Driver:
@@ -65,9 +59,9 @@ class Driver:
             if stamp != seen:
                 fresh, seen, since = fresh - 1, stamp, time.monotonic()
             elif not self.receive.isConnected():
-                raise StreamError("connection_lost")
+                raise ChildError("no connection", "connection_lost")
             elif time.monotonic() - since > STALE_S:
-                raise StreamError("stale_stream")
+                raise ChildError("nothing new", "stale_stream")
             else:
                 time.sleep(0.001)
         while True:  # all fields of one sample: the stream goes on while they are read
@@ -101,13 +95,14 @@ class Driver:
         return bool(self.control.isPoseWithinSafetyLimits(_metres(pose)))
 
     def close(self) -> None:
-        """Disconnects both interfaces; each waits half a second in there."""
-        interfaces = [interface for interface in (self.control, self.receive) if interface is not None]
-        threads = [threading.Thread(target=interface.disconnect) for interface in interfaces]
+        """Ends the program on the robot and disconnects both interfaces; each waits half a second in there."""
+        if self.control is not None:
+            dashboard.stop(self.host, STOP_S)
+        threads = [threading.Thread(target=end.disconnect, daemon=True) for end in (self.control, self.receive) if end]
         for thread in threads:
             thread.start()
         for thread in threads:
-            thread.join()
+            thread.join(STOP_S)
 
 
 def _metres(pose: Sequence[float]) -> list[float]:
@@ -119,26 +114,11 @@ def _millimetres(pose: Sequence[float]) -> list[float]:
 
 
 def main() -> None:
-    """Answers ``{"call": NAME, "id": N, ...}`` with ``{"result": ...}``, ``{"reason": ...}`` or ``{"error": ...}``."""
-    answers = os.fdopen(os.dup(1), "w", buffering=1)
-    os.dup2(2, 1)  # ur-rtde prints to standard output
+    """Serves a `Driver` to the parent."""
     driver = Driver()
-    for line in sys.stdin:
-        request = json.loads(line)
-        call, number = request.pop("call"), request.pop("id")
-        method: Callable[..., Any] = getattr(driver, call)
-        try:
-            answer: dict[str, Any] = {"result": method(**request)}
-        except StreamError as error:
-            answer = {"reason": str(error)}
-        except Exception as error:
-            answer = {"error": " ".join(str(error).split())}
-        answers.write(json.dumps({"id": number, **answer}) + "\n")
-        if call == "close":
-            os._exit(0)  # destructors of ur-rtde have aborted here
-    if driver.control is not None:
-        dashboard.stop(driver.host, STOP_S)
-    os._exit(0)
+    serve(lambda request, **arguments: getattr(driver, request)(**arguments))
+    driver.close()
+    os._exit(0)  # destructors of ur-rtde have aborted here
 
 
 if __name__ == "__main__":

@@ -1,49 +1,16 @@
-"""The names of what can be wrong with a robot, and how each is told from what the controller and the child say."""
+"""How each fault of a robot is told from what the controller and the child process say."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from enum import StrEnum
-
-from torchpose.rig.faults import RigFault
-from torchpose.rig.robot_link import LinkEnded, LinkError, LinkLate
-
-
-class RobotReason(StrEnum):
-    """Why the robot cannot go on."""
-
-    INVALID_POSE = "invalid_pose"
-    OUTSIDE_WORKSPACE = "outside_workspace"
-    UNREACHABLE_POSE = "unreachable_pose"
-    UNREACHABLE = "unreachable"
-    TIMED_OUT = "timed_out"
-    NOT_REMOTE = "not_remote"
-    NOT_READY = "not_ready"
-    REGISTERS_IN_USE = "registers_in_use"
-    REFUSED_SCRIPT = "refused_script"
-    PROTECTIVE_STOP = "protective_stop"
-    EMERGENCY_STOP = "emergency_stop"
-    SAFETY_STOP = "safety_stop"
-    PROGRAM_STOPPED = "program_stopped"
-    NOT_SETTLED = "not_settled"
-    STALE_STREAM = "stale_stream"
-    CONNECTION_LOST = "connection_lost"
-    CHILD_DIED = "child_died"
-    STOPPED = "stopped"
-
-
-class RobotFault(RigFault):
-    """The robot cannot go on."""
-
-    reason: RobotReason
-
+from torchpose.rig.child import ChildEnded, ChildError, ChildLate
+from torchpose.rig.faults import RobotReason
 
 Cause = tuple[RobotReason, str]  # what is wrong; the fix
 
-QUESTIONS = [
-    "get robot model", "get serial number", "PolyscopeVersion", "robotmode", "safetystatus", "is in remote control",
-    "running",
-]  # fmt: skip
+QUESTIONS = {
+    "model": "get robot model", "serial": "get serial number", "polyscope": "PolyscopeVersion",
+    "robot_mode": "robotmode", "safety_status": "safetystatus", "remote": "is in remote control", "running": "running",
+}  # fmt: skip
 
 _EMERGENCY: Cause = (RobotReason.EMERGENCY_STOP, "is in emergency stop; release the button and start the robot there")
 _PROTECTIVE: Cause = (
@@ -53,28 +20,18 @@ _PROTECTIVE: Cause = (
 _SAFEGUARD: Cause = (RobotReason.SAFETY_STOP, "is in safeguard stop; close the guard and reset it")
 _SAFETY: Cause = (RobotReason.SAFETY_STOP, "is in a safety fault or recovery; see the log at the pendant")
 _LOCAL: Cause = (RobotReason.NOT_REMOTE, "is in local control; switch it to remote control at the pendant")
+_SAFETY_BITS = {0b1110_0000: _EMERGENCY, 0b100: _PROTECTIVE, 0b1_0000: _SAFEGUARD, 0b111_0000_1000: _SAFETY}
+_SAFETY_WORDS = {"EMERGENCY_STOP": _EMERGENCY, "PROTECTIVE_STOP": _PROTECTIVE, "SAFEGUARD_STOP": _SAFEGUARD}
 
 
 def of_safety_bits(bits: int) -> Cause | None:
     """The cause in the stream's safety_status_bits (RTDE guide), None in normal and reduced mode."""
-    for mask, cause in (
-        (0b1110_0000, _EMERGENCY),
-        (0b100, _PROTECTIVE),
-        (0b1_0000, _SAFEGUARD),
-        (0b111_0000_1000, _SAFETY),
-    ):
-        if bits & mask:
-            return cause
-    return None
+    return next((cause for mask, cause in _SAFETY_BITS.items() if bits & mask), None)
 
 
 def of_dashboard(mode: str, safety: str, remote: str, running: str) -> Cause | None:
-    """The cause in the dashboard's answers to the last four `QUESTIONS`; None where all is well."""
-    for word, cause in (
-        ("EMERGENCY_STOP", _EMERGENCY),
-        ("PROTECTIVE_STOP", _PROTECTIVE),
-        ("SAFEGUARD_STOP", _SAFEGUARD),
-    ):
+    """The cause in what the dashboard answers; None where all is well."""
+    for word, cause in _SAFETY_WORDS.items():
         if safety.endswith(word):
             return cause
     if safety not in ("NORMAL", "REDUCED"):
@@ -88,13 +45,10 @@ def of_dashboard(mode: str, safety: str, remote: str, running: str) -> Cause | N
     return None
 
 
-def of_link(call: str, error: LinkError, answers: bool) -> Cause:
-    """The cause behind a failed request to the child.
-
-    Args:
-        call: name of the request. answers: whether the dashboard still does.
-    """
+def of_child(call: str, error: ChildError, answers: bool) -> Cause:
+    """The cause behind the failed request `call` to the child; `answers`: whether the dashboard still does."""
     text, restart = str(error), "restart the session"
+    ended = isinstance(error, ChildEnded)
     if call == "upload" and "remote control" in text:
         return _LOCAL
     if call == "upload" and "already in use" in text:
@@ -102,19 +56,14 @@ def of_link(call: str, error: LinkError, answers: bool) -> Cause:
             RobotReason.REGISTERS_IN_USE,
             "has its input registers in use; switch EtherNet/IP, PROFINET and MODBUS off at the pendant",
         )
-    if call == "upload" and not isinstance(error, LinkEnded):
+    if call == "upload" and not ended:
         return RobotReason.REFUSED_SCRIPT, f"did not start the control script ({text}); see the log at the pendant"
     if error.reason == RobotReason.STALE_STREAM:
         return RobotReason.STALE_STREAM, f"sends no new readings; check the network, {restart}"
-    if error.reason == RobotReason.CONNECTION_LOST or (isinstance(error, LinkEnded) and not answers):
+    if error.reason == RobotReason.CONNECTION_LOST or (ended and not answers):
         return RobotReason.CONNECTION_LOST, f"has gone from the network; check it, {restart}"
-    if isinstance(error, LinkLate):
+    if isinstance(error, ChildLate):
         return RobotReason.TIMED_OUT, f"{text}; check the controller, {restart}"
-    if isinstance(error, LinkEnded):
+    if ended:
         return RobotReason.CHILD_DIED, f"the process that talks to it has ended ({text}); {restart}"
     return RobotReason.CONNECTION_LOST, f"{call} failed ({text}); check the controller, {restart}"
-
-
-def describe(pose: Sequence[float]) -> str:
-    """A pose for a message, on one line and not too long."""
-    return " ".join(repr(pose).split())[:100]

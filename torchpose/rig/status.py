@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from types import TracebackType
 from typing import Self
 
 import torch
@@ -14,8 +13,8 @@ from torchpose.camera import Camera
 from torchpose.errors import ConfigError
 from torchpose.pipeline import PoseEstimator
 from torchpose.results import Status
-from torchpose.rig.camera import CameraSettings
 from torchpose.rig.cameras import Frame
+from torchpose.rig.settings import CameraSettings
 from torchpose.target import Target
 
 
@@ -24,13 +23,10 @@ class LiveStatus:
 
     Args:
         estimators: by camera name; frames of other cameras are not looked at.
-
-    Attributes:
-        counts: frames and targets so far by the name of their status.
     """
 
     def __init__(self, estimators: Mapping[str, PoseEstimator]) -> None:
-        self.counts: Counter[str] = Counter()
+        self.counts: Counter[str] = Counter()  # targets so far by the name of their status
         self._estimators = estimators
         self._worker = ThreadPoolExecutor(1)
         self._last: Future[None] | None = None
@@ -51,17 +47,16 @@ class LiveStatus:
         for path, settings in zip(cameras, rig, strict=False):
             camera = Camera.load(path)
             if (camera.width, camera.height) != (settings.width, settings.height):
-                raise ConfigError(
-                    f"{path}: image_width, image_height: {camera.width} x {camera.height}, but camera {settings.name} "
-                    f"of the rig has {settings.width} x {settings.height}; give its own camera file"
-                )
+                there = f"camera {settings.name} of the rig has {settings.width} x {settings.height}"
+                size = f"image_width, image_height: {camera.width} x {camera.height}"
+                raise ConfigError(f"{path}: {size}, but {there}; give its own camera file")
             estimators[settings.name] = PoseEstimator(camera, known, method="centers")
         return cls(estimators)
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self._worker.shutdown(cancel_futures=True)
 
     def wait(self) -> None:

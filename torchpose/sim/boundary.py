@@ -15,58 +15,50 @@ docs/decisions/0003-renderer.md compares it with supersampling.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.camera import Camera
+from torchpose.geometry.rows import Rows
+from torchpose.geometry.segments import ragged_arange
 from torchpose.sim.shapes import Shapes
 
 REACH = 5.0  # the Gaussian is cut at this many standard deviations: 6e-7 of an edge's contrast
 _COARSE_CIRCLE, _COARSE_SIDE = 72, 9  # samples from which speed and extent in pixels are taken
 _MARGIN = 1.05  # for the speed between those samples
-_NODES, _PANEL = 16, 11.0  # Gauss-Legendre nodes on each panel of at most so many sigma; leaves about 5e-9
+_NODES, _PANEL = 16, 11.0  # Gauss-Legendre nodes on each panel of a side of so many sigma; leaves about 5e-9
 _CHUNK_CELLS = 1 << 18  # pixels of patches computed at a time: they stay in the processor's cache
 _MIN_CHORD = 1e-3  # px; chords below this blur by less than 1e-6 px^2, and differences over them would cancel
 
 
 @dataclass(frozen=True, eq=False)
-class Boundary:
-    """Quadrature samples of region boundaries, fixed to the target; N in all, flat.
+class Boundary(Rows):
+    """Quadrature samples of region boundaries, fixed to the target: pose, shape, point in mm.
 
-    Attributes:
-        frame, shape: (N,) int64, index of the pose and of the shape.
-        point: (N, 3) float64, mm, on the boundary.
-        step: (N, 3) float64, mm, tangent times quadrature weight; runs so that the region in the image is positive.
+    ``step`` is the tangent times the quadrature weight, mm; it runs so that the region in the image is positive.
     """
 
-    frame: Tensor
-    shape: Tensor
-    point: Tensor
-    step: Tensor
+    frame: Int[Tensor, " N"]
+    shape: Int[Tensor, " N"]
+    point: Float[Tensor, "N 3"]
+    step: Float[Tensor, "N 3"]
 
 
 @dataclass(frozen=True, eq=False)
-class Boxes:
-    """Windows of whole pixels, one a shape: where it is drawn.
+class Boxes(Rows):
+    """Windows of whole pixels, one a shape, where it is drawn: first column and row; columns and rows."""
 
-    Attributes:
-        corner: (P, 2) int64, first column and row. size: (P, 2) int64, columns and rows.
-    """
-
-    corner: Tensor
-    size: Tensor
+    corner: Int[Tensor, "P 2"]
+    size: Int[Tensor, "P 2"]
 
     @property
     def stride(self) -> int:
         """Cells of a row: one more than the widest window has columns, which takes what lies right of the window."""
-        return int(self.size[:, 0].amax()) + 1 if len(self.size) else 1
-
-    @property
-    def first_row(self) -> Tensor:
-        """(P,) rows of the windows before each."""
-        return self.size[:, 1].cumsum(0) - self.size[:, 1]
+        return int(self.size[:, 0].amax()) + 1 if len(self) else 1
 
     @property
     def rows(self) -> int:
@@ -74,78 +66,79 @@ class Boxes:
         return int(self.size[:, 1].sum())
 
 
+@dataclass(frozen=True, eq=False)
+class _Curves(Rows):
+    """Images of L boundary curves at A parameters each, with derivatives by the parameter, px."""
+
+    frame: Int[Tensor, " L"]
+    shape: Int[Tensor, " L"]
+    pixel: Float[Tensor, "L A 2"]
+    tangent: Float[Tensor, "L A 2"]
+    valid: Bool[Tensor, "L A"]
+
+    @property
+    def area(self) -> Float[Tensor, " L"]:
+        """Signed area that the curves contribute to their shapes, up to a positive factor."""
+        return (self.pixel[..., 0] * self.tangent[..., 1] - self.pixel[..., 1] * self.tangent[..., 0]).sum(-1)
+
+    @property
+    def speed(self) -> Float[Tensor, " L"]:
+        """Largest speed, px by the parameter's unit."""
+        return self.tangent.square().sum(-1).amax(-1).sqrt()
+
+
 @torch.no_grad()
-def sample_boundary(camera: Camera, shapes: Shapes, R: Tensor, t: Tensor, sigma: Tensor) -> Boundary:
+def sample_boundary(
+    camera: Camera, shapes: Shapes, R: Float[Tensor, "B 3 3"], t: Float[Tensor, "B 3"], sigma: Float[Tensor, " B"]
+) -> Boundary:
     """Boundary samples of the shapes that are in view, at most about one ``sigma`` px apart.
 
     A shape has none where it reaches behind the camera or beyond the radius up to which the distortion model is
     one-to-one, or where it lies outside of the frame.
-
-    Args:
-        camera: the camera. shapes: S shapes. R, t: (B, 3, 3), (B, 3) float64. sigma: (B,) float64, blur in px.
     """
-    parameter = torch.arange(_COARSE_CIRCLE, dtype=t.dtype, device=t.device) * (2 * math.pi / _COARSE_CIRCLE)
-    c_frame, s_frame = shapes.frame[shapes.circle_of], shapes.frame[shapes.side_of]
-    offset, slope = _on_circle(shapes.circle_axes[:, None], parameter)
-    c_pixel, c_tangent, c_valid = _posed(camera, R, t, c_frame, shapes.circle_center[:, None] + offset, slope)
-
-    fraction = torch.linspace(0, 1, _COARSE_SIDE, dtype=t.dtype, device=t.device)
-    first, along = shapes.side[:, :1], shapes.side[:, 1:] - shapes.side[:, :1]
-    s_point = first + fraction[:, None] * along
-    s_pixel, s_tangent, s_valid = _posed(camera, R, t, s_frame, s_point, along.expand_as(s_point))
-
-    seen = _in_view(
-        camera,
-        torch.cat([shapes.circle_of, shapes.side_of]),
-        torch.cat([c_pixel.amin(1), s_pixel.amin(1)]),
-        torch.cat([c_pixel.amax(1), s_pixel.amax(1)]),
-        torch.cat([c_valid.all(1), s_valid.all(1)]),
-        sigma[shapes.frame],
-    )
-    c_speed, s_speed = _speed(c_tangent), _speed(s_tangent)
-    c_turn = _sign(_area(c_pixel, c_tangent))
-    s_area = s_pixel.new_zeros(len(shapes)).index_add(0, shapes.side_of, _area(s_pixel, s_tangent))
-    s_turn = _sign(s_area)[shapes.side_of]
+    angle = torch.arange(_COARSE_CIRCLE, dtype=t.dtype, device=t.device) * (2 * math.pi / _COARSE_CIRCLE)
+    offset, slope = _on_circle(shapes.circles.axes[:, None], angle)
+    round_ = _posed(camera, R, t, shapes, shapes.circles.of, (shapes.circles.center[:, None] + offset, slope))
+    fraction = torch.linspace(0, 1, _COARSE_SIDE, dtype=t.dtype, device=t.device)[:, None]
+    first, last = shapes.sides.ends[:, :1], shapes.sides.ends[:, 1:]
+    along = (last - first).expand(-1, _COARSE_SIDE, 3)
+    straight = _posed(camera, R, t, shapes, shapes.sides.of, (first + fraction * along, along))
+    seen = _in_view(camera, shapes, (round_, straight), sigma)
 
     # circles: the trapezoidal rule
-    use = seen[shapes.circle_of].nonzero().squeeze(1)
-    count = (2 * math.pi * _MARGIN * c_speed[use] / sigma[c_frame[use]]).ceil().clamp(min=24).long()
-    item, number = ragged(count)
-    theta = number.to(t) * (2 * math.pi / count.to(t))[item]
-    c = use[item]
-    offset, slope = _on_circle(shapes.circle_axes[c], theta)
-    weight = (c_turn * shapes.circle_sign)[c] * (2 * math.pi / count.to(t))[item]
-    circles = Boundary(
-        c_frame[c],
-        shapes.circle_of[c],
-        shapes.circle_center[c] + offset,
-        weight[:, None] * slope,
-    )
-    # sides of polygons: Gauss-Legendre panels
-    use = seen[shapes.side_of].nonzero().squeeze(1)
-    panels = (_MARGIN * s_speed[use] / (_PANEL * sigma[s_frame[use]])).ceil().clamp(min=1).long()
-    item, number = ragged(panels)
-    node, weight = gauss_legendre(_NODES, t)
-    width = 1 / panels.to(t)[item]
-    position = ((number[:, None] + node) * width[:, None]).reshape(-1)
-    weight = (width[:, None] * weight).reshape(-1)
-    s = use[item].repeat_interleave(_NODES)
-    sides = Boundary(
-        s_frame[s],
-        shapes.side_of[s],
-        shapes.side[s, 0] + position[:, None] * along[s, 0],
-        (s_turn[s] * weight)[:, None] * along[s, 0],
-    )
-    return Boundary(
-        torch.cat([circles.frame, sides.frame]),
-        torch.cat([circles.shape, sides.shape]),
-        torch.cat([circles.point, sides.point]),
-        torch.cat([circles.step, sides.step]),
-    )
+    trapezoidal = t.new_zeros(1), t.new_ones(1)
+    use, angle, weight = _quadrature(round_, seen, sigma, 2 * math.pi, 1.0, 24, trapezoidal)
+    circles = shapes.circles[use]
+    offset, slope = _on_circle(circles.axes, angle)
+    weight = (_sign(round_.area) * shapes.circles.sign)[use] * weight
+    arcs = Boundary(shapes.frame[circles.of], circles.of, circles.center + offset, weight[:, None] * slope)
+    # sides of polygons, which turn as the whole polygon does
+    turn = _sign(t.new_zeros(len(shapes)).index_add(0, straight.shape, straight.area))
+    use, fraction, weight = _quadrature(straight, seen, sigma, 1.0, _PANEL, 1, gauss_legendre(_NODES, t))
+    of, (start, end) = shapes.sides.of[use], shapes.sides.ends[use].unbind(1)
+    step = (turn[of] * weight)[:, None] * (end - start)
+    return Boundary.cat([arcs, Boundary(shapes.frame[of], of, start + fraction[:, None] * (end - start), step)])
 
 
-def project(camera: Camera, edges: Boundary, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixels (N, 2) of boundary samples and the v component (N,) of their quadrature steps, in px."""
+def _quadrature(
+    curves: _Curves, seen: Tensor, sigma: Tensor, period: float, panel: float, least: int, rule: tuple[Tensor, Tensor]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Curve, parameter from 0 to ``period`` and weight of each sample of the curves of the shapes that are seen (S,).
+
+    Nodes and weights of ``rule`` on panels of at most ``panel`` sigma, at least ``least`` panels.
+    """
+    use = seen[curves.shape].nonzero().squeeze(1)
+    count = (period * _MARGIN * curves.speed[use] / (panel * sigma[curves.frame[use]])).ceil().clamp(min=least).long()
+    item, number = ragged_arange(count)
+    width = (period / count.to(sigma))[item, None]
+    chosen = use[item].repeat_interleave(len(rule[0]))
+    return chosen, ((number[:, None] + rule[0]) * width).reshape(-1), (width * rule[1]).reshape(-1)
+
+
+def project(
+    camera: Camera, edges: Boundary, R: Float[Tensor, "B 3 3"], t: Float[Tensor, "B 3"]
+) -> tuple[Float[Tensor, "N 2"], Float[Tensor, " N"]]:
+    """Pixels of boundary samples and the v component of their quadrature steps, in px."""
     rotation = R[edges.frame]
     x = (rotation @ edges.point[:, :, None]).squeeze(-1) + t[edges.frame]
     pixel, tangent, _ = _image(camera, x, (rotation @ edges.step[:, :, None]).squeeze(-1))
@@ -153,29 +146,35 @@ def project(camera: Camera, edges: Boundary, R: Tensor, t: Tensor) -> tuple[Tens
 
 
 @torch.no_grad()
-def boxes_around(pixel: Tensor, shape: Tensor, margin: Tensor, width: int, height: int) -> Boxes:
-    """Window of every shape: its samples (N, 2) with ``margin`` (S,) px on every side, cut by the frame."""
-    count = len(margin)
-    index = shape[:, None].expand_as(pixel)
-    low = pixel.new_full((count, 2), torch.inf).scatter_reduce(0, index, pixel, "amin")
-    high = pixel.new_full((count, 2), -torch.inf).scatter_reduce(0, index, pixel, "amax")
-    size = torch.tensor([width, height], device=pixel.device)
-    last = size.to(pixel) - 1
+def boxes_around(
+    pixel: Float[Tensor, "N 2"], shape: Int[Tensor, " N"], margin: Float[Tensor, " S"], camera: Camera
+) -> Boxes:
+    """Window of every shape: its samples with ``margin`` px on every side, cut by the frame."""
+    low, high = _extent(pixel, pixel, shape, len(margin))
+    last = _frame_size(camera, pixel) - 1
     first = (low - margin[:, None]).floor().clamp(min=0).minimum(last).long()
     end = (high + margin[:, None]).ceil().minimum(last).clamp(min=-1).long() + 1
     return Boxes(first, (end - first).clamp(min=0))
 
 
 def fill(
-    pixel: Tensor, dv: Tensor, sigma: Tensor, shape: Tensor, boxes: Boxes, *, half_chord: Tensor | None = None
-) -> Tensor:
+    pixel: Float[Tensor, "N 2"],
+    dv: Float[Tensor, " N"],
+    sigma: Float[Tensor, " N"],
+    shape: Int[Tensor, " N"],
+    boxes: Boxes,
+    *,
+    half_chord: Float[Tensor, " N"] | None = None,
+) -> Float[Tensor, "H W"]:
     """Blurred regions from their boundary samples: ``sum of - c(p_u - u) k(p_v - v) dv`` at every pixel p.
 
     Args:
-        pixel: (N, 2) float64, samples, which may lie outside of their window. dv: (N,), px.
-        sigma: (N,), Gaussian blur, px. shape: (N,) int64, window of each sample.
-        boxes: P windows.
-        half_chord: (N,), px: blur along the rows by a box of twice this width besides, see `on_chords`.
+        pixel: samples, which may lie outside of their window.
+        dv: px.
+        sigma: Gaussian blur, px.
+        shape: window of each sample.
+        boxes: the windows.
+        half_chord: px, blur along the rows by a box of twice this width besides, see `on_chords`.
 
     Returns:
         (boxes.rows, boxes.stride), of the dtype of the samples; the rows of all windows one below the other, 0 to
@@ -185,45 +184,43 @@ def fill(
         return pixel.new_zeros(boxes.rows, boxes.stride)
     reach = 1.0 + REACH * float(sigma.detach().max())
     beside = reach + (0.0 if half_chord is None else float(half_chord.detach().max()))
-    rows = _offsets(math.floor(reach), math.floor(reach), pixel)
+    rows = torch.arange(-math.floor(reach), math.floor(reach) + 1).to(pixel)
     # the sum along a row ends where the kernel does, which is a pixel further right than left
-    columns = _offsets(math.floor(beside), math.ceil(beside), pixel)
-    corner, size, first_row, stride = boxes.corner[shape], boxes.size[shape], boxes.first_row[shape], boxes.stride
+    columns = torch.arange(-math.floor(beside), math.ceil(beside) + 1).to(pixel)
+    corner, size, stride = boxes.corner[shape], boxes.size[shape], boxes.stride
+    first_row = (boxes.size[:, 1].cumsum(0) - boxes.size[:, 1])[shape]
     increments = pixel.new_zeros(boxes.rows * stride)
     # each chunk copies all windows where a derivative is wanted
     cells = _CHUNK_CELLS * (16 if torch.is_grad_enabled() else 1)
-    chunk = max(1, cells // (len(rows) * len(columns)))
-    for a in range(0, len(pixel), chunk):
-        s = slice(a, a + chunk)
-        nearest = pixel[s].detach().round()
-        from_nearest = pixel[s] - nearest
-        scale = sigma[s, None]
-        across = _box_gauss(rows - from_nearest[:, 1:], scale)
+    together = max(1, cells // (len(rows) * len(columns)))
+    for start in range(0, len(pixel), together):
+        part = slice(start, start + together)
+        nearest = pixel[part].detach().round()
+        from_nearest = pixel[part] - nearest
+        scale = sigma[part, None]
+        across = _on_pixel(torch.special.ndtr, rows - from_nearest[:, 1:], scale)
         # differences from each column to the next; the first has the column before it as its neighbour
         x = torch.cat([columns[:1] - 1, columns]) - from_nearest[:, :1]
-        along = (
-            _box_gauss_integral(x, scale) if half_chord is None else _chord_integral(x, scale, half_chord[s, None])
-        ).diff(dim=1)
-        local = nearest.long() - corner[s]
+        along = _row_integral(x, scale, None if half_chord is None else half_chord[part, None]).diff(dim=1)
+        local = nearest.long() - corner[part]
         row, column = local[:, 1:] + rows.long(), local[:, :1] + columns.long()
-        inside = (row >= 0) & (row < size[s, 1:])
-        across = across * inside * -dv[s, None]
+        inside = (row >= 0) & (row < size[part, 1:])
+        across = across * inside * -dv[part, None]
         # what begins left of the window has its full effect from the first column on
-        column = column.clamp(min=0).minimum(size[s, :1])
-        cell = (first_row[s, None] + torch.where(inside, row, 0)) * stride
+        column = column.clamp(min=0).minimum(size[part, :1])
+        cell = (first_row[part, None] + torch.where(inside, row, 0)) * stride
         index = cell[:, :, None] + column[:, None]
         increments = accumulate(increments, index.view(-1), (across[:, :, None] * along[:, None]).view(-1))
     return increments.view(-1, stride).cumsum(1)
 
 
-def on_chords(radius: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """A disc-shaped blur as weighted horizontal chords: offsets along v (J, N), half lengths (J, N), weights (J, N).
+def on_chords(
+    radius: Float[Tensor, " N"], sigma: Float[Tensor, " N"]
+) -> tuple[Float[Tensor, "J N"], Float[Tensor, "J N"], Float[Tensor, "J N"]]:
+    """A disc-shaped blur of a radius (px) as J weighted horizontal chords: offsets along v, half lengths, weights.
 
     Gauss-Chebyshev quadrature of the second kind, whose weight is the chord's length: exact for polynomials up to
     degree 2 J - 1 in the offset. J grows with the largest radius / sigma, so that the Gaussian is resolved.
-
-    Args:
-        radius: (N,), px. sigma: (N,), px.
     """
     ratio = float((radius.detach() / sigma.detach()).max()) if len(radius) else 0.0
     nodes = nodes_across(ratio)
@@ -239,22 +236,24 @@ def accumulate(total: Tensor, index: Tensor, values: Tensor) -> Tensor:
     return add(0, index, values)
 
 
-def ragged(count: Tensor) -> tuple[Tensor, Tensor]:
-    """Item (sum of count,) and the running number within the item."""
-    item = torch.arange(count.numel(), device=count.device).repeat_interleave(count)
-    return item, torch.arange(item.numel(), device=count.device) - (count.cumsum(0) - count)[item]
-
-
 def nodes_across(ratio: float) -> int:
     """Nodes of a Gauss rule that average an edge over an interval of half the length ``ratio`` sigma to 1e-5."""
     return 2 + math.ceil(1.9 * ratio)
 
 
-def _posed(
-    camera: Camera, R: Tensor, t: Tensor, frame: Tensor, point: Tensor, step: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+def gauss_legendre(order: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Nodes and weights (order,) on [0, 1] (Golub and Welsch 1969)."""
+    k = torch.arange(1, order, dtype=like.dtype, device=like.device)
+    off = k / (4 * k * k - 1).sqrt()
+    node, vector = torch.linalg.eigh(off.diag(1) + off.diag(-1))
+    return (node + 1) / 2, vector[0].square()
+
+
+def _posed(camera: Camera, R: Tensor, t: Tensor, shapes: Shapes, of: Tensor, points: tuple[Tensor, Tensor]) -> _Curves:
+    """Images of curves of the shapes ``of`` (L,): points and steps (L, A, 3) of the target."""
+    frame = shapes.frame[of]
     rotation = R[frame].mT
-    return _image(camera, point @ rotation + t[frame, None], step @ rotation)
+    return _Curves(frame, of, *_image(camera, points[0] @ rotation + t[frame, None], points[1] @ rotation))
 
 
 def _image(camera: Camera, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -274,69 +273,59 @@ def _on_circle(axes: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
     return cos * a + sin * b, cos * b - sin * a
 
 
-def _in_view(camera: Camera, shape: Tensor, low: Tensor, high: Tensor, valid: Tensor, sigma: Tensor) -> Tensor:
-    """(S,) bool, shapes whose outlines with extents low, high (L, 2) are valid (L,) and touch the frame."""
-    count = len(sigma)
-    index = shape[:, None].expand_as(low)
-    low = low.new_full((count, 2), torch.inf).scatter_reduce(0, index, low, "amin")
-    high = high.new_full((count, 2), -torch.inf).scatter_reduce(0, index, high, "amax")
-    reach = 1.0 + REACH * sigma[:, None]
-    size = torch.tensor([camera.width, camera.height], dtype=low.dtype, device=low.device)
-    broken = torch.zeros(count, dtype=torch.bool, device=low.device)
-    broken[shape[~valid]] = True
-    return ~broken & ((high > -reach) & (low < size + reach)).all(-1)
+def _in_view(camera: Camera, shapes: Shapes, curves: Sequence[_Curves], sigma: Tensor) -> Tensor:
+    """(S,) bool, shapes whose outlines are all valid and touch the frame."""
+    shape = torch.cat([c.shape for c in curves])
+    low, high = (torch.cat([c.pixel.amin(1) for c in curves]), torch.cat([c.pixel.amax(1) for c in curves]))
+    low, high = _extent(low, high, shape, len(shapes))
+    reach = 1.0 + REACH * sigma[shapes.frame, None]
+    whole = torch.ones(len(shapes), dtype=torch.bool, device=low.device)
+    whole[shape[~torch.cat([c.valid.all(1) for c in curves])]] = False
+    return whole & ((high > -reach) & (low < _frame_size(camera, low) + reach)).all(-1)
 
 
-def _area(pixel: Tensor, tangent: Tensor) -> Tensor:
-    """Signed area (L,) that outlines sampled at (L, A, 2) contribute, up to a positive factor."""
-    return (pixel[..., 0] * tangent[..., 1] - pixel[..., 1] * tangent[..., 0]).sum(-1)
+def _extent(low: Tensor, high: Tensor, index: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Least of low (N, 2) and greatest of high (N, 2) by index (N,): (count, 2) each, infinite where there is none."""
+    to = index[:, None].expand_as(low)
+    return (
+        low.new_full((count, 2), torch.inf).scatter_reduce(0, to, low, "amin"),
+        low.new_full((count, 2), -torch.inf).scatter_reduce(0, to, high, "amax"),
+    )
 
 
-def _speed(tangent: Tensor) -> Tensor:
-    return tangent.square().sum(-1).amax(-1).sqrt()
+def _frame_size(camera: Camera, like: Tensor) -> Tensor:
+    return torch.tensor([camera.width, camera.height], dtype=like.dtype, device=like.device)
 
 
 def _sign(x: Tensor) -> Tensor:
     return torch.where(x < 0, -1.0, 1.0).to(x)
 
 
-def _offsets(before: int, behind: int, like: Tensor) -> Tensor:
-    return torch.arange(-before, behind + 1, dtype=like.dtype, device=like.device)
+def _on_pixel(function: Callable[[Tensor], Tensor], x: Tensor, sigma: Tensor) -> Tensor:
+    """Difference of a function of x / sigma between the borders of a pixel about x."""
+    return function((x + 0.5) / sigma) - function((x - 0.5) / sigma)
 
 
-def gauss_legendre(order: int, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Nodes and weights (order,) on [0, 1] (Golub and Welsch 1969)."""
-    k = torch.arange(1, order, dtype=like.dtype, device=like.device)
-    off = k / (4 * k * k - 1).sqrt()
-    node, vector = torch.linalg.eigh(off.diag(1) + off.diag(-1))
-    return (node + 1) / 2, vector[0].square()
+def _row_integral(x: Tensor, sigma: Tensor, half: Tensor | None) -> Tensor:
+    """Integral up to x of the Gaussian convolved with the pixel and with a box of a half width and the area 1."""
+    if half is None:
+        return sigma * _on_pixel(_normal_loss, x, sigma)
+    right, left = (_on_pixel(_normal_loss_integral, x + side, sigma) for side in (half, -half))
+    return sigma * sigma * (right - left) / (2 * half)
 
 
-def _box_gauss(x: Tensor, s: Tensor) -> Tensor:
-    """Gaussian of standard deviation s convolved with the unit box."""
-    return torch.special.ndtr((x + 0.5) / s) - torch.special.ndtr((x - 0.5) / s)
+def _normal_loss(x: Tensor) -> Tensor:
+    """Integral of the normal distribution function: x Phi(x) + phi(x)."""
+    probability, density = _normal(x)
+    return x * probability + density
 
 
-def _box_gauss_integral(x: Tensor, s: Tensor) -> Tensor:
-    """Integral of `_box_gauss` from minus infinity to x."""
-    return s * (_normal_loss((x + 0.5) / s) - _normal_loss((x - 0.5) / s))
+def _normal_loss_integral(x: Tensor) -> Tensor:
+    """Integral of `_normal_loss`: ((x^2 + 1) Phi(x) + x phi(x)) / 2."""
+    probability, density = _normal(x)
+    return 0.5 * ((x.square() + 1) * probability + x * density)
 
 
-def _chord_integral(x: Tensor, s: Tensor, w: Tensor) -> Tensor:
-    """Integral from minus infinity to x of `_box_gauss` convolved with a box of the half width w and the area 1."""
-
-    def twice(y: Tensor) -> Tensor:
-        return _normal_loss_integral((y + 0.5) / s) - _normal_loss_integral((y - 0.5) / s)
-
-    return s * s * (twice(x + w) - twice(x - w)) / (2 * w)
-
-
-def _normal_loss(a: Tensor) -> Tensor:
-    """Integral of the normal distribution function: a Phi(a) + phi(a)."""
-    return a * torch.special.ndtr(a) + (-0.5 * a.square()).exp() / math.sqrt(2 * math.pi)
-
-
-def _normal_loss_integral(a: Tensor) -> Tensor:
-    """Integral of `_normal_loss`: ((a^2 + 1) Phi(a) + a phi(a)) / 2."""
-    density = (-0.5 * a.square()).exp() / math.sqrt(2 * math.pi)
-    return 0.5 * ((a.square() + 1) * torch.special.ndtr(a) + a * density)
+def _normal(x: Tensor) -> tuple[Tensor, Tensor]:
+    """Distribution function Phi(x) and density phi(x) of the normal distribution."""
+    return torch.special.ndtr(x), (-0.5 * x.square()).exp() / math.sqrt(2 * math.pi)

@@ -23,7 +23,8 @@ def random_clutter(target: Target, count: int, seed: int, frames: Sequence[int])
     Args:
         target: of whose rings the wrong rings have the sizes, with other ring codes.
         count: shapes a frame; fewer where the lattice has fewer cells.
-        seed: of the data set. frames: numbers of the frames; the shapes carry their positions in it.
+        seed: of the data set.
+        frames: numbers of the frames; the shapes carry their positions in it.
     """
     centers, radii = target.centers[:, :2].numpy(), target.radii[:, 0].numpy()
     largest = float(radii.max())
@@ -51,12 +52,8 @@ def random_covers(target: Target, fraction: float, seed: int, frames: Sequence[i
     for position, frame in enumerate(frames):
         rng = np.random.default_rng([seed % 2**32, frame, 2])
         for (x, y, _), (radius, _) in zip(target.centers.tolist(), target.radii.tolist(), strict=True):
-            chosen, direction, turn, grey = (
-                rng.random(),
-                rng.uniform(0, 2 * math.pi),
-                rng.random(),
-                rng.uniform(20, 235),
-            )
+            chosen, direction = rng.random(), rng.uniform(0, 2 * math.pi)
+            turn, grey = rng.random(), rng.uniform(20, 235)
             if chosen < fraction:
                 at = (x + radius * math.cos(direction), y + radius * math.sin(direction))
                 out.append(shapes.rectangle(at, 1.6 * radius, 2.5 * radius, math.pi * turn, grey, position))
@@ -88,5 +85,6 @@ def _foreign_ratios(target: Target) -> np.ndarray:
     """Ratios inner/outer that are as far from those of the target as its own are from each other at the least."""
     own = (target.radii[:, 1] / target.radii[:, 0]).numpy()
     ratios = np.linspace(0.2, 0.85, 66)
-    distance = abs(ratios[:, None] - own).min(1)
-    return ratios[distance >= 0.5 * distance.max()]
+    distance: np.ndarray = abs(ratios[:, None] - own).min(1)
+    chosen: np.ndarray = ratios[distance >= 0.5 * distance.max()]
+    return chosen

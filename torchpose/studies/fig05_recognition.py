@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import cv2
 import numpy as np
@@ -15,10 +14,11 @@ from torchpose.analysis import localisers
 from torchpose.analysis.marks import RING_RATIO, Mark, circles, cross, marks, square
 from torchpose.camera import Camera
 from torchpose.detect import find_candidates
-from torchpose.geometry import rotations
+from torchpose.io.rows import Row
 from torchpose.rings import measure_rings
 from torchpose.sim import add_noise, render, shapes
 from torchpose.sim.shapes import Shapes
+from torchpose.studies.views import turned
 from torchpose.target import Target
 
 WIDTH, HEIGHT, FOCAL_PX, DISTANCE_MM, RADIUS_MM = 720, 600, 640.0, 160.0, 5.0
@@ -33,24 +33,23 @@ AREA_RANGE = (0.45, 1.5)  # of the area of a mark face on
 CODE_NOISE = (2.0, 8.0)
 CODE_BLUR = (0.7, 1.0, 1.5)
 SPREAD = 6.0  # standard deviations between two codes
-RANGES = {"concentric rings": (0.15, 0.9), "cross": (0.1, 0.8), "rectangle": (1.0, 3.0)}
+RANGES = {"concentric rings": (0.15, 0.9), "cross": (0.1, 0.8), "rectangle": (1.0, 3.0)}  # of the codes
 
 
-def recognition(frames: int, seed: int) -> list[dict[str, Any]]:
+def recognition(frames: int, seed: int) -> list[Row]:
     """Part of the marks missed, and false recognitions a frame, for every shape; the same clutter for all.
 
     Every shape has its look-alikes in the clutter, but for the vertex: `THINGS`.
     """
     camera = frame_camera()
     target = Target.load("quad40")
-    R, t = _poses(frames, seed, DISTANCE_MM)
+    R, t = _poses(frames, seed)
     truth = camera.project(target.centers @ R.mT + t[:, None])
     things = clutter(target, frames, seed)
     rows = []
     for mark in marks(AREA_MM2):
-        drawn = shapes.cat([mark.draw(30.0, (x, y)) for x, y, _ in target.centers.tolist()]).in_frames(
-            torch.arange(frames)
-        )
+        drawn = shapes.cat([mark.draw(30.0, (x, y)) for x, y, _ in target.centers.tolist()])
+        drawn = drawn.in_frames(torch.arange(frames))
         images = add_noise(render(camera, drawn, R, t, clutter=things), NOISE, seed)
         seen = wrong = 0
         for centers, found in zip(truth, RECOGNISERS[mark.name](images, camera), strict=True):
@@ -140,16 +139,12 @@ def find_vertices(images: Tensor, camera: Camera) -> list[Tensor]:
     found = []
     for image in images.numpy():
         smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 2.0)
-        dxx, dyy = (
-            cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3, scale=s) for order, s in (((2, 0), 0.25), ((0, 2), 0.25))
-        )
-        dxy = cv2.Sobel(smooth, cv2.CV_32F, 1, 1, ksize=3, scale=0.25)
+        dxx, dyy, dxy = (cv2.Sobel(smooth, cv2.CV_32F, *o, ksize=3, scale=0.25) for o in ((2, 0), (0, 2), (1, 1)))
         response = dxy * dxy - dxx * dyy
         # of an ideal vertex of this contrast under the smoothing: (contrast / (pi sigma^2))^2; part of it, for the tilt
         least = 0.3 * (190 / (math.pi * (4.0 + 0.6))) ** 2
         peak = (response == cv2.dilate(response, np.ones((9, 9), np.uint8))) & (response > least)
-        v, u = np.nonzero(peak)
-        found.append(torch.from_numpy(np.stack([u, v], -1).astype(float)))
+        found.append(torch.from_numpy(np.argwhere(peak)[:, ::-1].astype(float)))
     return found
 
 
@@ -163,48 +158,40 @@ RECOGNISERS: dict[str, Callable[[Tensor, Camera], list[Tensor]]] = {
 }
 
 
-def capacities(count: int, seed: int) -> list[dict[str, Any]]:
+def capacities(count: int, seed: int) -> list[Row]:
     """Codes of the shapes that carry one: spread of the value read over noise, blur and tilt, and how many fit."""
-    readers: dict[str, tuple[Callable[[float], Mark], Callable[[localisers.EdgePoints, Tensor], Tensor]]] = {
-        "concentric rings": (lambda code: circles("rings", (RADIUS_MM, code * RADIUS_MM), 150), read_rings),
-        "cross": (lambda code: cross(AREA_MM2, code, 150), read_cross),
-        "rectangle": (lambda code: square(math.sqrt(AREA_MM2), 150), read_rectangle),
-    }
-    camera = Camera.ideal(161, 161, 2 * FOCAL_PX)
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     for noise in CODE_NOISE:
-        for name, (build, read) in readers.items():
-            low, high = RANGES[name]
+        for name, (low, high) in RANGES.items():
+            # rectangles are read as they are: one square stands for all
+            square_like = name == "rectangle"
+            codes = (1.0,) if square_like else tuple(low + (high - low) * x for x in (0.2, 0.4, 0.6, 0.8))
             errors = []
             for k, blur in enumerate(CODE_BLUR):
-                # rectangles are read as they are: one square stands for all
-                codes = (1.0,) if name == "rectangle" else tuple(low + (high - low) * x for x in (0.2, 0.4, 0.6, 0.8))
                 for code in codes:
-                    mark = build(code)
-                    R, t = _poses(count, seed + k, DISTANCE_MM)
-                    t = t * torch.tensor([0.001, 0.001, 1.0])
-                    drawn = mark.draw(30.0, (0.0, 0.0)).in_frames(torch.arange(count))
-                    images = add_noise(render(camera, drawn, R, t, psf_sigma=blur), noise, seed)
-                    points = torch.nn.functional.pad(mark.edges, (0, 1)).flatten(0, 1)
-                    outline = camera.project(points @ R.mT + t[:, None]).unflatten(1, mark.edges.shape[:2])
-                    value = read(localisers.edge_points(images, outline, blur), outline)
-                    errors.append(value.log() if name == "rectangle" else value - code)
+                    value = _read(name, code, blur, noise, _poses(count, seed + k), seed)
+                    errors.append(value.log() if square_like else value - code)
             rms = float(torch.cat(errors).square().nanmean().sqrt())
-            span = math.log(high / low) if name == "rectangle" else high - low
-            rows.append(
-                {
-                    "mark": name,
-                    "noise": noise,
-                    "rms": rms,
-                    "range": f"{low:g} to {high:g}",
-                    "codes": 1 + int(span / (SPREAD * rms)),
-                }
-            )
+            span = math.log(high / low) if square_like else high - low
+            fit = 1 + int(span / (SPREAD * rms))
+            rows.append({"mark": name, "noise": noise, "rms": rms, "range": f"{low:g} to {high:g}", "codes": fit})
         rows += [
-            {"mark": n, "noise": noise, "rms": None, "range": "", "codes": 1}
-            for n in ("filled circle", "chessboard vertex")
+            {"mark": name, "noise": noise, "rms": None, "range": "", "codes": 1}
+            for name in ("filled circle", "chessboard vertex")
         ]
     return rows
+
+
+def _read(name: str, code: float, blur: float, noise: float, poses: tuple[Tensor, Tensor], seed: int) -> Tensor:
+    """(B,) codes read from frames of marks that carry one."""
+    build, read = CODED[name]
+    mark, camera, (R, t) = build(code), Camera.ideal(161, 161, 2 * FOCAL_PX), poses
+    t = t * torch.tensor([0.001, 0.001, 1.0])
+    drawn = mark.draw(30.0, (0.0, 0.0)).in_frames(torch.arange(len(t)))
+    images = add_noise(render(camera, drawn, R, t, psf_sigma=blur), noise, seed)
+    points = torch.nn.functional.pad(mark.edges, (0, 1)).flatten(0, 1)
+    outline = camera.project(points @ R.mT + t[:, None]).unflatten(1, mark.edges.shape[:2])
+    return read(localisers.edge_points(images, outline, blur), outline)
 
 
 def read_rings(edges: localisers.EdgePoints, outline: Tensor) -> Tensor:
@@ -226,13 +213,22 @@ def read_rectangle(edges: localisers.EdgePoints, outline: Tensor) -> Tensor:
     return (side[:, 0] + side[:, 2]) / (side[:, 1] + side[:, 3])
 
 
+# the mark that carries a code, and what reads it from edges and outlines
+CODED: dict[str, tuple[Callable[[float], Mark], Callable[[localisers.EdgePoints, Tensor], Tensor]]] = {
+    "concentric rings": (lambda code: circles("rings", (RADIUS_MM, code * RADIUS_MM), 150), read_rings),
+    "cross": (lambda code: cross(AREA_MM2, code, 150), read_cross),
+    "rectangle": (lambda code: square(math.sqrt(AREA_MM2), 150), read_rectangle),
+}
+
+
 def _corners(lines: Tensor) -> Tensor:
     return localisers.meet(lines, lines.roll(-1, -2))
 
 
 def _area(corner: Tensor) -> Tensor:
     following = corner.roll(-1, 1)
-    return 0.5 * (corner[..., 0] * following[..., 1] - corner[..., 1] * following[..., 0]).sum(-1).abs()
+    cross_product = corner[..., 0] * following[..., 1] - corner[..., 1] * following[..., 0]
+    return cross_product.sum(-1).abs() / 2
 
 
 def _sized(area: Tensor) -> Tensor:
@@ -241,10 +237,8 @@ def _sized(area: Tensor) -> Tensor:
     return (area > AREA_RANGE[0] * expected) & (area < AREA_RANGE[1] * expected)
 
 
-def _poses(count: int, seed: int, distance: float) -> tuple[Tensor, Tensor]:
+def _poses(count: int, seed: int) -> tuple[Tensor, Tensor]:
     """R (count, 3, 3), t (count, 3): any roll, tilt to 30 degrees about any axis."""
     roll, azimuth, tilt, x, y = torch.rand(5, count, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    zero, azimuth = torch.zeros_like(roll), 2 * math.pi * azimuth
-    lean = rotations.exp(TILT * tilt[:, None] * torch.stack([azimuth.cos(), azimuth.sin(), zero], -1))
-    R = lean @ rotations.exp(torch.stack([zero, zero, 2 * math.pi * roll], -1))
-    return R, torch.stack([10 * (x - 0.5), 10 * (y - 0.5), torch.full_like(x, distance)], -1)
+    t = torch.stack([10 * (x - 0.5), 10 * (y - 0.5), torch.full_like(x, DISTANCE_MM)], -1)
+    return turned(TILT * tilt, azimuth, roll), t

@@ -8,7 +8,6 @@ uneven light, and four light rings on it. What is counted: ellipses that belong 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -18,21 +17,19 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.detect import find_shapes
 from torchpose.geometry import conics, rotations
+from torchpose.io.rows import Row
 from torchpose.io.shape_rows import shape_rows
 from torchpose.pipeline import PoseEstimator
 from torchpose.report.detection_overlay import draw_shapes
-from torchpose.report.figures import subplots
+from torchpose.report.figures import frames
 from torchpose.results import Status
 from torchpose.rings import measure_rings
 from torchpose.rings.inner_circles import find_inner
 from torchpose.sim import add_noise, render, shapes
 from torchpose.sim.sensor import Lighting
 from torchpose.studies import table02_detection
-from torchpose.studies.study import Picture, Progress, StudyResult, Table, Value, ignore_progress
+from torchpose.studies.study import Picture, Progress, StudyResult, Table, ignore_progress
 from torchpose.target import Target
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 NAME = "fig06_regions"
 TITLE = "Fig. 6: regions found in a drawing and on a phone"
@@ -49,32 +46,18 @@ def run(*, full: bool = False, seed: int = 0, progress: Progress = ignore_progre
     drawing = add_noise(drawn[None], NOISE, seed=seed)
     circles = torch.cat([circles, circles[:, 2:], torch.zeros(len(circles), 1)], 1).double()
     phone, phone_circles = phone_scene(seed)
-    rows: list[dict[str, Value]] = []
+    rows: list[Row] = []
     pictures = []
-    for letters, name, frames, truth in (
+    for letters, name, images, truth in (
         ("a, b", "drawing", drawing, circles),
         ("c, d", "phone", phone, phone_circles),
     ):
-        found = find_shapes(frames)
-        inner = find_inner(frames, found.ellipses)
-        hit = _same(found.ellipses.ellipse, truth)
-        ring = measure_rings(frames, found.ellipses, _camera(*frames.shape[1:]))
-        rows.append(
-            {
-                "scene": name,
-                "circles": len(truth),
-                "found": int(hit.any(0).sum()),
-                "other_ellipses": int((~hit.any(1)).sum()),
-                "rings": len(ring),
-                "segments": int((found.segments.chain < 0).sum()),
-                "polygons": len(found.segments.chain[found.segments.chain >= 0].unique()),
-            }
-        )
-        overlay = draw_shapes(
-            frames[0].numpy(), shape_rows(found, torch.where(inner.found, inner.ratio, torch.nan), [name])
-        )
+        row, overlay = _counted(name, images, truth)
+        rows.append(row)
+        height, width = overlay.shape[:2]
+        sheet = frames([("", images[0].numpy()), ("", overlay)], 1, (13, 6.6 * height / width))
         title = f"Fig. 6 ({letters}): the {name} and what was found in it"
-        pictures.append(Picture(f"fig06_{name}", title, _side_by_side(frames[0], overlay)))
+        pictures.append(Picture(f"fig06_{name}", title, sheet))
         progress(len(rows) / 2)
     poses = PoseEstimator(_camera(*phone.shape[1:]), phone_target())(phone)
     return StudyResult(
@@ -82,7 +65,7 @@ def run(*, full: bool = False, seed: int = 0, progress: Progress = ignore_progre
         pictures=pictures,
         statements=[
             *(
-                f"{str(row['scene']).capitalize()}: {row['found']} of {row['circles']} circles found and "
+                f"{row['scene'].capitalize()}: {row['found']} of {row['circles']} circles found and "
                 f"{row['other_ellipses']} other ellipses (of letters and rounded corners); {row['rings']} rings."
                 for row in rows
             ),
@@ -91,6 +74,24 @@ def run(*, full: bool = False, seed: int = 0, progress: Progress = ignore_progre
         ],
         settings={"noise": NOISE},
     )
+
+
+def _counted(name: str, images: Tensor, truth: Tensor) -> tuple[Row, np.ndarray]:
+    """What was found in a frame (1, H, W) with circles (C, 5): its row, and the picture of it, red-green-blue."""
+    found = find_shapes(images)
+    inner = find_inner(images, found.ellipses)
+    hit = _same(found.ellipses.ellipse, truth)
+    row = {
+        "scene": name,
+        "circles": len(truth),
+        "found": int(hit.any(0).sum()),
+        "other_ellipses": int((~hit.any(1)).sum()),
+        "rings": len(measure_rings(images, found.ellipses, _camera(*images.shape[1:]))),
+        "segments": int((found.segments.chain < 0).sum()),
+        "polygons": len(found.segments.chain[found.segments.chain >= 0].unique()),
+    }
+    shapes_found = shape_rows(found, torch.where(inner.found, inner.ratio, torch.nan), [name])
+    return row, cv2.cvtColor(draw_shapes(images[0].numpy(), shapes_found), cv2.COLOR_BGR2RGB)
 
 
 def phone_target() -> Target:
@@ -108,8 +109,8 @@ def _camera(height: int, width: int) -> Camera:
 def phone_scene(seed: int) -> tuple[Tensor, Tensor]:
     """Frames (1, H, W) uint8 and the ellipses (C, 5) of its circles, px: of each marker both, the lenses, the logo."""
     camera = _camera(1024, 1536)
-    r = rotations.exp(torch.tensor([[0.30, -0.22, 0.0]], dtype=torch.float64))
-    r = r @ rotations.exp(torch.tensor([[0.0, 0, 1.35]], dtype=torch.float64))
+    R = rotations.exp(torch.tensor([[0.30, -0.22, 0.0]], dtype=torch.float64))
+    R = R @ rotations.exp(torch.tensor([[0.0, 0, 1.35]], dtype=torch.float64))
     t = torch.tensor([[4.0, -2, 210]], dtype=torch.float64)
     ground = [
         shapes.polygon([_rounded(39.0, 76.0, 9.0)], 42.0),
@@ -124,7 +125,7 @@ def phone_scene(seed: int) -> tuple[Tensor, Tensor]:
     frame = render(
         camera,
         shapes.cat([*marks, *lenses, logo, *words]),
-        r,
+        R,
         t,
         light=128.0,
         clutter=shapes.cat(ground),
@@ -133,7 +134,7 @@ def phone_scene(seed: int) -> tuple[Tensor, Tensor]:
     )
     circles = [(x, y, radius) for x, y, inner in MARKERS for radius in (OUTER_RADIUS, inner)]
     circles += [*LENSES, *((x, y, 0.7 * radius) for x, y, radius in LENSES[:2]), (0.0, 12.0, 7.0)]
-    return add_noise(frame, NOISE, seed=seed), _images(camera, r[0], t[0], circles)
+    return add_noise(frame, NOISE, seed=seed), _images(camera, R[0], t[0], circles)
 
 
 def _rounded(half_width: float, half_height: float, radius: float) -> np.ndarray:
@@ -148,13 +149,13 @@ def _rounded(half_width: float, half_height: float, radius: float) -> np.ndarray
     return np.concatenate(parts)
 
 
-def _images(camera: Camera, r: Tensor, t: Tensor, circles: list[tuple[float, float, float]]) -> Tensor:
+def _images(camera: Camera, R: Tensor, t: Tensor, circles: list[tuple[float, float, float]]) -> Tensor:
     """Ellipses (C, 5) px of circles x, y, radius (mm) in the plane z = 0."""
     known = torch.tensor(circles, dtype=torch.float64)
-    centers = torch.nn.functional.pad(known[:, :2], (0, 1)) @ r.mT + t
+    centers = torch.nn.functional.pad(known[:, :2], (0, 1)) @ R.mT + t
     count = len(known)
     normal = torch.tensor([0.0, 0, 1], dtype=torch.float64).expand(count, 3)
-    return conics.circle_ellipse(camera.matrix, r.expand(count, 3, 3), centers, normal, known[:, 2])
+    return conics.circle_ellipse(camera.matrix, R.expand(count, 3, 3), centers, normal, known[:, 2])
 
 
 def _same(found: Tensor, truth: Tensor) -> Tensor:
@@ -162,12 +163,3 @@ def _same(found: Tensor, truth: Tensor) -> Tensor:
     size = truth[:, 3]
     near = torch.cdist(found[:, :2], truth[:, :2]) < 0.05 * size + 1.0
     return near & ((found[:, None, 2:4] - truth[:, 2:4]).abs().amax(-1) < 0.03 * size + 1.0)
-
-
-def _side_by_side(frame: Tensor, overlay: np.ndarray) -> Figure:
-    height, width = frame.shape
-    figure, (panels,) = subplots(1, 2, (13, 6.6 * height / width))
-    for panel, picture in zip(panels, (frame.numpy(), cv2.cvtColor(overlay, cv2.COLOR_BGR2RGB)), strict=True):
-        panel.imshow(picture, cmap="gray", vmin=0, vmax=255, interpolation="antialiased")
-        panel.set_axis_off()
-    return figure

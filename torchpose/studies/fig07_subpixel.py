@@ -7,24 +7,22 @@ Zernike moment A_11, the sub-pixel edges, and the ellipses fitted to them with t
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import cv2
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchpose import ellipse
 from torchpose.camera import Camera
 from torchpose.detect import find_candidates
 from torchpose.geometry import conics, rotations
+from torchpose.io.rows import Row
 from torchpose.report.figures import COLOURS, subplots
 from torchpose.rings import measure_rings, zernike
 from torchpose.rings.edges import RingEdges, ring_edges
 from torchpose.sim import add_noise, render, shapes
-from torchpose.studies.study import Picture, Progress, StudyResult, Table, Value, ignore_progress
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from torchpose.studies.study import Picture, Progress, StudyResult, Table, ignore_progress, load_data
 
 NAME = "fig07_subpixel"
 TITLE = "Figs. 7 and 8: from the region to sub-pixel edges and ellipses"
@@ -35,15 +33,11 @@ _REACH = 3.0  # px
 
 def run(*, full: bool = False, seed: int = 0, progress: Progress = ignore_progress) -> StudyResult:
     """Every step on one ring; ``full`` changes nothing."""
-    camera = Camera(
-        SIZE,
-        SIZE,
-        torch.tensor([[FOCAL, 0, 60.3], [0, FOCAL, 59.6], [0, 0, 1]], dtype=torch.float64),
-        torch.zeros(5, dtype=torch.float64),
-    )
-    r = rotations.exp(torch.tensor([[math.radians(20), 0, 0]], dtype=torch.float64))
+    matrix = torch.tensor([[FOCAL, 0, 60.3], [0, FOCAL, 59.6], [0, 0, 1]], dtype=torch.float64)
+    camera = Camera(SIZE, SIZE, matrix, torch.zeros(5, dtype=torch.float64))
+    R = rotations.exp(torch.tensor([[math.radians(20), 0, 0]], dtype=torch.float64))
     t = torch.tensor([[0.0, 0, DISTANCE]], dtype=torch.float64)
-    clean = render(camera, shapes.ring((0.0, 0.0), OUTER, INNER), r, t)
+    clean = render(camera, shapes.ring((0.0, 0.0), OUTER, INNER), R, t)
     frames = add_noise(clean, NOISE, seed=seed)
     rings = measure_rings(frames, find_candidates(frames), camera)
     raw = torch.cat([rings.outer_raw, rings.inner_raw])
@@ -52,8 +46,8 @@ def run(*, full: bool = False, seed: int = 0, progress: Progress = ignore_progre
     progress(0.5)
     fits = ellipse.fit(edges.points, edges.ring, 2)
     off = ellipse.distance(edges.points, edges.ring, fits)
-    truth = _truth(camera, r[0], t[0])
-    rows: list[dict[str, Value]] = []
+    truth = _truth(camera, R[0], t[0])
+    rows: list[Row] = []
     for i, name in enumerate(("outer", "inner")):
         mine = off[edges.ring == i]
         rows.append(
@@ -69,15 +63,7 @@ def run(*, full: bool = False, seed: int = 0, progress: Progress = ignore_progre
         )
     progress(1.0)
     return StudyResult(
-        tables=[
-            Table(
-                "fig07",
-                "Edges and ellipses of one ring",
-                rows,
-                "As read: Zernike edges as the paper takes them. Corrected: freed from what blur and curvature do to "
-                "them, which moves the circles' size most.",
-            )
-        ],
+        tables=[Table("fig07", "Edges and ellipses of one ring", rows, load_data("notes.yaml")[NAME]["fig07"])],
         pictures=[
             Picture("fig07", "Fig. 7: region, Canny, Zernike response, sub-pixel edges", _steps(frames[0], edges)),
             Picture("fig08", "Fig. 8: fitted ellipses, and how far the edges lie from them", _fitted(edges, fits, off)),
@@ -86,34 +72,31 @@ def run(*, full: bool = False, seed: int = 0, progress: Progress = ignore_progre
     )
 
 
-def _truth(camera: Camera, r: Tensor, t: Tensor) -> Tensor:
+def _truth(camera: Camera, R: Tensor, t: Tensor) -> Tensor:
     """(2, 5) exact ellipses of both circles, px."""
     normal = torch.tensor([0.0, 0, 1], dtype=torch.float64).expand(2, 3)
     radii = torch.tensor([OUTER, INNER], dtype=torch.float64)
-    return conics.circle_ellipse(camera.matrix, r.expand(2, 3, 3), t.expand(2, 3), normal, radii)
+    return conics.circle_ellipse(camera.matrix, R.expand(2, 3, 3), t.expand(2, 3), normal, radii)
 
 
 def _steps(frame: Tensor, edges: RingEdges) -> Figure:
-    canny = cv2.Canny(frame.numpy(), 60, 120)
-    layer = zernike.ZernikeMoments(orders=((1, 1),))
-    response = layer(frame[None, None]).norm(dim=1)[0]
-    half = zernike.MASK // 2
+    canny = torch.from_numpy(cv2.Canny(frame.numpy(), 60, 120))
+    response = zernike.ZernikeMoments(orders=((1, 1),))(frame[None, None]).norm(dim=1)[0]
+    half = zernike.MASK // 2  # which the response lacks on every side
     figure, (panels,) = subplots(1, 4, (16, 4.3))
-    last = SIZE - 0.5
-    pictures = (
-        (frame, "(a) region", (-0.5, last, last, -0.5)),
-        (torch.from_numpy(canny), "(b) Canny", (-0.5, last, last, -0.5)),
-        (response, "(c) Zernike |A11|", (half - 0.5, last - half, last - half, half - 0.5)),
-        (frame, "(d) sub-pixel edges", (-0.5, last, last, -0.5)),
-    )
-    for panel, (picture, title, extent) in zip(panels, pictures, strict=True):
-        panel.imshow(picture.numpy(), cmap="gray", extent=extent, interpolation="nearest")
+    for panel, picture, title, margin in zip(
+        panels,
+        (frame, canny, response, frame),
+        ("(a) region", "(b) Canny", "(c) Zernike |A11|", "(d) sub-pixel edges"),
+        (0, 0, half, 0),
+        strict=True,
+    ):
+        low, high = margin - 0.5, SIZE - 0.5 - margin
+        panel.imshow(picture.numpy(), cmap="gray", extent=(low, high, high, low), interpolation="nearest")
         panel.set_title(title)
         panel.grid(False)
-    xy = edges.points
-    panels[3].plot(xy[:, 0], xy[:, 1], ".", ms=4, color=COLOURS[1])
-    panels[3].set_xlim(60, 105)
-    panels[3].set_ylim(80, 35)
+    panels[3].plot(*edges.points.T, ".", ms=4, color=COLOURS[1])
+    panels[3].set(xlim=(60, 105), ylim=(80, 35))
     return figure
 
 
@@ -123,16 +106,14 @@ def _fitted(edges: RingEdges, fits: Tensor, off: Tensor) -> Figure:
     for i, name in enumerate(("outer", "inner")):
         mine = edges.ring == i
         xy, curve = edges.points[mine], conics.points_on(fits[i : i + 1], angle[None])[0]
-        whole.plot(curve[:, 0], curve[:, 1], color=COLOURS[i], lw=1, label=f"{name} ellipse")
-        whole.plot(xy[:, 0], xy[:, 1], ".", ms=2, color="black")
+        whole.plot(*curve.T, color=COLOURS[i], lw=1, label=f"{name} ellipse")
+        whole.plot(*xy.T, ".", ms=2, color="black")
         direction = torch.atan2(xy[:, 1] - fits[i, 1], xy[:, 0] - fits[i, 0]).rad2deg()
         residual.plot(direction, off[mine], ".", ms=4, color=COLOURS[i], label=name)
     whole.set_aspect("equal")
     whole.invert_yaxis()
-    whole.legend(fontsize=8)
-    whole.set_xlabel("u, px")
-    whole.set_ylabel("v, px")
-    residual.set_xlabel("direction from the centre, degrees")
-    residual.set_ylabel("edge - ellipse, px")
-    residual.legend(fontsize=8)
+    whole.set(xlabel="u, px", ylabel="v, px")
+    residual.set(xlabel="direction from the centre, degrees", ylabel="edge - ellipse, px")
+    for panel in (whole, residual):
+        panel.legend(fontsize=8)
     return figure

@@ -8,14 +8,16 @@ import platform
 import time
 import traceback
 from collections.abc import Callable, Sequence
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
 
 from torchpose.errors import ConfigError, TorchposeError
+from torchpose.io.rows import Row
 from torchpose.io.writers import atomic_path
+from torchpose.report.files import make_folder
 from torchpose.report.html import report
-from torchpose.studies.study import RESULT
+from torchpose.studies.study import RESULT, Progress, StudyResult
 
 # in the order of the paper
 STUDIES = (
@@ -47,7 +49,9 @@ def reproduce(
     """Runs the studies and writes ``OUT/NAME/`` for each and ``OUT/report.html``, again after every study.
 
     Args:
+        out: folder of the report.
         full: as many seeds and frames as the documented figures have, instead of a run of some minutes.
+        seed: of everything random.
         only: names of `STUDIES`; all by default. What an earlier run left of the others stays in the report.
         resume: keep the studies that an earlier run with the same version, settings and seed finished.
         progress: told the name of the study that runs and the part of it that is done.
@@ -61,37 +65,39 @@ def reproduce(
     unknown = [name for name in only if name not in STUDIES]
     if unknown:
         raise ConfigError(f"{unknown[0]}: --only: is no study; give one of {', '.join(STUDIES)}")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"{out}: --out: {error.strerror}; choose a folder that can be written") from None
+    make_folder(out, "--out")
     failed: dict[str, str] = {}
     for name in STUDIES:
         about = {"study": name, "full": full, "seed": seed, "version": version("torchpose")}
         if (only and name not in only) or (resume and _finished(out / name, about)):
             continue
         progress(name, 0.0)
-        study = importlib.import_module(f"torchpose.studies.{name}")
-        begun, cpu = time.perf_counter(), time.process_time()
         try:
-            result = study.run(full=full, seed=seed, progress=lambda done, name=name: progress(name, done))
+            result, record = _run(name, about, partial(progress, name))
         except TorchposeError as error:
             failed[name] = str(error)
-            continue
         except Exception as error:
             # one study must not cost the results of the others; what happened is kept beside them
             failed[name] = f"{type(error).__name__}: {error}"
             (out / name).mkdir(exist_ok=True)
             (out / name / "error.txt").write_text(traceback.format_exc(), encoding="utf-8")
-            continue
-        spent = {"seconds": time.perf_counter() - begun, "cpu_seconds": time.process_time() - cpu}
-        result.save(out / name, about | {"title": study.TITLE} | spent)
-        _write_report(out, failed)
+        else:
+            result.save(out / name, record)
+            _write_report(out, failed)
     _write_report(out, failed)
     return failed
 
 
-def _finished(folder: Path, about: dict[str, Any]) -> bool:
+def _run(name: str, about: Row, progress: Progress) -> tuple[StudyResult, Row]:
+    """Result of a study, and what its record says besides."""
+    study = importlib.import_module(f"torchpose.studies.{name}")
+    begun, cpu = time.perf_counter(), time.process_time()
+    result = study.run(full=about["full"], seed=about["seed"], progress=progress)
+    spent = {"seconds": time.perf_counter() - begun, "cpu_seconds": time.process_time() - cpu}
+    return result, about | {"title": study.TITLE} | spent
+
+
+def _finished(folder: Path, about: Row) -> bool:
     try:
         record = json.loads((folder / RESULT).read_text(encoding="utf-8"))
     except (OSError, ValueError):

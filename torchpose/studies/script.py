@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 import inspect
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from types import ModuleType
 
 from torchpose.errors import ConfigError
-from torchpose.studies.study import StudyResult, Table, Value
+from torchpose.report.html import cell
+from torchpose.studies.study import StudyResult, Table
 
 _COMMON = ("full", "seed", "progress")
 
@@ -39,25 +41,17 @@ def main(study: ModuleType) -> int:
 
 def finish(result: StudyResult, out: Path | None) -> None:
     """Prints a result and writes its files, where there is a folder for them."""
-    show(result)
-    if out:
-        for path in result.save(out):
-            print(path)
-
-
-def show(result: StudyResult) -> None:
-    """Prints tables, comparisons and statements."""
     for table in result.tables:
         print(f"\n{table.title}\n\n{text_of(table)}\n")
         if table.note:
             print(table.note)
     if result.comparisons:
-        rows: list[dict[str, Value]] = [
-            {"": c.what, "unit": c.unit, "paper": c.paper, "ours": c.ours, "bound": c.bound} for c in result.comparisons
-        ]
+        rows = [{"" if key == "what" else key: value for key, value in asdict(c).items()} for c in result.comparisons]
         print(f"\nBeside the paper\n\n{text_of(Table('', '', rows))}\n")
     for statement in result.statements:
         print(f"- {statement}")
+    for path in result.save(out) if out else ():
+        print(path)
 
 
 def text_of(table: Table) -> str:
@@ -66,10 +60,3 @@ def text_of(table: Table) -> str:
     widths = [max(len(line[i]) for line in cells) for i in range(len(table.columns))]
     lines = ["| " + " | ".join(text.ljust(w) for text, w in zip(line, widths, strict=True)) + " |" for line in cells]
     return "\n".join([lines[0], "| " + " | ".join("-" * w for w in widths) + " |", *lines[1:]])
-
-
-def cell(value: Value) -> str:
-    """A value as a reader wants it: four digits, nothing for None and not a number."""
-    if value is None or value != value:
-        return ""
-    return f"{value:.4g}" if isinstance(value, float) else str(value)

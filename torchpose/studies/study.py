@@ -7,17 +7,18 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from torchpose.errors import ConfigError
+import yaml
+from matplotlib.figure import Figure
+
+from torchpose.io.rows import Row
 from torchpose.io.writers import atomic_path, write_rows
+from torchpose.report.files import make_folder, save_figures
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-Value = float | int | str | bool | None
 Progress = Callable[[float], None]  # told the part that is done, 0 to 1
 RESULT = "result.json"
+DATA = Path(__file__).with_name("data")
 
 
 @dataclass(frozen=True)
@@ -27,13 +28,13 @@ class Table:
     Attributes:
         name: file name without suffix, unique within its study.
         title: one line, what the rows are.
-        rows: one mapping per row, all with the same keys; a key that holds a unit says so (``error_px``).
+        rows: numbers, texts and None, all rows with the same keys; a key that holds a unit says so (``error_px``).
         note: what a reader has to know beside the figures: where a published figure differs and why.
     """
 
     name: str
     title: str
-    rows: list[dict[str, Value]]
+    rows: list[Row]
     note: str = ""
 
     @property
@@ -56,8 +57,9 @@ class Comparison:
     """One figure of the paper beside ours and, where there is one, the bound that no method can beat.
 
     Attributes:
-        what: the quantity and its circumstances. unit: of all three figures, "" for counts and ratios.
-        paper, ours, bound: None where there is none; text where the paper states a claim.
+        what: the quantity and its circumstances.
+        unit: of all three figures, "" for counts and ratios.
+        paper: None where there is none, text where the paper states a claim; ``ours`` and ``bound`` likewise.
     """
 
     what: str
@@ -81,29 +83,24 @@ class StudyResult:
     pictures: list[Picture] = field(default_factory=list)
     comparisons: list[Comparison] = field(default_factory=list)
     statements: list[str] = field(default_factory=list)
-    settings: dict[str, Any] = field(default_factory=dict)
+    settings: Row = field(default_factory=dict)
 
-    def save(self, folder: Path, about: dict[str, Any] | None = None) -> list[Path]:
+    def save(self, folder: Path, about: Row | None = None) -> list[Path]:
         """Writes every table as ``NAME.csv``, every picture as ``NAME.png``, and all but the pictures' pixels as JSON.
 
         Args:
+            folder: made if missing.
             about: further entries of the JSON file, which is written last: where it is, the others are whole.
 
         Raises:
             ConfigError: the folder cannot be written.
         """
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ConfigError(f"{folder}: --out: {error.strerror}; choose a folder that can be written") from None
+        make_folder(folder, "--out")
         written = []
         for table in self.tables:
             written.append(folder / f"{table.name}.csv")
             write_rows(written[-1], table.rows, {column: _type(table.rows, column) for column in table.columns})
-        for picture in self.pictures:
-            written.append(folder / f"{picture.name}.png")
-            with atomic_path(written[-1]) as temporary:
-                picture.figure.savefig(temporary, format="png", dpi=110)
+        written += save_figures({f"{p.name}.png": p.figure for p in self.pictures}, folder, dpi=110)
         record = {
             **(about or {}),
             "settings": self.settings,
@@ -122,7 +119,13 @@ def ignore_progress(_done: float) -> None:
     """Progress of a study that nobody watches."""
 
 
-def _type(rows: list[dict[str, Value]], column: str) -> type:
+def load_data(name: str) -> Any:
+    """A file of data/: what the paper prints, scenes, set-ups, notes of tables."""
+    text = (DATA / name).read_text(encoding="utf-8")
+    return json.loads(text) if name.endswith(".json") else yaml.safe_load(text)
+
+
+def _type(rows: list[Row], column: str) -> type:
     """Type of a column: of the values that are there, float where integers and floats mix."""
     types = {type(row[column]) for row in rows if row[column] is not None}
     return types.pop() if len(types) == 1 else float if types == {int, float} else str

@@ -9,94 +9,99 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import TYPE_CHECKING, Any
 
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchpose import pnp
 from torchpose.analysis.sensitivity import Uncertainty, propagate
-from torchpose.analysis.sweep import sweep
+from torchpose.analysis.sweep import Sweep, sweep
 from torchpose.camera import Camera
 from torchpose.geometry import rotations
-from torchpose.report.figures import COLOURS, subplots
+from torchpose.io.rows import Row
+from torchpose.report.figures import COLOURS, curve, subplots
 from torchpose.studies.fig04_sensitivity import DISTANCES_MM, FOCAL_ERROR, paper_camera
-from torchpose.studies.study import Comparison, Picture, Progress, StudyResult, Table, ignore_progress
+from torchpose.studies.study import Comparison, Picture, Progress, StudyResult, Table, ignore_progress, load_data
 from torchpose.target import Target
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 NAME = "table01_orientation"
 TITLE = "Table I: errors of orientation"
 SIGMA_PX = 0.2
-PAPER_NOISE_DEG = {"yaw_pitch": 0.165, "roll": 0.051}
-PAPER_FOCAL_DEG = {"yaw_pitch": 1.387e-4, "roll": 6.131e-7}
+PAPER_NOISE_DEG, PAPER_FOCAL_DEG = load_data("paper.yaml")["table01"].values()  # each of yaw and pitch, and of roll
 HALF_SIDE_MM = 4.0
 TILTS_DEG = (0.0, 0.01, 0.1, 1.0, 5.0, 20.0)
 
 
 def run(*, full: bool = False, seed: int = 0, progress: Progress = ignore_progress) -> StudyResult:
     """Orientation against distance by noise, against tilt by focal error, and what would give the paper's numbers."""
-    near, far = DISTANCES_MM
-    distance = torch.linspace(near, far, 41 if full else 11, dtype=torch.float64)
+    distance = torch.linspace(*DISTANCES_MM, 41 if full else 11, dtype=torch.float64)
     draws = 2000 if full else 300
     target, camera = Target.load("quad8"), paper_camera()
-    s = sweep(camera, target, distance, Uncertainty(image=SIGMA_PX), draws=draws, seed=seed)
+    swept = sweep(camera, target, distance, Uncertainty(image=SIGMA_PX), draws=draws, seed=seed)
     progress(0.5)
-    rows: list[dict[str, Any]] = []
-    for k, d in enumerate(distance.tolist()):
-        most = largest_rotation(camera, target, d)
-        for axis, i in (("yaw_pitch", slice(3, 5)), ("roll", slice(5, 6))):
-            values = {
-                "predicted_rms_deg": s.budget.std()[k, i].mean(),
-                "rms_deg": s.errors[:, k, i].square().mean().sqrt(),
-                "largest_deg": s.largest[k, i].max(),
-                "worst_within_0.2px_deg": most[i].max(),
-            }
-            rows.append({"distance_mm": d, "axis": axis} | {name: math.degrees(float(v)) for name, v in values.items()})
-    focal: list[dict[str, Any]] = [
-        {"tilt_deg": tilt, **focal_rotation(camera, target, 20.0, tilt)} for tilt in TILTS_DEG
-    ]
+    rows = _noise_rows(swept, camera, target)
+    focal: list[Row] = [{"tilt_deg": tilt, **focal_rotation(camera, target, 20.0, tilt)} for tilt in TILTS_DEG]
     readings = [reading("standard deviation"), reading("worst within 0.2 px")]
     progress(1.0)
-    at_20 = {row["axis"]: row for row in rows if abs(row["distance_mm"] - 20) < 1e-6}
-    face_on, slope = focal[0], focal[3]["yaw_pitch_deg"] / TILTS_DEG[3]
-    best = readings[1]
+    note = load_data("notes.yaml")[NAME]["readings"]
+    at_20 = {row["axis"]: row["rms_deg"] for row in rows if abs(row["distance_mm"] - 20) < 1e-6}
     return StudyResult(
         tables=[
             Table("noise", f"Orientation by {SIGMA_PX} px of image noise", rows),
             Table("focal", "Orientation by 0.25 % of focal length, no noise, at 20 mm", focal),
-            Table("readings", "What would give the paper's 0.165 and 0.051 deg", readings, _note(best)),
+            Table("readings", "What would give the paper's 0.165 and 0.051 deg", readings, note.format(**readings[1])),
         ],
         pictures=[Picture("table01", "Orientation errors against distance", plot(rows))],
-        comparisons=[
-            *(
-                Comparison(f"{axis}, 0.2 px; ours: rms at 20 mm", "deg", paper, at_20[axis]["rms_deg"])
-                for axis, paper in PAPER_NOISE_DEG.items()
-            ),
-            *(
-                Comparison(f"{axis}, 0.25 % focal length; ours: face on", "deg", paper, face_on[f"{axis}_deg"])
-                for axis, paper in PAPER_FOCAL_DEG.items()
-            ),
-            Comparison(
-                "yaw and pitch over roll, 0.2 px; ours: at 20 mm",
-                "",
-                PAPER_NOISE_DEG["yaw_pitch"] / PAPER_NOISE_DEG["roll"],
-                at_20["yaw_pitch"]["rms_deg"] / at_20["roll"]["rms_deg"],
-            ),
-        ],
-        statements=[
-            f"At 20 mm, 0.2 px of noise give {at_20['yaw_pitch']['rms_deg']:.3f} deg of yaw and pitch and "
-            f"{at_20['roll']['rms_deg']:.4f} deg of roll: the roll is the better one, as the paper says, by a factor "
-            "that grows in proportion to the distance.",
-            f"Face on, a wrong focal length turns the pose by {max(face_on.values()):.1g} deg: the paper's "
-            f"1.387e-4 deg is what a tilt of {PAPER_FOCAL_DEG['yaw_pitch'] / slope:.2g} deg would give.",
-            f"A tilt of 20 deg turns by {focal[-1]['yaw_pitch_deg']:.3f} deg: away from the face-on view, the focal "
-            "length matters for the orientation too.",
-        ],
+        comparisons=_comparisons(at_20, focal[0]),
+        statements=_statements(at_20, focal),
         settings={"draws": draws, "distances": len(distance), "focal_error": FOCAL_ERROR, "target": target.name},
     )
+
+
+def _noise_rows(swept: Sweep, camera: Camera, target: Target) -> list[Row]:
+    rows: list[Row] = []
+    for k, distance in enumerate(swept.distance.tolist()):
+        most = largest_rotation(camera, target, distance)
+        for axis, i in (("yaw_pitch", slice(3, 5)), ("roll", slice(5, 6))):
+            values = {
+                "predicted_rms_deg": swept.budget.std()[k, i].mean(),
+                "rms_deg": swept.errors[:, k, i].square().mean().sqrt(),
+                "largest_deg": swept.largest[k, i].max(),
+                "worst_within_0.2px_deg": most[i].max(),
+            }
+            degrees = {name: math.degrees(float(value)) for name, value in values.items()}
+            rows.append({"distance_mm": distance, "axis": axis} | degrees)
+    return rows
+
+
+def _comparisons(at_20: Row, face_on: Row) -> list[Comparison]:
+    def ratio(errors: Row) -> float:
+        return float(errors["yaw_pitch"] / errors["roll"])
+
+    return [
+        *(
+            Comparison(f"{axis}, 0.2 px; ours: rms at 20 mm", "deg", paper, at_20[axis])
+            for axis, paper in PAPER_NOISE_DEG.items()
+        ),
+        *(
+            Comparison(f"{axis}, 0.25 % focal length; ours: face on", "deg", paper, face_on[f"{axis}_deg"])
+            for axis, paper in PAPER_FOCAL_DEG.items()
+        ),
+        Comparison("yaw and pitch over roll, 0.2 px; ours: at 20 mm", "", ratio(PAPER_NOISE_DEG), ratio(at_20)),
+    ]
+
+
+def _statements(at_20: Row, focal: list[Row]) -> list[str]:
+    slope = focal[3]["yaw_pitch_deg"] / TILTS_DEG[3]
+    return [
+        f"At 20 mm, 0.2 px of noise give {at_20['yaw_pitch']:.3f} deg of yaw and pitch and {at_20['roll']:.4f} deg of "
+        "roll: the roll is the better one, as the paper says, by a factor that grows in proportion to the distance.",
+        f"Face on, a wrong focal length turns the pose by {max(focal[0].values()):.1g} deg: the paper's "
+        f"1.387e-4 deg is what a tilt of {PAPER_FOCAL_DEG['yaw_pitch'] / slope:.2g} deg would give.",
+        f"A tilt of 20 deg turns by {focal[-1]['yaw_pitch_deg']:.3f} deg: away from the face-on view, the focal "
+        "length matters for the orientation too.",
+    ]
 
 
 def largest_rotation(camera: Camera, target: Target, distance: float) -> Tensor:
@@ -119,7 +124,7 @@ def focal_rotation(camera: Camera, target: Target, distance: float, tilt_deg: fl
     return {"yaw_pitch_deg": max(error[:2]), "roll_deg": error[2]}
 
 
-def reading(kind: str) -> dict[str, Any]:
+def reading(kind: str) -> Row:
     """Distance and focal length that give the paper's numbers, were its errors of that ``kind``, and ours there.
 
     Of a square with the half side a, face on at the distance d (derived), e the error of a coordinate: standard
@@ -146,27 +151,15 @@ def reading(kind: str) -> dict[str, Any]:
     }
 
 
-def _note(best: dict[str, Any]) -> str:
-    return (
-        "The ratio of the two numbers fixes the distance in half sides of the target, their size the focal length. "
-        f"Read as the worst case within 0.2 px, they belong to {best['distance_mm']:.1f} mm, in Fig. 4's range, "
-        f"and a focal length of {best['focal_px']:.0f} px, that of a small frame: the paper's own camera has 3333 px, "
-        "which makes every angle smaller in proportion. Read as standard deviations, they would need a distance below "
-        "Fig. 4's range and a lens of a very wide angle."
-    )
-
-
-def plot(rows: list[dict[str, Any]]) -> Figure:
+def plot(rows: list[Row]) -> Figure:
     """Both axes against the distance, and the paper's numbers."""
     figure, axes = subplots(1, 2, (12, 4.5))
+    styles = {"predicted_rms_deg": "-", "rms_deg": ".", "largest_deg": ".", "worst_within_0.2px_deg": "-"}
     for panel, (axis, paper) in zip(axes[0], PAPER_NOISE_DEG.items(), strict=True):
         part = [row for row in rows if row["axis"] == axis]
-        d = [row["distance_mm"] for row in part]
-        for k, name in enumerate(("predicted_rms_deg", "rms_deg", "largest_deg", "worst_within_0.2px_deg")):
-            style = "-" if k in (0, 3) else "."
-            panel.semilogy(d, [row[name] for row in part], style, color=COLOURS[k], label=name)
+        for (name, style), colour in zip(styles.items(), COLOURS, strict=False):
+            curve(panel, part, "distance_mm", name, style, color=colour, label=name)
         panel.axhline(paper, color="k", ls=":", label="paper")
-        panel.set_xlabel("distance [mm]")
-        panel.set_ylabel(f"{axis.replace('_', ' and ')} error [deg]")
+        panel.set(xlabel="distance [mm]", ylabel=f"{axis.replace('_', ' and ')} error [deg]", yscale="log")
         panel.legend(fontsize=8)
     return figure

@@ -7,21 +7,19 @@ program, one run for each noise (data/elsdc_table2_scene.json).
 
 from __future__ import annotations
 
-import json
 import math
-from importlib.resources import files
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchpose.detect import find_candidates
-from torchpose.studies.study import Comparison, Progress, StudyResult, Table, Value, ignore_progress
+from torchpose.io.rows import Row
+from torchpose.studies.study import Comparison, Progress, StudyResult, Table, ignore_progress, load_data
 
 NAME = "table02_detection"
 TITLE = "Table II: circles found by the coarse detection"
-PAPER_PX = {0: 4.955, 1: 4.958, 2: 4.958, 4: 4.957, 8: 4.963}  # mean over its four markers
-NOISE = (0, 1, 2, 4, 8)
+PAPER_PX: dict[int, float] = load_data("paper.yaml")["table02"]  # mean over its four markers
+NOISE = tuple(PAPER_PX)
 ELSDC_OFFSET = 0.5  # its gradient's stencil is centred at (+0.5, +0.5), which its ellipses lack
 REDUCTION = 4
 
@@ -37,43 +35,41 @@ def run(
     count = seeds or (20 if full else 3)
     data = reference()
     clean, circles = scene(data)
-    elsdc = {run["noise_sigma"]: run for run in data["runs"]}
-    rows: list[dict[str, Value]] = []
-    explained: list[dict[str, Value]] = []
+    elsdc = {run["noise_sigma"]: run["ellipses"] for run in data["runs"]}
+    rows: list[Row] = []
+    explained: list[Row] = []
     for done, noise in enumerate(NOISE):
+        frames = count if noise else 1
         worst, false = len(circles), 0
         errors: list[float] = []
         shifted: list[float] = []
-        for number in range(count if noise else 1):
+        for number in range(frames):
             g = torch.Generator().manual_seed(seed + 1000 * noise + number)
             frame = (clean + noise * torch.randn(clean.shape, generator=g)).round().clamp(0, 255).to(torch.uint8)
             found = find_candidates(frame[None], REDUCTION).ellipse
             hits, wrong, some = compare(found, circles)
             worst, false, errors = min(worst, hits), false + wrong, errors + some
             shifted += compare(mistaken(found), circles)[2]
-            progress((done + (number + 1) / (count if noise else 1)) / len(NOISE))
-        theirs = torch.tensor([[e[k] for k in ("x", "y", "a", "b", "theta")] for e in elsdc[noise]["ellipses"]])
-        theirs = theirs.double()
+            progress((done + (number + 1) / frames) / len(NOISE))
+        theirs = torch.tensor([[e[k] for k in ("x", "y", "a", "b", "theta")] for e in elsdc[noise]]).double()
         theirs[:, :2] += ELSDC_OFFSET
-        their_hits, their_wrong, their_errors = compare(theirs, circles)
-        rows.append({
-            "noise": noise, "frames": count if noise else 1, "found_of_8": worst, "false": false,
-            "rms_px": _rms(errors), "largest_px": max(errors, default=None),
-            "elsdc_found_of_8": their_hits, "elsdc_false": their_wrong,
-            "elsdc_rms_px": _rms(their_errors), "elsdc_largest_px": max(their_errors, default=None),
-        })  # fmt: skip
+        rows.append(
+            {"noise": noise, "frames": frames}
+            | _columns("", worst, false, errors)
+            | _columns("elsdc_", *compare(theirs, circles))
+        )
         mean = sum(shifted) / len(shifted) if shifted else None
         explained.append({"noise": noise, "mean_with_both_mistakes_px": mean, "paper_mean_px": PAPER_PX[noise]})
     axis = (REDUCTION - 1) / 2 + REDUCTION * ELSDC_OFFSET
+    title = "Circles found of 8 (the worst frame), false ones and centre errors"
     return StudyResult(
         tables=[
-            Table("table02", "Circles found of 8 (the worst frame), false ones and centre errors", rows,
-                  "ELSDc: its authors' program, its known offset of half a pixel taken off."),
+            Table("table02", title, rows, load_data("notes.yaml")[NAME]["table02"]),
             Table("offset", "The same detections with both mistakes of convention made", explained),
         ],
         comparisons=[
-            Comparison(f"coarse centre error, noise {row['noise']}", "px", PAPER_PX[noise], row["rms_px"])
-            for noise, row in zip(NOISE, rows, strict=True)
+            Comparison(f"coarse centre error, noise {row['noise']}", "px", PAPER_PX[row["noise"]], row["rms_px"])
+            for row in rows
         ],
         statements=[
             f"The paper's 4.95 px: a frame reduced by {REDUCTION} has its pixel x at u = {REDUCTION} x + "
@@ -82,15 +78,22 @@ def run(
             "whatever the noise.",
         ],
         settings={"frames_per_noise": count},
-    )  # fmt: skip
+    )
 
 
-def reference() -> Any:
+def _columns(who: str, hits: int, wrong: int, errors: list[float]) -> Row:
+    rms = math.sqrt(sum(e * e for e in errors) / len(errors)) if errors else None
+    numbers = {"found_of_8": hits, "false": wrong, "rms_px": rms, "largest_px": max(errors, default=None)}
+    return {f"{who}{name}": number for name, number in numbers.items()}
+
+
+def reference() -> Row:
     """Scene and outputs of ELSDc."""
-    return json.loads((files("torchpose.studies") / "data" / "elsdc_table2_scene.json").read_text(encoding="utf-8"))
+    found: Row = load_data("elsdc_table2_scene.json")
+    return found
 
 
-def scene(data: dict) -> tuple[Tensor, Tensor]:
+def scene(data: Row) -> tuple[Tensor, Tensor]:
     """Noise-free frame (H, W) and its circles (C, 3): u, v, radius, outer and inner of each marker in turn."""
     about = data["scene"]
     circles = []
@@ -114,10 +117,6 @@ def compare(found: Tensor, circles: Tensor) -> tuple[int, int, list[float]]:
     errors = torch.where(hit, miss, torch.inf).amin(0) if len(found) else torch.full((len(circles),), torch.inf)
     repeated = int((hit.sum(0) - 1).clamp_min(0).sum())
     return int(errors.isfinite().sum()), int((~hit.any(1)).sum()) + repeated, errors[errors.isfinite()].tolist()
-
-
-def _rms(errors: list[float]) -> float | None:
-    return math.sqrt(sum(e * e for e in errors) / len(errors)) if errors else None
 
 
 def mistaken(found: Tensor) -> Tensor:

@@ -18,10 +18,11 @@ from torch import Tensor
 
 import torchpose as tp
 from torchpose.detect import find_candidates
+from torchpose.io.rows import Row
 from torchpose.refine import Sight, refine_edges, refine_photometric
 from torchpose.rings import Rings, measure_rings
 from torchpose.sim import add_noise, render
-from torchpose.studies.study import Comparison, Progress, StudyResult, Table, Value, ignore_progress
+from torchpose.studies.study import Comparison, Progress, StudyResult, Table, ignore_progress, load_data
 
 NAME = "table03_centers"
 TITLE = "Table III: centres of rings that face the camera"
@@ -29,13 +30,7 @@ F64 = torch.float64
 WIDTH, HEIGHT, FOCAL = 2600, 3648, 40_000.0
 CENTERS = torch.tensor([[1057.0, 513], [2153, 601], [2097, 2041], [881, 3409]], dtype=F64)
 RADII_PX = torch.tensor([[200.0, 80], [200, 100], [200, 120], [200, 140]], dtype=F64)
-PAPER_PX = {
-    0: (0.0025, 0.0104, 0.0080, 0.0392),
-    1: (0.0188, 0.0171, 0.0168, 0.0384),
-    2: (0.0167, 0.0144, 0.0085, 0.0374),
-    4: (0.0065, 0.0142, 0.0045, 0.0319),
-    8: (0.0080, 0.0131, 0.0150, 0.0318),
-}
+PAPER_PX: dict[int, list[float]] = load_data("paper.yaml")["table03"]  # of its four centres
 NOISE = (0, 1, 2, 4, 8, 16)
 PSF = 0.7
 METHODS = ("paper", "corrected", "edges", "photometric")
@@ -52,7 +47,7 @@ def run(
     """
     count = seeds or (100 if full else 4)
     cam = camera()
-    rows: list[dict[str, Value]] = []
+    rows: list[Row] = []
     comparisons = []
     for done, noise in enumerate(NOISE):
         trials = []
@@ -60,27 +55,25 @@ def run(
             trials.append(errors(noise, 1000 * (seed * len(NOISE) + done) + number, cam))
             progress((done + (number + 1) / count) / len(NOISE))
         limit = math.sqrt(sum(bound(ring, noise) ** 2 for ring in range(4)) / len(RADII_PX))
-        every = {m: torch.stack([trial[m] for trial in trials]) for m in METHODS}
-        found = {m: float(e.square().mean().sqrt()) for m, e in every.items()}
-        # the paper's figure is the length of one error
-        worst = {m: float(e.norm(dim=-1).max()) for m, e in every.items()}
-        bias = {m: float(e.mean(0).norm(dim=-1).max()) for m, e in every.items()}
-        published = max(PAPER_PX[noise]) if noise in PAPER_PX else None
-        row: dict[str, Value] = {"noise": noise, "frames": count, "bound_px": limit, "paper_largest_px": published}
+        paper_px = max(PAPER_PX[noise]) if noise in PAPER_PX else None
+        row: Row = {"noise": noise, "frames": count, "bound_px": limit, "paper_largest_px": paper_px}
         for method in METHODS:
-            row |= {f"{method}_px": found[method], f"{method}_over_bound": found[method] / limit}
-            row |= {f"{method}_worst_px": worst[method], f"{method}_bias_px": bias[method]}
+            every = torch.stack([trial[method] for trial in trials])
+            rms = float(every.square().mean().sqrt())
+            # the paper's figure is the length of one error
+            worst, bias = (float(error.norm(dim=-1).max()) for error in (every, every.mean(0)))
+            row |= {f"{method}_px": rms, f"{method}_over_bound": rms / limit}
+            row |= {f"{method}_worst_px": worst, f"{method}_bias_px": bias}
         rows.append(row)
-        comparisons.append(
-            Comparison(f"centre error per axis, noise {noise}", "px", published, found["photometric"], limit)
-        )
+        what = f"centre error per axis, noise {noise}"
+        comparisons.append(Comparison(what, "px", paper_px, row["photometric_px"], limit))
+    most = max(row["paper_worst_px"] for row in rows if row["paper_largest_px"])
     return StudyResult(
         tables=[Table("table03", "RMS centre error per axis over frames and rings, and its ratio to the bound", rows)],
         comparisons=comparisons,
         statements=[
-            "The paper's own chain (Zernike edges as read, outer ellipse) errs by at most "
-            f"{max(float(str(r['paper_worst_px'])) for r in rows if r['paper_largest_px']):.4f} px up to noise 8; the "
-            f"paper publishes up to {max(max(v) for v in PAPER_PX.values())} px.",
+            f"The paper's own chain (Zernike edges as read, outer ellipse) errs by at most {most:.4f} px up to "
+            f"noise 8; the paper publishes up to {max(map(max, PAPER_PX.values()))} px.",
         ],
         settings={"frames_per_noise": count, "psf_sigma_px": PSF},
     )
@@ -143,16 +136,16 @@ def bound(ring: int, noise: float) -> float:
     target, *pose = scene(torch.zeros(4, 2, dtype=F64), camera())
     principal = (size - 1) / 2 - target.centers[ring, :2] / scale
 
-    def picture(x: Tensor) -> Tensor:
+    def picture(change: Tensor) -> Tensor:
+        """Pixels with the centre, the radii and the blur changed, px."""
         matrix = camera().matrix
-        matrix[:2, 2] = principal + x[:2]
+        matrix[:2, 2] = principal + change[:2]
         box = tp.Camera(width=size, height=size, matrix=matrix, distortion=torch.zeros(4, dtype=F64))
         radii = target.radii.clone()
-        radii[ring] += x[2:4] * scale
-        return render(box, replace(target, radii=radii), *pose, psf_sigma=PSF + float(x[4])).double().flatten()
+        radii[ring] += change[2:4] * scale
+        return render(box, replace(target, radii=radii), *pose, psf_sigma=PSF + float(change[4])).double().flatten()
 
-    x = step * torch.eye(5, dtype=F64)
-    columns = [(picture(d) - picture(-d)) / (2 * step) for d in x]
+    columns = [(picture(change) - picture(-change)) / (2 * step) for change in step * torch.eye(5, dtype=F64)]
     fraction = (picture(torch.zeros(5, dtype=F64)) - 30) / 190
     jacobian = torch.stack([*columns, fraction, 1 - fraction], 1)
     information = jacobian.T @ jacobian / (noise**2 + 1 / 12)

@@ -9,23 +9,22 @@ pixel by which the ring is off the axis drawn at random; RMS length of the error
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 import torchpose as tp
+from torchpose.analysis import rms
 from torchpose.detect import find_candidates
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import conics, rotations
+from torchpose.io.rows import Row
 from torchpose.pose import common_center, compensate
-from torchpose.report.figures import COLOURS, GREY, subplots
+from torchpose.report.figures import COLOURS, GREY, curve, subplots
 from torchpose.rings import measure_rings
 from torchpose.sim import add_noise, render
-from torchpose.studies.study import Comparison, Picture, Progress, StudyResult, Table, Value, ignore_progress
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from torchpose.studies.study import Comparison, Picture, Progress, StudyResult, Table, ignore_progress, load_data
 
 NAME = "table04_compensation"
 TITLE = "Table IV: the centre of a tilted ring, compensated"
@@ -33,7 +32,7 @@ F64 = torch.float64
 FOCAL, DISTANCE, SIZE = 3333.33, 160.0, 301
 RADII = torch.tensor([[5.0, 2.5]], dtype=F64)
 TILTS_DEG = (0, 5, 10, 20, 30, 40, 50, 60, 70)
-PAPER_PX = {5: (0.1811, 0.0075), 10: (0.2723, 0.0141)}  # uncompensated, eq. (7)
+PAPER_PX: dict[int, list[float]] = load_data("paper.yaml")["table04"]  # uncompensated, eq. (7)
 NAMES = ("ellipse", "eq7", "exact")
 NOISE = (0.0, 2.0)
 
@@ -47,70 +46,66 @@ def run(
         seeds: frames for each tilt and noise; by default 50, or 6 for a quick run.
     """
     count = seeds or (50 if full else 6)
-    rows: list[dict[str, Value]] = []
+    rows: list[Row] = []
     for done, tilt in enumerate(TILTS_DEG):
         g = torch.Generator().manual_seed(1000 * seed + tilt)
         draws = torch.rand(count, 3, dtype=F64, generator=g)
         axes = torch.stack([(2 * math.pi * draws[:, 0]).cos(), (2 * math.pi * draws[:, 0]).sin()], -1)
         lean = rotations.exp(torch.nn.functional.pad(axes * math.radians(tilt), (0, 1)))
         formula = errors(*projected(lean[0]))[0].tolist()
-        paper = PAPER_PX.get(tilt, (None, None))
+        paper = dict(zip(("paper_ellipse_px", "paper_eq7_px"), PAPER_PX.get(tilt, (None, None)), strict=True))
         for noise in NOISE:
             shift = draws[:, 1:] - 0.5
             found = errors(*measured(lean, shift, noise, seed))
             as_read = errors(*measured(lean, shift, noise, seed, correct=False))[:, 1:2]
-            rms = torch.cat([found, as_read], 1).square().mean(0).sqrt().tolist()
-            row: dict[str, Value] = {"tilt_deg": tilt, "noise": noise}
-            row |= {f"formula_{n}_px": x for n, x in zip(NAMES, formula, strict=True)}
-            row |= {f"measured_{n}_px": x for n, x in zip((*NAMES, "eq7_paper_edges"), rms, strict=True)}
-            rows.append(row | {"paper_ellipse_px": paper[0], "paper_eq7_px": paper[1]})
+            measured_px = rms(torch.cat([found, as_read], 1)).tolist()
+            row: Row = {"tilt_deg": tilt, "noise": noise}
+            row |= {f"formula_{name}_px": value for name, value in zip(NAMES, formula, strict=True)}
+            row |= {f"measured_{n}_px": v for n, v in zip((*NAMES, "eq7_paper_edges"), measured_px, strict=True)}
+            rows.append(row | paper)
         progress((done + 1) / len(TILTS_DEG))
     clean = {row["tilt_deg"]: row for row in rows if row["noise"] == 0}
-    comparisons = []
-    for tilt, (raw, compensated) in PAPER_PX.items():
-        row = clean[tilt]
-        comparisons.append(
-            Comparison(f"{tilt} degrees, not compensated", "px", raw, _number(row, "measured_ellipse_px"))
-        )
-        comparisons.append(Comparison(f"{tilt} degrees, eq. (7)", "px", compensated, _number(row, "measured_eq7_px")))
-        comparisons.append(Comparison(f"{tilt} degrees, exact", "px", compensated, _number(row, "measured_exact_px")))
     steep = max(tilt for tilt in TILTS_DEG if tilt <= 60)
+    title = "Distance of the centre from the truth: of the formula alone, and measured (RMS)"
     return StudyResult(
-        tables=[
-            Table("table04", "Distance of the centre from the truth: of the formula alone, and measured (RMS)", rows)
-        ],
+        tables=[Table("table04", title, rows)],
         pictures=[
             Picture("table04", "Error of the centre over the tilt", _plot(rows)),
             Picture("fig09", "Fig. 9: a ring tilted by 45 degrees, its ellipses' centres and its own", _ring_picture()),
         ],
-        comparisons=comparisons,
+        comparisons=[
+            Comparison(f"{tilt} degrees, {words}", "px", paper, clean[tilt][f"measured_{name}_px"])
+            for tilt, (raw, eq7) in PAPER_PX.items()
+            for words, paper, name in (
+                ("not compensated", raw, "ellipse"),
+                ("eq. (7)", eq7, "eq7"),
+                ("exact", eq7, "exact"),
+            )
+        ],
         statements=[
-            f"Eq. (7) itself leaves {_number(clean[steep], 'formula_eq7_px'):.4f} px at {steep} degrees, on exact "
+            f"Eq. (7) itself leaves {clean[steep]['formula_eq7_px']:.4f} px at {steep} degrees, on exact "
             f"ellipses; the common pole of both conics is exact. Measured, noise-free: "
-            f"{_number(clean[steep], 'measured_eq7_px'):.4f} and {_number(clean[steep], 'measured_exact_px'):.4f} px.",
+            f"{clean[steep]['measured_eq7_px']:.4f} and {clean[steep]['measured_exact_px']:.4f} px.",
         ],
         settings={"frames_per_row": count, "psf_sigma_px": 0.7},
     )
 
 
-def _number(row: dict[str, Value], key: str) -> float:
-    return float(str(row[key]))
-
-
-def _plot(rows: list[dict[str, Value]]) -> Figure:
+def _plot(rows: list[Row]) -> Figure:
     figure, (panels,) = subplots(1, len(NOISE), (6 * len(NOISE), 4.5), sharey=True)
+    lines = (
+        ("measured_ellipse_px", "centre of the ellipse"),
+        ("measured_eq7_px", "eq. (7)"),
+        ("measured_exact_px", "exact"),
+        ("measured_eq7_paper_edges_px", "eq. (7), edges as read"),
+    )
     for panel, noise in zip(panels, NOISE, strict=True):
         part = [row for row in rows if row["noise"] == noise]
-        tilt = [_number(row, "tilt_deg") for row in part]
-        lines = (("measured_ellipse_px", "centre of the ellipse"), ("measured_eq7_px", "eq. (7)"),
-                 ("measured_exact_px", "exact"), ("measured_eq7_paper_edges_px", "eq. (7), edges as read"))  # fmt: skip
         for (key, label), colour in zip(lines, COLOURS, strict=False):
-            panel.semilogy(tilt, [_number(row, key) for row in part], "o-", ms=4, color=colour, label=label)
-        for which, label in ((0, "paper, not compensated"), (1, "paper, compensated")):
-            panel.plot(list(PAPER_PX), [p[which] for p in PAPER_PX.values()], "x" if which else "+", color=GREY, ms=9,
-                       label=label)  # fmt: skip
-        panel.set_title(f"noise {noise:g}")
-        panel.set_xlabel("tilt, degrees")
+            curve(panel, part, "tilt_deg", key, ms=4, color=colour, label=label)
+        for which, (marker, label) in enumerate((("+", "paper, not compensated"), ("x", "paper, compensated"))):
+            panel.plot(list(PAPER_PX), [p[which] for p in PAPER_PX.values()], marker, color=GREY, ms=9, label=label)
+        panel.set(title=f"noise {noise:g}", xlabel="tilt, degrees", yscale="log")
     panels[0].set_ylabel("error of the centre, RMS, px")
     panels[-1].legend(fontsize=8)
     return figure
@@ -129,16 +124,14 @@ def _ring_picture() -> Figure:
     )
     for panel in (whole, near):
         for fit in (outer, inner):
-            xy = conics.points_on(fit.params, angle[None])[0]
-            panel.plot(xy[:, 0], xy[:, 1], color="black", lw=1)
+            panel.plot(*conics.points_on(fit.params, angle[None])[0].T, color="black", lw=1)
         for (label, place, marker), colour in zip(points, COLOURS, strict=False):
             panel.plot(*place.tolist(), marker, color=colour, ms=9, mfc="none", label=label)
         panel.set_aspect("equal")
         panel.invert_yaxis()
         panel.set_xlabel("u, px")
     reach = 1.6 * max(float(place.abs().max()) for _, place, _ in points)
-    near.set_xlim(-reach, reach)
-    near.set_ylim(reach, -reach)
+    near.set(xlim=(-reach, reach), ylim=(reach, -reach))
     near.legend(fontsize=8)
     return figure
 
@@ -159,7 +152,11 @@ def measured(
     """Ellipses of both circles in simulated frames, relative to the image of their centre.
 
     Args:
-        rotation: (B, 3, 3) of the ring. shift: (B, 2) px of its centre from the optical axis.
+        rotation: (B, 3, 3) of the ring.
+        shift: (B, 2) px of its centre from the optical axis.
+        noise: grey levels.
+        seed: of the noise.
+        correct: free the edges from blur and curvature.
     """
     camera = tp.Camera.ideal(SIZE, SIZE, FOCAL)
     # a target has three markers at least: the others lie outside of the frame

@@ -6,19 +6,15 @@ By hand: ``python -m torchpose.rig.twin.controller --host 127.0.0.2``; ur-rtde's
 from __future__ import annotations
 
 import argparse
-import json
-import queue
-import socket
 import sys
 import threading
 from collections.abc import Sequence
-from types import TracebackType
-from typing import IO, Annotated, Any
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from torchpose.errors import ConfigError
-from torchpose.rig.processes import start_module
+from torchpose.rig.child import Child, ChildEnded, ChildError
 from torchpose.rig.twin.machine import Fault
 
 __all__ = ["START_POSE", "Fault", "TwinController", "TwinErrors"]
@@ -31,18 +27,13 @@ _NotNegative = Annotated[FiniteFloat, Field(ge=0)]
 
 
 class TwinErrors(BaseModel):
-    """How the simulated robot deviates from an ideal one; part of a twin file.
-
-    `repeatability_mm` and `repeatability_deg` are standard deviations by axis of the true pose about the reported one,
-    drawn anew for every move. `scale` stretches true displacements from the start relative to reported ones.
-    `reading_noise_mm` is the standard deviation by axis of every reported position.
-    """
+    """How the simulated robot deviates from an ideal one; part of a twin file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    repeatability_mm: _NotNegative = 0.0
-    repeatability_deg: _NotNegative = 0.0
-    scale: FiniteFloat = 0.0
-    reading_noise_mm: _NotNegative = 0.0
+    repeatability_mm: _NotNegative = 0.0  # standard deviation by axis of the true pose about the reported one, drawn
+    repeatability_deg: _NotNegative = 0.0  # anew for every move
+    scale: FiniteFloat = 0.0  # how much longer true displacements from the start are than reported ones, relative
+    reading_noise_mm: _NotNegative = 0.0  # standard deviation by axis of every reported position
 
 
 class TwinController:
@@ -50,8 +41,10 @@ class TwinController:
 
     Args:
         host: loopback address; its ports 30003, 30004 and 29999 must be free.
-        faults: present from the start. start_pose: tool in the base, mm and rotation vector in rad.
-        errors: of the robot. seed: of their random numbers.
+        faults: present from the start.
+        start_pose: tool in the base, mm and rotation vector in rad.
+        errors: of the robot.
+        seed: of their random numbers.
 
     Raises:
         ConfigError: the address or one of its ports cannot be used.
@@ -66,62 +59,33 @@ class TwinController:
         seed: int = 0,
     ) -> None:
         self.host = host
-        setup = {
-            "host": host,
-            "faults": [Fault(fault).value for fault in faults],
-            "start_pose": list(start_pose),
-            "errors": (errors or TwinErrors()).model_dump(),
-            "seed": seed,
-        }
-        self._process = start_module("torchpose.rig.twin.server", json.dumps(setup))
-        self._lock = threading.Lock()
-        lines: queue.Queue[str] = queue.Queue()
-        assert self._process.stdout is not None
-        threading.Thread(target=_read_line, args=(self._process.stdout, lines), daemon=True).start()
+        self._child = Child("torchpose.rig.twin.server")
+        present, errors = [Fault(fault) for fault in faults], errors or TwinErrors()
+        setup = {"start_pose": list(start_pose), "errors": errors.model_dump(), "seed": seed, "faults": present}
         try:
-            ready = json.loads(lines.get(timeout=_START_S) or '{"error": "its process ended"}')
-        except queue.Empty:
-            ready = {"error": f"it did not start within {_START_S:g} s"}
-        if "error" in ready:
-            self._process.kill()
-            self._process.communicate()
-            raise ConfigError(
-                f"{host}: twin: cannot serve there ({ready['error']}); end the other twin or give another 127.0.0.x"
-            )
-        self._socket = socket.create_connection((host, ready["port"]), _ANSWER_S)
-        self._answers = self._socket.makefile("r", encoding="utf-8")
+            self._child.call("start", _START_S, host=host, **setup)
+        except ChildError as error:
+            self.close()
+            fix = "end the other twin or give another 127.0.0.x"
+            raise ConfigError(f"{host}: twin: cannot serve there ({error}); {fix}") from None
 
     def __enter__(self) -> TwinController:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
-
-    @property
-    def pid(self) -> int:
-        """Number of its process."""
-        return self._process.pid
-
-    def _ask(self, **request: Any) -> dict[str, Any]:
-        with self._lock:
-            self._socket.sendall(json.dumps(request).encode() + b"\n")
-            answer = self._answers.readline()
-        if not answer:
-            raise ConnectionError(f"{self.host}: the twin has ended")
-        result: dict[str, Any] = json.loads(answer)
-        return result
 
     def inject(self, fault: Fault | str, at_fraction: float | None = None) -> None:
         """Makes a fault, now or at a share (0 to 1) of the path of the present or the next move."""
         try:
-            self._ask(do="inject", fault=Fault(fault).value, at_fraction=at_fraction)
-        except ConnectionError:
+            self._child.call("inject", _ANSWER_S, fault=Fault(fault), at_fraction=at_fraction)
+        except ChildEnded:
             if fault != Fault.KILL:
                 raise
 
     def clear(self) -> None:
         """Normal operation again, as after a person has cleared the fault at the pendant; no program runs."""
-        self._ask(do="clear")
+        self._child.call("clear", _ANSWER_S)
 
     def state(self) -> dict[str, Any]:
         """Where it stands and what has happened.
@@ -129,7 +93,7 @@ class TwinController:
         Keys: pose and true_pose (mm, rad), moving, fraction (of the path), program (running), safety, faults, moves
         (how many were begun), unlocks (how often somebody unlocked a protective stop).
         """
-        return self._ask(do="state")
+        return dict(self._child.call("state", _ANSWER_S))
 
     def true_pose(self) -> tuple[float, ...]:
         """Where the tool really is in the base now: mm and rotation vector in rad."""
@@ -137,14 +101,7 @@ class TwinController:
 
     def close(self) -> None:
         """Ends its process."""
-        self._answers.close()
-        self._socket.close()
-        self._process.kill()
-        self._process.communicate()
-
-
-def _read_line(stream: IO[str], lines: queue.Queue[str]) -> None:
-    lines.put(stream.readline())
+        self._child.close(_ANSWER_S)
 
 
 def main() -> None:

@@ -7,8 +7,10 @@ The handshake is the one between ur-rtde's client and the script that it uploads
 
 from __future__ import annotations
 
+import math
 import os
 import sys
+from collections import defaultdict
 from enum import Enum, StrEnum
 from typing import Any
 
@@ -54,32 +56,28 @@ class Machine:
     """One controller. Times are seconds of any steady clock, passed in.
 
     Args:
-        start: (6,) pose of the tool in the base. errors: `repeatability_mm`, `repeatability_deg` (standard deviation by
-            axis, drawn for every move), `scale` (relative, about the start), `reading_noise_mm` (standard deviation by
-            axis of every reported position). seed: of their random numbers.
+        start: (6,) pose of the tool in the base.
+        errors: those of `torchpose.rig.twin.controller.TwinErrors` that are not 0, by name.
+        seed: of their random numbers.
     """
 
     def __init__(self, start: Array, errors: dict[str, float], seed: int) -> None:
         self.motion = Motion(start, start)
         self.origin = start
         self.tcp = np.zeros(6)
-        self.errors = errors
+        self.errors = defaultdict(float, errors)
         self.random = np.random.default_rng(seed)
-        self.offset_from = self.offset_to = np.zeros(
-            6
-        )  # error of the true pose at the start and at the end of the move
+        self.offset_from = self.offset_to = np.zeros(6)  # error of the true pose at the start and the end of the move
         self.registers: dict[str, float] = {}
         self.program = False
         self.executing = False
         self.blocking = False  # a synchronous move holds its command until it has arrived
         self.safety = Safety.NORMAL
         self.faults: set[Fault] = set()
-        self.pending: list[tuple[float, Fault]] = []
+        self.pending: list[tuple[float, Fault]] = []  # at which share of a path
         self.async_running = False
         self.async_writes = self.async_operation = 0
         self.moves = self.unlocks = 0
-
-    # the program
 
     def upload(self, now: float) -> None:
         """The client's script has arrived and starts."""
@@ -115,7 +113,6 @@ class Machine:
 
     def _execute(self, command: int, now: float) -> None:
         numbers = np.array([self.registers.get(f"input_double_register_{i}", 0.0) for i in range(8)])
-        result = None
         if command == MOVE_L:
             self._move(numbers, now)
         elif command == SET_TCP:
@@ -126,18 +123,15 @@ class Machine:
         elif command in (STOP_L, STOP_J):
             self.motion = self.motion.halt(now, float(numbers[0]))
         elif command == IS_POSE_SAFE:
-            result = self.reachable(numbers[:6])
+            self.registers["output_int_register_1"] = self.reachable(numbers[:6])
         elif command == GET_TCP:
             self.registers.update({f"output_double_register_{i}": float(v) for i, v in enumerate(self.tcp)})
         elif command == IS_STEADY:
-            result = not self.motion.moving(now)
-        elif command == STOP_SCRIPT:
-            self.stop_program(now)
+            self.registers["output_int_register_1"] = not self.motion.moving(now)
         else:
-            print(f"twin: command {command} is not emulated; the program ends", file=sys.stderr)
+            if command != STOP_SCRIPT:
+                print(f"twin: command {command} is not emulated; the program ends", file=sys.stderr)
             self.stop_program(now)
-        if result is not None:
-            self.registers["output_int_register_1"] = int(result)
 
     def reachable(self, pose: Array) -> bool:
         """Whether the flange gets to the tool pose (6,): a sphere stands for the robot's kinematics."""
@@ -153,11 +147,9 @@ class Machine:
             goal[0] += 0.5e-3
         if Fault.SLOW in self.faults:
             speed, acceleration = speed / 20, acceleration / 400
-        u = self.motion.fraction(now)
-        self.offset_from = (1 - u) * self.offset_from + u * self.offset_to
-        spread = [1e-3 * self.errors.get("repeatability_mm", 0.0)] * 3
-        spread += [float(np.radians(self.errors.get("repeatability_deg", 0.0)))] * 3
-        self.offset_to = self.random.normal(size=6) * spread
+        self.offset_from = self._offset(now)
+        spread = [1e-3 * self.errors["repeatability_mm"], math.radians(self.errors["repeatability_deg"])]
+        self.offset_to = self.random.normal(size=6) * np.repeat(spread, 3)
         self.motion = Motion(self.motion.pose(now), goal, speed, acceleration, now)
         self.moves += 1
         if int(self.registers.get("input_int_register_1", 0)):
@@ -170,16 +162,14 @@ class Machine:
         self.async_running = running
         self.async_writes = (self.async_writes + 1) % 128
         self.async_operation = (self.async_operation + running) % 128
-        value = self.async_writes << 16 | self.async_operation << 24 | (1 << 15 if running else 0)
-        self.registers["output_int_register_2"] = value
-
-    # time, faults and safety
+        self.registers["output_int_register_2"] = self.async_writes << 16 | self.async_operation << 24 | running << 15
 
     def advance(self, now: float) -> None:
         """What has become due at time `now`: faults at their place on the path, arrivals."""
-        for entry in [e for e in self.pending if self.motion.moving(now) and self.motion.fraction(now) >= e[0]]:
-            self.pending.remove(entry)
-            self._fail(entry[1], now)
+        for share, fault in list(self.pending):
+            if self.motion.moving(now) and self.motion.fraction(now) >= share:
+                self.pending.remove((share, fault))
+                self._fail(fault, now)
         if not self.motion.moving(now):
             if self.async_running and self.program:
                 self._write_async(running=False)
@@ -210,31 +200,30 @@ class Machine:
         self.pending.clear()
         self.safety, self.program = Safety.NORMAL, False
 
-    # what is seen from outside
-
     def pose(self, now: float) -> Array:
         """(6,) pose that the controller believes."""
         return self.motion.pose(now)
 
     def true_pose(self, now: float) -> Array:
         """(6,) pose in which the tool really is."""
-        pose, u = self.motion.pose(now), self.motion.fraction(now)
-        offset = (1 - u) * self.offset_from + u * self.offset_to
-        place = pose[:3] + self.errors.get("scale", 0.0) * (pose[:3] - self.origin[:3]) + offset[:3]
-        rotation = motion.vector(motion.matrix(offset[3:]) @ motion.matrix(pose[3:]))
-        return np.concatenate([place, rotation])
+        pose, offset = self.motion.pose(now), self._offset(now)
+        place = pose[:3] + self.errors["scale"] * (pose[:3] - self.origin[:3]) + offset[:3]
+        return np.append(place, motion.vector(motion.matrix(offset[3:]) @ motion.matrix(pose[3:])))
+
+    def _offset(self, now: float) -> Array:
+        share = self.motion.fraction(now)
+        return (1 - share) * self.offset_from + share * self.offset_to
 
     def value(self, name: str, now: float) -> Any:
         """One variable of the stream; what has no counterpart in the twin (joints, forces, currents) is zero."""
         if name in self.registers:
             return int(self.registers[name]) if "_int_" in name else self.registers[name]
         if name == "actual_TCP_pose":
-            noise = self.random.normal(size=3) * 1e-3 * self.errors.get("reading_noise_mm", 0.0)
+            noise = self.random.normal(size=3) * 1e-3 * self.errors["reading_noise_mm"]
             return self.pose(now) + np.append(noise, [0, 0, 0])
         if name == "target_TCP_pose":
             return self.pose(now)
-        powered = self.safety is not Safety.EMERGENCY_STOP
-        paused = self.safety is not Safety.NORMAL
+        powered, paused = self.safety is not Safety.EMERGENCY_STOP, self.safety is not Safety.NORMAL
         simple = {
             "timestamp": now,
             "robot_mode": 7 if powered else 3,
@@ -248,8 +237,8 @@ class Machine:
         return simple.get(name, 0)
 
     def state(self, now: float) -> dict[str, Any]:
-        """For the side channel: poses in mm and rad, and what has happened."""
-        scale = np.array([1e3] * 3 + [1.0] * 3)
+        """For `TwinController.state`: poses in mm and rad, and what has happened."""
+        scale = [1e3, 1e3, 1e3, 1, 1, 1]
         return {
             "pose": (self.pose(now) * scale).tolist(),
             "true_pose": (self.true_pose(now) * scale).tolist(),

@@ -25,34 +25,29 @@ def matrix(rotation_vector: Array) -> Array:
 def vector(rotation: Array) -> Array:
     """Rotation vector (3,) in rad, of length 0 to pi, of a rotation matrix (3, 3).
 
-    The quaternion's largest component is divided by, so no digits are lost at any angle (Shepperd 1978).
+    Its quaternion q is read from the row of 4 q q^T with the largest diagonal, which loses no digits (Shepperd 1978).
     """
-    m = rotation
-    four = np.array([1 + np.trace(m), *(1 - np.trace(m) + 2 * np.diag(m))])  # 4 w^2, 4 x^2, 4 y^2, 4 z^2
-    skew = np.array([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
-    best = int(four.argmax())
-    if best == 0:
-        q = np.array([four[0], *skew])
-    else:
-        axis = best - 1
-        q = np.array([skew[axis], *(m[:, axis] + m[axis])])
-        q[best] = four[best]
-    q /= np.linalg.norm(q) * (-1.0 if q[0] < 0 else 1.0)
-    sine = float(np.linalg.norm(q[1:]))
-    result: Array = q[1:] * (2 * math.atan2(sine, q[0]) / sine if sine > 1e-12 else 2.0)
+    skew = rotation[[2, 0, 1], [1, 2, 0]] - rotation[[1, 2, 0], [2, 0, 1]]
+    trace = np.trace(rotation)
+    vectors = rotation + rotation.T + (1 - trace) * np.eye(3)
+    products = np.block([[1 + trace, skew], [skew[:, None], vectors]])
+    w, *xyz = products[products.diagonal().argmax()]
+    sine = math.hypot(*xyz)
+    angle = 2 * math.atan2(sine, abs(w))
+    factor = math.copysign(angle / sine if sine > 1e-12 else 2 / abs(w), w)
+    result: Array = factor * np.array(xyz)
     return result
 
 
 def compose(a: Array, b: Array) -> Array:
     """Pose (6,) of the transform a after b."""
-    r = matrix(a[3:])
-    return np.concatenate([r @ b[:3] + a[:3], vector(r @ matrix(b[3:]))])
+    turn = matrix(a[3:])
+    return np.append(turn @ b[:3] + a[:3], vector(turn @ matrix(b[3:])))
 
 
 def inverse(a: Array) -> Array:
     """Pose (6,) of the inverse transform."""
-    r = matrix(a[3:]).T
-    return np.concatenate([-r @ a[:3], -a[3:]])
+    return np.append(-matrix(a[3:]).T @ a[:3], -a[3:])
 
 
 @dataclass(frozen=True)
@@ -80,57 +75,50 @@ class Motion:
         """The longer of the path in m and the turn in rad."""
         return max(float(np.linalg.norm(self.goal[:3] - self.start[:3])), float(np.linalg.norm(self.turn)))
 
+    @cached_property
+    def phases(self) -> list[tuple[float, float]]:
+        """Seconds and acceleration of each part: faster, steady, slower; when halted, up to then and braking."""
+        ramp = min(self.speed / self.acceleration, math.sqrt(self.length / self.acceleration))
+        steady = max(0.0, self.length / (self.acceleration * ramp) - ramp) if ramp > 0 else 0.0
+        phases = [(ramp, self.acceleration), (steady, 0.0), (ramp, -self.acceleration)]
+        if self.halted is None:
+            return phases
+        at, deceleration = self.halted
+        left, speed, done = at - self.begin, 0.0, []
+        for seconds, acceleration in phases:
+            done.append((min(seconds, left), acceleration))
+            left, speed = left - done[-1][0], speed + acceleration * done[-1][0]
+        return [*done, (speed / deceleration, -deceleration)]
+
     @property
     def duration(self) -> float:
-        """Seconds that the whole move takes when it is not halted."""
-        ramp, cruise = self._phases()
-        return 2 * ramp + cruise
-
-    def _phases(self) -> tuple[float, float]:
-        length = self.length
-        ramp = min(self.speed / self.acceleration, math.sqrt(length / self.acceleration))
-        return ramp, max(0.0, length / (self.acceleration * ramp) - ramp) if ramp > 0 else 0.0
-
-    def _travelled(self, t: float) -> tuple[float, float]:
-        """Distance and speed at `t` seconds after the start, not halted."""
-        ramp, cruise = self._phases()
-        total = 2 * ramp + cruise
-        t = min(max(t, 0.0), total)
-        a, top = self.acceleration, self.acceleration * ramp
-        if t < ramp:
-            return 0.5 * a * t * t, a * t
-        if t < ramp + cruise:
-            return 0.5 * a * ramp * ramp + top * (t - ramp), top
-        left = total - t
-        return self.length - 0.5 * a * left * left, a * left
+        """Seconds from the beginning until the tool stands."""
+        return sum(seconds for seconds, _ in self.phases)
 
     def fraction(self, now: float) -> float:
         """Share of the path that is done at time `now`, 0 to 1."""
-        if self.length == 0:
-            return 1.0
-        if self.halted is None or now <= self.halted[0]:
-            return self._travelled(now - self.begin)[0] / self.length
-        at, deceleration = self.halted
-        s, v = self._travelled(at - self.begin)
-        t = min(now - at, v / deceleration)
-        return (s + v * t - 0.5 * deceleration * t * t) / self.length
+        left, speed, distance = max(0.0, now - self.begin), 0.0, 0.0
+        for seconds, acceleration in self.phases:
+            t = min(seconds, left)
+            distance += speed * t + 0.5 * acceleration * t * t
+            left, speed = left - t, speed + acceleration * t
+        return distance / self.length if self.length > 0 else 1.0
 
     def moving(self, now: float) -> bool:
         """Whether the tool still moves at time `now`."""
-        if self.halted is None or now <= self.halted[0]:
-            return now - self.begin < self.duration
-        at, deceleration = self.halted
-        return now - at < self._travelled(at - self.begin)[1] / deceleration
+        return bool(now - self.begin < self.duration)
 
     def halt(self, now: float, deceleration: float) -> Motion:
-        """The same move, braked from time `now` on; a move that is being braked already stays as it is.
+        """The same move, braked from time `now` on; one that is being braked already, or has ended, stays as it is.
 
         It brakes at least as hard as the move itself would, so it never runs past its goal.
         """
-        return self if self.halted is not None else replace(self, halted=(now, max(deceleration, self.acceleration)))
+        if self.halted is not None or not self.moving(now):
+            return self
+        return replace(self, halted=(now, max(deceleration, self.acceleration)))
 
     def pose(self, now: float) -> Array:
         """Pose (6,) at time `now`."""
-        u = self.fraction(now)
-        rotation = vector(matrix(self.start[3:]) @ matrix(u * self.turn))
-        return np.concatenate([self.start[:3] + u * (self.goal[:3] - self.start[:3]), rotation])
+        share = self.fraction(now)
+        rotation = vector(matrix(self.start[3:]) @ matrix(share * self.turn))
+        return np.append(self.start[:3] + share * (self.goal[:3] - self.start[:3]), rotation)

@@ -1,52 +1,67 @@
-"""The twin's process: the four sockets of the simulated controller. Started by `TwinController`.
+"""The twin's process: the sockets of the simulated controller, around one `Machine`. Started by `TwinController`.
 
-RTDE stream (30004), script upload (30003), dashboard (29999), as a UR controller has them, and a side channel of JSON
-lines for faults and for the true pose. The process ends when its standard input closes.
+RTDE stream (30004), script upload (30003) and dashboard (29999), as a UR controller has them. Faults come from the
+parent process, which is told the true pose.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import os
 import struct
-import sys
-import threading
 import time
 import traceback
 from asyncio import StreamReader, StreamWriter
+from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any
 
 import numpy as np
 
+from torchpose.rig.child import serve
 from torchpose.rig.twin import wire
 from torchpose.rig.twin.machine import Fault, Machine, Safety
 
 RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
 VERSION = (5, 11, 1, 108318)
-MODEL = "UR5 torchpose twin"  # names the twin to whoever asks the dashboard for the model
-SERIAL = "20990000001"
 TICK_S = 0.004
+
+Handler = Callable[[StreamReader, StreamWriter], Awaitable[None]]
 
 
 class Server:
-    """Sockets around one `Machine`."""
+    """The controller's three sockets, and what the parent asks for (see `TwinController`); all in one event loop."""
 
-    def __init__(self, machine: Machine) -> None:
-        self.machine = machine
+    machine: Machine
 
-    async def run(self, host: str) -> None:
-        """Serves until the process ends; prints one JSON line when ready."""
-        handlers = {RTDE_PORT: self.rtde, SCRIPT_PORT: self.script, DASHBOARD_PORT: self.dashboard}
-        servers = [await asyncio.start_server(self._guarded(h), host, port) for port, h in handlers.items()]
-        side = await asyncio.start_server(self.side_channel, host, 0)
-        print(json.dumps({"port": side.sockets[0].getsockname()[1]}), flush=True)
-        while all(server.is_serving() for server in servers):
+    async def start(
+        self, host: str, start_pose: list[float], errors: dict[str, float], seed: int, faults: list[str]
+    ) -> None:
+        """Serves from now on, the tool at a pose (mm, rad). Raises OSError where a port cannot be used."""
+        self.machine = Machine(np.array(start_pose) * [1e-3, 1e-3, 1e-3, 1, 1, 1], errors, seed)
+        for fault in faults:
+            await self.inject(fault)
+        for port, handler in ((RTDE_PORT, self.rtde), (SCRIPT_PORT, self.script), (DASHBOARD_PORT, self.dashboard)):
+            await asyncio.start_server(self._guarded(handler), host, port)
+        self._ticking = _run(self._tick())
+
+    async def inject(self, fault: str, at_fraction: float | None = None) -> None:
+        self.machine.inject(Fault(fault), at_fraction, time.monotonic())
+
+    async def clear(self) -> None:
+        self.machine.clear()
+
+    async def state(self) -> dict[str, Any]:
+        now = time.monotonic()
+        self.machine.advance(now)
+        return self.machine.state(now)
+
+    async def _tick(self) -> None:
+        while True:
             self.machine.advance(time.monotonic())
             await asyncio.sleep(TICK_S)
 
-    def _guarded(self, handler: Any) -> Any:
+    def _guarded(self, handler: Handler) -> Handler:
         silent = {Fault.SILENT, Fault.SILENT_STREAM} if handler == self.rtde else {Fault.SILENT}
 
         async def serve(reader: StreamReader, writer: StreamWriter) -> None:
@@ -61,7 +76,8 @@ class Server:
     async def rtde(self, reader: StreamReader, writer: StreamWriter) -> None:
         """One client of the stream: recipes out and in, then data packets both ways."""
         inputs: dict[int, wire.Recipe] = {}
-        output, period, sender = wire.Recipe(1, ()), 0.008, None
+        output, period = wire.Recipe(1, ()), 0.008
+        sender: asyncio.Task[None] | None = None
         try:
             while True:
                 size, kind = wire.HEADER.unpack(await reader.readexactly(wire.HEADER.size))
@@ -77,15 +93,14 @@ class Server:
                 elif kind == wire.INPUTS:
                     recipe = wire.Recipe(len(inputs) + 1, wire.names(payload))
                     inputs[recipe.id] = recipe
-                    taken = Fault.REGISTERS_IN_USE in self.machine.faults
-                    reply = bytes([recipe.id]) + ",".join(["IN_USE"] if taken else recipe.types).encode()
+                    types = ["IN_USE"] if Fault.REGISTERS_IN_USE in self.machine.faults else recipe.types
+                    reply = bytes([recipe.id]) + ",".join(types).encode()
                 elif kind in (wire.START, wire.PAUSE):
                     if sender is not None:
                         sender.cancel()
                     accepted = kind == wire.PAUSE or "NOT_FOUND" not in output.types
                     if kind == wire.START and accepted:
-                        sender = asyncio.create_task(self._stream(writer, output, period))
-                        sender.add_done_callback(_report)
+                        sender = _run(self._stream(writer, output, period))
                     reply = bytes([accepted])
                 elif kind == wire.DATA:
                     self.machine.write(inputs[payload[0]].unpack(payload[1:]), time.monotonic())
@@ -134,59 +149,44 @@ class Server:
         if command == "unlock protective stop":
             machine.unlocks += 1
             return "Protective stop releasing"
-        version = ".".join(map(str, VERSION))
         answers = {
             "robotmode": f"Robotmode: {'POWER_OFF' if machine.safety is Safety.EMERGENCY_STOP else 'RUNNING'}",
             "safetystatus": f"Safetystatus: {machine.safety.value[2]}",
             "safetymode": f"Safetymode: {machine.safety.value[2]}",
             "is in remote control": str(Fault.NOT_REMOTE not in machine.faults).lower(),
-            "PolyscopeVersion": f"URSoftware {version} (torchpose twin)",
-            "get serial number": SERIAL,
-            "get robot model": MODEL,
+            "PolyscopeVersion": f"URSoftware {'.'.join(map(str, VERSION))} (torchpose twin)",
+            "get serial number": "20990000001",
+            "get robot model": "UR5 torchpose twin",  # `torchpose.rig.robot` knows the twin by it
             "running": f"Program running: {str(machine.program).lower()}",
             "programState": f"{'PLAYING' if machine.program else 'STOPPED'} rtde_control",
             "quit": "Disconnected",
         }
         return answers.get(command, f"could not understand: '{command}'")
 
-    async def side_channel(self, reader: StreamReader, writer: StreamWriter) -> None:
-        """``{"do": "state"}``, ``{"do": "clear"}``, ``{"do": "inject", "fault": ..., "at_fraction": ...}``."""
-        while line := await reader.readline():
-            request, now = json.loads(line), time.monotonic()
-            if request["do"] == "inject":
-                self.machine.inject(Fault(request["fault"]), request.get("at_fraction"), now)
-            elif request["do"] == "clear":
-                self.machine.clear()
-            self.machine.advance(now)
-            writer.write(json.dumps(self.machine.state(now)).encode() + b"\n")
+
+def _run(coroutine: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+    """Runs beside everything else; a programming error ends the process, it must not look like a silent controller."""
+
+    def report(task: asyncio.Task[None]) -> None:
+        if not task.cancelled() and (error := task.exception()) and not isinstance(error, ConnectionError):
+            traceback.print_exception(error)
+            os._exit(1)
+
+    task = asyncio.create_task(coroutine)
+    task.add_done_callback(report)
+    return task
 
 
-def _report(task: asyncio.Task[None]) -> None:
-    """A programming error must not look like a silent controller."""
-    if not task.cancelled() and (error := task.exception()) and not isinstance(error, ConnectionError):
-        traceback.print_exception(error)
-        os._exit(1)
+async def main() -> None:
+    """Serves the parent until it ends."""
+    server, loop = Server(), asyncio.get_running_loop()
 
+    def answer(request: str, **arguments: Any) -> Any:
+        return asyncio.run_coroutine_threadsafe(getattr(server, request)(**arguments), loop).result()
 
-def _end_with_parent() -> None:
-    sys.stdin.read()
+    await asyncio.to_thread(serve, answer)
     os._exit(0)
 
 
-def main() -> None:
-    """``server.py SETUP``: SETUP is JSON with host, start_pose (mm, rad), errors, seed and faults."""
-    setup = json.loads(sys.argv[1])
-    start = np.array(setup["start_pose"], dtype=float)
-    start[:3] *= 1e-3
-    machine = Machine(start, setup["errors"], setup["seed"])
-    for fault in setup["faults"]:
-        machine.inject(Fault(fault), None, time.monotonic())
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    try:
-        asyncio.run(Server(machine).run(setup["host"]))
-    except OSError as error:
-        print(json.dumps({"error": error.strerror or str(error)}), flush=True)
-
-
 if __name__ == "__main__":
-    main()
+    asyncio.run(main())

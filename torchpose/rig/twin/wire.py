@@ -5,42 +5,20 @@ A packet is a big-endian uint16 size, a type byte and a payload. A recipe is a l
 
 from __future__ import annotations
 
+import json
 import struct
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 
 HEADER = struct.Struct(">HB")
 PROTOCOL, VERSION, OUTPUTS, INPUTS, START, PAUSE, DATA = (ord(c) for c in "VvOISPU")
 
-_FORMATS = {
-    "DOUBLE": "d",
-    "VECTOR6D": "6d",
-    "VECTOR3D": "3d",
-    "VECTOR6INT32": "6i",
-    "INT32": "i",
-    "UINT32": "I",
-    "UINT64": "Q",
-}
-_TYPES = {
-    "DOUBLE": "timestamp actual_execution_time speed_scaling target_speed_fraction actual_momentum actual_main_voltage "
-    "actual_robot_voltage actual_robot_current standard_analog_input0 standard_analog_input1 standard_analog_output0 "
-    "standard_analog_output1 payload",
-    "VECTOR6D": "target_q target_qd target_qdd target_current target_moment actual_q actual_qd actual_qdd "
-    "actual_current actual_current_as_torque joint_control_output actual_TCP_pose actual_TCP_speed "
-    "actual_TCP_force target_TCP_pose target_TCP_speed joint_temperatures actual_joint_voltage "
-    "ft_raw_wrench payload_inertia",
-    "VECTOR3D": "actual_tool_accelerometer payload_cog",
-    "VECTOR6INT32": "joint_mode",
-    "INT32": "robot_mode safety_mode",
-    "UINT32": "runtime_state robot_status_bits safety_status_bits output_bit_registers0_to_31 "
-    "output_bit_registers32_to_63 speed_slider_mask",
-    "UINT64": "actual_digital_input_bits actual_digital_output_bits",
-}
-TYPES = {name: kind for kind, names in _TYPES.items() for name in names.split()}
-for _i in range(48):
-    for _side in ("input", "output"):
-        TYPES[f"{_side}_int_register_{_i}"] = "INT32"
-        TYPES[f"{_side}_double_register_{_i}"] = "DOUBLE"
+_KINDS = json.loads(Path(__file__).with_name("variables.json").read_text(encoding="utf-8"))
+_FORMATS = {kind: given["format"] for kind, given in _KINDS.items()}
+TYPES = {name: kind for kind, given in _KINDS.items() for name in given["names"]}
+for _register in (f"{side}_{{}}_register_{i}" for side in ("input", "output") for i in range(48)):
+    TYPES |= {_register.format("int"): "INT32", _register.format("double"): "DOUBLE"}
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from torchpose.rig.robot_link import LinkEnded, LinkError, LinkLate, RobotLink
+from torchpose.rig.child import Child, ChildEnded, ChildError, ChildLate
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("rtde_control") is None, reason="needs ur-rtde: pip install '.[rig]'"
@@ -18,13 +18,13 @@ pytestmark = pytest.mark.skipif(
 
 
 @pytest.fixture
-def link() -> Iterator[RobotLink]:
-    running = RobotLink()
+def link() -> Iterator[Child]:
+    running = Child("torchpose.rig.robot_child", quiet=True)
     yield running
     running.close(1.0)
 
 
-def test_answers_to_requests_that_were_given_up_are_dropped(link: RobotLink) -> None:
+def test_answers_to_requests_that_were_given_up_are_dropped(link: Child) -> None:
     def interrupt(_number: int, _frame: object) -> None:
         raise KeyboardInterrupt
 
@@ -35,23 +35,23 @@ def test_answers_to_requests_that_were_given_up_are_dropped(link: RobotLink) -> 
             link.call("load", 20.0)
     finally:
         signal.signal(signal.SIGALRM, previous)
-    with pytest.raises(LinkError, match="NoneType"):  # its own answer: nothing is connected
+    with pytest.raises(ChildError, match="NoneType"):  # its own answer: nothing is connected
         link.call("read", 20.0, fresh=1)
     assert link.call("load", 20.0) is None
 
 
-def test_a_late_child_is_killed(link: RobotLink) -> None:
-    with pytest.raises(LinkLate, match="load: no answer within 0 s"):
+def test_a_late_child_is_killed(link: Child) -> None:
+    with pytest.raises(ChildLate, match="load: no answer within 0 s"):
         link.call("load", 0.0)
-    with pytest.raises(LinkEnded):
+    with pytest.raises(ChildEnded):
         link.call("load", 5.0)
 
 
-def test_a_dead_child_is_noticed_by_every_later_request(link: RobotLink) -> None:
+def test_a_dead_child_is_noticed_by_every_later_request(link: Child) -> None:
     link.call("load", 20.0)
     os.kill(link.pid, signal.SIGKILL)
     for _ in range(3):
         begin = time.monotonic()
-        with pytest.raises(LinkEnded, match="it printed nothing"):
+        with pytest.raises(ChildEnded, match="it printed nothing"):
             link.call("read", 5.0, fresh=1)
         assert time.monotonic() - begin < 2.0

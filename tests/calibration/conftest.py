@@ -1,6 +1,0 @@
-"""Makes `calibration_scenes` importable by name."""
-
-import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).parent))

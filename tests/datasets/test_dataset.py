@@ -1,0 +1,67 @@
+"""Plans as rows, and data sets on disk, beside what tests/cli/test_simulate.py shows of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from torchpose.camera import Camera
+from torchpose.datasets.dataset import analytic, write_bop, write_dataset
+from torchpose.datasets.plan import Plan, load_plan
+from torchpose.errors import ConfigError
+
+F64 = torch.float64
+
+
+@pytest.fixture
+def plan(tmp_path: Path) -> Plan:
+    """Four frames of 160 x 120, each with its own conditions."""
+    matrix = torch.tensor([[250.0, 0, 79.5], [0, 250.0, 59.5], [0, 0, 1]], dtype=F64)
+    Camera(160, 120, matrix, torch.tensor([-0.1, 0.02, 0.0, 0.0], dtype=F64)).save(tmp_path / "camera.json")
+    text = {
+        "camera": "camera.json",
+        "target": "quad40",
+        "poses": {"random": {"count": 4, "x": [-5, 5], "y": [-5, 5], "z": [160, 200]}},
+        "imaging": {"psf_sigma": [0.6, 0.9], "dark": [20, 40], "plate": [70, 70], "motion_mm": [0, 0.3]},
+        "bounds": False,
+    }
+    (tmp_path / "plan.yaml").write_text(yaml.safe_dump(text))
+    return load_plan(tmp_path / "plan.yaml")
+
+
+def test_rows_of_a_plan_are_its_frames(plan: Plan) -> None:
+    which = torch.tensor([3, 1])
+    part = plan[which]
+    assert len(part) == 2
+    assert part.names == ["0000.png", "0001.png"]
+    assert part.camera is plan.camera
+    assert torch.equal(part.conditions.psf_sigma, plan.conditions.psf_sigma[which])
+    frames = analytic(plan)(which)
+    torch.testing.assert_close(analytic(part)(torch.arange(2)), frames, rtol=0, atol=1e-3)
+
+
+def test_bop_is_that_of_the_folder(plan: Plan, tmp_path: Path) -> None:
+    out = tmp_path / "set"
+    assert write_dataset(plan, out) == 4
+    write_bop(out)
+    about = json.loads((out / "bop" / "camera.json").read_text())
+    assert about == {
+        "cx": 79.5, "cy": 59.5, "fx": 250.0, "fy": 250.0, "depth_scale": 1.0,
+        "width": 160, "height": 120, "distortion": plan.camera.distortion.tolist(),
+    }  # fmt: skip
+    assert json.loads((out / "bop" / "targets.json").read_text()) == {"1": "quad40"}
+    poses = json.loads((out / "bop" / "000000" / "scene_gt.json").read_text())
+    assert [poses[str(i)][0]["cam_t_m2c"] for i in range(4)] == plan.t.tolist()
+
+
+@pytest.mark.parametrize("text", ["{", "[1]", "3"])
+def test_a_damaged_origin_is_one_clear_line(plan: Plan, tmp_path: Path, text: str) -> None:
+    out = tmp_path / "set"
+    write_dataset(plan, out)
+    (out / "plan.json").write_text(text)
+    with pytest.raises(ConfigError, match=r"plan\.json: --resume: missing or damaged; choose another folder"):
+        write_dataset(plan, out, resume=True)
