@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torchpose.camera import Camera
 from torchpose.detect import find_candidates
 from torchpose.errors import ConfigError, FrameError
+from torchpose.geometry.grey import grey
 from torchpose.identify import Identified, MarkerTable, Scene, identify, look_again
 from torchpose.kernels import find_compiler
 from torchpose.pose import (
@@ -112,7 +113,8 @@ class PoseEstimator(nn.Module):
         """Poses of every target in every frame.
 
         Args:
-            frames: (B, H, W) or (B, 1, H, W) grey; uint8, uint16, or floating point with white at ``float_range``.
+            frames: (B, H, W) or (B, 1, H, W) grey, or (B, 3, H, W) RGB, of which the luma counts; uint8, uint16, or
+                floating point with white at ``float_range``.
 
         Returns:
             B * T rows, frame-major, on the device of the frames.
@@ -136,8 +138,12 @@ class PoseEstimator(nn.Module):
     def _checked(self, frames: Tensor) -> Tensor:
         if frames.ndim == 4 and frames.shape[1] == 1:
             frames = frames[:, 0]
+        if frames.ndim == 4 and frames.shape[1] == 3 and frames.dtype in _FRAME_TYPES:
+            frames = grey(frames)
         if frames.ndim != 3:
-            raise FrameError(f"frames: shape {tuple(frames.shape)}; pass grey frames (B, H, W) or (B, 1, H, W)")
+            raise FrameError(
+                f"frames: shape {tuple(frames.shape)}; pass grey frames (B, H, W) or (B, 1, H, W), or RGB (B, 3, H, W)"
+            )
         if frames.dtype not in _FRAME_TYPES:
             raise FrameError(f"frames: dtype {frames.dtype}; pass uint8, uint16 or floating point")
         size = (self.camera.height, self.camera.width)
