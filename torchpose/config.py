@@ -3,8 +3,6 @@
 Every error is a `ConfigError` of the form ``FILE: FIELD: what is wrong; the fix``.
 """
 
-from __future__ import annotations
-
 import difflib
 import json
 import os

@@ -1,7 +1,5 @@
 """Intrinsics of a camera from views of known points, with their covariance and what there is to doubt about them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, replace
 

@@ -5,8 +5,6 @@ spellings read.
 COLMAP counts pixels from the corner of the first pixel: its principal point is ours + 0.5.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Callable, Mapping

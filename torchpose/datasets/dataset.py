@@ -9,8 +9,6 @@ A data set is a folder:
     bop/                     the same in the layout of the BOP challenge, where asked for
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

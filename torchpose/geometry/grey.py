@@ -1,7 +1,5 @@
 """Grey values of colour frames."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -4,8 +4,6 @@ Kornia's conversions have the same digits (tests/geometry/test_rotations.py) but
 rotations, of which refinement turns many, and their import would delay the start of every run (docs/kornia.md).
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -4,8 +4,6 @@ Plain grey PNG files go through kornia_rs, in a third to a half of OpenCV's time
 (docs/kornia.md), everything else through OpenCV, which also has the last word on a file that kornia_rs refuses.
 """
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Callable

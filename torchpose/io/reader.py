@@ -1,7 +1,5 @@
 """Frames from disk in batches: decoding runs ahead in threads, memory is two batches however many frames there are."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor

@@ -5,8 +5,6 @@ is such a minimum. The second derivatives cost little more than the first (`norm
 leave no positive definite matrix, the step is that of Gauss-Newton, stretched.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -6,8 +6,6 @@ centres by their covariances, and the shapes of the rings' own ellipses, which d
 seen.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Faults of print, light and sensor as kornia's augmentation modules, each frame with random numbers of its own."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

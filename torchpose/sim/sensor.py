@@ -1,7 +1,5 @@
 """What lies between the picture and the stored grey values: uneven light on the way in, noise and rounding after it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ The centres of the four markers are projected, noise is added, and `torchpose.pn
 has Gaussian noise of 0.2 or 1 px on each coordinate. With focal error the lens has 8.02 mm and the solver 8 mm.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Second part of Fig. 5: marks among clutter, missed and false, and the codes that each shape can carry."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -5,8 +5,6 @@ uneven light, and four light rings on it. What is counted: ellipses that belong 
 (both circles measured, concentric) and the markers that the pose estimation knows by their ratio of radii.
 """
 
-from __future__ import annotations
-
 import math
 
 import cv2

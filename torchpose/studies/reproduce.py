@@ -1,7 +1,5 @@
 """All studies, one after the other, into one folder and one report."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import platform

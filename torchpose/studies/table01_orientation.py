@@ -5,8 +5,6 @@ deviation, a largest one), so ours is given over the distance, and the circumsta
 are worked out.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 

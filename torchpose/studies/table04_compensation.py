@@ -6,8 +6,6 @@ nor says which of its sizes are diameters. ``formula``: from the exact conics, t
 pixel by which the ring is off the axis drawn at random; RMS length of the error over the frames.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch
