@@ -8,6 +8,7 @@ the names of the dimensions, so that ``N`` is one number within a call.
 from __future__ import annotations
 
 import functools
+import itertools
 import sys
 import typing
 import warnings
@@ -23,6 +24,7 @@ from beartype.roar import BeartypeDecorHintPep585DeprecationWarning
 from jaxtyping import AbstractArray, jaxtyped
 
 _beartype: Any = beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int is a float
+OFTEN = 100  # calls of a function after which every tenth is checked
 # constructors that take what `torch.as_tensor` takes, and say with the field's name what is wrong with the rest
 COERCING = {"torchpose.camera.model.Camera.__init__"}
 
@@ -79,11 +81,15 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
     if not any(isinstance(part, type) and issubclass(part, AbstractArray) for part in parts):
         return inner
 
+    numbers = itertools.count()
+
     @functools.wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
         __tracebackhide__ = True
-        if torch.compiler.is_compiling():
-            return function(*args, **kwargs)  # the check is no part of what is compiled
+        number = next(numbers)
+        # what is called over and over is not checked each time; and the check is no part of what torch compiles
+        if (number > OFTEN and number % 10) or torch.compiler.is_compiling():
+            return function(*args, **kwargs)
         with jaxtyped("context"):
             return inner(*args, **kwargs)
 

@@ -30,7 +30,7 @@ DISTANCES_MM = (12.0, 32.0)
 
 def paper_camera() -> Camera:
     """Basler acA5472-17um, 2.4 um pixels, with an 8 mm lens without distortion."""
-    return Camera.pinhole(5472, 3648, FOCAL_MM / PITCH_MM)
+    return Camera.ideal(5472, 3648, FOCAL_MM / PITCH_MM)
 
 
 def run(*, full: bool = False, seed: int = 0, progress: Progress = ignore_progress) -> StudyResult:

@@ -103,7 +103,7 @@ def phone_target() -> Target:
 
 
 def _camera(height: int, width: int) -> Camera:
-    return Camera.pinhole(width, height, FOCAL_PX)
+    return Camera.ideal(width, height, FOCAL_PX)
 
 
 def phone_scene(seed: int) -> tuple[Tensor, Tensor]:

@@ -34,7 +34,7 @@ STUDIES = (
     "fig13_experiment",
 )
 REPORT = "report.html"
-_PACKAGES = ("torchpose", "torch", "kornia", "numpy", "opencv-python-headless", "scikit-image", "matplotlib")
+_PACKAGES = ("torchpose", "torch", "kornia", "numpy", "opencv-python-headless", "matplotlib")
 
 
 def reproduce(

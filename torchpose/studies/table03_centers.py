@@ -80,7 +80,7 @@ def run(
 
 
 def camera() -> tp.Camera:
-    return tp.Camera.pinhole(WIDTH, HEIGHT, FOCAL)
+    return tp.Camera.ideal(WIDTH, HEIGHT, FOCAL)
 
 
 def scene(shift: Tensor, cam: tp.Camera) -> tuple[tp.Target, Tensor, Tensor]:
