@@ -12,6 +12,7 @@ from torch import Tensor
 
 import torchpose as tp
 from tests.exact import F64, pinhole, random_poses
+from torchpose.kernels import has_compiler
 from torchpose.pipeline import Method
 from torchpose.refine import METHODS
 from torchpose.sim import add_noise, render
@@ -119,3 +120,23 @@ def test_the_module_moves_as_any_other(estimator: tp.PoseEstimator) -> None:
     assert halved.camera.matrix.dtype == F64
     assert torch.equal(halved(FRAMES["good"]).t, estimator(FRAMES["good"]).t)
     assert "640x480" in repr(torch.nn.Sequential(estimator))
+
+
+@pytest.mark.skipif(not has_compiler(), reason="no C++ compiler")
+def test_compiled_poses_are_the_same(estimator: tp.PoseEstimator) -> None:
+    """With missing markers and an uncertain camera, and in any batch."""
+    compiled = tp.PoseEstimator(estimator.camera, QUAD, compile=True)
+    frames = torch.cat([FRAMES[kind] for kind in ("good", "three markers", "black")] * 3)
+    expected, found = estimator(frames), compiled(frames)
+    assert torch.equal(found.status, expected.status)
+    torch.testing.assert_close(found.t, expected.t, rtol=0, atol=1e-6, equal_nan=True)
+    torch.testing.assert_close(found.R, expected.R, rtol=0, atol=1e-8, equal_nan=True)
+    torch.testing.assert_close(found.std, expected.std, rtol=1e-4, atol=0, equal_nan=True)
+    torch.testing.assert_close(compiled(frames[:1]).t, expected.t[:1], rtol=0, atol=1e-6)
+
+
+def test_compiled_without_a_compiler_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("CXX", raising=False)
+    with pytest.raises(tp.ConfigError, match="compiler"):
+        tp.PoseEstimator(CAMERA, QUAD, compile=True)

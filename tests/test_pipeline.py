@@ -21,6 +21,7 @@ from torchpose.sim import add_noise, render
 
 SAMPLE = Path(__file__).parent.parent / "data" / "sample"
 QUAD = tp.Target.load("quad40")
+MOST_OPERATIONS = 21_100  # dispatched for one frame
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +89,15 @@ def test_no_loop_over_frames(sample: tuple[tp.PoseEstimator, Tensor]) -> None:
     assert counts[32] < 1.4 * counts[1]
 
 
+def test_one_frame_takes_few_operations(sample: tuple[tp.PoseEstimator, Tensor]) -> None:
+    """Every operation costs microseconds of dispatch on a CPU, and starves a GPU: 21,100 in November 2026."""
+    estimator, frames = sample
+    estimator(frames[:1])
+    with OpCount() as ops:
+        estimator(frames[:1])
+    assert ops.count <= MOST_OPERATIONS
+
+
 @pytest.mark.parametrize("hidden", range(4))
 def test_three_markers(sample: tuple[tp.PoseEstimator, Tensor], poses: tp.Poses, hidden: int) -> None:
     estimator, frames = sample
@@ -135,12 +145,25 @@ def test_same_poses_in_every_type(sample: tuple[tp.PoseEstimator, Tensor], poses
         assert ((result.t - poses.t[:3]).abs() < poses.std[:3, :3]).all()
 
 
+def test_colour_frames_count_by_their_luma(sample: tuple[tp.PoseEstimator, Tensor], poses: tp.Poses) -> None:
+    """As OpenCV reduces colour files, bit for bit."""
+    estimator, frames = sample
+    g = torch.Generator().manual_seed(0)
+    tint = torch.tensor([0, -9, 14], dtype=torch.int16)[:, None, None]
+    colour = (frames[:1, None].short() + tint + torch.randint(0, 3, (1, 3, *frames.shape[1:]), generator=g)).clamp(
+        0, 255
+    )
+    colour = colour.to(torch.uint8)
+    grey = torch.from_numpy(cv2.cvtColor(colour[0].permute(1, 2, 0).contiguous().numpy(), cv2.COLOR_RGB2GRAY))
+    assert torch.equal(estimator(colour).t, estimator(grey[None]).t)
+
+
 def test_wrong_frames_are_refused(sample: tuple[tp.PoseEstimator, Tensor]) -> None:
     estimator, _ = sample
     with pytest.raises(tp.FrameError, match="640 x 480"):
         estimator(torch.zeros(1, 480, 640, dtype=torch.uint8))
     with pytest.raises(tp.FrameError, match="shape"):
-        estimator(torch.zeros(1, 3, 1216, 1824, dtype=torch.uint8))
+        estimator(torch.zeros(1, 2, 1216, 1824, dtype=torch.uint8))
     with pytest.raises(tp.FrameError, match="dtype"):
         estimator(torch.zeros(1, 1216, 1824, dtype=torch.int64))
 

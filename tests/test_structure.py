@@ -1,6 +1,7 @@
 """The house: what may import what, and how large a function may grow."""
 
 import ast
+import re
 from ast import Module
 from collections.abc import Iterator
 from pathlib import Path
@@ -32,6 +33,7 @@ FLOW = [
 LEVEL = {room: level for level, rooms in enumerate(FLOW) for room in rooms}
 MODULES = sorted(ROOT.rglob("*.py"))
 LOOSE = 8  # files beside __init__.py
+LONGEST, MOST_PARAMETERS = 60, 7  # of a function: lines, and parameters outside pnp/ and the command line
 
 
 def imported(tree: Module) -> Iterator[tuple[str, int]]:
@@ -62,3 +64,31 @@ def test_every_room_has_its_place() -> None:
 
 def test_few_loose_files() -> None:
     assert len([path for path in ROOT.glob("*.py") if path.name != "__init__.py"]) <= LOOSE
+
+
+def functions(path: Path) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]:
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            yield node
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_functions_are_small(path: Path) -> None:
+    for function in functions(path):
+        length = (function.end_lineno or 0) - function.lineno + 1
+        assert length <= LONGEST, f"{function.name}: {length} lines"
+        if path.relative_to(ROOT).parts[0] in ("pnp", "cli"):
+            continue
+        arguments = function.args
+        names = [a.arg for a in (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs)]
+        count = len([name for name in names if name not in ("self", "cls")])
+        assert count <= MOST_PARAMETERS, f"{function.name}: {count} parameters"
+
+
+def test_tensor_rows_share_their_base() -> None:
+    """What selects, joins or moves rows is written in `geometry/rows.py` alone."""
+    for path in MODULES:
+        if path.name != "rows.py":
+            assert "__dataclass_fields__" not in path.read_text(), path
+    rows = [path for path in MODULES if re.search(r"^class \w+\(Rows\):", path.read_text(), re.M)]
+    assert len(rows) >= 12

@@ -3,14 +3,13 @@
 Every error is a `ConfigError` of the form ``FILE: FIELD: what is wrong; the fix``.
 """
 
-from __future__ import annotations
-
 import difflib
 import json
 import os
 import re
 import typing
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -56,6 +55,22 @@ _Loader.add_implicit_resolver(
 )
 
 
+@contextmanager
+def within(prefix: str, names: Mapping[str, str] | None = None, other: str | None = None) -> Iterator[None]:
+    """Says in front of a `ConfigError` where its field stands.
+
+    Args:
+        prefix: such as ``FILE: `` or ``cam0.``.
+        names: what the file calls a field.
+        other: what it calls those that are not in ``names``; None leaves them as they are.
+    """
+    try:
+        yield
+    except ConfigError as error:
+        field, _, problem = str(error).partition(": ")
+        raise ConfigError(f"{prefix}{(names or {}).get(field, other or field)}: {problem}") from None
+
+
 def _one_line(text: str) -> str:
     return " ".join(text.split())
 
@@ -66,22 +81,22 @@ def read_text(path: str | os.PathLike[str]) -> str:
     Raises:
         ConfigError: it is missing, a folder, unreadable, empty or not text.
     """
-    path = Path(path)
     try:
-        text = path.read_bytes().decode("utf-8-sig")
+        text = Path(path).read_bytes().decode("utf-8-sig")
+        problem = "is not text; give a YAML or JSON file" if "\0" in text else ""
+        if not text.strip():
+            problem = "is empty; write the fields into it"
     except FileNotFoundError:
-        raise ConfigError(f"{path}: file: does not exist; check the path") from None
+        problem = "does not exist; check the path"
     except IsADirectoryError:
-        raise ConfigError(f"{path}: file: is a folder; name a file in it") from None
+        problem = "is a folder; name a file in it"
     except UnicodeDecodeError:
-        raise ConfigError(f"{path}: file: is not text; give a YAML or JSON file") from None
+        problem = "is not text; give a YAML or JSON file"
     except (OSError, ValueError) as error:
-        problem = getattr(error, "strerror", None) or str(error)
-        raise ConfigError(f"{path}: file: cannot be read ({problem}); check the path and its permissions") from None
-    if "\0" in text:
-        raise ConfigError(f"{path}: file: is not text; give a YAML or JSON file")
-    if not text.strip():
-        raise ConfigError(f"{path}: file: is empty; write the fields into it")
+        reason = getattr(error, "strerror", None) or str(error)
+        problem = f"cannot be read ({reason}); check the path and its permissions"
+    if problem:
+        raise ConfigError(f"{path}: file: {problem}")
     return text
 
 
@@ -94,11 +109,8 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return data
 
 
-def parse_mapping(text: str, path: str | os.PathLike[str]) -> dict[str, Any]:
+def parse_mapping(text: str) -> dict[str, Any]:
     """The mapping in YAML or JSON text; OpenCV's ``%YAML:1.0`` header and matrix tags are accepted.
-
-    Args:
-        text: contents of the file. path: its name, for messages.
 
     Raises:
         ConfigError: not YAML, several documents, a duplicate key, or not a mapping.
@@ -110,22 +122,20 @@ def parse_mapping(text: str, path: str | os.PathLike[str]) -> dict[str, Any]:
             # OpenCV writes "%YAML:1.0" where the standard wants "%YAML 1.0"; the line is emptied, so numbering holds
             documents = [d for d in yaml.load_all(re.sub(r"\A%YAML:.*", "", text), Loader=_Loader) if d is not None]
             if len(documents) > 1:
-                raise ConfigError(f"{path}: file: holds {len(documents)} YAML documents; keep one") from None
+                raise ConfigError(f"file: holds {len(documents)} YAML documents; keep one") from None
             data = documents[0] if documents else None
     except _DuplicateKey as error:
-        raise ConfigError(f"{path}: {_one_line(str(error))}") from None
+        raise ConfigError(_one_line(str(error))) from None
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         where = f"line {mark.line + 1}" if mark else "file"
-        raise ConfigError(
-            f"{path}: {where}: is not YAML ({_one_line(str(error.problem))}); correct the syntax"
-        ) from None
+        raise ConfigError(f"{where}: is not YAML ({_one_line(str(error.problem))}); correct the syntax") from None
     except (yaml.YAMLError, ValueError, TypeError, AttributeError, RecursionError) as error:  # from PyYAML's tags
         first = _one_line(str(error))[:120]
-        raise ConfigError(f"{path}: file: is not YAML ({first}); give a YAML or JSON file") from None
+        raise ConfigError(f"file: is not YAML ({first}); give a YAML or JSON file") from None
     if not isinstance(data, dict):
         kind = {list: "a list", str: "plain text", type(None): "nothing"}.get(type(data), "a single value")
-        raise ConfigError(f"{path}: file: holds {kind}, not a mapping; write it as `key: value` lines")
+        raise ConfigError(f"file: holds {kind}, not a mapping; write it as `key: value` lines")
     return {str(key): value for key, value in data.items()}
 
 
@@ -135,7 +145,9 @@ def read_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
     Raises:
         ConfigError: as `read_text` and `parse_mapping`.
     """
-    return parse_mapping(read_text(path), path)
+    text = read_text(path)
+    with within(f"{path}: "):
+        return parse_mapping(text)
 
 
 def beside(path: Path, name: str) -> str:
@@ -144,7 +156,7 @@ def beside(path: Path, name: str) -> str:
     return str(file) if file.with_name(file.name.split("#")[0]).exists() or "/" in name else name
 
 
-def suggest(key: str, allowed: typing.Iterable[str]) -> str:
+def suggest(key: str, allowed: Iterable[str]) -> str:
     """The fix for an unknown name: the nearest of the allowed ones, or all of them."""
     allowed = list(allowed)
     near = difflib.get_close_matches(key, allowed, n=1)
@@ -182,7 +194,9 @@ def validate(model: type[ModelT], data: Any, path: str | os.PathLike[str]) -> Mo
     """``data`` as an instance of the pydantic ``model``.
 
     Args:
-        model: validators may raise `ValueError` with the text ``what is wrong; the fix``. path: file named in messages.
+        model: its validators may raise `ValueError` with the text ``what is wrong; the fix``.
+        data: what was read.
+        path: file named in messages.
 
     Raises:
         ConfigError: the first error, and how many more there are.
@@ -216,7 +230,7 @@ def format_number(value: float) -> str:
     return text.replace("e", ".0e") if "e" in text and "." not in text else text
 
 
-def format_list(values: typing.Iterable[float]) -> str:
+def format_list(values: Iterable[float]) -> str:
     """``[a, b, ...]`` of `format_number`."""
     return "[" + ", ".join(map(format_number, values)) + "]"
 

@@ -4,8 +4,6 @@ Every function takes points as flat (E, 2) with the ellipse index (E,), so thous
 are fitted by one sequence of tensor operations. Ellipses are (cx, cy, a >= b, theta in [0, pi) from +u towards +v).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal

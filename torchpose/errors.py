@@ -1,7 +1,5 @@
 """The errors that torchpose raises on purpose. Each message is one line that names the file, the field and the fix."""
 
-from __future__ import annotations
-
 
 class TorchposeError(Exception):
     """Base of every deliberate error; the command line prints its message alone and exits with 2."""

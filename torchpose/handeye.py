@@ -80,7 +80,7 @@ class HandEye:
 
     Attributes:
         mount: 'base' for a camera fixed in the cell, 'tool' for one carried by the robot.
-        rotation: (3, 3) float64. translation: (3,) float64, mm.
+        rotation, translation: (3, 3) and (3,) float64, mm.
         source: the file, for messages.
         covariance: (6, 6) float64 of the translation (mm), then the rotation w (rad) with R_true = exp(w) R, along and
             about the axes of the mount; None where it is not known.
@@ -159,16 +159,15 @@ class HandEye:
         """What the uncertainty of this calibration adds to poses in the robot base, (N, 6, 6); zero if not known.
 
         Args:
-            translation: (N, 3) of the poses in the base, mm. tool_poses: as in `base_from_camera`.
+            translation: (N, 3) of the poses in the base, mm.
+            tool_poses: as in `base_from_camera`.
         """
-        count = len(translation)
+        jacobian = translation.new_zeros(len(translation), 6, 6)
         if self.covariance is None:
-            return translation.new_zeros(count, 6, 6)
+            return jacobian
         _, camera = self.base_from_camera(tool_poses)
-        turn = (tool_poses[0] if self.mount == "tool" and tool_poses else torch.eye(3).to(translation)).expand(
-            count, 3, 3
-        )
+        turn = tool_poses[0] if self.mount == "tool" and tool_poses else torch.eye(3).to(translation)
+        jacobian[:, :3, :3] = jacobian[:, 3:, 3:] = turn
         # a turn w of the camera about itself takes what is ``arm`` away along
-        arm = rotations.skew(translation - camera)
-        jacobian = torch.cat([torch.cat([turn, -arm @ turn], -1), torch.cat([torch.zeros_like(turn), turn], -1)], -2)
+        jacobian[:, :3, 3:] = -rotations.skew(translation - camera) @ turn
         return jacobian @ self.covariance.to(translation) @ jacobian.mT

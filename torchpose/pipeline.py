@@ -12,7 +12,9 @@ from torch import Tensor, nn
 from torchpose.camera import Camera
 from torchpose.detect import find_candidates
 from torchpose.errors import ConfigError, FrameError
+from torchpose.geometry.grey import grey
 from torchpose.identify import Identified, MarkerTable, Scene, identify, look_again
+from torchpose.kernels import find_compiler
 from torchpose.pose import (
     MIN_MARKERS,
     Evidence,
@@ -45,9 +47,10 @@ class PoseEstimator(nn.Module):
         float_range: grey value of white in floating-point frames: 1.0 or 255.0.
         srgb: the grey values are sRGB-encoded and are taken back to linear ones first. Edges are half-way in linear
             grey, so encoded frames that are taken as linear ones shift them (docs/precision.md).
+        compile: solve small problems in compiled loops (`torchpose.kernels`), on the CPU; the first call takes seconds.
 
     Raises:
-        ConfigError: no target, or two of one name; an unknown method.
+        ConfigError: no target, or two of one name; an unknown method; ``compile`` without a C++ compiler.
     """
 
     def __init__(
@@ -58,6 +61,7 @@ class PoseEstimator(nn.Module):
         method: Method = "photometric",
         float_range: float = 1.0,
         srgb: bool = False,
+        compile: bool = False,
     ) -> None:
         super().__init__()
         self.camera = camera
@@ -75,6 +79,9 @@ class PoseEstimator(nn.Module):
         self.method = method
         self.float_range = float_range
         self.srgb = srgb
+        self.solves_compiled = compile
+        if compile:
+            find_compiler()
         self.table = MarkerTable.of(self.targets)
         for owner in ("camera", "table"):
             for name, value in _tensors(getattr(self, owner)).items():
@@ -106,7 +113,8 @@ class PoseEstimator(nn.Module):
         """Poses of every target in every frame.
 
         Args:
-            frames: (B, H, W) or (B, 1, H, W) grey; uint8, uint16, or floating point with white at ``float_range``.
+            frames: (B, H, W) or (B, 1, H, W) grey, or (B, 3, H, W) RGB, of which the luma counts; uint8, uint16, or
+                floating point with white at ``float_range``.
 
         Returns:
             B * T rows, frame-major, on the device of the frames.
@@ -130,8 +138,12 @@ class PoseEstimator(nn.Module):
     def _checked(self, frames: Tensor) -> Tensor:
         if frames.ndim == 4 and frames.shape[1] == 1:
             frames = frames[:, 0]
+        if frames.ndim == 4 and frames.shape[1] == 3 and frames.dtype in _FRAME_TYPES:
+            frames = grey(frames)
         if frames.ndim != 3:
-            raise FrameError(f"frames: shape {tuple(frames.shape)}; pass grey frames (B, H, W) or (B, 1, H, W)")
+            raise FrameError(
+                f"frames: shape {tuple(frames.shape)}; pass grey frames (B, H, W) or (B, 1, H, W), or RGB (B, 3, H, W)"
+            )
         if frames.dtype not in _FRAME_TYPES:
             raise FrameError(f"frames: dtype {frames.dtype}; pass uint8, uint16 or floating point")
         size = (self.camera.height, self.camera.width)
@@ -151,7 +163,9 @@ class PoseEstimator(nn.Module):
         evidence = gather_evidence(rings, identified.ring, markers, scene.camera.matrix, self._recipe.locate)
         solvable = (evidence.mask.sum(-1) >= MIN_MARKERS).nonzero()[:, 0]
         rough = identified.R[solvable], identified.t[solvable]
-        return Found(rings, identified, evidence, solvable, solve_poses(evidence[solvable], rough))
+        return Found(
+            rings, identified, evidence, solvable, solve_poses(evidence[solvable], rough, compile=self.solves_compiled)
+        )
 
     def _second_look(self, scene: Scene, found: Found) -> tuple[Rings, Identified]:
         """Looks for missing markers where the solutions put them, or the rough pose where there is none."""

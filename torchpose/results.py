@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Any, Self
+from typing import TYPE_CHECKING
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.geometry import rotations
+from torchpose.geometry.rows import Rows, shared
+
+if TYPE_CHECKING:
+    from kornia.geometry.liegroup import Se3
 
 
 class Status(IntEnum):
@@ -36,128 +41,99 @@ class Reason(IntEnum):
     TWO_SOLUTIONS = 6  # with Status.AMBIGUOUS
 
 
-class _TensorBundle:
-    """Common operations of the dataclasses of tensors below."""
-
-    def to(self, *args: Any, **kwargs: Any) -> Self:
-        """Same as `Tensor.to` on every tensor, nested ones too; integer tensors keep their dtype."""
-        moved: dict[str, Any] = {}
-        for f in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, f.name)
-            if isinstance(value, Tensor):
-                target = value.to(*args, **kwargs)
-                # integers go to the device only: a large id would not survive the way through a float
-                moved[f.name] = target if value.is_floating_point() else value.to(target.device)
-            elif isinstance(value, _TensorBundle):
-                moved[f.name] = value.to(*args, **kwargs)
-        return replace(self, **moved)  # type: ignore[type-var]
-
-    def cpu(self) -> Self:
-        return self.to("cpu")
-
-    def __getitem__(self, index: Any) -> Self:
-        """The rows selected by a mask, a slice or an index tensor."""
-        picked = {}
-        for f in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, f.name)
-            if isinstance(value, Tensor):
-                picked[f.name] = value[index]
-        return replace(self, **picked)  # type: ignore[type-var]
-
-
 @dataclass(frozen=True, eq=False)
-class Detections(_TensorBundle):
+class Detections(Rows):
     """The K markers found in a batch, flat. Pixels are those of the raw (distorted) frame, OpenCV convention.
 
     Attributes:
-        frame: (K,) int64, index of the frame in the batch.
-        target: (K,) int64, index of the target.
-        marker: (K,) int64, marker id as in the target file.
-        center: (K, 2) float64, image of the marker's centre, compensated for perspective, px.
-        center_cov: (K, 2, 2) float64, its covariance, px^2.
-        outer, inner: (K, 5) float64, fitted ellipses cx, cy, a >= b (semi-axes, px), theta (rad, [0, pi)).
+        frame: index of the frame in the batch.
+        target: index of the target.
+        marker: marker id as in the target file.
+        center: image of the marker's centre, compensated for perspective, px.
+        center_cov: its covariance, px^2.
+        outer, inner: fitted ellipses cx, cy, a >= b (semi-axes, px), theta (rad, [0, pi)).
     """
 
-    frame: Tensor
-    target: Tensor
-    marker: Tensor
-    center: Tensor
-    center_cov: Tensor
-    outer: Tensor
-    inner: Tensor
-
-    def __len__(self) -> int:
-        return self.frame.shape[0]
+    frame: Int[Tensor, " K"]
+    target: Int[Tensor, " K"]
+    marker: Int[Tensor, " K"]
+    center: Float[Tensor, "K 2"]
+    center_cov: Float[Tensor, "K 2 2"]
+    outer: Float[Tensor, "K 5"]
+    inner: Float[Tensor, "K 5"]
 
 
 @dataclass(frozen=True, eq=False)
-class Poses(_TensorBundle):
+class Poses(Rows):
     """Poses of T targets in B frames as N = B * T rows, frame-major; with one target, row = frame.
 
     Where there is no pose, R, t, covariance and rms are NaN and `status` says why.
 
     Attributes:
-        frame: (N,) int64, index of the frame in the batch.
-        target: (N,) int64, index of the target.
-        R: (N, 3, 3) float64, target to camera: X_cam = R X_target + t.
-        t: (N, 3) float64, mm.
-        covariance: (N, 6, 6) float64, translation (mm) first, then rotation (rad, left-multiplied: R = exp(w) R_est,
-            that is about the camera axes).
-        rms: (N,) float64, reprojection RMS of the compensated marker centres, px.
-        status: (N,) int64, `Status`.
-        reason: (N,) int64, `Reason`.
-        markers: (N,) int64, number of markers used.
-        chi2: (N,) float64, of all evidence (centres and ring shapes) at the pose.
+        frame: index of the frame in the batch.
+        target: index of the target.
+        R, t: target to camera: X_cam = R X_target + t, mm.
+        covariance: translation (mm) first, then rotation (rad, left-multiplied: R = exp(w) R_est, that is about the
+            camera axes).
+        rms: reprojection RMS of the compensated marker centres, px.
+        status, reason: `Status` and `Reason`.
+        markers: number of markers used.
+        chi2: of all evidence (centres and ring shapes) at the pose.
         R_alt, t_alt, rms_alt, chi2_alt: the other minimum of the same evidence (the second planar solution); NaN
             where both coincide or there is none.
         detections: the markers of the whole batch; selecting rows leaves them alone, their `frame` and `target` say
             whose they are.
     """
 
-    frame: Tensor
-    target: Tensor
-    R: Tensor
-    t: Tensor
-    covariance: Tensor
-    rms: Tensor
-    status: Tensor
-    reason: Tensor
-    markers: Tensor
-    chi2: Tensor
-    R_alt: Tensor
-    t_alt: Tensor
-    rms_alt: Tensor
-    chi2_alt: Tensor
-    detections: Detections
-
-    def __len__(self) -> int:
-        return self.frame.shape[0]
+    frame: Int[Tensor, " N"]
+    target: Int[Tensor, " N"]
+    R: Float[Tensor, "N 3 3"]
+    t: Float[Tensor, "N 3"]
+    covariance: Float[Tensor, "N 6 6"]
+    rms: Float[Tensor, " N"]
+    status: Int[Tensor, " N"]
+    reason: Int[Tensor, " N"]
+    markers: Int[Tensor, " N"]
+    chi2: Float[Tensor, " N"]
+    R_alt: Float[Tensor, "N 3 3"]
+    t_alt: Float[Tensor, "N 3"]
+    rms_alt: Float[Tensor, " N"]
+    chi2_alt: Float[Tensor, " N"]
+    detections: Detections = shared()
 
     @property
-    def ok(self) -> Tensor:
-        """(N,) bool, rows with `Status.OK`."""
+    def ok(self) -> Bool[Tensor, " N"]:
+        """Rows with `Status.OK`."""
         return self.status == Status.OK
 
     @property
-    def rotation_vector(self) -> Tensor:
-        """(N, 3) rotation vectors in rad."""
+    def rotation_vector(self) -> Float[Tensor, "N 3"]:
+        """Rotation vectors in rad."""
         return rotations.log(self.R)
 
     @property
-    def quaternion(self) -> Tensor:
-        """(N, 4) unit quaternions w, x, y, z with w >= 0."""
+    def quaternion(self) -> Float[Tensor, "N 4"]:
+        """Unit quaternions w, x, y, z with w >= 0."""
         return rotations.quaternion(self.R)
 
     @property
-    def std(self) -> Tensor:
-        """(N, 6) standard deviations of t (mm) and of the rotation (rad)."""
+    def std(self) -> Float[Tensor, "N 6"]:
+        """Standard deviations of t (mm) and of the rotation (rad)."""
         return self.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+
+    def se3(self) -> Se3:
+        """The N poses as kornia's `Se3`, camera from target, mm; back by ``pose.so3.matrix(), pose.t``."""
+        from kornia.geometry.liegroup import Se3
+        from kornia.geometry.quaternion import Quaternion
+
+        return Se3(Quaternion(self.quaternion), self.t)
 
     def moved(self, rotation: Tensor, translation: Tensor) -> Poses:
         """Poses of another frame fixed to the target, whose coordinates are ``rotation @ X_target + translation``.
 
         Args:
-            rotation: (3, 3) or (N, 3, 3). translation: (3,) or (N, 3), mm (`Target.part_from_target`).
+            rotation: (3, 3) or (N, 3, 3).
+            translation: (3,) or (N, 3), mm (`Target.part_from_target`).
         """
         r_inv, t_inv = rotations.inverse(rotation.to(self.R), translation.to(self.t))
         r, t = rotations.compose(self.R, self.t, r_inv, t_inv)
@@ -172,7 +148,8 @@ class Poses(_TensorBundle):
         """Poses in another fixed frame whose coordinates are ``rotation @ X_cam + translation`` (hand-eye).
 
         Args:
-            rotation: (3, 3) or (N, 3, 3). translation: (3,) or (N, 3), mm.
+            rotation: (3, 3) or (N, 3, 3).
+            translation: (3,) or (N, 3), mm.
         """
         ra, ta = rotation.to(self.R), translation.to(self.t)
         r, t = rotations.compose(ra, ta, self.R, self.t)

@@ -13,7 +13,7 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
 from torch import Tensor
 
-from torchpose.config import format_list, format_number, read_yaml, validate, write_text
+from torchpose.config import format_list, format_number, read_yaml, validate, within, write_text
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 
@@ -223,7 +223,7 @@ class Target:
                 f"{path}: markers[{i}].normal: is zero; give the direction into the printed plane, such as [0, 0, 1]"
             )
         pose = data.part_from_target
-        try:
+        with within(f"{path}: "):
             return cls(
                 name=data.name,
                 background=data.background,
@@ -234,8 +234,6 @@ class Target:
                 part_rotation=None if pose is None else _floats(pose.rotation),
                 part_translation=None if pose is None else _floats(pose.translation),
             )
-        except ConfigError as error:
-            raise ConfigError(f"{path}: {error}") from None
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes a target file in one piece; centers, radii and the part's pose read back exactly.

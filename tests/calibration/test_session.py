@@ -65,9 +65,14 @@ def photograph(picture: np.ndarray, mm_per_px: float, pose: scenes.Transform) ->
     frames = []
     for r, t in zip(*pose, strict=True):
         depth = (r[:, 2] @ t) / (ray @ r[:, 2])
-        x = ((depth[..., None] * ray - t) @ r)[..., :2] / mm_per_px
+        across, down = (((depth[..., None] * ray - t) @ r)[..., :2] / mm_per_px).float().unbind(-1)
         fine_frame = cv2.remap(
-            picture, x.float().numpy(), np.empty(0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=230
+            picture,
+            across.numpy(),
+            down.numpy(),
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=230,
         )
         frames.append(cv2.resize(fine_frame, (CAMERA.width, CAMERA.height), interpolation=cv2.INTER_AREA))
     return torch.from_numpy(np.stack(frames))

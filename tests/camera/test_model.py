@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,6 +12,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchpose.camera import Camera
 from torchpose.errors import ConfigError
@@ -218,3 +220,23 @@ def test_wrong_fields_are_named(changes: dict[str, object], message: str) -> Non
     fields: dict[str, object] = {"width": 10, "height": 10, "matrix": K, "distortion": BROWN["barrel"]}
     with pytest.raises(ConfigError, match=f"^{message}"):
         Camera(**{**fields, **changes})  # type: ignore[arg-type]
+
+
+def test_moving_checks_and_reads_nothing() -> None:
+    """No value of a camera is read at each move: on a device that would wait for all that is queued."""
+
+    class NoReads(TorchDispatchMode):
+        def __torch_dispatch__(
+            self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+        ) -> Any:
+            assert func not in (torch.ops.aten._local_scalar_dense.default, torch.ops.aten.isfinite.default), func
+            return func(*args, **(kwargs or {}))
+
+    for cam in (camera(BROWN["barrel"]), camera(FISHEYE, "kannala_brandt"), camera([0.0] * 4), camera([])):
+        cam.to(torch.float32)  # what follows from the coefficients is found once
+        with NoReads():  # type: ignore[no-untyped-call]
+            moved = cam.to(torch.float32).to("meta")
+        assert moved.fold_radius == cam.fold_radius
+        assert moved.matrix.device.type == moved.distortion.device.type == "meta"
+    points = torch.ones(3, 2, device="meta", dtype=torch.float64)
+    assert moved.undistort_points(points).device.type == "meta"

@@ -24,7 +24,7 @@ from torchpose.target import Target
 Image = NDArray[np.uint8]
 METHODS: tuple[str, ...] = get_args(Method)
 WIDTH, HEIGHT = 400, 320
-CAMERA = Camera.pinhole(WIDTH, HEIGHT, 700.0)
+CAMERA = Camera.ideal(WIDTH, HEIGHT, 700.0)
 DARK = 128
 
 # kind of frame: the status of its row

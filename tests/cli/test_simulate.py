@@ -87,8 +87,9 @@ def test_frames_are_those_of_the_renderer(folder: Path) -> None:
     assert (truth.extra["sx"] < 0.05).all()
 
 
-def test_frames_depend_on_the_plan_alone(folder: Path) -> None:
-    path = save(folder, bounds=False)
+@pytest.mark.parametrize("faults", [{}, {"RandomErasing": {"scale": [0.01, 0.02], "value": 0.3, "p": 0.8}}])
+def test_frames_depend_on_the_plan_alone(folder: Path, faults: dict[str, Any]) -> None:
+    path = save(folder, bounds=False, faults=faults)
     assert run("simulate", path, "--out", folder / "a", "--batch", 2, "--threads", 2) == 0
     assert run("simulate", path, "--out", folder / "b", "--batch", 5, "--threads", 1) == 0
     (folder / "b" / "frames" / "0003.png").unlink()
@@ -166,6 +167,7 @@ def test_depth_of_the_sensor(folder: Path) -> None:
         ({"depth_range": [150.0, 100.0]}, ("depth_range",)),
         ({"imaging__background": "pictures", "imaging__plate": None}, ("imaging", "plate")),
         ({"target": "quad41"}, ("quad41",)),
+        ({"faults": {"RandomErase": {}}}, ("faults.RandomErase", "did you mean RandomErasing?")),
         ({"camera": "none.yaml"}, ("none.yaml",)),
         (
             {"imaging__defocus": {"f_number": 0, "focal_length": 8, "focus_distance": 100}},

@@ -22,7 +22,7 @@ from torchpose.sim import render
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is:DeprecationWarning")
 
 F64 = torch.float64
-CAMERA = tp.Camera.pinhole(640, 520, 800.0)
+CAMERA = tp.Camera.ideal(640, 520, 800.0)
 VOLUME = WorkingVolume((140.0, 150.0), (3.0, 2.0), math.radians(20))
 
 

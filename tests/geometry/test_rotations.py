@@ -9,7 +9,11 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+from kornia.geometry.conversions import (
+    axis_angle_to_rotation_matrix,
+    rotation_matrix_to_axis_angle,
+    rotation_matrix_to_quaternion,
+)
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -36,9 +40,29 @@ def test_exp_log_and_quaternion_equal_scipy(angle: float) -> None:
     np.testing.assert_allclose(rotations.quaternion(ours), quaternion, rtol=0, atol=1e-9 if angle > 3.1 else 2e-15)
 
 
-def test_exp_equals_kornia_away_from_zero() -> None:
-    v = vectors(1.3)
-    torch.testing.assert_close(rotations.exp(v), axis_angle_to_rotation_matrix(v), rtol=0, atol=1e-9)
+@pytest.mark.parametrize("angle", [*ANGLES, 1.3])
+def test_kornia_says_the_same(angle: float) -> None:
+    """Ours stay for their time on few rotations and for kornia's import (docs/kornia.md), not for their digits."""
+    v = vectors(angle)
+    torch.testing.assert_close(rotations.exp(v), axis_angle_to_rotation_matrix(v), rtol=0, atol=3e-15)
+    R = rotations.exp(v)
+    torch.testing.assert_close(rotations.log(R), rotation_matrix_to_axis_angle(R), rtol=0, atol=3e-15)
+    q = rotation_matrix_to_quaternion(R)
+    torch.testing.assert_close(rotations.quaternion(R), torch.where(q[:, :1] < 0, -q, q), rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-3, 0.5, 3.0, math.pi - 1e-6])
+def test_kornias_gradients_are_the_same(angle: float) -> None:
+    weight = torch.arange(9.0, dtype=F64).view(3, 3)
+    slopes = []
+    for exp, log in (
+        (rotations.exp, rotations.log),
+        (axis_angle_to_rotation_matrix, rotation_matrix_to_axis_angle),
+    ):
+        v = vectors(angle, 5).requires_grad_()
+        R = exp(v)
+        slopes.append([*torch.autograd.grad((weight * R).sum() + log(R).sum(), v)])
+    torch.testing.assert_close(slopes[0], slopes[1], rtol=1e-10, atol=1e-11)
 
 
 @given(st.lists(st.floats(-3, 3), min_size=6, max_size=6))

@@ -77,12 +77,12 @@ def test_decoding_runs_one_batch_ahead_and_no_further(tmp_path: Path, monkeypatc
     lock = threading.Lock()
     decode = images.decode
 
-    def counting(path: Path) -> np.ndarray:
+    def counting(path: Path, threads: int) -> np.ndarray:
         nonlocal count
         with lock:
             count += 1
         started.release()
-        return decode(path)
+        return decode(path, threads=threads)
 
     monkeypatch.setattr(reader_module, "decode", counting)
     steps = iter(FrameReader(in_batches(find_sources([tmp_path]), 5), SIZE[1], SIZE[0], threads=2))

@@ -1,7 +1,5 @@
 """Cramer-Rao bound of the target pose: no unbiased estimator from the grey values has a smaller covariance."""
 
-from __future__ import annotations
-
 from typing import TypedDict, Unpack
 
 import torch

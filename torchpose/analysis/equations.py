@@ -4,8 +4,6 @@ Lengths in mm, image lengths in px, the pixel pitch mu in mm. Numbers or tensors
 model (tilt, perspective, distortion, every marker at once) is `torchpose.analysis.propagate`.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from torch import Tensor

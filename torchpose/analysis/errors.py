@@ -1,7 +1,5 @@
 """Errors of estimated poses against known ones, and whether the predicted covariance explains them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Protocol
 

@@ -1,7 +1,5 @@
 """Tables of pose errors over a data set: bias, spread and consistency of each axis, success by status."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Sequence

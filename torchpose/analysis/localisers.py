@@ -4,8 +4,6 @@ For the comparison of shapes (paper, section III-A). Every mark is localised fro
 give it; edges are Zernike edges for all shapes. Polygons become straight lines by weighted total least squares.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Marks of five shapes on an equal area of the plate: how they are drawn, outlined and localised (paper, Fig. 5)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Monte-Carlo of the measuring chain: what propagation says to first order, by trial."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any, NamedTuple, Required, TypedDict, Unpack
 

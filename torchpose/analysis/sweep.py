@@ -1,7 +1,5 @@
 """Errors over the working distance: the paper's equations, propagation and Monte-Carlo side by side (Fig. 4)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

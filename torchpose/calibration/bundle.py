@@ -1,7 +1,5 @@
 """Joint least squares of a camera's intrinsics and the poses of all views (bundle adjustment of a known target)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch

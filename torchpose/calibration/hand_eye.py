@@ -5,8 +5,6 @@ Both mounts are one equation, A_i X B_i = Z: B_i is the target in the camera, X 
 - camera on the base: A_i = tool_from_base, X = base_from_camera, Z = tool_from_target (the target is on the tool).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal, cast
 

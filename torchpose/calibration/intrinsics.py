@@ -1,7 +1,5 @@
 """Intrinsics of a camera from views of known points, with their covariance and what there is to doubt about them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, replace
 
@@ -78,7 +76,7 @@ def start_cameras(width: int, height: int, lens: str) -> list[Camera]:
         ConfigError: an unknown lens model.
     """
     model, names = _lens(lens)
-    ideal = [Camera.pinhole(width, height, focal * width) for focal in _START_FOCALS]
+    ideal = [Camera.ideal(width, height, focal * width) for focal in _START_FOCALS]
     return [replace(camera, model=model, distortion=camera.matrix.new_zeros(len(names))) for camera in ideal]
 
 

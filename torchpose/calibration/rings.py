@@ -1,7 +1,5 @@
 """Views of ring targets: markers found with a rough camera, then their centres from the grey values."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """From frames to a calibration: one camera, a ring target or a board, and the robot's poses where there are any."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from torch import Tensor

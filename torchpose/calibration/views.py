@@ -1,7 +1,5 @@
 """What a calibration is computed from: known points seen in N views, flat."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, compress

@@ -1,7 +1,5 @@
 """How pixels move with the intrinsics of their camera."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Float
 from torch import Tensor

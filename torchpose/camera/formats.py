@@ -5,19 +5,19 @@ spellings read.
 COLMAP counts pixels from the corner of the first pixel: its principal point is ours + 0.5.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Callable, Mapping
 from decimal import Decimal
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch.nn.functional import pad
 
 from torchpose.camera.model import Camera, Model
-from torchpose.config import format_list, format_number, parse_mapping, read_text, suggest, write_text
+from torchpose.config import format_list, format_number, parse_mapping, read_text, suggest, within, write_text
 from torchpose.errors import ConfigError
 
 FIELDS: dict[str, tuple[str, ...]] = {
@@ -61,37 +61,38 @@ def load(path: str | os.PathLike[str]) -> Camera:
     if "#" in name and not Path(name).is_file():
         name, selector = name.rsplit("#", 1)
     text = read_text(name)
-    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-    readers: dict[str, Callable[[str], Camera]]
-    if lines and _COLMAP_LINE.match(lines[0].strip()):
-        rows = [line.split() for line in lines]
-        readers = {row[0]: _colmap_reader(row) for row in rows}
-        if len(readers) < len(rows):
-            raise ConfigError(f"{name}: CAMERA_ID: given twice; keep one line for each camera")
-    else:
+    with within(f"{name}: "):
+        lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
         if text.lstrip().startswith(("<?xml", "<opencv_storage")):
-            raise ConfigError(f"{name}: file: is XML; save it as YAML (cv2.FileStorage with the suffix .yaml)")
-        if all(line.lstrip().startswith("#") for line in text.splitlines() if line.strip()):
-            raise ConfigError(f"{name}: file: holds only comments; write the fields into it")
-        data = parse_mapping(text, name)
-        chain = {key: value for key, value in data.items() if re.fullmatch(r"cam\d+", key)}
-        if not chain:
-            if selector is not None:
-                raise ConfigError(f"{name}: #{selector}: the file holds one camera only; drop #{selector}")
-            return _read(_native, data, name)
-        readers = {key: _kalibr_reader(value) for key, value in chain.items()}
-    choices = ", ".join(f"#{key}" for key in readers)
-    if selector is None and len(readers) > 1:
-        raise ConfigError(f"{name}: file: holds {len(readers)} cameras; append one of {choices} to the name")
-    if selector is not None and selector not in readers:
-        raise ConfigError(f"{name}: #{selector}: no such camera; choose {choices}")
-    return _read(lambda key: readers[key](key), selector or next(iter(readers)), name)
+            raise ConfigError("file: is XML; save it as YAML (cv2.FileStorage with the suffix .yaml)")
+        if not lines:
+            raise ConfigError("file: holds only comments; write the fields into it")
+        if _COLMAP_LINE.match(lines[0].strip()):
+            rows = [line.split() for line in lines]
+            readers = {row[0]: partial(_colmap, row) for row in rows}
+            if len(readers) < len(rows):
+                raise ConfigError("CAMERA_ID: given twice; keep one line for each camera")
+        else:
+            data = parse_mapping(text)
+            readers = {key: partial(_kalibr, key, data[key]) for key in data if re.fullmatch(r"cam\d+", key)}
+            if not readers:
+                if selector is not None:
+                    raise ConfigError(f"#{selector}: the file holds one camera only; drop #{selector}")
+                return _native(data)
+        choices = ", ".join(f"#{key}" for key in readers)
+        if selector is None and len(readers) > 1:
+            raise ConfigError(f"file: holds {len(readers)} cameras; append one of {choices} to the name")
+        if selector is not None and selector not in readers:
+            raise ConfigError(f"#{selector}: no such camera; choose {choices}")
+        return readers[selector or next(iter(readers))]()
 
 
 def save(camera: Camera, path: str | os.PathLike[str], format: str | None = None) -> None:
     """Writes a camera file; numbers read back exactly.
 
     Args:
+        camera: what to write.
+        path: where to.
         format: opencv (also readable by cv2.FileStorage), json, ros (camera_info), kalibr (camchain of one camera) or
             colmap (cameras.txt with CAMERA_ID 1; it has no place for the covariance, which is left out).
             None: .yaml and .yml are opencv, .json is json, .txt is colmap.
@@ -108,25 +109,16 @@ def save(camera: Camera, path: str | os.PathLike[str], format: str | None = None
     }
     suffixes = {".yaml": "opencv", ".yml": "opencv", ".json": "json", ".txt": "colmap"}
     name = os.fspath(path)
-    if format is None:
-        suffix = Path(name).suffix.lower()
-        if suffix not in suffixes:
-            raise ConfigError(f"{name}: suffix: {suffix!r} is not known; use {', '.join(suffixes)} or give a format")
-        format = suffixes[suffix]
-    if format not in writers:
-        raise ConfigError(f"{name}: format: {format!r} is not known; {suggest(format, writers)}")
-    try:
+    with within(f"{name}: "):
+        if format is None:
+            suffix = Path(name).suffix.lower()
+            if suffix not in suffixes:
+                raise ConfigError(f"suffix: {suffix!r} is not known; use {', '.join(suffixes)} or give a format")
+            format = suffixes[suffix]
+        if format not in writers:
+            raise ConfigError(f"format: {format!r} is not known; {suggest(format, writers)}")
         text = writers[format](camera)
-    except ConfigError as error:
-        raise ConfigError(f"{name}: {error}") from None
     write_text(name, text)
-
-
-def _read(reader: Callable[[Any], Camera], source: Any, name: str) -> Camera:
-    try:
-        return reader(source)
-    except ConfigError as error:
-        raise ConfigError(f"{name}: {error}") from None
 
 
 def _native(data: Mapping[str, Any]) -> Camera:
@@ -142,7 +134,6 @@ def _native(data: Mapping[str, Any]) -> Camera:
         matrix = matrix.reshape(3, 3)  # ROS messages write K row by row
     elif matrix.shape != (3, 3):
         raise ConfigError(f"camera_matrix: has shape {tuple(matrix.shape)}; give 3 rows of 3")
-    covariance = data.get("camera_matrix_covariance")
     default = "fisheye" if data.get("fisheye_model") in (1, True) else "brown_conrady"
     return Camera(
         _size(get("image_width"), "image_width"),
@@ -150,76 +141,62 @@ def _native(data: Mapping[str, Any]) -> Camera:
         matrix,
         _numbers(get("distortion_coefficients"), "distortion_coefficients").flatten(),
         _model(data.get("distortion_model", default)),
-        None if covariance is None else _numbers(covariance, "camera_matrix_covariance"),
+        _covariance(data),
     )
 
 
-def _kalibr_reader(entry: Any) -> Callable[[str], Camera]:
-    def read(key: str) -> Camera:
-        if not isinstance(entry, Mapping):
-            raise ConfigError(f"{key}: is not a mapping; write `intrinsics:` and so on below it")
+def _kalibr(key: str, entry: Any) -> Camera:
+    if not isinstance(entry, Mapping):
+        raise ConfigError(f"{key}: is not a mapping; write `intrinsics:` and so on below it")
+    names = {
+        "image_width": "resolution",
+        "image_height": "resolution",
+        "camera_matrix": "intrinsics",
+        "distortion_coefficients": "distortion_coeffs",
+    }
+    with within(f"{key}.", names):
         for field in ("intrinsics", "resolution", "distortion_model", "distortion_coeffs"):
             if field not in entry:
-                raise ConfigError(f"{key}.{field}: is missing; add it")
+                raise ConfigError(f"{field}: is missing; add it")
         if entry.get("camera_model", "pinhole") != "pinhole":
-            raise ConfigError(f"{key}.camera_model: is {entry['camera_model']!r}; calibrate with pinhole")
-        intrinsics = _numbers(entry["intrinsics"], f"{key}.intrinsics")
+            raise ConfigError(f"camera_model: is {entry['camera_model']!r}; calibrate with pinhole")
+        intrinsics = _numbers(entry["intrinsics"], "intrinsics")
         if intrinsics.shape != (4,):
-            raise ConfigError(f"{key}.intrinsics: has shape {tuple(intrinsics.shape)}; give [fx, fy, cx, cy]")
+            raise ConfigError(f"intrinsics: has shape {tuple(intrinsics.shape)}; give [fx, fy, cx, cy]")
         resolution = entry["resolution"]
         if not isinstance(resolution, list) or len(resolution) != 2:
-            raise ConfigError(f"{key}.resolution: is {resolution!r}; give [width, height]")
-        covariance = entry.get("camera_matrix_covariance")
-        names = {
-            "image_width": "resolution",
-            "image_height": "resolution",
-            "camera_matrix": "intrinsics",
-            "distortion_coefficients": "distortion_coeffs",
-        }
-        try:
-            return Camera(
-                _size(resolution[0], "image_width"),
-                _size(resolution[1], "image_height"),
-                _matrix(*intrinsics.tolist()),
-                _numbers(entry["distortion_coeffs"], "distortion_coefficients").flatten(),
-                _model(entry["distortion_model"]),
-                None if covariance is None else _numbers(covariance, "camera_matrix_covariance"),
-            )
-        except ConfigError as error:
-            field, _, problem = str(error).partition(": ")
-            raise ConfigError(f"{key}.{names.get(field, field)}: {problem}") from None
-
-    return read
+            raise ConfigError(f"resolution: is {resolution!r}; give [width, height]")
+        return Camera(
+            _size(resolution[0], "image_width"),
+            _size(resolution[1], "image_height"),
+            _matrix(*intrinsics.tolist()),
+            _numbers(entry["distortion_coeffs"], "distortion_coefficients").flatten(),
+            _model(entry["distortion_model"]),
+            _covariance(entry),
+        )
 
 
-def _colmap_reader(row: list[str]) -> Callable[[str], Camera]:
-    def read(key: str) -> Camera:
-        model_name = row[1] if len(row) > 1 else ""
-        if model_name not in COLMAP_MODELS:
-            raise ConfigError(f"camera {key}: MODEL: {model_name!r} is not supported; use {', '.join(COLMAP_MODELS)}")
-        focals, model, slots, count = COLMAP_MODELS[model_name]
+def _colmap(row: list[str]) -> Camera:
+    with within(f"camera {row[0]}: ", {"image_width": "WIDTH", "image_height": "HEIGHT", "MODEL": "MODEL"}, "PARAMS"):
+        name = row[1] if len(row) > 1 else ""
+        if name not in COLMAP_MODELS:
+            raise ConfigError(f"MODEL: {name!r} is not supported; use {', '.join(COLMAP_MODELS)}")
+        focals, model, slots, count = COLMAP_MODELS[name]
         wanted = focals + 2 + len(slots)
         if len(row) != 4 + wanted:
-            raise ConfigError(f"camera {key}: PARAMS: {max(len(row) - 4, 0)} parameters; {model_name} has {wanted}")
+            raise ConfigError(f"PARAMS: {max(len(row) - 4, 0)} parameters; {name} has {wanted}")
         try:
             # in decimals, so that the half pixel costs no digit
-            params = [Decimal(p) for p in row[4:]]
+            params = [Decimal(text) for text in row[4:]]
             fx, fy = float(params[0]), float(params[focals - 1])
-            cx, cy = (float(p - Decimal("0.5")) for p in params[focals : focals + 2])
+            cx, cy = (float(center - Decimal("0.5")) for center in params[focals : focals + 2])
         except (ArithmeticError, ValueError):
-            raise ConfigError(f"camera {key}: PARAMS: not all are numbers; write numbers only") from None
-        distortion = [0.0] * count
+            raise ConfigError("PARAMS: not all are numbers; write numbers only") from None
+        distortion = torch.zeros(count, dtype=torch.float64)
         for slot, value in zip(slots, params[focals + 2 :], strict=True):
             distortion[slot] = float(value)
-        names = {"image_width": "WIDTH", "image_height": "HEIGHT"}
-        try:
-            width, height = (_size(_integer(text), f) for text, f in zip(row[2:4], names, strict=True))
-            return Camera(width, height, _matrix(fx, fy, cx, cy), torch.tensor(distortion, dtype=torch.float64), model)
-        except ConfigError as error:
-            field, _, problem = str(error).partition(": ")
-            raise ConfigError(f"camera {key}: {names.get(field, 'PARAMS')}: {problem}") from None
-
-    return read
+        width, height = _size(_integer(row[2]), "image_width"), _size(_integer(row[3]), "image_height")
+        return Camera(width, height, _matrix(fx, fy, cx, cy), distortion, model)
 
 
 def _integer(text: str) -> int | str:
@@ -242,6 +219,11 @@ def _model(name: Any) -> Model:
 
 def _matrix(fx: float, fy: float, cx: float, cy: float) -> torch.Tensor:
     return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+
+
+def _covariance(data: Mapping[str, Any]) -> torch.Tensor | None:
+    field = "camera_matrix_covariance"
+    return None if data.get(field) is None else _numbers(data[field], field)
 
 
 def _numbers(value: Any, field: str) -> torch.Tensor:
@@ -276,60 +258,59 @@ def _row(values: torch.Tensor) -> str:
     return format_list(values.detach().flatten().tolist())
 
 
-def _mapping_matrix(name: str, values: torch.Tensor, tag: str = "") -> str:
-    rows, cols = values.shape if values.ndim == 2 else ((1, len(values)) if len(values) else (0, 0))
+def _yaml(entries: Mapping[str, Any], tag: str = "") -> str:
+    """Lines of YAML; tensors as mappings of rows, cols and data, those that are None left out."""
     kind = "\n   dt: d" if tag else ""
-    return f"{name}:{tag}\n   rows: {rows}\n   cols: {cols}{kind}\n   data: {_row(values)}\n"
+    text = ""
+    for name, value in entries.items():
+        if isinstance(value, torch.Tensor):
+            rows, cols = value.shape if value.ndim == 2 else ((1, len(value)) if len(value) else (0, 0))
+            text += f"{name}:{tag}\n   rows: {rows}\n   cols: {cols}{kind}\n   data: {_row(value)}\n"
+        elif value is not None:
+            text += f"{name}: {value}\n"
+    return text
+
+
+def _entries(camera: Camera) -> dict[str, Any]:
+    return {
+        "image_width": camera.width,
+        "image_height": camera.height,
+        "camera_matrix": camera.matrix,
+        "distortion_model": camera.model,
+        "distortion_coefficients": camera.distortion,
+        "camera_matrix_covariance": camera.covariance,
+    }
 
 
 def _opencv_text(camera: Camera) -> str:
-    tag = " !!opencv-matrix"
-    text = (
-        f"%YAML:1.0\n---\nimage_width: {camera.width}\nimage_height: {camera.height}\n"
-        + _mapping_matrix("camera_matrix", camera.matrix, tag)
-        + f"distortion_model: {camera.model}\n"
-        + _mapping_matrix("distortion_coefficients", camera.distortion, tag)
-    )
-    if camera.covariance is not None:
-        text += _mapping_matrix("camera_matrix_covariance", camera.covariance, tag)
-    return text
+    return "%YAML:1.0\n---\n" + _yaml(_entries(camera), " !!opencv-matrix")
 
 
 def _json_text(camera: Camera) -> str:
-    def table(values: torch.Tensor) -> str:
-        return "[" + ", ".join(map(_row, values)) + "]"
+    def written(value: Any) -> str:
+        if not isinstance(value, torch.Tensor):
+            return f'"{value}"' if isinstance(value, str) else f"{value}"
+        return _row(value) if value.ndim == 1 else "[" + ", ".join(map(_row, value)) + "]"
 
-    fields = [
-        f'"image_width": {camera.width}',
-        f'"image_height": {camera.height}',
-        f'"camera_matrix": {table(camera.matrix)}',
-        f'"distortion_model": "{camera.model}"',
-        f'"distortion_coefficients": {_row(camera.distortion)}',
-    ]
-    if camera.covariance is not None:
-        fields.append(f'"camera_matrix_covariance": {table(camera.covariance)}')
-    return "{\n  " + ",\n  ".join(fields) + "\n}\n"
+    fields = [f'  "{name}": {written(value)}' for name, value in _entries(camera).items() if value is not None]
+    return "{\n" + ",\n".join(fields) + "\n}\n"
 
 
 def _ros_text(camera: Camera) -> str:
-    d = camera.distortion
-    if camera.model == "kannala_brandt":
-        model = "equidistant"
-    else:  # plumb_bob has five coefficients, rational_polynomial eight
-        d = torch.nn.functional.pad(d, (0, (8 if len(d) == 8 else 5) - len(d)))
-        model = "rational_polynomial" if len(d) == 8 else "plumb_bob"
-    projection = torch.nn.functional.pad(camera.matrix, (0, 1))
-    text = (
-        f"image_width: {camera.width}\nimage_height: {camera.height}\ncamera_name: camera\n"
-        + _mapping_matrix("camera_matrix", camera.matrix)
-        + f"distortion_model: {model}\n"
-        + _mapping_matrix("distortion_coefficients", d)
-        + _mapping_matrix("rectification_matrix", torch.eye(3))
-        + _mapping_matrix("projection_matrix", projection)
-    )
-    if camera.covariance is not None:
-        text += _mapping_matrix("camera_matrix_covariance", camera.covariance)
-    return text
+    entries, model = _entries(camera), "equidistant"
+    coefficients, covariance = camera.distortion, entries.pop("camera_matrix_covariance")
+    if camera.model == "brown_conrady":  # plumb_bob has five coefficients, rational_polynomial eight
+        model = "rational_polynomial" if len(coefficients) == 8 else "plumb_bob"
+        coefficients = pad(coefficients, (0, (8 if len(coefficients) == 8 else 5) - len(coefficients)))
+    entries |= {
+        "distortion_model": model,
+        "distortion_coefficients": coefficients,
+        "camera_name": "camera",
+        "rectification_matrix": torch.eye(3),
+        "projection_matrix": pad(camera.matrix, (0, 1)),
+        "camera_matrix_covariance": covariance,
+    }
+    return _yaml(entries)
 
 
 def _focal_center(camera: Camera) -> tuple[float, float, float, float]:
@@ -338,7 +319,7 @@ def _focal_center(camera: Camera) -> tuple[float, float, float, float]:
 
 
 def _kalibr_text(camera: Camera) -> str:
-    d = torch.nn.functional.pad(camera.distortion.detach(), (0, 8 - len(camera.distortion)))
+    d = pad(camera.distortion.detach(), (0, 8 - len(camera.distortion)))
     if bool(d[4:].any()):
         raise ConfigError("distortion_coefficients: Kalibr holds k1 k2 p1 p2 only; save in the format opencv or ros")
     text = (

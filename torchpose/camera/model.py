@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from copy import copy
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -16,8 +17,17 @@ from torch.nn.functional import pad
 
 from torchpose.errors import ConfigError
 
+if TYPE_CHECKING:
+    from kornia.geometry.camera import PinholeCamera
+
 Model = Literal["brown_conrady", "kannala_brandt"]
 _MAX_ITERATIONS = 60
+# the tensors of a camera and what files call them
+_FIELDS = {
+    "matrix": "camera_matrix",
+    "distortion": "distortion_coefficients",
+    "covariance": "camera_matrix_covariance",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,17 +79,12 @@ class Camera:
         ) -> None: ...
 
     @classmethod
-    def pinhole(cls, width: int, height: int, focal: float) -> Camera:
+    def ideal(cls, width: int, height: int, focal: float) -> Camera:
         """A camera without distortion, its optical axis in the middle of the frame; all in px."""
-        matrix = [[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]]
-        return cls(width, height, torch.tensor(matrix, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))
+        return cls(width, height, [[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]], [])
 
     def __post_init__(self) -> None:
-        for name, field in (
-            ("matrix", "camera_matrix"),
-            ("distortion", "distortion_coefficients"),
-            ("covariance", "camera_matrix_covariance"),
-        ):
+        for name, field in _FIELDS.items():
             value = getattr(self, name)
             if value is None and name == "covariance":
                 continue
@@ -96,59 +101,40 @@ class Camera:
                 raise ConfigError(f"{field}: is {size!r}; give the frame size as a positive integer, in px")
         self._check_matrix()
         self._check_distortion()
-        self._check_covariance()
+        if self.covariance is not None:
+            _check_covariance(self.covariance.detach())
 
     def _check_matrix(self) -> None:
-        m = self.matrix.detach()
-        if m.shape != (3, 3):
-            raise ConfigError(f"camera_matrix: has shape {tuple(m.shape)}; give 3 rows of 3")
-        (fx, skew, _), (below, fy, _), last = m.tolist()
+        if self.matrix.shape != (3, 3):
+            raise ConfigError(f"camera_matrix: has shape {tuple(self.matrix.shape)}; give 3 rows of 3")
+        (fx, skew, _), (below, fy, _), last = self.matrix.tolist()
         if last != [0, 0, 1]:
             raise ConfigError(f"camera_matrix: last row is {last}; write [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
         if skew or below:
             raise ConfigError(f"camera_matrix: has a skew entry ({skew or below}); calibrate without skew and write 0")
-        for name, f in (("fx", fx), ("fy", fy)):
-            if f <= 0:
-                raise ConfigError(f"camera_matrix: focal length {name} is {f}; give a positive number of px")
+        for name, focal in (("fx", fx), ("fy", fy)):
+            if focal <= 0:
+                raise ConfigError(f"camera_matrix: focal length {name} is {focal}; give a positive number of px")
 
     def _check_distortion(self) -> None:
-        d = self.distortion.detach()
         if self.model not in get_args(Model):
             raise ConfigError(f"distortion_model: is {self.model!r}; known are {', '.join(get_args(Model))}")
-        if d.ndim != 1:
-            raise ConfigError(f"distortion_coefficients: has shape {tuple(d.shape)}; give one list")
-        n = len(d)
-        if self.model == "brown_conrady" and n in (12, 14):
-            if bool(d[8:].any()):
+        if self.distortion.ndim != 1:
+            raise ConfigError(f"distortion_coefficients: has shape {tuple(self.distortion.shape)}; give one list")
+        count = len(self.distortion)
+        if self.model == "brown_conrady" and count in (12, 14):
+            if bool(self.distortion[8:].any()):
                 raise ConfigError(
                     "distortion_coefficients: thin-prism or tilted terms are not zero; calibrate with 8 coefficients"
                 )
             object.__setattr__(self, "distortion", self.distortion[:8])
-        elif n not in ((4,) if self.model == "kannala_brandt" else (0, 4, 5, 8)):
+        elif count not in ((4,) if self.model == "kannala_brandt" else (0, 4, 5, 8)):
             wanted = "k1 k2 k3 k4" if self.model == "kannala_brandt" else "none or k1 k2 p1 p2 [k3 [k4 k5 k6]]"
-            raise ConfigError(f"distortion_coefficients: {n} coefficients for {self.model}; give {wanted}")
-
-    def _check_covariance(self) -> None:
-        if self.covariance is None:
-            return
-        c = self.covariance.detach()
-        if c.shape != (4, 4):
-            raise ConfigError(f"camera_matrix_covariance: has shape {tuple(c.shape)}; give 4 x 4 for fx fy cx cy")
-        slack = c.abs().max() * (1e-9 if c.dtype == torch.float64 else 1e-5)
-        if bool((c - c.T).abs().max() > slack):
-            raise ConfigError("camera_matrix_covariance: is not symmetric; give the covariance of fx fy cx cy in px^2")
-        if bool(torch.linalg.eigvalsh(c)[0] < -slack):
-            raise ConfigError(
-                "camera_matrix_covariance: has a negative eigenvalue; give the covariance of fx fy cx cy in px^2"
-            )
+            raise ConfigError(f"distortion_coefficients: {count} coefficients for {self.model}; give {wanted}")
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Camera:
-        """Reads a camera file in any of the formats of `torchpose.camera.formats`; ``FILE#cam1`` picks one of several.
-
-        Raises:
-            ConfigError: one line ``FILE: FIELD: what is wrong; the fix``.
-        """
+        """Reads a camera file, see `torchpose.camera.formats.load`; ``FILE#cam1`` picks one of several."""
         from torchpose.camera import formats
 
         return formats.load(path)
@@ -156,22 +142,56 @@ class Camera:
     def save(
         self, path: str | os.PathLike[str], format: Literal["opencv", "json", "ros", "kalibr", "colmap"] | None = None
     ) -> None:
-        """Writes the camera file in one piece; see `torchpose.camera.formats.save`.
-
-        Raises:
-            ConfigError: the format cannot hold this camera, or the file cannot be written.
-        """
+        """Writes the camera file in one piece, see `torchpose.camera.formats.save`."""
         from torchpose.camera import formats
 
         formats.save(self, path, format)
 
     def to(self, *args: Any, **kwargs: Any) -> Camera:
-        """Same as `Tensor.to` on every tensor; ``self`` where nothing changes."""
-        matrix, distortion = self.matrix.to(*args, **kwargs), self.distortion.to(*args, **kwargs)
-        covariance = None if self.covariance is None else self.covariance.to(*args, **kwargs)
-        if matrix is self.matrix and distortion is self.distortion and covariance is self.covariance:
+        """Same as `Tensor.to` on every tensor; ``self`` where nothing changes. Nothing is checked or read again."""
+        tensors = {name: value for name in _FIELDS if (value := getattr(self, name)) is not None}
+        moved = {name: value.to(*args, **kwargs) for name, value in tensors.items()}
+        if all(moved[name] is value for name, value in tensors.items()):
             return self
-        return replace(self, matrix=matrix, distortion=distortion, covariance=covariance)
+        # what is derived once goes along: another device would have to wait for it
+        _ = self.fold_radius, self._distorts
+        camera = copy(self)
+        for name, value in moved.items():
+            object.__setattr__(camera, name, value)
+        return camera
+
+    def pinhole(self, R: Tensor | None = None, t: Tensor | None = None) -> PinholeCamera:
+        """Kornia's camera of the same matrix at B poses; it has no distortion, its pixels are ideal ones.
+
+        Args:
+            R: (B, 3, 3) rotations, target to camera, such as `Poses.R`; the identity (B = 1) where there are none.
+            t: (B, 3) translations, mm. Kornia's world is the target, its extrinsics are these poses.
+        """
+        from kornia.geometry.camera import PinholeCamera
+
+        matrix = self.matrix if R is None else self.matrix.to(R)
+        extrinsics = torch.eye(4).to(matrix).repeat(1 if R is None else len(R), 1, 1)
+        if R is not None and t is not None:
+            extrinsics[:, :3, :3], extrinsics[:, :3, 3] = R, t.to(R)
+        intrinsics = torch.block_diag(matrix, torch.ones(1, 1).to(matrix)).expand_as(extrinsics)
+        height, width = (matrix.new_full((len(extrinsics),), size) for size in (self.height, self.width))
+        return PinholeCamera(intrinsics, extrinsics, height, width)
+
+    @classmethod
+    def from_pinhole(cls, camera: PinholeCamera, index: int = 0) -> Camera:
+        """The camera number ``index`` of kornia's batch; its extrinsics are poses and stay behind.
+
+        Raises:
+            ConfigError: its matrix has skew, or another field is wrong.
+        """
+        width, height = (int(size[index]) for size in (camera.width, camera.height))
+        return cls(width, height, camera.camera_matrix[index].double(), [])
+
+    @cached_property
+    def _distorts(self) -> bool:
+        """Whether any coefficient moves a point, or might (while it is being estimated)."""
+        fisheye = self.model == "kannala_brandt"
+        return fisheye or self.distortion.requires_grad or bool(self.distortion.detach().any())
 
     @cached_property
     def fold_radius(self) -> float:
@@ -180,7 +200,7 @@ class Camera:
         Beyond it the model folds back onto the image and has no inverse.
         """
         d = np.zeros(8)
-        d[: len(self.distortion)] = self.distortion.detach().cpu().double().numpy()
+        d[: len(self.distortion)] = self.distortion.tolist()
         if self.model == "kannala_brandt":
             # derivative of theta (1 + k1 theta^2 + ...) as a polynomial in theta^2
             growth = np.polynomial.Polynomial([1.0, *(d[:4] * [3, 5, 7, 9])])
@@ -225,10 +245,7 @@ class Camera:
         """
         focal, center = self._intrinsics(uv)
         xy_distorted = (uv - center) / focal
-        if len(self.distortion) == 0:
-            return xy_distorted
-        ideal = self.model != "kannala_brandt" and not bool(self.distortion.any())
-        if ideal and not self.distortion.requires_grad:
+        if not self._distorts:
             return xy_distorted
         u, v = xy_distorted.unbind(-1)
         with torch.no_grad():
@@ -258,10 +275,8 @@ class Camera:
             ex_trial, ey_trial = x_distorted - u, y_distorted - v
             trial_error = torch.hypot(ex_trial, ey_trial)
             better = (trial_error < error) & (torch.hypot(x_trial, y_trial) < limit)
-            old, new = (
-                (x, y, ex, ey, error, *jacobian),
-                (x_trial, y_trial, ex_trial, ey_trial, trial_error, *trial_jacobian),
-            )
+            old = x, y, ex, ey, error, *jacobian
+            new = x_trial, y_trial, ex_trial, ey_trial, trial_error, *trial_jacobian
             x, y, ex, ey, error, *jacobian = (torch.where(better, b, a) for a, b in zip(old, new, strict=True))
             fraction = torch.where(better, 1.0, 0.5 * fraction)
         j_xx, j_xy, j_yy = jacobian
@@ -305,6 +320,17 @@ class Camera:
             slope * x * y + 2 * (p1 * x + p2 * y),
             s_tangential + slope * y * y + 4 * p1 * y,
         )
+
+
+def _check_covariance(covariance: Tensor) -> None:
+    fix = "give the covariance of fx fy cx cy in px^2"
+    if covariance.shape != (4, 4):
+        raise ConfigError(f"camera_matrix_covariance: has shape {tuple(covariance.shape)}; give 4 x 4 for fx fy cx cy")
+    slack = covariance.abs().max() * (1e-9 if covariance.dtype == torch.float64 else 1e-5)
+    if bool((covariance - covariance.T).abs().max() > slack):
+        raise ConfigError(f"camera_matrix_covariance: is not symmetric; {fix}")
+    if bool(torch.linalg.eigvalsh(covariance)[0] < -slack):
+        raise ConfigError(f"camera_matrix_covariance: has a negative eigenvalue; {fix}")
 
 
 def _first_positive_root(polynomial: np.polynomial.Polynomial) -> float:

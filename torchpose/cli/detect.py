@@ -102,7 +102,7 @@ def _decoded(sources: Sequence[Source], threads: int) -> Iterator[tuple[Source, 
 
     def load(source: Source) -> np.ndarray | str:
         try:
-            return decode(source.path)
+            return decode(source.path, threads=threads)
         except UnreadableImageError as error:
             return error.reason
 

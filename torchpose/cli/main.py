@@ -1,7 +1,5 @@
 """Entry point: ``torchpose COMMAND ...``. Errors of the user end in one line on stderr and the exit code 2."""
 
-from __future__ import annotations
-
 import sys
 import traceback
 from collections.abc import Sequence

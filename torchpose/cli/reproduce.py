@@ -1,7 +1,5 @@
 """``torchpose reproduce``: the paper's tables and figures in one report."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """``torchpose simulate``: a plan file in, frames with exact truth out."""
 
-from __future__ import annotations
-
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """What a command shows on stderr while it runs. Nothing unless stderr is a terminal."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import sys

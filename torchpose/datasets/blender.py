@@ -9,8 +9,6 @@ Cycles samples a pixel filter, which stands for the optical blur and the pixel's
 of the same variance as the plan's Gaussian and the unit square. Its name in the settings says half of its support.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os

@@ -9,8 +9,6 @@ A data set is a folder:
     bop/                     the same in the layout of the BOP challenge, where asked for
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -36,6 +34,7 @@ from torchpose.geometry import rotations
 from torchpose.io.images import UnreadableImageError, decode
 from torchpose.io.truth import Truth, read_truth, write_truth
 from torchpose.io.writers import atomic_path
+from torchpose.sim import faults_of, with_faults
 from torchpose.sim.clutter import random_clutter, random_covers
 from torchpose.sim.renderer import Defocus, render
 from torchpose.sim.sensor import Lighting, add_noise
@@ -131,8 +130,10 @@ def analytic(plan: Plan) -> Renderer:
 
 def simulated_frames(plan: Plan, renderer: Renderer, which: Int[Tensor, " B"]) -> Shaped[Tensor, "B H W"]:
     """The frames numbered ``which``, uint8 or uint16, as the plan's sensor delivers them."""
-    sensor = plan.file.sensor.model_dump(exclude={"noise"})
-    return add_noise(renderer(which), plan.conditions.noise[which], plan.file.seed, index=which, **sensor)
+    sensor, frames = plan.file.sensor.model_dump(exclude={"noise"}), renderer(which)
+    if plan.file.faults:
+        frames = with_faults(frames, faults_of(plan.file.faults), plan.file.seed, index=which)
+    return add_noise(frames, plan.conditions.noise[which], plan.file.seed, index=which, **sensor)
 
 
 def write_dataset(

@@ -25,13 +25,14 @@ from pydantic import (
 from torch import Tensor
 
 from torchpose.camera import Camera
-from torchpose.config import beside, read_yaml, validate
+from torchpose.config import beside, read_yaml, validate, within
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.geometry.rotations import plane_axes
 from torchpose.geometry.rows import Rows, shared
 from torchpose.io.sources import find_sources
 from torchpose.io.truth import read_truth
+from torchpose.sim import faults_of
 from torchpose.target import Target
 
 _HALTON_BASES = (2, 3, 5, 7, 11, 13)
@@ -189,6 +190,7 @@ class PlanFile(_Section):
     poses: Poses
     imaging: Imaging = Imaging()
     sensor: Sensor = Sensor()
+    faults: dict[str, dict[str, Any]] = {}
     depth_range: Pair | None = None
     out_of_view: Literal["error", "mark"] = "error"
     bounds: bool = True
@@ -254,6 +256,9 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
     file = validate(PlanFile, read_yaml(path), path)
     camera = Camera.load(beside(path, file.camera))
     target = Target.load(beside(path, file.target))
+    if file.faults:
+        with within(f"{path}: "):
+            faults_of(file.faults)
     if file.depth_range is not None and not 0 < file.depth_range[0] < file.depth_range[1]:
         raise ConfigError(f"{path}: depth_range: {file.depth_range} is not 0 < near < far; correct it")
     R, t = _poses(path, file, camera, target)

@@ -4,8 +4,6 @@ Both writers are our own so that a circle stays a circle (SVG) or eight cubic ar
 which knows no circle), and a length on the page is the number in the file.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from xml.sax.saxutils import escape

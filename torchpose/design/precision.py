@@ -1,7 +1,5 @@
 """Predicted precision of a target over a working volume: its middle, its worst points, and maps."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Predicted pose covariance: of straight edges in closed form, and as the estimator itself states it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

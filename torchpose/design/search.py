@@ -1,7 +1,5 @@
 """The choice: the fewest rings that reach the accuracy needed at the worst point of the working volume."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace

@@ -3,8 +3,6 @@
 Nothing but the rings lies within the plate. It shows the side that the camera sees, x to the right and y down.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import dataclass

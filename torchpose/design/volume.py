@@ -1,7 +1,5 @@
 """The poses that a target is designed for."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

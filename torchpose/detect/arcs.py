@@ -5,8 +5,6 @@ region breaks into arcs or runs on along the other edge. Arcs that belong to one
 (Patraucean, Gurdjos, Grompone von Gioi 2017), here all pairs of a batch at once.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """Candidate ellipses of a batch of frames: fits to level-line regions and chained arcs, validated a contrario."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

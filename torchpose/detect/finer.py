@@ -1,7 +1,5 @@
 """A second, finer look at small places where something round may be, each cut out as a small frame of its own."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor

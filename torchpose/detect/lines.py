@@ -1,7 +1,5 @@
 """Straight edges and the polygons they form: the other interpretations that ELSDc weighs against ellipses."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

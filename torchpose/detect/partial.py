@@ -6,8 +6,6 @@ half of it, and the one that most of the perimeter agrees with is kept: a consen
 samples are the runs, few enough to try them all.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

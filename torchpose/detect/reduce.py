@@ -1,7 +1,5 @@
 """Area reduction of a whole batch of frames: the only full-size pass of the detector, and it stays in integers."""
 
-from __future__ import annotations
-
 from typing import TypeVar
 
 import cv2

@@ -5,8 +5,6 @@ criterion, agreement of neighbouring level-line angles, becomes the edge set of 
 connected components are found by parallel min-hooking and pointer jumping (Shiloach and Vishkin 1982).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Everything a picture holds, each edge explained once: ellipses, polygons and straight segments."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch

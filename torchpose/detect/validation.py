@@ -5,8 +5,6 @@ what is seen belongs to its best interpretation, the one with the fewest false a
 is left. Two circles side by side have arcs that a third ellipse joins, too long to be an accident, and yet it is none.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from enum import IntEnum

@@ -9,8 +9,6 @@ the integral of the Gaussian of r times (v . n) dl. Both integrands are periodic
 trapezoidal rule converges faster than any power of its step (Trefethen, Weideman, SIAM Review 56, 2014).
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

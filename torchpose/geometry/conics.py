@@ -5,8 +5,6 @@ A conic is the coefficient vector (A, B, C, D, E, F) of A x^2 + B xy + C y^2 + D
 (3, 3) matrix.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """How the image of a point moves with the point, and with the pose of the body that it belongs to."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Float
 from torch import Tensor

@@ -4,8 +4,6 @@ Every stage hands its results on as such rows. What is done to rows is done here
 moving to a device. A field may be a tensor, other rows, a tuple of these, or None; `shared` fields belong to all rows.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import MISSING, field, fields, replace
 from typing import Any, Self

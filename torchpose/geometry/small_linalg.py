@@ -5,8 +5,6 @@ is a contiguous vector over the batch, so an elimination is a few dozen elementw
 compiler fuses them (`torchpose.kernels`). All functions are differentiable and keep dtype and device.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import combinations
 

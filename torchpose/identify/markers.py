@@ -6,8 +6,6 @@ turns it), and the pose under which most markers have a ring of the right place,
 frames are tried in one flat batch.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 

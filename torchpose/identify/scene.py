@@ -1,7 +1,5 @@
 """What is known of a batch before anything in it is measured."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Self

@@ -5,8 +5,6 @@ look. The markers that were found tell place, size and shape of the others: each
 candidate is, and counts if it has the place and the code of the marker.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

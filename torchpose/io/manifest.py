@@ -14,8 +14,6 @@ Other keys and other records are ignored. A last line without its newline is one
 stopped; it is dropped unless it is whole. Image and robot pose are joined by their record, never by position.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar

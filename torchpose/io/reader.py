@@ -1,7 +1,5 @@
 """Frames from disk in batches: decoding runs ahead in threads, memory is two batches however many frames there are."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -76,7 +74,7 @@ class FrameReader:
 
     def __iter__(self) -> Iterator[Batch]:
         largest = max((len(batch) for batch in self.batches), default=0)
-        buffers = [_Buffer(largest, (self.height, self.width)) for _ in range(2)]
+        buffers = [_Buffer(largest, (self.height, self.width), self.threads) for _ in range(2)]
         pool = ThreadPoolExecutor(self.threads, thread_name_prefix="decode")
 
         def submit(number: int) -> list[Future[Fault | np.dtype]]:
@@ -97,7 +95,8 @@ class FrameReader:
 class _Buffer:
     """Memory of one batch for each pixel type, allocated when the first frame of the type arrives."""
 
-    def __init__(self, frames: int, shape: tuple[int, int]) -> None:
+    def __init__(self, frames: int, shape: tuple[int, int], threads: int) -> None:
+        self._threads = threads
         self._size = (frames, *shape)
         self._planes: dict[np.dtype, Tensor] = {}
         self._lock = threading.Lock()
@@ -105,7 +104,7 @@ class _Buffer:
     def load(self, slot: int, source: Source) -> Fault | np.dtype:
         """Decodes a source into a slot; returns its pixel type, or what is wrong with it."""
         try:
-            image = decode(source.path)
+            image = decode(source.path, threads=self._threads)
         except UnreadableImageError as error:
             return Fault(Status.UNREADABLE, error.reason)
         if image.shape != self._size[1:]:

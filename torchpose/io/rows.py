@@ -1,7 +1,5 @@
 """Rows of the result tables: plain dictionaries of column to value, None where there is none."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Rows of the table of shapes: ellipses, segments and polygons of pictures."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """From what the user names (files, folders, manifests) to the list of frames, each with its name in the results."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Iterator, Sequence

@@ -7,8 +7,6 @@ made from. At the end the tables are written whole and moved into place, what th
 line torn; a resumed one drops that line and goes on. A finished table is resumed by turning it into a journal again.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json

@@ -1,7 +1,5 @@
 """The truth of simulated frames: one CSV row per frame and target."""
 
-from __future__ import annotations
-
 import csv
 import io
 import itertools

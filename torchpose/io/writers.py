@@ -1,7 +1,5 @@
 """Result tables as CSV, JSON lines or Parquet, by suffix: written beside their place, then moved there whole."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import json

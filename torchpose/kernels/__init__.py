@@ -7,7 +7,7 @@ compiler make one loop over the problems of it, a lane of a vector for each (`bu
 functions of tensors with the problems first, and does without where it must. docs/decisions/0007 has the figures.
 """
 
-from torchpose.kernels.build import has_compiler
+from torchpose.kernels.build import find_compiler, has_compiler
 from torchpose.kernels.functions import LEAST, compiled, mapped, padded, repeated, tracing
 
-__all__ = ["LEAST", "compiled", "has_compiler", "mapped", "padded", "repeated", "tracing"]
+__all__ = ["LEAST", "compiled", "find_compiler", "has_compiler", "mapped", "padded", "repeated", "tracing"]

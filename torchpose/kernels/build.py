@@ -1,7 +1,5 @@
 """C++ to machine code: the compiler, and what it has made before."""
 
-from __future__ import annotations
-
 import ctypes
 import hashlib
 import os

@@ -1,7 +1,5 @@
 """`compiled`, `repeated` and `mapped`: functions of tensors, run as one loop over the problems of a batch in C++."""
 
-from __future__ import annotations
-
 import threading
 import warnings
 from collections.abc import Callable, Iterator

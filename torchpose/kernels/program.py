@@ -1,7 +1,5 @@
 """Straight-line code on numbers, and the C++ loop that runs it for a batch of problems at once."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ of indices and leave nothing behind, and matrix products and sums come down to t
 is done by `geometry.small_linalg`.
 """
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -5,8 +5,6 @@ each scalar of a formula is one contiguous vector over the poses (docs/decisions
 are permuted views of those arrays: handing them from one solver to the next copies nothing.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

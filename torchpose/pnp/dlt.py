@@ -1,7 +1,5 @@
 """Direct linear transform (Abdel-Aziz, Karara 1971; Hartley, Zisserman, 2nd ed., section 7.1) with known intrinsics."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -5,8 +5,6 @@ The factors come from the distances between control points, which a rigid motion
 paper's approximations, then by Gauss-Newton. The pose with the least reprojection error is kept.
 """
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import torch

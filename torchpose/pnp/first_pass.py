@@ -6,8 +6,6 @@ an evaluation in float64, which gives the covariance and says whether the pose h
 not decided, is left to `second_pass`.
 """
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@ At the minimum of cost(x, p) over the pose x, dx/dp = -H^-1 d(grad_x cost)/dp wi
 with H held fixed has this gradient and, at the minimum, the value zero.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

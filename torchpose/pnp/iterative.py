@@ -5,8 +5,6 @@ is such a minimum. The second derivatives cost little more than the first (`norm
 leave no positive definite matrix, the step is that of Gauss-Newton, stretched.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch
@@ -60,7 +58,9 @@ def not_above(cost: Tensor, old: Tensor, floor: Tensor) -> Tensor:
     return cost <= old + 2 * (old * floor).sqrt() + floor
 
 
-def _advance(state: _State, obs: Observations, rtol: float, floor: Tensor, enough: Tensor) -> tuple[_State, Tensor]:
+def _advance(
+    state: _State, obs: Observations, rtol: float | Tensor, floor: Tensor, enough: Tensor
+) -> tuple[_State, Tensor]:
     """Evaluates the trial poses, accepts those that lower the cost, and proposes the next step. (B,): who goes on?"""
     pose, normal = state.trial, normal_equations(obs, state.trial, newton=True)
     lower = not_above(normal[COST], state.normal[COST], floor)
@@ -92,7 +92,7 @@ def _advance(state: _State, obs: Observations, rtol: float, floor: Tensor, enoug
 
 
 def _off_saddle(
-    obs: Observations, pose: Tensor, cost: Tensor, damping: Tensor, rtol: float, floor: Tensor, enough: Tensor
+    obs: Observations, pose: Tensor, cost: Tensor, damping: Tensor, rtol: float | Tensor, floor: Tensor, enough: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """`_proposal` of Gauss-Newton, for poses at which Newton's matrix is not positive definite.
 
@@ -110,7 +110,7 @@ def _proposal(
     damping: Tensor,
     step: Tensor,
     decrease: Tensor,
-    rtol: float,
+    rtol: float | Tensor,
     floor: Tensor,
     enough: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -131,7 +131,7 @@ def minimise(
     pose: Tensor,
     *,
     max_iterations: int,
-    rtol: float = 1e-12,
+    rtol: float | Tensor = 1e-12,
     enough: Tensor | None = None,
     compile: bool = False,
 ) -> Estimate:

@@ -5,8 +5,6 @@ entries of [R t] for each of two points of every line. The refinement minimises 
 projected end points of the object lines from the observed lines.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -62,7 +62,7 @@ class Observations(NamedTuple):
     xy: Tensor
     whitening: Tensor
     camera: Camera | None = None
-    huber: float | None = None
+    huber: float | Tensor | None = None
     sums: Sums | None = None
 
     def select(self, index: Tensor) -> Observations:
@@ -117,7 +117,7 @@ def residuals(obs: Observations, uv: Tensor) -> Tensor:
     return obs.whitening[:, 0] * difference[0] + obs.whitening[:, 1] * difference[1]
 
 
-def robust(square: Tensor, huber: float) -> tuple[Tensor, Tensor]:
+def robust(square: Tensor, huber: float | Tensor) -> tuple[Tensor, Tensor]:
     """Huber's cost of squared residuals, linear in the residual above ``huber``, and the weight of their squares."""
     outside = square > huber**2
     length = torch.where(outside, square, 1).sqrt()

@@ -6,8 +6,6 @@ lines are split off by adjugates (Richter-Gebert, Perspectives on Projective Geo
 but elementwise arithmetic is needed. Newton steps on the cosine law remove what rounding left.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -5,8 +5,6 @@ the points, which lies in front of the camera. IPPE then needs only the first-or
 centroid: it fixes the depth, and the rotation up to the two-fold ambiguity of a small plane.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

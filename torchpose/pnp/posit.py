@@ -5,8 +5,6 @@ and so on. For a plane, the linear system leaves the components along the normal
 length and orthogonality of the axes allow are both followed, each branch keeping the better of its two descendants.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

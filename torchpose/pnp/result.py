@@ -1,7 +1,5 @@
 """What `torchpose.pnp.solve` returns."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import IntEnum
 

@@ -4,8 +4,6 @@ The other minimum is followed in float32 first, until it is reached or sure to b
 neither does it matter to the last digit.
 """
 
-from __future__ import annotations
-
 import torch
 
 from torchpose.kernels import padded

@@ -1,7 +1,5 @@
 """`solve`: poses from points in pixels, by any method of this package, with covariance and a code for every pose."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache

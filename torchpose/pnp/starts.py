@@ -1,7 +1,5 @@
 """Starts of the iterative method: every pose that a closed form finds."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Stage: the image of a ring's centre, freed from the eccentricity of perspective (paper, section III-B-4, eq. (7))."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Covariance of poses from centres, or from edges all along the rings, and what uncertain intrinsics add to it."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

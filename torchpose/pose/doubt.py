@@ -1,7 +1,5 @@
 """Poses from three markers that put a fourth where it cannot be: three centres fit many a mix-up."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor

@@ -1,7 +1,5 @@
 """What became of every target in every frame: who owns a ring that two targets claim, the status, the rows returned."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -6,8 +6,6 @@ centres by their covariances, and the shapes of the rings' own ellipses, which d
 seen.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 
@@ -23,7 +21,7 @@ _ITERATIONS = (16, 60)  # of the solver: for most rows, and for those that need 
 _CENTER_RMS = 0.3  # px, below which they do not: small errors of calibration or print are no mix-up
 
 
-def solve_poses(evidence: Evidence, rough: tuple[Tensor, Tensor]) -> Solutions:
+def solve_poses(evidence: Evidence, rough: tuple[Tensor, Tensor], *, compile: bool = False) -> Solutions:
     """Pose, alternative, covariance and status of N rows with three markers or more.
 
     A row whose centres contradict each other is solved again without each of its markers in turn; if one of these fits,
@@ -32,18 +30,21 @@ def solve_poses(evidence: Evidence, rough: tuple[Tensor, Tensor]) -> Solutions:
     Args:
         evidence: N rows.
         rough: R (N, 3, 3), t (N, 3) to start from.
+        compile: as for `pnp.solve`.
     """
     if len(evidence) == 0:
         return _no_solutions(evidence, *rough)
-    solved = _solve(evidence, rough, _ITERATIONS[0])
+    solved = _solve(evidence, rough, _ITERATIONS[0], compile)
     slow = (solved.reason == Reason.NOT_CONVERGED).nonzero()[:, 0]
     if slow.numel():
-        solved = solved.replaced(slow, _solve(evidence[slow], (rough[0][slow], rough[1][slow]), _ITERATIONS[1]))
+        solved = solved.replaced(
+            slow, _solve(evidence[slow], (rough[0][slow], rough[1][slow]), _ITERATIONS[1], compile)
+        )
     bad = (solved.status == Status.REJECTED) & (evidence.mask.sum(-1) >= 4)
     row, marker = (bad[:, None] & evidence.mask).nonzero().unbind(-1)
     if row.numel() == 0:
         return solved
-    retry = _solve(evidence[row].without(marker), (rough[0][row], rough[1][row]), _ITERATIONS[1])
+    retry = _solve(evidence[row].without(marker), (rough[0][row], rough[1][row]), _ITERATIONS[1], compile)
     # of the subsets that fit, the one with the least chi-squared
     cost = torch.where(retry.status == Status.REJECTED, torch.inf, retry.chi2.nan_to_num(nan=torch.inf))
     least = torch.full(bad.shape, torch.inf, dtype=cost.dtype, device=cost.device).scatter_reduce(0, row, cost, "amin")
@@ -51,7 +52,7 @@ def solve_poses(evidence: Evidence, rough: tuple[Tensor, Tensor]) -> Solutions:
     return solved.replaced(row[winner], retry[winner])
 
 
-def _solve(evidence: Evidence, rough: tuple[Tensor, Tensor], iterations: int) -> Solutions:
+def _solve(evidence: Evidence, rough: tuple[Tensor, Tensor], iterations: int, compile: bool) -> Solutions:
     result = pnp.solve(
         evidence.points,
         torch.where(evidence.mask[..., None], evidence.center, 0.0),
@@ -60,6 +61,7 @@ def _solve(evidence: Evidence, rough: tuple[Tensor, Tensor], iterations: int) ->
         mask=evidence.mask,
         initial=_starts(evidence, rough),
         max_iterations=iterations,
+        compile=compile,
     )
     # both minima of the centres, weighed again with the rings' shapes
     R, t = torch.stack([result.R, result.R_alt], 1), torch.stack([result.t, result.t_alt], 1)

@@ -5,8 +5,6 @@ they tell, for it extrapolates from both circles to radius 0; predicting the ell
 nothing, and their eccentricity tells of the tilt besides.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -5,8 +5,6 @@ Two poses that compensated centres cannot tell apart may differ by many deviatio
 open, but not the grey values around their edges.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

@@ -1,7 +1,5 @@
 """The methods of `PoseEstimator`: how each locates centres, and the steps that it takes once there are solutions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """What a refinement looks at, and what it returns."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
 

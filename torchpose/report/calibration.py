@@ -1,7 +1,5 @@
 """Plots and tables of a calibration: where the residuals are, and whether they are what their covariances say."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

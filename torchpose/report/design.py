@@ -1,7 +1,5 @@
 """Map plots of the precision that a target promises over its working volume."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Pictures of what the detector saw: ellipses, polygons and segments, and with an explanation what it rejected."""
 
-from __future__ import annotations
-
 import math
 
 import cv2

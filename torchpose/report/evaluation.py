@@ -1,7 +1,5 @@
 """Plots of an evaluation: errors per frame, their distribution, and whether the claimed uncertainty holds."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Plots of the experiment, as Fig. 13 of the paper: errors over frames and steps, with what the poses claim."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -1,7 +1,5 @@
 """How the plots look: one style, no window, no global state. Slow to import: commands do where they plot."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

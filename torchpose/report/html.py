@@ -1,7 +1,5 @@
 """The report of the studies: one HTML file that needs no other, for a desk's screen and a phone's."""
 
-from __future__ import annotations
-
 import base64
 import json
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Pictures that show at once what was found in a frame: fitted ellipses, ids, axes, status."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path

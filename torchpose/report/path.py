@@ -1,7 +1,5 @@
 """Picture of a capture plan: where the tool goes, and the box that it may not leave."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from matplotlib.patches import Rectangle

@@ -1,7 +1,5 @@
 """Plots of errors over the working distance, and of the error budget."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from matplotlib.figure import Figure

@@ -4,8 +4,6 @@ Every frame is an acquisition of its own: started, triggered, fetched, stopped. 
 taken for the frame of this one. The emulator that ships with pypylon (``PYLON_CAMEMU=1``) runs the same code.
 """
 
-from __future__ import annotations
-
 import contextlib
 import time
 import warnings

@@ -1,7 +1,5 @@
 """The capture loop: move, settle, read the pose, expose all cameras, read the pose again, store, next."""
 
-from __future__ import annotations
-
 import contextlib
 import signal
 import time

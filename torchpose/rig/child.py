@@ -5,8 +5,6 @@ Both ends are here: `Child` in the parent, `serve` in the child. It is a fresh i
 terminal reaches only the parent, which decides what to do.
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import json

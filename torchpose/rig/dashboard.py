@@ -3,8 +3,6 @@
 Plain sockets with a deadline and no state: `stop` has to work from a signal handler while everything else hangs.
 """
 
-from __future__ import annotations
-
 import socket
 import time
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """What can be wrong with a rig: every fault has a reason, which the manifest and the exit line name."""
 
-from __future__ import annotations
-
 from enum import StrEnum
 
 from torchpose.errors import TorchposeError

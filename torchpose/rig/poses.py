@@ -1,7 +1,5 @@
 """Poses of the tool as six numbers ``(x, y, z, rx, ry, rz)``: position in mm, rotation vector in rad."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Annotated, Any

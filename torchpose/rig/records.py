@@ -1,7 +1,5 @@
 """The records of a capture session's manifest, as they are written and read back; docs/rig.md describes them."""
 
-from __future__ import annotations
-
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field

@@ -5,8 +5,6 @@ whole process. So it runs here, alone, and the parent ends this process when an 
 and rad towards ur-rtde. When the parent is done or gone, the robot is stopped.
 """
 
-from __future__ import annotations
-
 import os
 import threading
 import time

@@ -1,7 +1,5 @@
 """How each fault of a robot is told from what the controller and the child process say."""
 
-from __future__ import annotations
-
 from torchpose.rig.child import ChildEnded, ChildError, ChildLate
 from torchpose.rig.faults import RobotReason
 

@@ -4,8 +4,6 @@ An image is written under a temporary name, synced and renamed, then its line is
 a line is there only for an image that is whole. ``torchpose.io.manifest`` describes what all manifests have in common.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import hashlib

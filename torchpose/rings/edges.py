@@ -5,8 +5,6 @@ the maximum of the gradient along the ellipse's own normal is searched directly:
 given, at a few pixels per pixel of perimeter instead of all of the region.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """The circle inside each candidate, from the mean radial profile of grey: ratio of the radii, and where it shows."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

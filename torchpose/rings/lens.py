@@ -1,7 +1,5 @@
 """Ellipses and points between the pixels of the frame and ideal ones, of the same camera without distortion."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

@@ -1,7 +1,5 @@
 """Stage: concentric pairs. From candidate ellipses to rings with both circles measured."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch

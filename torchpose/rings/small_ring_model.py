@@ -4,8 +4,6 @@ Parameters theta (K, 9) of a ring: centre of the outer ellipse, its shape matrix
 and the inner centre from the outer one.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -8,8 +8,6 @@ Model: a straight step of height k at distance l (in units of the mask radius N/
 direction phi of increasing grey. Then A'_11 = (2/3) k (1 - l^2)^(3/2) and A_20 = l A'_11.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import lru_cache

@@ -12,8 +12,6 @@ support of the kernel, so every sample is scattered into a small patch and a run
 docs/decisions/0003-renderer.md compares it with supersampling.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Random clutter and covers for stress sets: a function of the seed and of the frame's number alone."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -10,8 +10,6 @@ multiplied after the blur (`torchpose.sim.sensor.Lighting`). docs/decisions/0003
 have the comparisons with supersampling.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """What lies between the picture and the stored grey values: uneven light on the way in, noise and rounding after it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -90,8 +88,10 @@ def add_noise(
     SplitMix64 of Steele, Lea and Flood 2014 and the Box-Muller transform in float32), so it is the same in any batch.
 
     Args:
-        frames: (B, H, W), grey levels 0..255. sigma: read noise in grey levels of 0..255; a number or (B,).
-        seed: any integer. index: (B,) int64, the frames' numbers; 0 to B - 1 by default.
+        frames: (B, H, W), grey levels 0..255.
+        sigma: read noise in grey levels of 0..255; a number or (B,).
+        seed: any integer.
+        index: (B,) int64, the frames' numbers; 0 to B - 1 by default.
         bits: 1 to 16; white (255) becomes 2^bits - 1.
         full_well: electrons of a white pixel; None for a sensor without shot noise.
         gamma: stored = 255 (grey / 255)^(1 / gamma), after the noise.
@@ -111,29 +111,35 @@ def add_noise(
     amplitude = torch.as_tensor(sigma, dtype=torch.float32, device=frames.device).expand(count)
     if not bool((amplitude >= 0).all()):
         raise ConfigError("sigma: the noise is negative; give 0 or more grey levels")
-    top, dtype = 2**bits - 1, torch.uint8 if bits <= 8 else torch.uint16
-    number = torch.arange(count, device=frames.device) if index is None else index.to(frames.device)
-    key = _mix64(_mix64(torch.full_like(number, seed % 2**62)) + number)
+    key = frame_keys(count, seed, None if index is None else index.to(frames.device)).to(frames.device)
     steps = torch.arange(1, min(_CHUNK, (height * width + 1) // 2) + 1, device=frames.device) * _GOLDEN
-    flat = frames.reshape(count, height * width)
-    out = torch.empty(flat.shape, dtype=dtype, device=frames.device)
+    flat, top = frames.reshape(count, height * width), 2**bits - 1
+    out = torch.empty(flat.shape, dtype=torch.uint8 if bits <= 8 else torch.uint16, device=frames.device)
     together = max(1, 2 * _CHUNK // max(1, flat.shape[1]))  # small frames share a chunk
     for a in range(0, count, together):
         rows = slice(a, a + together)
         for b in range(0, flat.shape[1], 2 * _CHUNK):
             grey = flat[rows, b : b + 2 * _CHUNK].float()
             start = key[rows] + torch.tensor(b // 2, device=key.device) * _GOLDEN
-            noise = _normal(start, steps, grey.shape[1])
-            if full_well is None:
-                noise.mul_(amplitude[rows, None])
-            else:
-                variance = grey.clamp_min(0) * (GREY_MAX / full_well) + amplitude[rows, None].square()
-                noise.mul_(variance.sqrt_())
-            level = noise.add_(grey)
+            level = _noisy(grey, _normal(start, steps, grey.shape[1]), amplitude[rows, None], full_well)
             if gamma != 1:
                 level.div_(GREY_MAX).clamp_min_(0).pow_(1 / gamma).mul_(GREY_MAX)
-            out[rows, b : b + 2 * _CHUNK] = level.mul_(top / GREY_MAX).round_().clamp_(0, top).to(dtype)
+            out[rows, b : b + 2 * _CHUNK] = level.mul_(top / GREY_MAX).round_().clamp_(0, top).to(out.dtype)
     return out.view(count, height, width)
+
+
+def _noisy(grey: Tensor, deviate: Tensor, sigma: Tensor, full_well: float | None) -> Tensor:
+    """Grey levels with noise, in the memory of the normal deviates."""
+    if full_well is None:
+        return deviate.mul_(sigma).add_(grey)
+    variance = grey.clamp_min(0) * (GREY_MAX / full_well) + sigma.square()
+    return deviate.mul_(variance.sqrt_()).add_(grey)
+
+
+def frame_keys(count: int, seed: int, index: Tensor | None = None) -> Tensor:
+    """(B,) int64 keys of the chance in each frame, from its number ``index`` (B,), 0 to ``count`` - 1 by default."""
+    number = torch.arange(count) if index is None else index
+    return _mix64(_mix64(torch.full_like(number, seed % 2**62)) + number)
 
 
 def _normal(start: Tensor, steps: Tensor, count: int) -> Tensor:

@@ -5,8 +5,6 @@ f = 1111 px. Lines against points: the four corners of the square as points, and
 to 25 edge points; every corner and every edge point has the same noise, so the lines use more of the image.
 """
 
-from __future__ import annotations
-
 import math
 import statistics
 import time

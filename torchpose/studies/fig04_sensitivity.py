@@ -4,8 +4,6 @@ The centres of the four markers are projected, noise is added, and `torchpose.pn
 has Gaussian noise of 0.2 or 1 px on each coordinate. With focal error the lens has 8.02 mm and the solver 8 mm.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -30,7 +28,7 @@ DISTANCES_MM = (12.0, 32.0)
 
 def paper_camera() -> Camera:
     """Basler acA5472-17um, 2.4 um pixels, with an 8 mm lens without distortion."""
-    return Camera.pinhole(5472, 3648, FOCAL_MM / PITCH_MM)
+    return Camera.ideal(5472, 3648, FOCAL_MM / PITCH_MM)
 
 
 def run(*, full: bool = False, seed: int = 0, progress: Progress = ignore_progress) -> StudyResult:

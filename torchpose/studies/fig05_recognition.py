@@ -1,7 +1,5 @@
 """Second part of Fig. 5: marks among clutter, missed and false, and the codes that each shape can carry."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 
@@ -62,7 +60,7 @@ def recognition(frames: int, seed: int) -> list[Row]:
 
 def frame_camera() -> Camera:
     """Camera of the frames with clutter."""
-    return Camera.pinhole(WIDTH, HEIGHT, FOCAL_PX)
+    return Camera.ideal(WIDTH, HEIGHT, FOCAL_PX)
 
 
 def clutter(target: Target, frames: int, seed: int) -> Shapes:
@@ -185,7 +183,7 @@ def capacities(count: int, seed: int) -> list[Row]:
 def _read(name: str, code: float, blur: float, noise: float, poses: tuple[Tensor, Tensor], seed: int) -> Tensor:
     """(B,) codes read from frames of marks that carry one."""
     build, read = CODED[name]
-    mark, camera, (R, t) = build(code), Camera.pinhole(161, 161, 2 * FOCAL_PX), poses
+    mark, camera, (R, t) = build(code), Camera.ideal(161, 161, 2 * FOCAL_PX), poses
     t = t * torch.tensor([0.001, 0.001, 1.0])
     drawn = mark.draw(30.0, (0.0, 0.0)).in_frames(torch.arange(len(t)))
     images = add_noise(render(camera, drawn, R, t, psf_sigma=blur), noise, seed)

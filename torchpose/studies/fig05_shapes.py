@@ -6,8 +6,6 @@ others on the same Zernike edges: ellipse, two ellipses and eq. (7), diagonals o
 cross. Grey 30 on 220, 8 bit.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

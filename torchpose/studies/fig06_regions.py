@@ -5,8 +5,6 @@ uneven light, and four light rings on it. What is counted: ellipses that belong 
 (both circles measured, concentric) and the markers that the pose estimation knows by their ratio of radii.
 """
 
-from __future__ import annotations
-
 import math
 
 import cv2
@@ -103,7 +101,7 @@ def phone_target() -> Target:
 
 
 def _camera(height: int, width: int) -> Camera:
-    return Camera.pinhole(width, height, FOCAL_PX)
+    return Camera.ideal(width, height, FOCAL_PX)
 
 
 def phone_scene(seed: int) -> tuple[Tensor, Tensor]:

@@ -4,8 +4,6 @@ One ring, tilted by 20 degrees, PSF 0.7 px, noise of 2 grey levels: the region, 
 Zernike moment A_11, the sub-pixel edges, and the ellipses fitted to them with their residuals.
 """
 
-from __future__ import annotations
-
 import math
 
 import cv2

@@ -5,8 +5,6 @@ the target quad40 at 160 mm, 2 MP, PSF 0.7 px, noise of 2 grey levels. As bars s
 estimates claim and the Cramer-Rao bound.
 """
 
-from __future__ import annotations
-
 from dataclasses import astuple, replace
 
 import cv2

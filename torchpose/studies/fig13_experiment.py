@@ -6,8 +6,6 @@ the capture runs but optics and real motion. Its robot is exact: what is left is
 where the claim is right and the robot exact; ``scale``: how much longer the camera sees the moves along an axis.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import math
 from collections.abc import Callable

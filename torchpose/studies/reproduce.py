@@ -1,7 +1,5 @@
 """All studies, one after the other, into one folder and one report."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import platform
@@ -34,7 +32,7 @@ STUDIES = (
     "fig13_experiment",
 )
 REPORT = "report.html"
-_PACKAGES = ("torchpose", "torch", "kornia", "numpy", "opencv-python-headless", "scikit-image", "matplotlib")
+_PACKAGES = ("torchpose", "torch", "kornia", "numpy", "opencv-python-headless", "matplotlib")
 
 
 def reproduce(

@@ -1,7 +1,5 @@
 """The command line of a study that is run by itself: ``python scripts/fig02_pnp_comparison.py --out out/fig02``."""
 
-from __future__ import annotations
-
 import argparse
 import inspect
 import sys

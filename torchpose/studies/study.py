@@ -1,7 +1,5 @@
 """What every study returns: tables with their units in the column names, pictures, and figures beside the paper's."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable

@@ -5,8 +5,6 @@ deviation, a largest one), so ours is given over the distance, and the circumsta
 are worked out.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 
@@ -137,7 +135,7 @@ def reading(kind: str) -> Row:
     focal = SIGMA_PX * ratio / roll / (1 if worst else 2 * math.sqrt(2))
     distance = ratio * HALF_SIDE_MM
     size = max(1001, 2 * round(1.5 * focal / ratio) + 1)  # room for the target
-    camera, target = Camera.pinhole(size, size, focal), Target.load("quad8")
+    camera, target = Camera.ideal(size, size, focal), Target.load("quad8")
     eye = torch.eye(3, dtype=torch.float64)[None]
     at = torch.tensor([[0.0, 0.0, distance]], dtype=torch.float64)
     spread = propagate(camera, target, eye, at, Uncertainty(image=SIGMA_PX)).std()[0]

@@ -5,8 +5,6 @@ within 6 px of its centre and 5 % of its radius, everything else is false. ELSDc
 program, one run for each noise (data/elsdc_table2_scene.json).
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

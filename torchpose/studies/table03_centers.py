@@ -8,8 +8,6 @@ at whole pixels the errors of an edge operator cancel by symmetry. RMS per axis 
 longest error of all, ``bias``: the longest mean error of a ring. The bound counts rounding as noise of 1/12.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -80,7 +78,7 @@ def run(
 
 
 def camera() -> tp.Camera:
-    return tp.Camera.pinhole(WIDTH, HEIGHT, FOCAL)
+    return tp.Camera.ideal(WIDTH, HEIGHT, FOCAL)
 
 
 def scene(shift: Tensor, cam: tp.Camera) -> tuple[tp.Target, Tensor, Tensor]:

@@ -6,8 +6,6 @@ nor says which of its sizes are diameters. ``formula``: from the exact conics, t
 pixel by which the ring is off the axis drawn at random; RMS length of the error over the frames.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch
@@ -158,7 +156,7 @@ def measured(
         seed: of the noise.
         correct: free the edges from blur and curvature.
     """
-    camera = tp.Camera.pinhole(SIZE, SIZE, FOCAL)
+    camera = tp.Camera.ideal(SIZE, SIZE, FOCAL)
     # a target has three markers at least: the others lie outside of the frame
     centers = torch.tensor([[0.0, 0, 0], [60, 0, 0], [0, 60, 0]], dtype=F64)
     radii = torch.cat([RADII, torch.tensor([[5.0, 2.0], [5, 1.5]], dtype=F64)])

@@ -1,7 +1,5 @@
 """Views that the studies draw at random."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -10,8 +10,6 @@ frame is found along with its pose: the slope of o over l (`zernike.blur_slope`)
 the last steps read the same edges, and the blur, with matched filters, which scatter less (`step_filter`).
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

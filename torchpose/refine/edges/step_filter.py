@@ -5,8 +5,6 @@ step is the filter of least noise. Both grey levels are free in every window, so
 filter is made orthogonal to them.
 """
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """The pixels near the two circles of a ring, enumerated row by row without touching the others."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

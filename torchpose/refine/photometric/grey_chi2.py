@@ -1,7 +1,5 @@
 """Chi-squared of the grey values around the rings under two poses of the same frame."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

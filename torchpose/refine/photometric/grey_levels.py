@@ -4,8 +4,6 @@ Each marker has linear unknowns of its own: ring and paper, constant and gradien
 curved second derivatives too.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -6,8 +6,6 @@ it is not. So they have a normal prior about 0 whose width is found in the frame
 the mean square of its gradients beyond what their noise explains.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

@@ -5,8 +5,6 @@ The handshake is the one between ur-rtde's client and the script that it uploads
 ``output_int_register_1`` and the state of an asynchronous move in ``output_int_register_2``. Poses in m and rad.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import sys

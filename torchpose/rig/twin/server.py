@@ -4,8 +4,6 @@ RTDE stream (30004), script upload (30003) and dashboard (29999), as a UR contro
 parent process, which is told the true pose.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import os

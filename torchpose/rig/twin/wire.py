@@ -3,8 +3,6 @@
 A packet is a big-endian uint16 size, a type byte and a payload. A recipe is a list of variables that travel together.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Iterable
