@@ -19,11 +19,13 @@ from types import FunctionType, ModuleType
 from typing import Any, Literal, Self, get_args, get_origin
 
 import torch
-from beartype import BeartypeConf, beartype
+from beartype import BeartypeConf, FrozenDict, beartype
 from beartype.roar import BeartypeDecorHintPep585DeprecationWarning
 from jaxtyping import AbstractArray, jaxtyped
 
-_beartype: Any = beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int is a float
+# an int is a float, and so is what stands for a number while a kernel is traced
+_NUMBER: Any = float | int | torch.Tensor
+_beartype: Any = beartype(conf=BeartypeConf(hint_overrides=FrozenDict({float: _NUMBER})))
 OFTEN = 100  # calls of a function after which every tenth is checked
 # constructors that take what `torch.as_tensor` takes, and say with the field's name what is wrong with the rest
 COERCING = {"torchpose.camera.model.Camera.__init__"}
