@@ -2,7 +2,7 @@
 
 The moments A_nm up to order 4 of the N x N window around a pixel are correlations with fixed kernels. They come as a
 convolution layer for dense use, and evaluated at a list of edge pixels only (gather and one matrix product), which
-gives the same numbers at a hundredth of the cost on a large frame; tests/test_zernike.py shows both equal.
+gives the same numbers at a hundredth of the cost on a large frame; tests/rings/test_zernike.py shows both equal.
 
 Model: a straight step of height k at distance l (in units of the mask radius N/2) from the pixel's centre, along the
 direction phi of increasing grey. Then A'_11 = (2/3) k (1 - l^2)^(3/2) and A_20 = l A'_11.
@@ -194,7 +194,7 @@ def edge_correlation(size: int = MASK) -> float:
 
     For white pixel noise the error of l at an edge pixel is the noise correlated with the A_20 kernel, so the errors of
     a row of edge pixels have the autocorrelation of that kernel; the factor is its sum (derived; checked by Monte-Carlo
-    in tests/test_zernike.py).
+    in tests/rings/test_zernike.py).
     """
     kernel = kernels(size, ((2, 0),))[0]
     return float(kernel.sum(1).square().sum() / kernel.square().sum())
