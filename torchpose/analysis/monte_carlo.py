@@ -12,7 +12,7 @@ from torchpose.analysis.errors import Pose, pose_difference
 from torchpose.analysis.sensitivity import Uncertainty, marker_axes, markers_seen, radius_shift
 from torchpose.camera import Camera
 from torchpose.geometry import least_squares
-from torchpose.pipeline import Method, PoseEstimator
+from torchpose.pipeline import PoseEstimator
 from torchpose.sim import add_noise, render
 from torchpose.target import Target
 
@@ -25,14 +25,6 @@ class Trials(TypedDict, total=False):
     draws: Required[int]
     seed: int
     true_camera: Camera  # about which cameras are drawn, where it is not the nominal one: for errors of known size
-
-
-class FrameTrials(Trials, total=False):
-    """Besides those."""
-
-    noise: float  # grey levels, 1 if not given
-    bits: int  # of the sensor, 8 if not given
-    method: Method  # of `PoseEstimator`
 
 
 def simulate_points(
@@ -78,7 +70,7 @@ def simulate_points(
 
 
 def simulate_frames(
-    camera: Camera, target: Target, R: Tensor, t: Tensor, uncertainty: Uncertainty, **trials: Unpack[FrameTrials]
+    camera: Camera, target: Target, R: Tensor, t: Tensor, uncertainty: Uncertainty, **imaging: Any
 ) -> Float[Tensor, "D B 6"]:
     """Errors as of `simulate_points`, of frames rendered with the drawn camera and print, by `PoseEstimator`.
 
@@ -86,12 +78,12 @@ def simulate_frames(
         R: (B, 3, 3), target to camera.
         t: (B, 3), target to camera, mm.
         uncertainty: its ``image`` is not used: ``noise`` grey levels of every pixel and ``bits`` are.
-        trials: see `FrameTrials`; and those of `torchpose.sim.render`, such as ``psf_sigma``, ``dark``, ``plate``.
+        imaging: ``draws``, ``seed`` and ``true_camera`` as of `Trials`; ``noise`` (1), ``bits`` of the sensor (8),
+            ``method`` of `PoseEstimator`; the rest is for `torchpose.sim.render`.
 
     Raises:
         ConfigError: a drawn print is no valid target any more: its uncertainty is too large for the target's rings.
     """
-    imaging: dict[str, Any] = {**trials}
     draws, seed, true = imaging.pop("draws"), imaging.pop("seed", 0), imaging.pop("true_camera", camera)
     noise, bits, method = imaging.pop("noise", 1.0), imaging.pop("bits", 8), imaging.pop("method", "photometric")
     drawn = _draw(true, target, uncertainty, draws, torch.Generator().manual_seed(seed))

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -112,6 +113,8 @@ def predicted_covariance(
     Arguments and result as of `edge_covariance`; NaN where the refinement fails.
     """
     rings, out = rims(target), []
+    look: dict[str, Any] = {name: getattr(imaging, name) for name in ("psf_sigma", "dark", "light")}
+    look["defocus"] = imaging.lens
     index = torch.arange(len(rings), device=t.device).repeat_interleave(_SAMPLES)
     for i in range(len(t)):
         pixel = camera.project(rings @ R[i].T + t[i])  # (2 M, S, 2)
@@ -121,15 +124,7 @@ def predicted_covariance(
         matrix[:2, 2] -= low
         crop = replace(camera, width=width, height=height, matrix=matrix)
         pose = R[i : i + 1], t[i : i + 1]
-        levels = render(
-            crop,
-            target,
-            *pose,
-            psf_sigma=imaging.psf_sigma,
-            dark=imaging.dark,
-            light=imaging.light,
-            defocus=imaging.lens,
-        )
+        levels = render(crop, target, *pose, **look)
         noisy = add_noise(levels, imaging.noise, index=index.new_tensor([i]))
         seen = ellipse.fit((pixel - low).flatten(0, 1), index, len(pixel)).view(1, len(target), 2, 5)
         refined = refine_photometric(Sight.of(noisy, crop, target, index.new_zeros(1), seen), *pose)
