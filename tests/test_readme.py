@@ -97,3 +97,16 @@ def test_layout_names_every_part() -> None:
     helpers = {"errors.py", "config.py"}
     modules = {path.name for path in parts if path.suffix == ".py"} - helpers
     assert set(re.findall(r"`([\w.]+/?)`", layout)) >= stages | modules
+
+
+@pytest.mark.parametrize("record", sorted((ROOT / "docs" / "decisions").glob("0*.md")), ids=lambda path: str(path.stem))
+def test_records_have_a_date_and_a_status_and_are_listed(record: Path) -> None:
+    title, _, date, status = record.read_text(encoding="utf-8").splitlines()[:4]
+    assert title.startswith(f"# {record.name[:4]} ")
+    assert re.fullmatch(r"- Date: \d{4}-\d\d-\d\d", date)
+    assert status.startswith("- Status: ")
+    listed = (ROOT / "docs" / "decisions" / "README.md").read_text(encoding="utf-8")
+    row = f"| [{record.name[:4]}]({record.name}) | "
+    assert any(
+        line.startswith(row) and line.endswith(f" | {date[8:]} | {status[10:]} |") for line in listed.splitlines()
+    )
