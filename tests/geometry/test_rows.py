@@ -27,6 +27,12 @@ class Outer(Rows):
     extra: Tensor | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class Named(Rows):
+    values: Tensor
+    names: tuple[str, ...] = shared()
+
+
 MATRIX = torch.eye(3)
 
 
@@ -76,6 +82,7 @@ def test_integers_keep_their_type() -> None:
     assert moved.planes[0].dtype == torch.float32
     assert moved.matrix.dtype == torch.float32
     assert rows(2).to("meta").number.device.type == "meta"
+    assert Named(torch.arange(2), ("a", "b")).to("meta").names == ("a", "b")
 
 
 def test_rows_are_copied_and_pickled() -> None:

@@ -76,7 +76,7 @@ class Rows:
                     raise ValueError(
                         f"{type(self).__name__}.{f.name} belongs to all rows and differs between the parts"
                     )
-            elif isinstance(values[0], tuple):
+            elif isinstance(values[0], tuple) and all(isinstance(item, (Tensor, Rows)) for item in values[0]):
                 changed[f.name] = tuple(change(*items) for items in zip(*values, strict=True))
             elif isinstance(values[0], (Tensor, Rows)):
                 changed[f.name] = change(*values)
