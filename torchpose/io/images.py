@@ -81,7 +81,8 @@ def _plain_png(data: bytes) -> np.ndarray | None:
     """Grey values of a grey PNG file of 8 or 16 bits, not interlaced, by kornia_rs; None where OpenCV is to decide.
 
     kornia_rs stops at the last pixel and checks neither the sum of the last chunk nor that there is an end, so the
-    chunks are checked here. It never checks the sum of the zlib stream; those of the chunks cover the same bytes.
+    chunks are checked here. It never checks the sum of the zlib stream: those of the chunks tell what a disk or a cable
+    did to the file, but not a fault within the program that wrote it.
     """
     header = _plain_header(data)
     if header is None:
