@@ -111,6 +111,32 @@ def test_state_carries_camera_and_target(estimator: tp.PoseEstimator) -> None:
     assert torch.equal(loaded.camera.matrix, estimator.camera.matrix)
 
 
+def test_a_state_leaves_the_caller_s_camera_alone(estimator: tp.PoseEstimator) -> None:
+    camera = dataclasses.replace(
+        estimator.camera, matrix=CAMERA.matrix * torch.tensor([[1.1], [1.1], [1.0]], dtype=F64)
+    )
+    before = camera.matrix.clone()
+    tp.PoseEstimator(camera, QUAD).load_state_dict(estimator.state_dict())
+    assert torch.equal(camera.matrix, before)
+
+
+def test_a_state_of_another_camera_is_refused(estimator: tp.PoseEstimator) -> None:
+    other = tp.PoseEstimator(dataclasses.replace(estimator.camera, width=320), QUAD)
+    with pytest.raises(tp.ConfigError, match="camera"):
+        other.load_state_dict(estimator.state_dict())
+
+
+def test_batches_join() -> None:
+    """Two batches one after the other are one: frames are numbered through."""
+    estimator = tp.PoseEstimator(CAMERA, QUAD, method="centers")
+    frames = [torch.cat([FRAMES["good"], FRAMES["black"]]), FRAMES["three markers"]]
+    joined, whole = tp.Poses.cat([estimator(some) for some in frames]), estimator(torch.cat(frames))
+    for name in ("frame", "target", "status", "markers"):
+        assert torch.equal(getattr(joined, name), getattr(whole, name))
+    assert torch.equal(joined.detections.frame, whole.detections.frame)
+    torch.testing.assert_close(joined.t, whole.t, rtol=0, atol=1e-6, equal_nan=True)
+
+
 def test_the_module_moves_as_any_other(estimator: tp.PoseEstimator) -> None:
     """To a device and back; a change of dtype leaves the geometry at double precision."""
     moved = copy.deepcopy(estimator).to("meta")

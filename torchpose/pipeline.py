@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from torchpose.camera import Camera
+from torchpose.camera.model import Model
 from torchpose.detect import find_candidates
 from torchpose.errors import ConfigError, FrameError
 from torchpose.geometry.grey import grey
@@ -85,7 +86,10 @@ class PoseEstimator(nn.Module):
         self.table = MarkerTable.of(self.targets)
         for owner in ("camera", "table"):
             for name, value in _tensors(getattr(self, owner)).items():
-                self.register_buffer(f"{owner}_{name}", value)
+                self.register_buffer(f"{owner}_{name}", value.detach().clone())  # the caller's own stays the caller's
+        lens = get_args(Model).index(self.camera.model)
+        self.register_buffer("made_for", torch.tensor([self.camera.width, self.camera.height, lens]))
+        self._from_buffers()
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> PoseEstimator:
         """Moves to a device, as any module; geometry stays float64."""
@@ -94,8 +98,20 @@ class PoseEstimator(nn.Module):
         self.camera, self.table = self.camera.to(device), self.table.to(device)
         return self
 
-    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
-        super()._load_from_state_dict(*args, **kwargs)
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any) -> None:
+        """
+        Raises:
+            ConfigError: the state is of a camera of another size or lens model.
+        """
+        made_for = state_dict.get(f"{prefix}made_for", self.made_for)
+        if not torch.equal(made_for.to(self.made_for), self.made_for):
+            raise ConfigError(
+                "state_dict: made for a camera of another size or lens model; make the estimator for that one"
+            )
+        super()._load_from_state_dict(state_dict, prefix, *args)
+        self._from_buffers()
+
+    def _from_buffers(self) -> None:
         for owner in ("camera", "table"):
             old = getattr(self, owner)
             setattr(self, owner, replace(old, **{name: getattr(self, f"{owner}_{name}") for name in _tensors(old)}))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -100,6 +101,17 @@ class Poses(Rows):
     rms_alt: Float[Tensor, " N"]
     chi2_alt: Float[Tensor, " N"]
     detections: Detections = shared()
+
+    @classmethod
+    def cat(cls, parts: Sequence[Self]) -> Self:
+        """The rows of several batches, one after the other; frames are numbered through, those of detections too."""
+        first, joined = 0, []
+        for part in parts:
+            found = replace(part.detections, frame=part.detections.frame + first)
+            joined.append(replace(part, frame=part.frame + first, detections=found))
+            first += int(part.frame.max()) + 1 if len(part) else 0
+        detections = Detections.cat([part.detections for part in joined])
+        return super().cat([replace(part, detections=detections) for part in joined])
 
     @property
     def ok(self) -> Bool[Tensor, " N"]:

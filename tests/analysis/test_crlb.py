@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.exact import pinhole, random_poses
 from torchpose.analysis import pose_crlb
 from torchpose.camera import Camera
 from torchpose.errors import ConfigError
@@ -143,3 +144,10 @@ def test_blur_must_be_positive() -> None:
     R, t = tilted()
     with pytest.raises(ConfigError, match="psf_sigma"):
         pose_crlb(camera(), Target.load("quad40"), R, t, psf_sigma=-1.0)
+
+
+def test_a_keyword_that_is_none_is_refused() -> None:
+    camera, target = pinhole(), Target.load("quad40")
+    r, t = random_poses(1, 10, (150, 160))
+    with pytest.raises(TypeError, match="noise"):
+        pose_crlb(camera, target, r, t, noise=2.0)

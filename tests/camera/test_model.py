@@ -240,3 +240,16 @@ def test_moving_checks_and_reads_nothing() -> None:
         assert moved.matrix.device.type == moved.distortion.device.type == "meta"
     points = torch.ones(3, 2, device="meta", dtype=torch.float64)
     assert moved.undistort_points(points).device.type == "meta"
+
+
+def test_coefficients_are_looked_at_where_they_changed() -> None:
+    """A lens that is estimated from zero: used once, then given a gradient, then moved in place."""
+    matrix = torch.tensor([[700.0, 0, 320], [0, 700.0, 240], [0, 0, 1]], dtype=torch.float64)
+    camera = Camera(640, 480, matrix, torch.zeros(4, dtype=torch.float64))
+    pixel = torch.tensor([10.0, 20.0], dtype=torch.float64)
+    straight = camera.undistort_points(pixel)
+    camera.distortion.requires_grad_()
+    assert camera.undistort_points(pixel).requires_grad
+    camera.distortion.requires_grad_(False)
+    camera.distortion[0] = 0.1
+    assert (camera.undistort_points(pixel) - straight).abs().max() > 1e-3

@@ -1,6 +1,7 @@
 """Cramer-Rao bound of the target pose: no unbiased estimator from the grey values has a smaller covariance."""
 
-from typing import TypedDict, Unpack
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -17,22 +18,21 @@ from torchpose.target import Target
 _CHUNK_POSES = 16  # poses differentiated at a time
 
 
-class Settings(TypedDict, total=False):
-    """Conditions of B frames, numbers or (B,): Gaussian blur in px (0.7 if not given), grey levels of 0..255 (30, 220)
-    and their white noise (1), bits of the sensor (8), whose step is 255 / (2^bits - 1) grey levels.
+@dataclass(frozen=True, eq=False)
+class Conditions:
+    """Of B frames, numbers or (B,): Gaussian blur in px, grey levels of 0..255 and their white noise, bits of the
+    sensor, whose step is 255 / (2^bits - 1) grey levels.
     """
 
-    psf_sigma: float | Tensor
-    dark: float | Tensor
-    light: float | Tensor
-    noise_sigma: float | Tensor
-    bits: int
+    psf_sigma: float | Tensor = 0.7
+    dark: float | Tensor = 30.0
+    light: float | Tensor = 220.0
+    noise_sigma: float | Tensor = 1.0
+    bits: int = 8
 
 
 @torch.enable_grad()
-def pose_crlb(
-    camera: Camera, target: Target, R: Tensor, t: Tensor, **settings: Unpack[Settings]
-) -> Float[Tensor, "B 6 6"]:
+def pose_crlb(camera: Camera, target: Target, R: Tensor, t: Tensor, **conditions: Any) -> Float[Tensor, "B 6 6"]:
     """Lower bound of the pose covariance from frames of `torchpose.sim.render` with white Gaussian noise.
 
     Inverse Fisher information of the grey values (Kay 1993, section 3.9), of all pixels of every marker's bounding box
@@ -43,7 +43,7 @@ def pose_crlb(
     Args:
         R: (B, 3, 3), target to camera.
         t: (B, 3), target to camera, mm.
-        settings: ``psf_sigma``, ``dark``, ``light``, ``noise_sigma``, ``bits``, see `Settings`.
+        conditions: fields of `Conditions`: ``psf_sigma``, ``dark``, ``light``, ``noise_sigma``, ``bits``.
 
     Returns:
         float64, mm and rad: translation, then rotation w with R_true = exp(w) R. NaN where the markers in view do not
@@ -53,10 +53,10 @@ def pose_crlb(
         ConfigError: ``psf_sigma`` is not above 0. FrameError: shapes of R and t disagree.
     """
     R, t = renderer.check_poses(R, t)
-    sigma = renderer.check_blur(settings.get("psf_sigma", 0.7), t)
-    levels = settings.get("dark", 30.0), settings.get("light", 220.0), settings.get("noise_sigma", 1.0)
-    dark, light, noise = (renderer.per_frame(level, t) for level in levels)
-    step = GREY_MAX / (2 ** settings.get("bits", 8) - 1)
+    given = Conditions(**conditions)
+    sigma = renderer.check_blur(given.psf_sigma, t)
+    dark, light, noise = (renderer.per_frame(level, t) for level in (given.dark, given.light, given.noise_sigma))
+    step = GREY_MAX / (2**given.bits - 1)
     parts = zip(*(x.split(_CHUNK_POSES) for x in (R, t, sigma, light - dark)), strict=True)
     information = torch.cat([_fisher(camera, target, *part) for part in parts]) if len(t) else t.new_zeros(0, 7, 7)
     inverse, known = scaled_inverse(information / (noise.square() + step * step / 12)[:, None, None])

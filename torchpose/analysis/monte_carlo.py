@@ -1,7 +1,7 @@
 """Monte-Carlo of the measuring chain: what propagation says to first order, by trial."""
 
-from dataclasses import replace
-from typing import Any, NamedTuple, Required, TypedDict, Unpack
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -19,16 +19,17 @@ from torchpose.target import Target
 _FRAMES = 16  # estimated at a time
 
 
-class Trials(TypedDict, total=False):
+@dataclass(frozen=True, eq=False)
+class Trials:
     """Keywords of the simulations."""
 
-    draws: Required[int]
-    seed: int
-    true_camera: Camera  # about which cameras are drawn, where it is not the nominal one: for errors of known size
+    draws: int
+    seed: int = 0
+    true_camera: Camera | None = None  # about which cameras are drawn, if not the nominal one: for errors of known size
 
 
 def simulate_points(
-    camera: Camera, target: Target, R: Tensor, t: Tensor, uncertainty: Uncertainty, **trials: Unpack[Trials]
+    camera: Camera, target: Target, R: Tensor, t: Tensor, uncertainty: Uncertainty, **trials: Any
 ) -> Float[Tensor, "D B 6"]:
     """Errors of poses from marker centres: truth drawn about the nominal one, projected, solved.
 
@@ -39,13 +40,13 @@ def simulate_points(
         R: (B, 3, 3), target to camera.
         t: (B, 3), target to camera, mm.
         uncertainty: as of `propagate` with features "centers".
-        trials: ``draws``, ``seed`` and ``true_camera``, see `Trials`.
+        trials: fields of `Trials`: ``draws``, ``seed``, ``true_camera``.
 
     Returns:
         estimate minus truth: translation in mm, rotation vector in rad, about the camera axes; NaN without a pose.
     """
-    generator = torch.Generator().manual_seed(trials.get("seed", 0))
-    draws, true = trials["draws"], trials.get("true_camera", camera)
+    wanted = Trials(**trials)
+    generator, draws, true = torch.Generator().manual_seed(wanted.seed), wanted.draws, wanted.true_camera or camera
     drawn = _draw(true, target, uncertainty, draws, generator)
     points = torch.einsum("bij,dmj->dbmi", R, drawn.centers) + t[:, None]
     normals = (target.normals @ R.mT).expand_as(points)

@@ -46,7 +46,7 @@ def adjust(views: Views, camera: Camera, R: Tensor, t: Tensor, *, free: bool = T
         free: whether the intrinsics are unknown; otherwise only poses are found.
 
     Raises:
-        ConfigError: the start puts points behind the camera.
+        ConfigError: the start puts points behind the camera, or the points of a view leave its pose open.
     """
     whiten = torch.linalg.inv(torch.linalg.cholesky(views.covariance))
     own = {"intrinsics": Vector(views.pixels.new_zeros(1, 4 + len(camera.distortion)))} if free else {}
@@ -67,7 +67,9 @@ def adjust(views: Views, camera: Camera, R: Tensor, t: Tensor, *, free: bool = T
     part = normal.eliminated
     if moved is None or part is None or not bool(normal.cost.isfinite().all()):
         raise ConfigError("INPUT: a view has points behind the camera that calibration starts from; remove --camera")
-    covariance, _ = least_squares.scaled_inverse(part.information)
+    covariance, determined = least_squares.scaled_inverse(part.information)
+    if not bool(determined.all()):
+        raise ConfigError("INPUT: the points of a view leave its pose open; use targets whose points are not on a line")
     residual = views.pixels - moved.project(_placed(views, pose)[1])
     chi2 = (whiten @ residual[..., None]).square().sum((-1, -2))
     gain, converged = -covariance @ part.mixed.mT, int(found.code) == Code.CONVERGED

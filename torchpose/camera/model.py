@@ -154,10 +154,9 @@ class Camera:
         if all(moved[name] is value for name, value in tensors.items()):
             return self
         # what is derived once goes along: another device would have to wait for it
-        _ = self.fold_radius, self._distorts
+        _, known = self.fold_radius, self._any_coefficient
         camera = copy(self)
-        for name, value in moved.items():
-            object.__setattr__(camera, name, value)
+        camera.__dict__.update(moved, _coefficients=(_version(moved["distortion"]), known))
         return camera
 
     def pinhole(self, R: Tensor | None = None, t: Tensor | None = None) -> PinholeCamera:
@@ -187,11 +186,19 @@ class Camera:
         width, height = (int(size[index]) for size in (camera.width, camera.height))
         return cls(width, height, camera.camera_matrix[index].double(), [])
 
-    @cached_property
+    @property
     def _distorts(self) -> bool:
         """Whether any coefficient moves a point, or might (while it is being estimated)."""
-        fisheye = self.model == "kannala_brandt"
-        return fisheye or self.distortion.requires_grad or bool(self.distortion.detach().any())
+        return self.model == "kannala_brandt" or self.distortion.requires_grad or self._any_coefficient
+
+    @property
+    def _any_coefficient(self) -> bool:
+        """Whether one is not zero; looked at anew only where the tensor was written to: a GPU would be waited for."""
+        version, known = self.__dict__.get("_coefficients", (None, False))
+        if version != _version(self.distortion):
+            known = bool(self.distortion.detach().any())
+            self.__dict__["_coefficients"] = _version(self.distortion), known
+        return known
 
     @cached_property
     def fold_radius(self) -> float:
@@ -344,3 +351,8 @@ def _newton_step(ex: Tensor, ey: Tensor, j_xx: Tensor, j_xy: Tensor, j_yy: Tenso
     """J^-1 e by Cramer's rule."""
     determinant = j_xx * j_yy - j_xy * j_xy
     return (j_yy * ex - j_xy * ey) / determinant, (j_xx * ey - j_xy * ex) / determinant
+
+
+def _version(tensor: Tensor) -> int:
+    """How often a tensor was written to, as far as torch counts."""
+    return -1 if tensor.is_inference() else tensor._version

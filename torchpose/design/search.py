@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import TypedDict, Unpack
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -47,16 +47,17 @@ class Design:
         return float(gap) / ratio_tolerance(self.semi_minor)
 
 
-class Choice(TypedDict, total=False):
+@dataclass(frozen=True)
+class Choice:
     """What may be chosen of a target."""
 
-    name: str | None  # by default number of rings and size
-    background: str  # light (by default) or dark
-    markers: int | None  # number of rings; by default the fewest that do
+    name: str | None = None  # by default number of rings and size
+    background: str = "light"  # or dark
+    markers: int | None = None  # number of rings; by default the fewest that do
 
 
 def design_target(
-    camera: Camera, volume: WorkingVolume, plate: Size, need: Need, imaging: Imaging, **choice: Unpack[Choice]
+    camera: Camera, volume: WorkingVolume, plate: Size, need: Need, imaging: Imaging, **choice: Any
 ) -> Design:
     """The target with the fewest rings whose predicted standard deviations meet the need everywhere in the volume.
 
@@ -66,7 +67,7 @@ def design_target(
 
     Args:
         plate: width and height, mm.
-        choice: ``name``, ``background`` and ``markers``, see `Choice`.
+        choice: fields of `Choice`: ``name``, ``background``, ``markers``.
 
     Raises:
         ConfigError: the rings are out of view or too small, or the accuracy is out of reach; with the figure that can
@@ -74,7 +75,8 @@ def design_target(
     """
     if not all(0 < side < math.inf for side in plate):
         raise ConfigError(f"plate: {plate[0]:g} x {plate[1]:g} mm; give two positive lengths")
-    markers, background = choice.get("markers"), choice.get("background", "light")
+    chosen = Choice(**choice)
+    markers, background = chosen.markers, chosen.background
     if markers is not None and markers not in ARRANGEMENTS:
         raise ConfigError(f"markers: {markers}; there are layouts of {', '.join(map(str, ARRANGEMENTS))} rings")
     limits = Limits.of(camera, volume.least_scale(camera, (plate[0] / 2, plate[1] / 2)))
@@ -84,7 +86,7 @@ def design_target(
         target = _best(camera, volume, need, imaging, _targets(limits, count, plate, camera.matrix.device))
         if target is None:
             continue
-        name = choice.get("name") or f"rings{count}_{plate[0]:g}x{plate[1]:g}"
+        name = chosen.name or f"rings{count}_{plate[0]:g}x{plate[1]:g}"
         target = replace(target, name=name, background=background)  # type: ignore[arg-type]  # it checks
         precision = predict_volume(camera, target, volume, imaging)
         excess = float(need.excess(precision.worst).nan_to_num(nan=math.inf))

@@ -72,7 +72,7 @@ class Rows:
         for f in fields(self):  # type: ignore[arg-type]
             values = [getattr(rows, f.name) for rows in (self, *others)]
             if f.metadata.get("shared") and not with_shared:
-                if any(value is not values[0] for value in values):
+                if not all(_same(value, values[0]) for value in values):
                     raise ValueError(
                         f"{type(self).__name__}.{f.name} belongs to all rows and differs between the parts"
                     )
@@ -83,3 +83,9 @@ class Rows:
             elif values[0] is not None and not f.metadata.get("shared"):
                 raise TypeError(f"{type(self).__name__}.{f.name} is no tensor and no rows; mark it as shared")
         return replace(self, **changed)  # type: ignore[type-var]
+
+
+def _same(a: Any, b: Any) -> bool:
+    if a is b or not (isinstance(a, Tensor) and isinstance(b, Tensor)):
+        return a is b
+    return a.device == b.device and torch.equal(a, b)

@@ -132,7 +132,7 @@ def _checked(
                 "(B, S, 3, 3) and (B, S, 3)"
             )
         initial = rotation.to(pixels), translation.to(pixels)
-    huber = None if given.huber == float("inf") else given.huber
+    huber = None if given.huber in (None, float("inf")) else float(given.huber)
     return replace(given, points=given.points.to(pixels), pixels=pixels, camera=camera, huber=huber), initial
 
 

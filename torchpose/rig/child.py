@@ -100,7 +100,8 @@ class Child:
     def _receive(self) -> None:
         """Hands answers to whom they belong, in a thread of its own: so they can be waited for with a deadline."""
         assert self._process.stdout is not None
-        with self._process.stdout as stream, contextlib.suppress(ValueError):  # a last line may be torn
+        # a last line may be torn, and what is no answer ends the talk
+        with self._process.stdout as stream, contextlib.suppress(ValueError, KeyError, TypeError):
             for line in stream:
                 answer = json.loads(line)
                 if reply := self._waiting.pop(answer["id"], None):
@@ -111,7 +112,7 @@ class Child:
 
     def _last_words(self) -> str:
         """The last line that a quiet child has printed."""
-        if self._log is not None:
+        if self._log is not None and not self._log.closed:
             self._log.seek(0)
             if lines := self._log.read().decode(errors="replace").strip().splitlines():
                 return lines[-1].strip()
