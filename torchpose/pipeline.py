@@ -54,6 +54,8 @@ class PoseEstimator(nn.Module):
         ConfigError: no target, or two of one name; an unknown method; ``compile`` without a C++ compiler.
     """
 
+    made_for: Tensor
+
     def __init__(
         self,
         camera: Camera,
