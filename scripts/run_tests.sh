@@ -7,5 +7,12 @@ setup_venv dev
 
 .venv/bin/python -m ruff check
 .venv/bin/python -m ruff format --check
-.venv/bin/python -m mypy
-.venv/bin/python -m pytest "$@"
+types=$(mktemp)
+trap 'rm -f "$types"' EXIT
+.venv/bin/python -m mypy >"$types" 2>&1 & # on the second core, which the tests leave free most of the time
+mypy=$!
+status=0
+.venv/bin/python -m pytest "$@" || status=$?
+wait "$mypy" || status=$?
+cat "$types"
+exit "$status"

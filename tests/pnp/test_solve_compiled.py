@@ -48,7 +48,11 @@ def both(points: Tensor, image: Tensor, camera: Camera | Tensor, **options: Any)
     return pnp.solve(points, image, camera, compile=True, **options), pnp.solve(points, image, camera, **options)
 
 
-@pytest.mark.parametrize("points", [SQUARE, GRID, CUBOID], ids=["4", "9", "solid"])
+# each of these traces and compiles for ten seconds; what the others compile as well waits for `-m slow`
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize("points", [SQUARE, GRID, pytest.param(CUBOID, marks=SLOW)], ids=["4", "9", "solid"])
 def test_poses_are_the_same(points: Tensor) -> None:
     """Near planes with two minima, tilted ones that decide at once, and points in space."""
     same(*both(points, pixels(views(points, 1500, tilt_deg=(0, 75), far=60)[2], 0.1), MATRIX))
@@ -69,7 +73,11 @@ def test_cameras_share_what_was_compiled() -> None:
         assert float(result.rms.max()) < 1e-7, "the camera of the call, not the one that was compiled for"
 
 
-@pytest.mark.parametrize("kind", ["own", "mask", "weights", "covariances", "huber", "initial", "initials", "matrices"])
+@pytest.mark.parametrize(
+    "kind",
+    ["mask", "covariances", "huber", "initials"]
+    + [pytest.param(kind, marks=SLOW) for kind in ("own", "weights", "initial", "matrices")],
+)
 def test_options(kind: str) -> None:
     g = torch.Generator().manual_seed(5)
     r, t, xy = views(GRID, 80)
