@@ -16,7 +16,7 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.geometry import conics
 from torchpose.geometry.rows import Rows, shared
-from torchpose.geometry.segments import ragged_arange, rank_in_group
+from torchpose.geometry.segments import pairs_in_group, rank_in_group
 from torchpose.identify.scene import MarkerTable
 from torchpose.rings import Rings
 
@@ -98,7 +98,7 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int) -> I
     """
     rows, markers, device = frames * len(table), table.ids.shape[1], rings.frame.device
     proposed = _propose(rings, table)
-    poses = _poses_of_pairs(proposed, rows, camera.matrix)
+    poses = _poses_of_pairs(proposed, camera.matrix)
     # each pose gathers the rings that lie where it puts their markers
     cost, of_pose, member = _support(poses, proposed, camera.matrix)
     # the code has its say, too: markers of neighbouring codes must not change places
@@ -152,18 +152,13 @@ def _propose(rings: Rings, table: MarkerTable) -> _Assignments:
     )
 
 
-def _poses_of_pairs(one: _Assignments, rows: int, matrix: Tensor) -> _Poses:
+def _poses_of_pairs(one: _Assignments, matrix: Tensor) -> _Poses:
     """Poses from every ordered pair of the best assignments of a row: the first places, the second turns."""
     # every ring alone has two poses of its plane
     conic = matrix.T @ conics.to_matrix(conics.conic_from_ellipse(one.ellipse)) @ matrix
     where, axis = conics.circle_poses(conic, one.radius)  # (A, 2, 3)
-    order = _rank_in_row(one.mismatch + 4.0 / one.ellipse[:, 3], one.row, rows)
-    index = (order < _SEEDS).nonzero()[:, 0]
-    row = one.row[index]
-    per_row = torch.bincount(row, minlength=rows)
-    start = per_row.cumsum(0) - per_row
-    first, second = ragged_arange(per_row[row])
-    a, b = index[first], index[start[row[first]] + second]
+    index = (rank_in_group(one.row, by=one.mismatch + 4.0 / one.ellipse[:, 3]) < _SEEDS).nonzero()[:, 0]
+    a, b = (index[one_of] for one_of in pairs_in_group(one.row[index], one.row[index]))
     distinct = (one.ring[a] != one.ring[b]) & (one.marker[a] != one.marker[b])
     a, b = a[distinct], b[distinct]
     # two tilts of the plane, and its normal towards or away from the camera
@@ -177,14 +172,6 @@ def _poses_of_pairs(one: _Assignments, rows: int, matrix: Tensor) -> _Poses:
     return _Poses(rotation, origin.flatten(0, 1) - (rotation @ one.center[a][..., None]).squeeze(-1), a)
 
 
-def _rank_in_row(value: Tensor, row: Tensor, rows: int) -> Tensor:
-    """Rank (A,) of each assignment within its row, by rising value."""
-    order = torch.argsort(value, stable=True)
-    rank = torch.empty_like(row)
-    rank[order] = rank_in_group(row[order], rows)
-    return rank
-
-
 def _frame(normal: Tensor, direction: Tensor) -> Tensor:
     """Right-handed orthonormal frames (..., 3, 3), columns: direction in the plane, normal x direction, normal."""
     x = direction - (direction * normal).sum(-1, keepdim=True) * normal
@@ -195,12 +182,7 @@ def _frame(normal: Tensor, direction: Tensor) -> Tensor:
 
 def _support(poses: _Poses, one: _Assignments, matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Assignments that agree with each pose: cost (S,) in [0, 1), pose (S,) and assignment (S,), flat."""
-    rows = int(one.row.max()) + 1 if len(one) else 0
-    per_row = torch.bincount(one.row, minlength=rows)
-    start = per_row.cumsum(0) - per_row
-    row = one.row[poses.origin]
-    pose, offset = ragged_arange(per_row[row])
-    member = start[row[pose]] + offset
+    pose, member = pairs_in_group(one.row[poses.origin], one.row)
     x = (poses.R[pose] @ one.center[member][..., None]).squeeze(-1) + poses.t[pose]
     uv = (x @ matrix.T)[:, :2] / x[:, 2:]
     seen = one.ellipse[member]

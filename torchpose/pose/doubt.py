@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose.geometry.segments import marked
 from torchpose.identify import MarkerTable
 from torchpose.rings import Rings
 
@@ -40,4 +41,4 @@ def crossed_out(
     apart = torch.linalg.vector_norm(at[row, marker] - outer[:, :2], dim=-1)
     reach = torch.minimum(size[row, marker], outer[:, 2])
     across = (apart < outer[:, 3] + _OVERLAP * reach) & (apart > _CONCENTRIC * reach) & (x[row, marker, 2] > 0)
-    return torch.zeros_like(frame, dtype=torch.bool).index_fill(0, row[across], True)
+    return marked(row[across], len(frame))
