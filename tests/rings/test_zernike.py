@@ -186,7 +186,7 @@ def test_deblur_inverts_its_law() -> None:
 
 
 def test_edge_blur_by_direction_and_group() -> None:
-    """Offsets by the law for a blur of 1 x 1.4 px at 30 degrees; a group of one direction tells that one; none, none."""
+    """Offsets by the law for a blur of 1 x 1.4 px at 30 degrees; a group of one direction tells that one."""
     g = torch.Generator().manual_seed(3)
     angle = 2 * math.pi * torch.rand(400, dtype=F64, generator=g)
     angle[300:] = 0.0

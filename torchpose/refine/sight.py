@@ -76,7 +76,7 @@ class Sight(Rows):
         return torch.where(self.mask.any(1, keepdim=True), known.nanmedian(1).values, blurs.isotropic(start))
 
     def reduced(self, factor: int) -> Sight:
-        """The same rows in frames of which blocks of ``factor`` px make one, and only in those frames that they need."""
+        """The same rows in frames of which blocks of ``factor`` px make one; only those frames that they need."""
         if factor == 1:
             return self
         which, frame = self.frame.unique(return_inverse=True)

@@ -6,8 +6,9 @@ read at the offset o from its pixel's centre, along the normal of increasing gre
     deblurred(o) - kappa k = l,
 
 l the offset of the projected circle, k its curvature, kappa the shift of `zernike.curvature_shift`. The blur of each
-frame is found along with its pose: the slope of o over l, by direction (`zernike.edge_blur`). Once pose and blur are nearly known,
-the last steps read the same edges, and the blur, with matched filters, which scatter less (`step_filter`).
+frame is found along with its pose: the slope of o over l, by direction (`zernike.edge_blur`). Once pose and blur are
+nearly known, the last steps read the same edges, and the blur, with matched filters, which scatter less
+(`step_filter`).
 """
 
 import math
@@ -203,7 +204,7 @@ def _seen(
 
 
 def _filter_errors(seen: _Seen, sight: Sight, pose: Pose, blur: Tensor) -> tuple[Tensor, Tensor, StepOffsets]:
-    """Derivatives (E, 6) of the distance, normals (E, 2), and what the matched filters see in the windows of the same pixels."""
+    """Derivatives (E, 6) of the distance, normals (E, 2), and what the matched filters see in the same windows."""
     edges = seen.edges
     pixel = (edges.points - edges.offset[:, None] * edges.normal).round()
     distance, bend, across, by_pose = seen.circles(pose)

@@ -21,7 +21,8 @@ _BEND_REACH = (0.63, 1.2)  # px along an edge: where the fourth order of an elli
 
 class StepOffsets(NamedTuple):
     """Fields (E,): error, px, of the edge outside the curve; widening, px^2, of the blur's variance across the edge
-    beyond the one assumed; the information about both, px^-2 and px^-4, at a noise of one step; step, grey outside less inside."""
+    beyond the one assumed; the information about both, px^-2 and px^-4, at a noise of one step; step, grey outside less
+    inside."""
 
     error: Tensor
     widening: Tensor

@@ -4,8 +4,8 @@ import torch
 from torch import Tensor
 
 from torchpose.geometry import blur as blurs
-from torchpose.geometry.segments import ragged_arange
 from torchpose.geometry.blurred_edge import Spread
+from torchpose.geometry.segments import ragged_arange
 
 BAND = 4.0  # px on either side of an edge, at least
 _PER_BLUR = 4.6  # band of a wide blur, in its standard deviations

@@ -4,9 +4,9 @@ Every pixel in a band around the edges of a frame's rings is predicted as
 
     grey = ring + (paper - ring) F
 
-with the fraction of paper F of `ring_model`. Pose and blur (three numbers a frame) are the unknowns; the two grey levels
-of each marker, with linear gradients over the plane, are eliminated (`grey_levels`, `light`). Frames and markers are
-padded blocks of pixels: one sequence of tensor operations for the whole batch.
+with the fraction of paper F of `ring_model`. Pose and blur (three numbers a frame) are the unknowns; the two grey
+levels of each marker, with linear gradients over the plane, are eliminated (`grey_levels`, `light`). Frames and markers
+are padded blocks of pixels: one sequence of tensor operations for the whole batch.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from torchpose.geometry import blur as blurs
+from torchpose.geometry.blurred_edge import LEAST, MOST, Kind, Spread
 from torchpose.geometry.least_squares import Block, Minimum, Normal, Pose, PosePrior, Unknowns, Vector, minimise
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import segment_sum
@@ -32,7 +33,6 @@ from torchpose.refine.photometric.grey_levels import (
     sum_products,
 )
 from torchpose.refine.photometric.light import LEVELS, POSE, normal_equations
-from torchpose.geometry.blurred_edge import LEAST, MOST, Kind, Spread
 from torchpose.refine.photometric.ring_model import gather_pixels, ring_model
 from torchpose.refine.photometric.sectors import Sectors, away_from_unclear, clear_sectors, doubtful, sum_sectors, trust
 from torchpose.refine.sight import Refined, Sight, at_full_size

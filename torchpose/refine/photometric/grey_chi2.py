@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from torchpose.geometry.blurred_edge import Spread
 from torchpose.geometry.least_squares import solve_scaled
 from torchpose.geometry.segments import segment_sum
 from torchpose.refine.photometric.band import band_width
@@ -17,7 +18,6 @@ from torchpose.refine.photometric.grey_levels import (
     sum_products,
 )
 from torchpose.refine.photometric.light import POSE
-from torchpose.geometry.blurred_edge import Spread
 from torchpose.refine.photometric.ring_model import gather_pixels, ring_model
 from torchpose.refine.photometric.sectors import clear_sectors, misfit, sum_sectors
 from torchpose.refine.sight import Refined, Sight

@@ -9,9 +9,9 @@ import math
 import torch
 from torch import Tensor
 
+from torchpose.geometry.blurred_edge import Spread
 from torchpose.geometry.least_squares import geman_mcclure, solve_scaled
 from torchpose.refine.photometric.light import LEVELS
-from torchpose.geometry.blurred_edge import Spread
 from torchpose.refine.photometric.ring_model import PixelBlocks, RingModel, ring_model
 
 TILE = 256  # pixels summed in float32 at a time; sums of tiles are float64, so padding changes no digit that counts

@@ -11,9 +11,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from torchpose.geometry.blurred_edge import BLUR
 from torchpose.geometry.least_squares import Eliminated, Normal
 from torchpose.geometry.segments import segment_mean, segment_sum
-from torchpose.geometry.blurred_edge import BLUR
 
 POSE, LEVELS = 6 + BLUR, 6  # unknowns of a frame (translation, rotation, blur) and of a marker, at least
 _GRADIENTS = (1, 2, 4, 5)  # among the levels

@@ -3,7 +3,8 @@
     F = E(d_outer) + 1 - E(d_inner)
 
 is the fraction of paper in a pixel; d is its distance in px from the projected circle, and E what the blur makes of an
-edge of that curvature and direction (`geometry.blurred_edge`). The distortion of the lens enters once, as the ray of each pixel.
+edge of that curvature and direction (`geometry.blurred_edge`). The distortion of the lens enters once, as the ray of
+each pixel.
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchpose.geometry import blur as blurs
+from torchpose.geometry.blurred_edge import Spread
 from torchpose.geometry.rotations import plane_axes
 from torchpose.geometry.rows import Rows, shared
 from torchpose.geometry.segments import values_at
 from torchpose.refine.photometric.band import band_pixels
-from torchpose.geometry.blurred_edge import Spread
 from torchpose.refine.sight import Sight
 
 _FULL_SCALES = (255.0, 1023.0, 4095.0, 16383.0, 65520.0, 65535.0)  # of 8 to 16 bits; 12 bits in the upper ones of 16
