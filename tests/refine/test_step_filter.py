@@ -41,7 +41,8 @@ def measured(
     one = torch.ones_like(distance)
     bend = one / radius
     zero = torch.zeros(len(angle), dtype=torch.int64)
-    return step_offsets(frame, zero, pixel.long(), normal, distance - (radius - error), bend, isotropic(blur * one))
+    curve = (normal, distance - (radius - error), bend)
+    return step_offsets(frame, zero, pixel.long(), curve, isotropic(blur * one))
 
 
 @pytest.mark.parametrize(("radius", "offset", "blur"), [(5.0, 0.003, 0.008), (11.0, 0.0015, 0.002)])
@@ -95,7 +96,7 @@ def test_neighbouring_windows_share_noise() -> None:
     means, singles = [], []
     for _ in range(count):
         frame = (clean + 2 * torch.randn(clean.shape, dtype=F64, generator=g))[None]
-        found = step_offsets(frame, torch.zeros(length, dtype=torch.int64), pixel, normal, distance, bend, blur)
+        found = step_offsets(frame, torch.zeros(length, dtype=torch.int64), pixel, (normal, distance, bend), blur)
         weight = found.information / found.information.sum()
         means.append((weight * found.error).sum())
         singles.append(found.error)

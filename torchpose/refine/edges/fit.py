@@ -43,6 +43,7 @@ _STEPS = 6  # on Zernike edges
 _SOFT_STEPS = 2  # of these, the first, that weigh all points instead of leaving some out
 _FILTER_STEPS = 2  # on matched filters
 _LEAST_BLUR = 0.3  # px, point-spread function and pixel: a pixel alone
+_ROOM = 1.2  # of half the ring's width: a filter that sees the other circle takes it for its own
 _WIDEST = 1.3  # px, of a blur's major axis: a wider one is out of the mask's reach
 _MOST_BLUR = 3.0  # px, about what a window of the filter holds
 _MOST_CHANGE = 0.6  # px, of the blur in a step, times the blur itself: of its variance
@@ -91,7 +92,7 @@ class _Fit:
         block = edges.ring // 2
         radius = sight.radii[row, marker].flatten()[edges.ring]
         circles = (sight.centers[row, marker][block], sight.normals[row, marker][block], radius)
-        self.seen = _seen(edges, sight.camera, outward, row[block], *circles)
+        self.seen = _seen(edges, sight.camera, outward, row[block], *circles)._replace(room=_ROOM * gap[block])
         # the error of an edge point falls with the height of its step, taken from the whole circle: a high one by
         # chance must not count more
         self.step = segment_mean(edges.step, edges.ring, 2 * row.numel())[edges.ring]
@@ -174,7 +175,7 @@ class _Seen(NamedTuple):
     """Edge points, flat, their rows ``of`` and their circles; 0 in ``sound`` where unusable.
 
     ray: (E, 3). warp: (E, 2, 2), d(ray)/d(pixel). center, normal: (E, 3), radius: (E,), of the circle. sign: (E,), +1
-    where grey rises outwards.
+    where grey rises outwards. room: (E,) px, to either side, to what is not this edge.
     """
 
     edges: RingEdges
@@ -186,6 +187,7 @@ class _Seen(NamedTuple):
     radius: Tensor
     sign: Tensor
     sound: Tensor
+    room: Tensor
 
     def circles(self, pose: Pose) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """`circle_distance` of the poses of N rows."""
@@ -200,7 +202,7 @@ def _seen(
     warp = torch.linalg.inv(camera.J_distort(xy))
     ray = torch.cat([xy, torch.ones_like(xy[:, :1])], -1)
     sound = ray.isfinite().all(-1).double()
-    return _Seen(edges, of, ray.nan_to_num(nan=0.0), warp, center, normal, radius, outward[edges.ring], sound)
+    return _Seen(edges, of, ray.nan_to_num(nan=0.0), warp, center, normal, radius, outward[edges.ring], sound, sound)
 
 
 def _filter_errors(seen: _Seen, sight: Sight, pose: Pose, blur: Tensor) -> tuple[Tensor, Tensor, StepOffsets]:
@@ -209,8 +211,8 @@ def _filter_errors(seen: _Seen, sight: Sight, pose: Pose, blur: Tensor) -> tuple
     pixel = (edges.points - edges.offset[:, None] * edges.normal).round()
     distance, bend, across, by_pose = seen.circles(pose)
     middle = distance + (across * (pixel - edges.points)).sum(-1)
-    frame = sight.frame[seen.of]
-    found = step_offsets(sight.frames, frame, pixel.long(), across, middle, bend, blur[seen.of])
+    frame, curve = sight.frame[seen.of], (across, middle, bend)
+    found = step_offsets(sight.frames, frame, pixel.long(), curve, blur[seen.of], seen.room)
     return by_pose, across, StepOffsets(*(x.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0) for x in found))
 
 

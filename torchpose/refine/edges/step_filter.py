@@ -32,23 +32,32 @@ class StepOffsets(NamedTuple):
 
 
 def step_offsets(
-    frames: Tensor, frame: Tensor, pixel: Tensor, normal: Tensor, distance: Tensor, bend: Tensor, blur: Tensor
+    frames: Tensor,
+    frame: Tensor,
+    pixel: Tensor,
+    curve: tuple[Tensor, Tensor, Tensor],
+    blur: Tensor,
+    room: Tensor | None = None,
 ) -> StepOffsets:
     """Offsets of edges from curves that pass within about a pixel of a window's middle, to first order.
 
     Args:
         frames: (B, H, W) grey. frame: (E,) int64. pixel: (E, 2) int64 u, v of the window's middle; what of the window
             is beyond the border does not count.
-        normal, distance, bend, blur: as in `step_filters`.
+        curve: normal, distance and bend as in `step_filters`. blur: as there.
+        room: (E,) px, of the window's pixels to use to either side of the curve; all by default.
     """
     height, width = frames.shape[-2:]
     du, dv = _window(frames.device)
     u, v = pixel[:, :1] + du, pixel[:, 1:] + dv
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     at = (frame[:, None] * height + v.clamp(0, height - 1)) * width + u.clamp(0, width - 1)
+    if room is not None:
+        across = curve[1][:, None] + curve[0][:, :1] * du + curve[0][:, 1:] * dv
+        inside &= across.abs() < room[:, None]
     grey = frames.reshape(-1)[at].float()
     grey = grey - grey[:, WINDOW * WINDOW // 2, None]  # keeps float32 exact to rounding
-    fraction, slope, widen = step_filters(normal, distance, bend, blur, inside)
+    fraction, slope, widen = step_filters(*curve, blur, inside)
     step = (fraction * grey).sum(-1) / fraction.square().sum(-1)
     information, blur_information = slope.square().sum(-1), widen.square().sum(-1)
     error = -(slope * grey).sum(-1) / (step * information)
