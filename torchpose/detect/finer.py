@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.detect.reduce import area_reduce
-from torchpose.geometry.segments import earlier_in_group, marked, pairs_in_group, positions, rank_in_group
+from torchpose.geometry.segments import marked, near_pairs, positions, rank_in_group
 
 SIDE = 64  # px of a cut-out
 _LARGEST = 10.0  # reduced px of semi-major axis: whatever is larger needs no finer look
@@ -27,12 +27,14 @@ def promising_places(
     place = place[torch.argsort(a[place], descending=True, stable=True)]
     place = place[torch.argsort(frame[place], stable=True)]
     known = positions(whole)
-    i, j = pairs_in_group(frame[place], frame[known])
+    center = ellipses[:, :2]
+    j, i = near_pairs(center[known], center[place], 0.5 * b[known], (frame[known], frame[place]))
     apart = torch.linalg.vector_norm(ellipses[place[i], :2] - ellipses[known[j], :2], dim=-1)
     place = place[~marked(i[apart < 0.5 * b[known[j]]], len(place))]
-    i, j = earlier_in_group(frame[place])
-    apart = torch.linalg.vector_norm(ellipses[place[i], :2] - ellipses[place[j], :2], dim=-1)
-    place = place[~marked(i[apart < _SAME_PLACE], len(place))]
+    near = torch.full_like(b[place], _SAME_PLACE)
+    i, j = near_pairs(center[place], center[place], near, (frame[place], frame[place]))
+    apart = torch.linalg.vector_norm(center[place[i]] - center[place[j]], dim=-1)
+    place = place[~marked(i[(j < i) & (apart < _SAME_PLACE)], len(place))]
     return place[rank_in_group(frame[place]) < _MOST_PLACES]
 
 

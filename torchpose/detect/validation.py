@@ -17,7 +17,7 @@ from torchpose.detect.arcs import cells_at, perimeter_samples
 from torchpose.detect.regions import Gradient
 from torchpose.geometry import conics
 from torchpose.geometry.rows import Rows
-from torchpose.geometry.segments import earlier_in_group, marked, members, pairs_in_group, positions, segment_sum
+from torchpose.geometry.segments import marked, members, near_pairs, positions, segment_sum
 
 WHOLE = 0.9  # cover from which on an ellipse is seen whole
 SAME = 0.08  # of the semi-minor axis, plus a pixel: ellipses nearer than that are one
@@ -133,12 +133,15 @@ def merge_duplicates(found: Candidates, tolerance: float = SAME, *, explain: boo
     """
     order = torch.argsort(found.log10_nfa, stable=True)  # NaN, of those rejected without a score, comes last
     found = found[order[torch.argsort(found.frame[order], stable=True)]]
-    # each against those before it in its frame, which have fewer false alarms
-    later, better = earlier_in_group(found.frame)
+    # each against those near it that come before it in its frame, which have fewer false alarms
+    center, reach = found.ellipse[:, :2], 1.0 + tolerance * found.ellipse[:, 3]
+    better, later = near_pairs(center, center, reach, (found.frame, found.frame))
+    ahead = positions((better < later) & (found.polarity[later] == found.polarity[better]))
+    later, better = later[ahead], better[ahead]
     p, q = found.ellipse[later], found.ellipse[better]
     shape = (conics.shape_matrix(p) - conics.shape_matrix(q)).flatten(1).abs().amax(-1)
     apart = torch.maximum(torch.linalg.vector_norm(p[:, :2] - q[:, :2], dim=-1), shape)
-    same = (found.polarity[later] == found.polarity[better]) & (apart < 1.0 + tolerance * q[:, 3])
+    same = apart < reach[better]
     if explain:
         same &= (found.verdict[later] == Verdict.ACCEPTED) & (found.verdict[better] == Verdict.ACCEPTED)
     again = marked(later[same], len(found))
@@ -168,11 +171,22 @@ def explain_once(grad: Gradient, found: Candidates, known: Candidates | None = N
     return replace(found, verdict=torch.where(kept[: len(found)], found.verdict, int(Verdict.EXPLAINED)))
 
 
+def _overlapping(some: Candidates, others: Candidates) -> tuple[Tensor, Tensor]:
+    """Pairs (i, j) of the same frame whose circumscribed circles overlap, or nearly: a few others are among them."""
+    a, b = some.ellipse[:, 2] + _NEAR, others.ellipse[:, 2] + _NEAR
+    frames = some.frame, others.frame
+    # the centres are nearer than twice the larger of both
+    i, j = near_pairs(some.ellipse[:, :2], others.ellipse[:, :2], 2 * a, frames)
+    larger = positions(a[i] >= b[j])
+    q, p = near_pairs(others.ellipse[:, :2], some.ellipse[:, :2], 2 * b, frames[::-1])
+    smaller = positions(a[p] < b[q])
+    return torch.cat([i[larger], p[smaller]]), torch.cat([j[larger], q[smaller]])
+
+
 def _explained(samples: Samples, weak: Candidates, every: Candidates) -> tuple[Tensor, Tensor]:
     """Which of the samples of ``weak`` (Q,) lie on the edges of which better ones of ``every`` (Q,)."""
     best = positions(every.verdict == Verdict.ACCEPTED)
-    best = best[torch.argsort(every.frame[best], stable=True)]
-    i, j = pairs_in_group(weak.frame, every.frame[best])
+    i, j = _overlapping(weak, every[best])
     j = best[j]
     apart = torch.linalg.vector_norm(weak.ellipse[i, :2] - every.ellipse[j, :2], dim=-1)
     meet = (every.log10_nfa[j] < weak.log10_nfa[i]) & (apart < weak.ellipse[i, 2] + every.ellipse[j, 2] + _NEAR)
