@@ -8,7 +8,7 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from torchpose import ellipse
-from torchpose.detect.arcs import chain_pairs, describe_arcs, fit_joint, follow
+from torchpose.detect.arcs import chain_pairs, describe_arcs, fit_pairs, follow
 from torchpose.detect.finer import SIDE, cut_outs, promising_places
 from torchpose.detect.partial import free_of_stumps
 from torchpose.detect.reduce import area_reduce, reduction_factor
@@ -175,19 +175,20 @@ def fit_arcs(grad: Gradient, arcs: Regions) -> Candidates:
     xy = grad.centers(arcs.cell)
     about = describe_arcs(arcs, xy)
     pair = chain_pairs(about)
-    count = len(pair)
-    if count == 0:
+    if len(pair) == 0:
         return score(grad, about.frame[:0], xy.new_zeros(0, 5), xy.new_zeros(0))
+    params = fit_pairs(arcs, about, xy, pair)
+    some = positions(plausible(grad, params) == Verdict.ACCEPTED)
+    pair, params = pair[some], params[some]
     # the cells of both members, flat
     which, cell = members(about.size, pair.flatten())
     cell = torch.argsort(arcs.region, stable=True)[cell]
     index = which // 2
     xy, gradient = xy[cell], arcs.gradient[cell]
     weight = torch.linalg.vector_norm(gradient, dim=-1)
-    params = fit_joint(xy, gradient, index, count, weight)
     r = ellipse.distance(xy, index, params)
-    rms = segment_mean(r.square(), index, count, weight.double()).sqrt()
-    good = positions((plausible(grad, params) == Verdict.ACCEPTED) & (rms < _ARC_RMS))
+    rms = segment_mean(r.square(), index, len(pair), weight.double()).sqrt()
+    good = positions(rms < _ARC_RMS)
     frame, polarity = about.frame[pair[good, 0]], about.curvature[pair[good, 0]].sign()
     found = score(grad, frame, params[good], polarity)
     for least_cover, rounds in _FOLLOW:

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchpose.detect.arcs import direction_rows, edge_band, fit_scatter, perimeter_samples
+from torchpose.detect.arcs import edge_band, fit_scatter, perimeter_samples, scatter_sums
 from torchpose.detect.regions import Gradient
 from torchpose.geometry.rows import Rows, shared
 from torchpose.geometry.segments import positions, segment_sum
@@ -58,7 +58,8 @@ def free_of_stumps(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Te
         # and again with all of the perimeter that agrees, until it stays as it is: the runs' borders leave no trace
         for _ in range(_SETTLE):
             near = find_ridge(grad, frame[part], fits, polarity[part])
-            sums = segment_sum(_rows(near, fits, near.found & (near.offset.abs() < 1)), near.of, len(fits))
+            on = (near.found & (near.offset.abs() < 1)).double()
+            sums = scatter_sums(near.xy, near.gradient, near.of, fits[:, :2], on)
             refit = fit_scatter(sums, fits[:, :2], fits[:, 2])
             fits = torch.where(refit.isfinite().all(-1, keepdim=True), refit, fits)
         ellipses = ellipses.index_copy(0, part, fits)
@@ -88,14 +89,9 @@ def find_ridge(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor
 def _runs(ridge: Ridge, ellipses: Tensor) -> Float[Tensor, "M 16 5"]:
     """Ellipses fitted to the ridge of every run of sectors, NaN where it is none."""
     count = len(ellipses)
-    rows = _rows(ridge, ellipses, ridge.found)
-    sums = segment_sum(rows, ridge.of * _SECTORS + ridge.sector, count * _SECTORS).view(count, _SECTORS, -1)
-    runs = torch.cat([sums, sums[:, : _RUN - 1]], 1).unfold(1, _RUN, 1).sum(-1)
+    sector = ridge.of * _SECTORS + ridge.sector
     center, scale = (v.repeat_interleave(_SECTORS, 0) for v in (ellipses[:, :2], ellipses[:, 2]))
+    sums = scatter_sums(ridge.xy, ridge.gradient, sector, center, ridge.found, _MOST_SAMPLES // _SECTORS)
+    sums = sums.view(count, _SECTORS, 6, 6)
+    runs = torch.cat([sums, sums[:, : _RUN - 1]], 1).unfold(1, _RUN, 1).sum(-1)
     return fit_scatter(runs.flatten(0, 1), center, scale).view(count, _SECTORS, 5)
-
-
-def _rows(ridge: Ridge, ellipses: Tensor, use: Tensor) -> Tensor:
-    """`direction_rows` of the samples of a ridge, 0 for those that are not of use."""
-    rows = direction_rows(ridge.xy, ridge.gradient, ridge.of, ellipses[:, :2], ellipses[:, 2])
-    return torch.where(use[:, None], rows, 0.0)
