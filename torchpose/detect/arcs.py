@@ -84,14 +84,15 @@ def describe_arcs(regions: Regions, xy: Float[Tensor, "P 2"]) -> Arcs:
     return Arcs(regions.frame, middle, normal, curvature, turn, size)
 
 
-def chain_pairs(arcs: Arcs) -> Int[Tensor, "Q 2"]:
+def chain_pairs(arcs: Arcs, polarity: float = 0.0) -> Int[Tensor, "Q 2"]:
     """Pairs of arcs that may be of one ellipse: same turning sense, each on the inner side of the other.
 
-    The middles are no farther apart than the two circles of curvature allow. Arcs are sorted by frame.
+    The middles are no farther apart than the two circles of curvature allow. Arcs are sorted by frame. With a
+    ``polarity`` only those count that belong to ellipses of this one.
     """
     curved = arcs.turn > _LEAST_TURN
     rank = segments.rank_in_group(arcs.frame, by=torch.where(curved, -arcs.size, 0))
-    index = positions(curved & (rank < _MOST_ARCS))
+    index = positions(curved & (rank < _MOST_ARCS) & (arcs.curvature * polarity >= 0))
     i, j = segments.pairs_in_group(arcs.frame[index], arcs.frame[index])
     ahead = positions(i < j)
     i, j = index[i[ahead]], index[j[ahead]]

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.detect.arcs import cells_at, perimeter_samples
@@ -41,6 +41,7 @@ class Verdict(IntEnum):
     FRAGMENT = 7  # too little of its perimeter is there
     POLYGON = 8  # straight sides explain it better
     EXPLAINED = 9  # it is put together from edges of better ellipses
+    UNWANTED = 10  # seen in part, and not what was asked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +62,38 @@ class Candidates(Rows):
     log10_nfa: Float[Tensor, " M"]
     cover: Float[Tensor, " M"]
     verdict: Int[Tensor, " M"]
+
+
+@dataclass(frozen=True, eq=False)
+class Wanted:
+    """What is asked for: by default every ellipse. The rest costs little, and need not be found.
+
+    Attributes:
+        polarity: +1 dark inside, -1 light inside, 0 either.
+        semi_minor: px, the least.
+        around: where the centres of each frame (B, 2) are, and how far off they may be, px; None for anywhere.
+    """
+
+    polarity: float = 0.0
+    semi_minor: float = 0.0
+    around: tuple[Tensor, float] | None = None
+
+    def reduced(self, factor: int) -> "Wanted":
+        """The same in a frame reduced by a factor, anywhere in it."""
+        return Wanted(self.polarity, self.semi_minor / factor)
+
+    def admits(self, found: Candidates) -> Bool[Tensor, " M"]:
+        """Which candidates are asked for."""
+        good = found.ellipse[:, 3] >= self.semi_minor
+        if self.polarity:
+            good &= found.polarity == self.polarity
+        if self.around is not None:
+            center, reach = self.around
+            good &= torch.linalg.vector_norm(found.ellipse[:, :2] - center[found.frame], dim=-1) < reach
+        return good
+
+
+ANYTHING = Wanted()
 
 
 def accepted(found: Candidates) -> Candidates:
