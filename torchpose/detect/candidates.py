@@ -39,6 +39,7 @@ _FOLLOW = ((0.4, 1), (0.5, 2))  # least cover to be followed further, and rounds
 _ON_ELLIPSE = 1.5  # reduced px
 _TAPER = 3.0  # reduced px, where the weight of a cell in the second fit has fallen to 0
 _FLANK, _FLANK_COS = 4.0, 0.8  # reduced px, and of the gradient with the normal: a blurred edge of a whole ellipse
+_LENGTH = 1.5  # of a place: semi-major axis over the least semi-minor axis that is wanted
 _ARC_RMS = 1.2  # reduced px, of the cells of an arc, which is a few cells wide
 
 
@@ -80,7 +81,9 @@ def find_finer(
     """
     fine = factor // 2
     whole = (coarse.verdict == Verdict.ACCEPTED) & (coarse.cover > WHOLE)
-    place = promising_places(coarse.frame, coarse.ellipse, whole)
+    # an arc of what is wanted turns as it does, though its own ellipse may be flatter
+    asked = (coarse.polarity * wanted.polarity >= 0) & (coarse.ellipse[:, 2] >= _LENGTH * wanted.semi_minor / factor)
+    place = promising_places(coarse.frame, coarse.ellipse, whole, asked)
     height, width = frames.shape[-2:]
     if place.numel() == 0 or min(height, width) < SIDE * fine:
         return coarse[place[:0]]

@@ -17,14 +17,15 @@ _MOST_PLACES = 160  # in a frame, the largest
 
 
 def promising_places(
-    frame: Int[Tensor, " M"], ellipses: Float[Tensor, "M 5"], whole: Bool[Tensor, " M"]
+    frame: Int[Tensor, " M"], ellipses: Float[Tensor, "M 5"], whole: Bool[Tensor, " M"], asked: Bool[Tensor, " M"]
 ) -> Int[Tensor, " P"]:
     """Indices of the small ellipses, of whatever verdict, worth a finer look; ellipses are sorted by frame.
 
-    Those within one that was seen whole are not, nor those beside a larger one of the same place.
+    Those within one that was seen whole are not, nor those beside a larger one of the same place, nor those that are
+    not asked for.
     """
     a, b = ellipses[:, 2], ellipses[:, 3]
-    place = positions((a < _LARGEST) & (b > _SMALLEST) & (b > _LEAST_ASPECT * a) & ~whole)
+    place = positions((a < _LARGEST) & (b > _SMALLEST) & (b > _LEAST_ASPECT * a) & ~whole & asked)
     place = place[torch.argsort(a[place], descending=True, stable=True)]
     place = place[torch.argsort(frame[place], stable=True)]
     known = positions(whole)
