@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchpose import ellipse
 from torchpose.detect.arcs import chain_pairs, describe_arcs, fit_pairs, follow
-from torchpose.detect.finer import AROUND, SIDE, cut_outs, promising_places
+from torchpose.detect.finer import LARGER, SHIFT, SIDE, cut_outs, promising_places
 from torchpose.detect.partial import free_of_stumps
 from torchpose.detect.reduce import area_reduce, reduction_factor
 from torchpose.detect.regions import Gradient, Regions, gradient, level_line_regions, region_polarity, strong_cells
@@ -18,6 +18,7 @@ from torchpose.detect.validation import (
     SAME,
     WHOLE,
     Candidates,
+    Place,
     Verdict,
     Wanted,
     accepted,
@@ -93,7 +94,8 @@ def find_finer(
     # where edges fill most of a cut-out, the noise of the whole frame tells more than the median of their gradients
     grad = replace(grad, threshold=torch.minimum(grad.threshold, factor / fine * threshold[frame]))
     if wanted is not ANYTHING:  # what lies elsewhere in a cut-out is a place of its own
-        wanted = replace(wanted.reduced(fine), around=((middle - corner - 0.5 * (fine - 1)) / fine, AROUND))
+        reach = SHIFT + LARGER * factor / fine * coarse.ellipse[place, 2]
+        wanted = replace(wanted.reduced(fine), place=Place((middle - corner - 0.5 * (fine - 1)) / fine, SHIFT, reach))
     found = accepted(find_ellipses(grad, wanted))
     ellipses = rescaled(found.ellipse, fine)
     ellipses = torch.cat([ellipses[:, :2] + corner[found.frame], ellipses[:, 2:]], -1)
@@ -115,7 +117,7 @@ def find_ellipses(grad: Gradient, wanted: Wanted = ANYTHING, known: Candidates |
     What is not ``wanted`` is among them where it is seen whole, and explains its edges.
     ``known`` are accepted ellipses of a finer scale in the pixels of this one, which may explain edges better.
     """
-    regions = level_line_regions(grad, strong_cells(grad), MIN_PIXELS)
+    regions = level_line_regions(grad, wanted.within_reach(grad, strong_cells(grad)), MIN_PIXELS)
     whole, explained = fit_regions(grad, regions, wanted)
     rest = regions.cell[~explained].sort().values
     pieces = fit_arcs(grad, level_line_regions(grad, rest, MIN_PIXELS, _SECTORS, _PHASE), wanted)

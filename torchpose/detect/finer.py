@@ -8,7 +8,8 @@ from torchpose.detect.reduce import area_reduce
 from torchpose.geometry.segments import marked, near_pairs, positions, rank_in_group
 
 SIDE = 64  # px of a cut-out
-AROUND = 16.0  # px of a cut-out: how far from its middle the ellipse that it is made for may have its centre
+SHIFT = 16.0  # px of a cut-out: how far from its middle the ellipse that it is made for may have its centre
+LARGER = 1.2  # than the place itself, what it is a part of, beside its shift
 _LARGEST = 10.0  # reduced px of semi-major axis: whatever is larger needs no finer look
 _SMALLEST = 1.2  # reduced px of semi-minor axis
 _LEAST_ASPECT = 0.15

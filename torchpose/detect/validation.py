@@ -65,18 +65,33 @@ class Candidates(Rows):
 
 
 @dataclass(frozen=True, eq=False)
+class Place:
+    """Where an ellipse is looked for in each of B frames, in their px."""
+
+    center: Float[Tensor, "B 2"]
+    shift: float  # how far off its centre may be
+    reach: Float[Tensor, " B"]  # how far from there its edge may run
+
+
+@dataclass(frozen=True, eq=False)
 class Wanted:
     """What is asked for: by default every ellipse. The rest costs little, and need not be found.
 
     Attributes:
         polarity: +1 dark inside, -1 light inside, 0 either.
         semi_minor: px, the least.
-        around: where the centres of each frame (B, 2) are, and how far off they may be, px; None for anywhere.
+        place: where in each frame; None for anywhere.
     """
 
     polarity: float = 0.0
     semi_minor: float = 0.0
-    around: tuple[Tensor, float] | None = None
+    place: Place | None = None
+
+    @classmethod
+    def of(cls, polarities: Float[Tensor, " T"], semi_minor: float) -> "Wanted":
+        """Ellipses of any of these polarities, of at least such a semi-minor axis, px."""
+        each = polarities.unique()
+        return cls(float(each) if each.numel() == 1 else 0.0, semi_minor)
 
     def reduced(self, factor: int) -> "Wanted":
         """The same in a frame reduced by a factor, anywhere in it."""
@@ -87,10 +102,20 @@ class Wanted:
         good = found.ellipse[:, 3] >= self.semi_minor
         if self.polarity:
             good &= found.polarity == self.polarity
-        if self.around is not None:
-            center, reach = self.around
-            good &= torch.linalg.vector_norm(found.ellipse[:, :2] - center[found.frame], dim=-1) < reach
+        if self.place is not None:
+            away = found.ellipse[:, :2] - self.place.center[found.frame]
+            good &= torch.linalg.vector_norm(away, dim=-1) < self.place.shift
         return good
+
+    def within_reach(self, grad: Gradient, cells: Int[Tensor, " P"]) -> Int[Tensor, " P"]:
+        """Those of the cells that an ellipse of the place may run through."""
+        if self.place is None:
+            return cells
+        frame = torch.div(cells, grad.shape[1] * grad.shape[2], rounding_mode="floor")
+        (column, row), center = grad.grid(cells), self.place.center.mT.float().contiguous()
+        x = column.float() + 0.5 - center[0].index_select(0, frame)
+        y = row.float() + 0.5 - center[1].index_select(0, frame)
+        return cells[positions(x * x + y * y < self.place.reach.float().square().index_select(0, frame))]
 
 
 ANYTHING = Wanted()
