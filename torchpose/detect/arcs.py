@@ -225,19 +225,24 @@ def perimeter_samples(ellipses: Float[Tensor, "M 5"], most: int | None = None, m
 def cells_at(grad: Gradient, frame: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Flat cells (...) of the frame nearest to positions, their columns and rows, and which positions lie on it."""
     _, height, width = grad.shape
-    x, y = (x - 0.5).round(), (y - 0.5).round()
+    x, y = (x - 0.5).round_(), (y - 0.5).round_()
     on_x, on_y = x.clamp(0, width - 2), y.clamp(0, height - 2)
-    return ((frame * height + on_y) * width + on_x).long(), on_x, on_y, (x == on_x) & (y == on_y)
+    inside = (x == on_x).logical_and_(y == on_y)
+    cell = torch.add(on_y, frame, alpha=height, out=y).mul_(width).add_(on_x).long()
+    return cell, on_x, on_y, inside
 
 
 def edge_band(grad: Gradient, frame: Tensor, polarity: Tensor, at: Perimeter, reach: int) -> Band:
     """Edges of the right direction up to ``reach`` cells to either side of samples of ellipses, as for `follow`."""
     across = torch.arange(-reach, reach + 1, dtype=torch.float64, device=at.xy.device)
-    beside = (p[:, None] + n[:, None] * across for p, n in zip(at.xy.unbind(-1), at.normal.unbind(-1), strict=True))
+    planes = zip(at.xy.unbind(-1), at.normal.unbind(-1), strict=True)
+    beside = (torch.addcmul(p[:, None], n[:, None], across) for p, n in planes)
     cell, column, row, inside = cells_at(grad, frame.index_select(0, at.of)[:, None], *beside)
     gx, gy = (g.view_as(column) for g in grad.components(cell.flatten()))
     nx, ny = (n[:, None].float() for n in at.normal.unbind(-1))
-    rise = (gx * nx + gy * ny) * polarity.index_select(0, at.of)[:, None].float()
-    power, least = gx * gx + gy * gy, (0.5 * grad.threshold[frame]).square()
-    good = inside & (rise > 0) & (rise * rise > _BAND_COS**2 * power) & (power > least[at.of, None])
-    return Band(at, column + 0.5, row + 0.5, gx, gy, torch.where(good, rise, 0.0))
+    outward = polarity.index_select(0, at.of)[:, None].float()
+    rise = (gx * nx).addcmul_(gy, ny).mul_(outward)
+    power, least = (gx * gx).addcmul_(gy, gy), (0.5 * grad.threshold[frame]).square()
+    steep = rise.square() > _BAND_COS**2 * power
+    good = inside.logical_and_(rise > 0).logical_and_(steep).logical_and_(power > least[at.of, None])
+    return Band(at, column + 0.5, row + 0.5, gx, gy, rise.masked_fill_(~good, 0.0))

@@ -25,6 +25,7 @@ from torchpose.detect.validation import (
     explain_once,
     merge_duplicates,
     score,
+    without_known,
 )
 from torchpose.geometry import conics
 from torchpose.geometry.segments import marked, members, positions, segment_mean
@@ -122,6 +123,8 @@ def find_ellipses(grad: Gradient, wanted: Wanted = ANYTHING, known: Candidates |
     rest = regions.cell[~explained].sort().values
     pieces = fit_arcs(grad, level_line_regions(grad, rest, MIN_PIXELS, _SECTORS, _PHASE), wanted)
     found = merge_duplicates(Candidates.cat([whole, pieces]), explain=True)
+    if known is not None:
+        found = without_known(found, known)
     valid = positions((found.verdict == Verdict.ACCEPTED) & wanted.admits(found))
     some = found[valid]
     freed = free_of_stumps(grad, some.frame, some.ellipse, some.polarity)
@@ -202,7 +205,6 @@ def fit_arcs(grad: Gradient, arcs: Regions, wanted: Wanted = ANYTHING) -> Candid
     pair, params = pair[some], params[some]
     # the cells of both members, flat
     which, cell = members(about.size, pair.flatten())
-    cell = torch.argsort(arcs.region, stable=True)[cell]
     index = which // 2
     xy, gradient = xy[cell], arcs.gradient[cell]
     weight = torch.linalg.vector_norm(gradient, dim=-1)

@@ -66,7 +66,7 @@ class Gradient(Rows):
 
 @dataclass(frozen=True, eq=False)
 class Regions(Rows):
-    """Cells of R regions."""
+    """Cells of R regions, one region after the other, the cells of each rising."""
 
     cell: Int[Tensor, " P"]  # flat index into (B, h, w)
     region: Int[Tensor, " P"]
@@ -183,9 +183,19 @@ def level_line_regions(
     number = large.cumsum(0) - 1
     keep = positions(large.index_select(0, label))
     region = number.index_select(0, label.index_select(0, keep))
+    region, order = _sorted(region)  # what is summed by region lies together
+    keep = keep.index_select(0, order)
     first = positions(large)
     gradient = torch.stack([gx.index_select(0, keep), gy.index_select(0, keep)])
     return Regions(cell.index_select(0, keep), region, gradient.mT, cell[first] // (height * width))
+
+
+def _sorted(region: Tensor) -> tuple[Tensor, Tensor]:
+    """As a stable sort; NumPy sorts short integers by their digits, in a fraction of the time."""
+    if region.device.type == "cpu" and region.numel() and int(region.max()) < 1 << 16:
+        order = torch.from_numpy(region.numpy().astype(np.uint16).argsort(kind="stable"))
+        return region.index_select(0, order), order
+    return region.sort(stable=True)
 
 
 def _neighbours(cell: Tensor, width: int) -> tuple[Tensor, Tensor]:

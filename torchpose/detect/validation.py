@@ -192,19 +192,35 @@ def merge_duplicates(found: Candidates, tolerance: float = SAME, *, explain: boo
     order = torch.argsort(found.log10_nfa, stable=True)  # NaN, of those rejected without a score, comes last
     found = found[order[torch.argsort(found.frame[order], stable=True)]]
     # each against those near it that come before it in its frame, which have fewer false alarms
-    center, reach = found.ellipse[:, :2], 1.0 + tolerance * found.ellipse[:, 3]
-    better, later = near_pairs(center, center, reach, (found.frame, found.frame))
-    ahead = positions((better < later) & (found.polarity[later] == found.polarity[better]))
-    later, better = later[ahead], better[ahead]
-    p, q = found.ellipse[later], found.ellipse[better]
-    shape = (conics.shape_matrix(p) - conics.shape_matrix(q)).flatten(1).abs().amax(-1)
-    apart = torch.maximum(torch.linalg.vector_norm(p[:, :2] - q[:, :2], dim=-1), shape)
-    same = apart < reach[better]
+    better, later = same_ellipses(found, found, tolerance)
+    ahead = positions(better < later)
+    better, later = better[ahead], later[ahead]
+    same = torch.ones_like(later, dtype=torch.bool)
     if explain:
         same &= (found.verdict[later] == Verdict.ACCEPTED) & (found.verdict[better] == Verdict.ACCEPTED)
     again = marked(later[same], len(found))
     if not explain:
         return found[~again]
+    return replace(found, verdict=torch.where(again, int(Verdict.DUPLICATE), found.verdict))
+
+
+def same_ellipses(ones: Candidates, others: Candidates, tolerance: float = SAME) -> tuple[Tensor, Tensor]:
+    """Pairs (i, j) that are the same ellipse of the same frame, to within a part of the minor axis of ``ones``."""
+    reach = 1.0 + tolerance * ones.ellipse[:, 3]
+    i, j = near_pairs(ones.ellipse[:, :2], others.ellipse[:, :2], reach, (ones.frame, others.frame))
+    alike = positions(ones.polarity[i] == others.polarity[j])
+    i, j = i[alike], j[alike]
+    p, q = ones.ellipse[i], others.ellipse[j]
+    shape = (conics.shape_matrix(p) - conics.shape_matrix(q)).flatten(1).abs().amax(-1)
+    apart = torch.maximum(torch.linalg.vector_norm(p[:, :2] - q[:, :2], dim=-1), shape)
+    same = positions(apart < reach[i])
+    return i[same], j[same]
+
+
+def without_known(found: Candidates, known: Candidates) -> Candidates:
+    """The same candidates; those accepted that are among ``known``, with fewer false alarms there, are duplicates."""
+    i, j = same_ellipses(known, found)
+    again = marked(j[known.log10_nfa[i] < found.log10_nfa[j]], len(found)) & (found.verdict == Verdict.ACCEPTED)
     return replace(found, verdict=torch.where(again, int(Verdict.DUPLICATE), found.verdict))
 
 
