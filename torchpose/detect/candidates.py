@@ -174,6 +174,8 @@ def fit_regions(grad: Gradient, regions: Regions, wanted: Wanted = ANYTHING) -> 
 
 def _followed(grad: Gradient, found: Candidates, rounds: int) -> tuple[Candidates, Tensor]:
     """Those that are still ellipses when they have been followed along their edge, and their indices (K,)."""
+    if len(found) == 0:
+        return found, found.frame
     refit = follow(grad, found.frame, found.ellipse, found.polarity, rounds)
     sound = positions(plausible(grad, refit) == Verdict.ACCEPTED)
     return score(grad, found.frame[sound], refit[sound], found.polarity[sound]), sound
@@ -214,7 +216,7 @@ def fit_arcs(grad: Gradient, arcs: Regions, wanted: Wanted = ANYTHING) -> Candid
     frame, polarity = about.frame[pair[good, 0]], about.curvature[pair[good, 0]].sign()
     found = score(grad, frame, params[good], polarity)
     found = found[wanted.admits(found)]
-    for least_cover, rounds in _FOLLOW:
+    for least_cover, rounds in _FOLLOW if len(found) else ():
         found = merge_duplicates(found[found.cover > least_cover], 2 * SAME)
         found, _ = _followed(grad, found, rounds)
     return accepted(found)

@@ -192,13 +192,10 @@ def merge_duplicates(found: Candidates, tolerance: float = SAME, *, explain: boo
     order = torch.argsort(found.log10_nfa, stable=True)  # NaN, of those rejected without a score, comes last
     found = found[order[torch.argsort(found.frame[order], stable=True)]]
     # each against those near it that come before it in its frame, which have fewer false alarms
-    better, later = same_ellipses(found, found, tolerance)
-    ahead = positions(better < later)
-    better, later = better[ahead], later[ahead]
-    same = torch.ones_like(later, dtype=torch.bool)
-    if explain:
-        same &= (found.verdict[later] == Verdict.ACCEPTED) & (found.verdict[better] == Verdict.ACCEPTED)
-    again = marked(later[same], len(found))
+    some = positions(found.verdict == Verdict.ACCEPTED) if explain else torch.arange(len(found)).to(found.frame)
+    better, later = same_ellipses(found[some], found[some], tolerance)
+    later = later[positions(better < later)]
+    again = marked(some[later], len(found))
     if not explain:
         return found[~again]
     return replace(found, verdict=torch.where(again, int(Verdict.DUPLICATE), found.verdict))
