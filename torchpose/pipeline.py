@@ -32,7 +32,9 @@ from torchpose.results import Poses, Reason, Status
 from torchpose.rings import Rings, measure_rings
 from torchpose.target import Target
 
-_LEAST_CANDIDATE = 3.0  # px of semi-minor axis: rings below 4 are refused (`rings.measure`); candidates of covered ones err
+_LEAST_CANDIDATE = (
+    3.0  # px of semi-minor axis: rings below 4 are refused (`rings.measure`); candidates of covered ones err
+)
 _FRAME_TYPES = (torch.uint8, torch.uint16, torch.float16, torch.bfloat16, torch.float32, torch.float64)
 Method = Literal["photometric", "edges", "centers", "paper"]
 

@@ -114,7 +114,9 @@ def chain_pairs(arcs: Arcs, polarity: float = 0.0) -> Int[Tensor, "Q 2"]:
     return torch.stack([i[fits], j[fits]], -1)
 
 
-def fit_pairs(regions: Regions, about: Arcs, xy: Float[Tensor, "P 2"], pair: Int[Tensor, "Q 2"]) -> Float[Tensor, "Q 5"]:
+def fit_pairs(
+    regions: Regions, about: Arcs, xy: Float[Tensor, "P 2"], pair: Int[Tensor, "Q 2"]
+) -> Float[Tensor, "Q 5"]:
     """`fit_joint` of the cells of pairs of arcs, each arc summed once however many pairs it is in."""
     arc, member = pair.flatten().unique(return_inverse=True)
     number = torch.full((len(about),), -1, device=pair.device).index_copy(0, arc, torch.arange(len(arc)))

@@ -95,7 +95,7 @@ def _agreement(ridge: Ridge, fits: Float[Tensor, "M F 5"]) -> Float[Tensor, "M F
 
 
 def _settled(grad: Gradient, frame: Tensor, fits: Tensor, polarity: Tensor) -> Float[Tensor, "M 5"]:
-    """Fitted again to all of the perimeter that agrees, until they stay as they are: the runs' borders leave no trace."""
+    """Fitted again to all of the perimeter that agrees, until they stay: the borders of the runs leave no trace."""
     moving = torch.arange(len(fits), device=fits.device)
     for _ in range(_SETTLE):
         now = fits[moving]

@@ -202,7 +202,8 @@ def _neighbours(cell: Tensor, width: int) -> tuple[Tensor, Tensor]:
     """Pairs of positions in ``cell`` (P,), rising, that are neighbours, by 8-connectivity; each once.
 
     The three neighbours below a cell follow each other in the list, wherever they begin: no table of all cells is
-    needed, and one is only made where it would be well filled. The last row and column hold no cell, so that an index that wraps around meets none.
+    needed, and one is only made where it would be well filled. The last row and column hold no cell, so that an index
+    that wraps around meets none.
     """
     right = positions(cell[1:] - cell[:-1] == 1)
     first, second = [right], [right + 1]
