@@ -30,6 +30,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -361,9 +362,9 @@ def clutter(scale: int) -> None:
         clean = render(lens, target, r, t, psf_sigma=0.8, dark=30.0, light=220.0, plate=(70.0, 70.0), surround=around)
         frames = add_noise(clean, 2.0, 0)
         grey = np.ascontiguousarray(frames[0].numpy())
-        every, some = (median_cpu(lambda w=w: find_candidates(frames, wanted=w)) for w in (Wanted(), asked))
-        peers = [("ArUco", median_cpu(lambda: aruco.detectMarkers(grey)))]
-        peers += [("AprilTag 3", median_cpu(lambda: tags.detect(grey)))] if tags else []
+        every, some = (median_cpu(partial(find_candidates, frames, wanted=w)) for w in (Wanted(), asked))
+        peers = [("ArUco", median_cpu(partial(aruco.detectMarkers, grey)))]
+        peers += [("AprilTag 3", median_cpu(partial(tags.detect, grey)))] if tags else []
         found, wanted = len(find_candidates(frames)), len(find_candidates(frames, wanted=asked))
         beside = ", ".join(f"{some / cpu:.2f} of {peer} ({cpu:.0f} ms)" for peer, cpu in peers)
         print(
