@@ -352,9 +352,7 @@ def clutter(scale: int) -> None:
     aruco = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
     tags = None
     if importlib.util.find_spec("pupil_apriltags"):
-        from pupil_apriltags import Detector as TagDetector
-
-        tags = TagDetector(families="tag36h11", nthreads=1, quad_decimate=1.0)
+        tags = importlib.import_module("pupil_apriltags").Detector(families="tag36h11", nthreads=1, quad_decimate=1.0)
     r = rotations.exp(torch.tensor([[0.3, -0.2, 0.5]], dtype=F64))
     t = torch.tensor([[5.0, -4.0, 160.0]], dtype=F64)
     for name, picture in surrounds((lens.height, lens.width)):

@@ -24,8 +24,8 @@ def discs(seed: int, covered: bool = False) -> torch.Tensor:
         cv2.circle(frame, (int(16 * at[1]), int(16 * at[0])), int(16 * radius), grey, -1, cv2.LINE_AA, 4)
         if covered:
             cv2.circle(frame, (int(16 * (at[1] + radius)), int(16 * at[0])), int(6 * radius), 128, -1, cv2.LINE_AA, 4)
-    frame = cv2.GaussianBlur(cv2.resize(frame, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), (0, 0), 0.8)
-    return torch.from_numpy((frame + rng.normal(0, 2, frame.shape)).round().clip(0, 255).astype(np.uint8))[None]
+    blurred = cv2.GaussianBlur(cv2.resize(frame, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), (0, 0), 0.8)
+    return torch.from_numpy((blurred + rng.normal(0, 2, blurred.shape)).round().clip(0, 255).astype(np.uint8))[None]
 
 
 @pytest.mark.parametrize("covered", [False, True])
