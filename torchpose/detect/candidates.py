@@ -4,13 +4,14 @@ import math
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchpose import ellipse
 from torchpose.detect.arcs import chain_pairs, describe_arcs, fit_pairs, follow
 from torchpose.detect.finer import LARGER, SHIFT, SIDE, cut_outs, promising_places
 from torchpose.detect.partial import free_of_stumps
+from torchpose.detect.prospects import rings, worth_a_fit
 from torchpose.detect.reduce import area_reduce, reduction_factor
 from torchpose.detect.regions import Gradient, Regions, gradient, level_line_regions, region_polarity, strong_cells
 from torchpose.detect.validation import (
@@ -74,6 +75,20 @@ def find_candidates(
     return merge_duplicates(every if explain else accepted(every), explain=explain)
 
 
+def find_coarse(
+    frames: Shaped[Tensor, "B H W"], factor: int | None = None, *, wanted: Wanted = ANYTHING
+) -> Candidates:
+    """Ellipses at twice the reduction of `find_candidates` alone, a fraction of its work; arguments as there."""
+    factor = 2 * (reduction_factor(*frames.shape[-2:]) if factor is None else factor)
+    found = find_ellipses(gradient(reduced_twice(area_reduce(frames, factor // 2))), wanted.reduced(factor))
+    found = accepted(found)
+    return replace(found, ellipse=rescaled(found.ellipse, factor))[wanted.admits(found)]
+
+
+def reduced_twice(reduced: Tensor) -> Tensor:
+    return area_reduce(reduced, 2, exact=True)
+
+
 def find_finer(
     frames: Tensor, factor: int, threshold: Tensor, coarse: Candidates, wanted: Wanted = ANYTHING
 ) -> Candidates:
@@ -119,13 +134,16 @@ def find_ellipses(grad: Gradient, wanted: Wanted = ANYTHING, known: Candidates |
     ``known`` are accepted ellipses of a finer scale in the pixels of this one, which may explain edges better.
     """
     regions = level_line_regions(grad, wanted.within_reach(grad, strong_cells(grad)), MIN_PIXELS)
+    aside = regions.cell[:0]
+    if wanted.concentric:
+        regions, aside = regions.parted(worth_a_fit(regions, grad.centers(regions.cell), wanted.polarity))
     whole, explained = fit_regions(grad, regions, wanted)
-    rest = regions.cell[~explained].sort().values
+    rest = torch.cat([regions.cell[~explained], aside]).sort().values
     pieces = fit_arcs(grad, level_line_regions(grad, rest, MIN_PIXELS, _SECTORS, _PHASE), wanted)
     found = merge_duplicates(Candidates.cat([whole, pieces]), explain=True)
     if known is not None:
         found = without_known(found, known)
-    valid = positions((found.verdict == Verdict.ACCEPTED) & wanted.admits(found))
+    valid = positions((found.verdict == Verdict.ACCEPTED) & asked_for(grad, found, wanted))
     some = found[valid]
     freed = free_of_stumps(grad, some.frame, some.ellipse, some.polarity)
     moved = positions((freed != some.ellipse).any(-1) & (plausible(grad, freed) == Verdict.ACCEPTED))
@@ -157,7 +175,7 @@ def fit_regions(grad: Gradient, regions: Regions, wanted: Wanted = ANYTHING) -> 
     # a region that is not a whole ellipse runs along something else as well: only what lies along the ellipse counts
     beyond = edge < WHOLE * torch.bincount(regions.region, minlength=count)
     partial = (found.cover <= WHOLE) | beyond[good]
-    admitted = wanted.admits(found)
+    admitted = asked_for(grad, found, wanted)
     lost = partial & ~admitted & (found.verdict == Verdict.ACCEPTED)
     found = replace(found, verdict=torch.where(lost, int(Verdict.UNWANTED), found.verdict))
     part = positions(partial & admitted)
@@ -215,11 +233,20 @@ def fit_arcs(grad: Gradient, arcs: Regions, wanted: Wanted = ANYTHING) -> Candid
     good = positions(rms < _ARC_RMS)
     frame, polarity = about.frame[pair[good, 0]], about.curvature[pair[good, 0]].sign()
     found = score(grad, frame, params[good], polarity)
-    found = found[wanted.admits(found)]
+    found = found[asked_for(grad, found, wanted)]
     for least_cover, rounds in _FOLLOW if len(found) else ():
         found = merge_duplicates(found[found.cover > least_cover], 2 * SAME)
         found, _ = _followed(grad, found, rounds)
     return accepted(found)
+
+
+def asked_for(grad: Gradient, found: Candidates, wanted: Wanted) -> Bool[Tensor, " M"]:
+    """Which candidates are what is wanted, as far as their frames tell."""
+    good = wanted.admits(found)
+    if wanted.concentric:
+        some = positions(good)
+        good = good.index_copy(0, some, rings(grad, found[some]))
+    return good
 
 
 def plausible(grad: Gradient, ellipses: Float[Tensor, "M 5"]) -> Int[Tensor, " M"]:

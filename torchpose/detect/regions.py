@@ -6,12 +6,12 @@ connected components are found by parallel min-hooking and pointer jumping (Shil
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int, Real
+from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
 from torchpose.geometry.rows import Rows, shared
@@ -72,6 +72,13 @@ class Regions(Rows):
     region: Int[Tensor, " P"]
     gradient: Float[Tensor, "P 2"]
     frame: Int[Tensor, " R"] = shared()  # of each region
+
+    def parted(self, some: Bool[Tensor, " R"]) -> tuple["Regions", Int[Tensor, " Q"]]:
+        """Some of the regions, and the cells of the others."""
+        mine = some.index_select(0, self.region)
+        kept, number = self[positions(mine)], some.cumsum(0) - 1
+        kept = replace(kept, region=number.index_select(0, kept.region), frame=self.frame[some])
+        return kept, self.cell[positions(~mine)]
 
 
 def gradient(frames: Real[Tensor, "B h w"]) -> Gradient:

@@ -81,21 +81,23 @@ class Wanted:
         polarity: +1 dark inside, -1 light inside, 0 either.
         semi_minor: px, the least.
         place: where in each frame; None for anywhere.
+        concentric: outer circles of rings only.
     """
 
     polarity: float = 0.0
     semi_minor: float = 0.0
     place: Place | None = None
+    concentric: bool = False
 
     @classmethod
     def of(cls, polarities: Float[Tensor, " T"], semi_minor: float) -> "Wanted":
-        """Ellipses of any of these polarities, of at least such a semi-minor axis, px."""
+        """Rings of any of these polarities, of at least such a semi-minor axis, px."""
         each = polarities.unique()
-        return cls(float(each) if each.numel() == 1 else 0.0, semi_minor)
+        return cls(float(each) if each.numel() == 1 else 0.0, semi_minor, concentric=True)
 
     def reduced(self, factor: int) -> "Wanted":
         """The same in a frame reduced by a factor, anywhere in it."""
-        return Wanted(self.polarity, self.semi_minor / factor)
+        return replace(self, semi_minor=self.semi_minor / factor, place=None)
 
     def admits(self, found: Candidates) -> Bool[Tensor, " M"]:
         """Which candidates are asked for."""
