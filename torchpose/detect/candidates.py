@@ -11,7 +11,7 @@ from torchpose import ellipse
 from torchpose.detect.arcs import chain_pairs, describe_arcs, fit_pairs, follow
 from torchpose.detect.finer import LARGER, SHIFT, SIDE, cut_outs, promising_places
 from torchpose.detect.partial import free_of_stumps
-from torchpose.detect.prospects import rings, worth_a_fit
+from torchpose.detect.prospects import hints, rings, worth_a_fit
 from torchpose.detect.reduce import area_reduce, reduction_factor
 from torchpose.detect.regions import Gradient, Regions, gradient, level_line_regions, region_polarity, strong_cells
 from torchpose.detect.validation import (
@@ -47,7 +47,12 @@ _ARC_RMS = 1.2  # reduced px, of the cells of an arc, which is a few cells wide
 
 
 def find_candidates(
-    frames: Shaped[Tensor, "B H W"], factor: int | None = None, *, explain: bool = False, wanted: Wanted = ANYTHING
+    frames: Shaped[Tensor, "B H W"],
+    factor: int | None = None,
+    *,
+    explain: bool = False,
+    wanted: Wanted = ANYTHING,
+    coarse: Candidates | None = None,
 ) -> Candidates:
     """Ellipses in grey frames, one pass for the whole batch.
 
@@ -59,18 +64,20 @@ def find_candidates(
             reduction, where blurred and noisy edges stand out four times as much.
         explain: also return what was looked at and rejected, see `Candidates.verdict`.
         wanted: what is asked for; of other ellipses only whole ones are found, and left out.
+        coarse: what `find_coarse` found in these frames, if it is known.
     """
     factor = reduction_factor(*frames.shape[-2:]) if factor is None else factor
     reduced = area_reduce(frames, factor)
     grad = gradient(reduced)
-    coarse = find_ellipses(grad, wanted.reduced(factor))
-    found = [find_finer(frames, factor, grad.threshold, coarse, wanted)] if factor > 1 else []
-    known = accepted(coarse)
-    known = replace(known, ellipse=rescaled(known.ellipse, 0.5))
-    blurred = find_ellipses(gradient(area_reduce(reduced, 2, exact=True)), wanted.reduced(2 * factor), known)
-    for scale, some in ((factor, coarse), (2 * factor, blurred)):
-        found.append(replace(some, ellipse=rescaled(some.ellipse, scale)))
-    every = Candidates.cat(found)
+    sharp = find_ellipses(grad, wanted.reduced(factor))
+    found = [find_finer(frames, factor, grad, sharp, wanted)] if factor > 1 else []
+    found.append(replace(sharp, ellipse=rescaled(sharp.ellipse, factor)))
+    if coarse is None:
+        known = accepted(sharp)
+        known = replace(known, ellipse=rescaled(known.ellipse, 0.5))
+        blurred = find_ellipses(gradient(area_reduce(reduced, 2, exact=True)), wanted.reduced(2 * factor), known)
+        coarse = replace(blurred, ellipse=rescaled(blurred.ellipse, 2 * factor))
+    every = Candidates.cat([*found, coarse])
     every = every[(every.verdict != Verdict.ACCEPTED) | wanted.admits(every)]
     return merge_duplicates(every if explain else accepted(every), explain=explain)
 
@@ -78,47 +85,46 @@ def find_candidates(
 def find_coarse(
     frames: Shaped[Tensor, "B H W"], factor: int | None = None, *, wanted: Wanted = ANYTHING
 ) -> Candidates:
-    """Ellipses at twice the reduction of `find_candidates` alone, a fraction of its work; arguments as there."""
-    factor = 2 * (reduction_factor(*frames.shape[-2:]) if factor is None else factor)
-    found = find_ellipses(gradient(reduced_twice(area_reduce(frames, factor // 2))), wanted.reduced(factor))
-    found = accepted(found)
-    return replace(found, ellipse=rescaled(found.ellipse, factor))[wanted.admits(found)]
-
-
-def reduced_twice(reduced: Tensor) -> Tensor:
-    return area_reduce(reduced, 2, exact=True)
+    """What `find_candidates` finds at twice its reduction alone, at a fraction of its cost; arguments as there."""
+    factor = reduction_factor(*frames.shape[-2:]) if factor is None else factor
+    reduced = area_reduce(area_reduce(frames, factor), 2, exact=True)
+    found = accepted(find_ellipses(gradient(reduced), wanted.reduced(2 * factor)))
+    found = replace(found, ellipse=rescaled(found.ellipse, 2 * factor))
+    return found[wanted.admits(found)]
 
 
 def find_finer(
-    frames: Tensor, factor: int, threshold: Tensor, coarse: Candidates, wanted: Wanted = ANYTHING
+    frames: Tensor, factor: int, sharp: Gradient, found: Candidates, wanted: Wanted = ANYTHING
 ) -> Candidates:
-    """Small ellipses of a finer scale, full px, where the coarse one has something round that is no whole ellipse.
+    """Small ellipses of a finer scale, full px, where a coarser one has something round that is no whole ellipse.
 
-    ``factor``, ``threshold`` (B,) of the gradient and what was looked at are of the coarse scale.
+    ``factor``, the gradient and what was looked at are of the coarser scale.
     """
     fine = factor // 2
-    whole = (coarse.verdict == Verdict.ACCEPTED) & (coarse.cover > WHOLE)
+    whole = (found.verdict == Verdict.ACCEPTED) & (found.cover > WHOLE)
     # an arc of what is wanted turns as it does, though its own ellipse may be flatter
-    asked = (coarse.polarity * wanted.polarity >= 0) & (coarse.ellipse[:, 2] >= _LENGTH * wanted.semi_minor / factor)
-    place = promising_places(coarse.frame, coarse.ellipse, whole, asked)
+    asked = (found.polarity * wanted.polarity >= 0) & (found.ellipse[:, 2] >= _LENGTH * wanted.semi_minor / factor)
+    place = promising_places(found.frame, found.ellipse, whole, asked)
+    if wanted.concentric:
+        place = place[hints(sharp, found[place])]
     height, width = frames.shape[-2:]
     if place.numel() == 0 or min(height, width) < SIDE * fine:
-        return coarse[place[:0]]
-    frame, middle = coarse.frame[place], rescaled(coarse.ellipse[place], factor)[:, :2]
+        return found[place[:0]]
+    frame, middle = found.frame[place], rescaled(found.ellipse[place], factor)[:, :2]
     cut, corner = cut_outs(frames, frame, middle, fine)
     grad = gradient(cut)
     # where edges fill most of a cut-out, the noise of the whole frame tells more than the median of their gradients
-    grad = replace(grad, threshold=torch.minimum(grad.threshold, factor / fine * threshold[frame]))
+    grad = replace(grad, threshold=torch.minimum(grad.threshold, factor / fine * sharp.threshold[frame]))
     if wanted is not ANYTHING:  # what lies elsewhere in a cut-out is a place of its own
-        reach = SHIFT + LARGER * factor / fine * coarse.ellipse[place, 2]
+        reach = SHIFT + LARGER * factor / fine * found.ellipse[place, 2]
         wanted = replace(wanted.reduced(fine), place=Place((middle - corner - 0.5 * (fine - 1)) / fine, SHIFT, reach))
-    found = accepted(find_ellipses(grad, wanted))
-    ellipses = rescaled(found.ellipse, fine)
-    ellipses = torch.cat([ellipses[:, :2] + corner[found.frame], ellipses[:, 2:]], -1)
+    finer = accepted(find_ellipses(grad, wanted))
+    ellipses = rescaled(finer.ellipse, fine)
+    ellipses = torch.cat([ellipses[:, :2] + corner[finer.frame], ellipses[:, 2:]], -1)
     # the ellipses that might have been tried are those of the frame, not those of the cut-out
     more = 2.5 * math.log10(height * width / (SIDE * fine) ** 2)
-    found = replace(found, ellipse=ellipses, frame=frame[found.frame], log10_nfa=found.log10_nfa + more)
-    return found[found.log10_nfa < 0]
+    finer = replace(finer, ellipse=ellipses, frame=frame[finer.frame], log10_nfa=finer.log10_nfa + more)
+    return finer[finer.log10_nfa < 0]
 
 
 def rescaled(ellipses: Float[Tensor, "M 5"], factor: int | float) -> Float[Tensor, "M 5"]:
@@ -143,7 +149,7 @@ def find_ellipses(grad: Gradient, wanted: Wanted = ANYTHING, known: Candidates |
     found = merge_duplicates(Candidates.cat([whole, pieces]), explain=True)
     if known is not None:
         found = without_known(found, known)
-    valid = positions((found.verdict == Verdict.ACCEPTED) & asked_for(grad, found, wanted))
+    valid = positions(asked_for(grad, found, wanted, found.verdict == Verdict.ACCEPTED))
     some = found[valid]
     freed = free_of_stumps(grad, some.frame, some.ellipse, some.polarity)
     moved = positions((freed != some.ellipse).any(-1) & (plausible(grad, freed) == Verdict.ACCEPTED))
@@ -175,10 +181,10 @@ def fit_regions(grad: Gradient, regions: Regions, wanted: Wanted = ANYTHING) -> 
     # a region that is not a whole ellipse runs along something else as well: only what lies along the ellipse counts
     beyond = edge < WHOLE * torch.bincount(regions.region, minlength=count)
     partial = (found.cover <= WHOLE) | beyond[good]
-    admitted = asked_for(grad, found, wanted)
+    admitted = partial & asked_for(grad, found, wanted, partial)
     lost = partial & ~admitted & (found.verdict == Verdict.ACCEPTED)
     found = replace(found, verdict=torch.where(lost, int(Verdict.UNWANTED), found.verdict))
-    part = positions(partial & admitted)
+    part = positions(admitted)
     if part.numel():
         again, sound = _followed(grad, found[part], _PART_ROUNDS)
         found = found.replaced(part[sound], again)
@@ -232,17 +238,18 @@ def fit_arcs(grad: Gradient, arcs: Regions, wanted: Wanted = ANYTHING) -> Candid
     rms = segment_mean(r.square(), index, len(pair), weight.double()).sqrt()
     good = positions(rms < _ARC_RMS)
     frame, polarity = about.frame[pair[good, 0]], about.curvature[pair[good, 0]].sign()
-    found = score(grad, frame, params[good], polarity)
-    found = found[asked_for(grad, found, wanted)]
+    mine = wanted.admits_ellipses(frame, params[good], polarity)
+    found = score(grad, frame[mine], params[good][mine], polarity[mine])
+    found = found[asked_for(grad, found, wanted, found.cover > _FOLLOW[0][0])]
     for least_cover, rounds in _FOLLOW if len(found) else ():
         found = merge_duplicates(found[found.cover > least_cover], 2 * SAME)
         found, _ = _followed(grad, found, rounds)
     return accepted(found)
 
 
-def asked_for(grad: Gradient, found: Candidates, wanted: Wanted) -> Bool[Tensor, " M"]:
-    """Which candidates are what is wanted, as far as their frames tell."""
-    good = wanted.admits(found)
+def asked_for(grad: Gradient, found: Candidates, wanted: Wanted, among: Bool[Tensor, " M"]) -> Bool[Tensor, " M"]:
+    """Which candidates among these are what is wanted, as far as their frames tell."""
+    good = among & wanted.admits(found)
     if wanted.concentric:
         some = positions(good)
         good = good.index_copy(0, some, rings(grad, found[some]))

@@ -78,12 +78,13 @@ def _best_fits(
     """
     runs = _runs(ridge, ellipses)
     likely = _agreement(ridge, runs).topk(_TRIALS, 1).indices
-    fits = torch.cat([runs.gather(1, likely[..., None].expand(-1, -1, 5)), ellipses[:, None]], 1)
+    fits = runs.gather(1, likely[..., None].expand(-1, -1, 5))
     each = torch.arange(len(ellipses), device=ellipses.device)
-    of = each.repeat_interleave(fits.shape[1])
+    of = each.repeat_interleave(_TRIALS)
     again = find_ridge(grad, frame[of], fits.flatten(0, 1), polarity[of])
-    best = again.support.view(fits.shape[:2]).argmax(1)
-    return fits[each, best], best < _TRIALS
+    support, best = again.support.view(-1, _TRIALS).max(1)
+    changed = support >= ridge.support
+    return torch.where(changed[:, None], fits[each, best], ellipses), changed
 
 
 def _agreement(ridge: Ridge, fits: Float[Tensor, "M F 5"]) -> Float[Tensor, "M F"]:

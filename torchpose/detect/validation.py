@@ -100,12 +100,16 @@ class Wanted:
         return replace(self, semi_minor=self.semi_minor / factor, place=None)
 
     def admits(self, found: Candidates) -> Bool[Tensor, " M"]:
-        """Which candidates are asked for."""
-        good = found.ellipse[:, 3] >= self.semi_minor
+        """Which candidates are asked for, by their ellipses alone."""
+        return self.admits_ellipses(found.frame, found.ellipse, found.polarity)
+
+    def admits_ellipses(self, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> Bool[Tensor, " M"]:
+        """Which ellipses (M, 5) of frames (M,) and polarities (M,) are asked for."""
+        good = ellipses[:, 3] >= self.semi_minor
         if self.polarity:
-            good &= found.polarity == self.polarity
+            good &= polarity == self.polarity
         if self.place is not None:
-            away = found.ellipse[:, :2] - self.place.center[found.frame]
+            away = ellipses[:, :2] - self.place.center[frame]
             good &= torch.linalg.vector_norm(away, dim=-1) < self.place.shift
         return good
 
