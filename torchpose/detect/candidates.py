@@ -11,7 +11,7 @@ from torchpose import ellipse
 from torchpose.detect.arcs import chain_pairs, describe_arcs, fit_pairs, follow
 from torchpose.detect.finer import LARGER, SHIFT, SIDE, cut_outs, promising_places
 from torchpose.detect.partial import free_of_stumps
-from torchpose.detect.prospects import hints, rings, worth_a_fit
+from torchpose.detect.prospects import hints, rings, sorted_out
 from torchpose.detect.reduce import area_reduce, reduction_factor
 from torchpose.detect.regions import Gradient, Regions, gradient, level_line_regions, region_polarity, strong_cells
 from torchpose.detect.validation import (
@@ -142,7 +142,8 @@ def find_ellipses(grad: Gradient, wanted: Wanted = ANYTHING, known: Candidates |
     regions = level_line_regions(grad, wanted.within_reach(grad, strong_cells(grad)), MIN_PIXELS)
     aside = regions.cell[:0]
     if wanted.concentric:
-        regions, aside = regions.parted(worth_a_fit(regions, grad.centers(regions.cell), wanted.polarity))
+        fit, arcs = sorted_out(regions, grad.centers(regions.cell), wanted.polarity)
+        regions, aside = regions.of(fit), regions.cells_of(arcs)
     whole, explained = fit_regions(grad, regions, wanted)
     rest = torch.cat([regions.cell[~explained], aside]).sort().values
     pieces = fit_arcs(grad, level_line_regions(grad, rest, MIN_PIXELS, _SECTORS, _PHASE), wanted)

@@ -18,6 +18,8 @@ from torchpose.geometry.segments import run_sums, values_at
 # of length 0.64 at most and a roundness of at least 0.27; an ellipse of an axes' ratio of 0.12 has 0.27 as well.
 _STRAIGHT = 0.8  # length of the mean direction of a region that turns too little: an arc of 130 degrees has 0.8
 _ROUND = 0.2
+_LINE = 0.985  # an arc of 34 degrees
+_OTHER = -0.5  # roundness of a region of the other polarity
 _WHOLE = 0.3  # length of the mean direction of a region that goes all the way round
 _STEP = 0.2  # of the inner edge, to the outer one: true rings have it in 0.83 of the directions at least
 _SHARE = 0.6  # of the directions in which the outer edge is seen
@@ -45,11 +47,15 @@ def roundness(regions: Regions, xy: Float[Tensor, "P 2"]) -> tuple[Float[Tensor,
     return mean.sqrt(), (mixed - mx * mgx - my * mgy) / spread
 
 
-def worth_a_fit(regions: Regions, xy: Float[Tensor, "P 2"], polarity: float) -> Bool[Tensor, " R"]:
-    """Regions that may be most of an ellipse of the polarity (0 for either), or the whole of another one."""
+def sorted_out(
+    regions: Regions, xy: Float[Tensor, "P 2"], polarity: float
+) -> tuple[Bool[Tensor, " R"], Bool[Tensor, " R"]]:
+    """Regions that may be most of an ellipse of the polarity (0 for either) or the whole of another one; and those
+    that are not, but may have arcs of the polarity in them."""
     mean, turning = roundness(regions, xy)
     own = turning.abs() if polarity == 0 else polarity * turning
-    return ((mean < _STRAIGHT) & (own > _ROUND)) | ((mean < _WHOLE) & (turning.abs() > _ROUND))
+    fit = ((mean < _STRAIGHT) & (own > _ROUND)) | ((mean < _WHOLE) & (turning.abs() > _ROUND))
+    return fit, ~fit & (mean < _LINE) & (own > _OTHER)
 
 
 def rings(grad: Gradient, found: Candidates) -> Bool[Tensor, " M"]:

@@ -73,12 +73,14 @@ class Regions(Rows):
     gradient: Float[Tensor, "P 2"]
     frame: Int[Tensor, " R"] = shared()  # of each region
 
-    def parted(self, some: Bool[Tensor, " R"]) -> tuple["Regions", Int[Tensor, " Q"]]:
-        """Some of the regions, and the cells of the others."""
-        mine = some.index_select(0, self.region)
-        kept, number = self[positions(mine)], some.cumsum(0) - 1
-        kept = replace(kept, region=number.index_select(0, kept.region), frame=self.frame[some])
-        return kept, self.cell[positions(~mine)]
+    def of(self, some: Bool[Tensor, " R"]) -> "Regions":
+        """Some of the regions."""
+        kept, number = self[positions(some.index_select(0, self.region))], some.cumsum(0) - 1
+        return replace(kept, region=number.index_select(0, kept.region), frame=self.frame[some])
+
+    def cells_of(self, some: Bool[Tensor, " R"]) -> Int[Tensor, " Q"]:
+        """Their cells alone."""
+        return self.cell[positions(some.index_select(0, self.region))]
 
 
 def gradient(frames: Real[Tensor, "B h w"]) -> Gradient:
