@@ -10,8 +10,8 @@ from torch import Tensor
 from torchpose import ellipse
 from torchpose.detect.arcs import chain_pairs, describe_arcs, fit_pairs, follow
 from torchpose.detect.finer import LARGER, SHIFT, SIDE, cut_outs, promising_places
-from torchpose.detect.partial import free_of_stumps
-from torchpose.detect.prospects import hints, rings, sorted_out
+from torchpose.detect.partial import SETTLE, free_of_stumps
+from torchpose.detect.prospects import crests, hints, rings, sorted_out
 from torchpose.detect.reduce import area_reduce, reduction_factor
 from torchpose.detect.regions import Gradient, Regions, gradient, level_line_regions, region_polarity, strong_cells
 from torchpose.detect.validation import (
@@ -32,12 +32,14 @@ from torchpose.geometry import conics
 from torchpose.geometry.segments import marked, members, positions, segment_mean
 
 MIN_PIXELS = 10
+_MIN_CRESTS = 7  # of cells that are left where edges are thinned
 _SECTORS = 8  # arcs turn by up to 45 degrees
 _PHASE = 0.5  # sectors centred on the axes and diagonals turn into each other when a frame is mirrored or transposed
 _MIN_SEMI_MINOR = 2.0  # reduced px
 _MIN_ASPECT = 0.12
 _MIN_CELLS = 0.35  # of a region on its ellipse, a pixel of perimeter; an edge is two to three cells wide
 _PART_ROUNDS = 2  # of following the ellipse of a region that is only a part of it
+_RING_SETTLE = 2  # fits of a ring to what agrees: its edges are measured later
 _FOLLOW = ((0.4, 1), (0.5, 2))  # least cover to be followed further, and rounds of it
 _ON_ELLIPSE = 1.5  # reduced px
 _TAPER = 3.0  # reduced px, where the weight of a cell in the second fit has fallen to 0
@@ -139,20 +141,25 @@ def find_ellipses(grad: Gradient, wanted: Wanted = ANYTHING, known: Candidates |
     What is not ``wanted`` is among them where it is seen whole, and explains its edges.
     ``known`` are accepted ellipses of a finer scale in the pixels of this one, which may explain edges better.
     """
-    regions = level_line_regions(grad, wanted.within_reach(grad, strong_cells(grad)), MIN_PIXELS)
+    cell = wanted.within_reach(grad, strong_cells(grad))
+    least = MIN_PIXELS
+    if wanted.concentric:
+        cell, least = crests(grad, cell), _MIN_CRESTS
+    regions = level_line_regions(grad, cell, least)
     aside = regions.cell[:0]
     if wanted.concentric:
         fit, arcs = sorted_out(regions, grad.centers(regions.cell), wanted.polarity)
         regions, aside = regions.of(fit), regions.cells_of(arcs)
     whole, explained = fit_regions(grad, regions, wanted)
     rest = torch.cat([regions.cell[~explained], aside]).sort().values
-    pieces = fit_arcs(grad, level_line_regions(grad, rest, MIN_PIXELS, _SECTORS, _PHASE), wanted)
+    pieces = fit_arcs(grad, level_line_regions(grad, rest, least, _SECTORS, _PHASE), wanted)
     found = merge_duplicates(Candidates.cat([whole, pieces]), explain=True)
     if known is not None:
         found = without_known(found, known)
     valid = positions(asked_for(grad, found, wanted, found.verdict == Verdict.ACCEPTED))
     some = found[valid]
-    freed = free_of_stumps(grad, some.frame, some.ellipse, some.polarity)
+    settle = _RING_SETTLE if wanted.concentric else SETTLE
+    freed = free_of_stumps(grad, some.frame, some.ellipse, some.polarity, settle)
     moved = positions((freed != some.ellipse).any(-1) & (plausible(grad, freed) == Verdict.ACCEPTED))
     if moved.numel():
         again = score(grad, some.frame[moved], freed[moved], some.polarity[moved])

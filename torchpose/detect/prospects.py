@@ -6,16 +6,17 @@ inside its outer one, of the opposite step, in whatever direction one looks.
 """
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.detect.regions import Gradient, Regions
 from torchpose.detect.validation import Candidates
 from torchpose.geometry import conics
-from torchpose.geometry.segments import run_sums, values_at
+from torchpose.geometry.segments import positions, run_sums, values_at
 
 # Of true rings of `scripts/clutter_statistics.py`, seeds 41, 42 and 33: regions of outer circles have a mean direction
 # of length 0.64 at most and a roundness of at least 0.27; an ellipse of an axes' ratio of 0.12 has 0.27 as well.
+_CREST = 0.5  # of squared gradients
 _STRAIGHT = 0.8  # length of the mean direction of a region that turns too little: an arc of 130 degrees has 0.8
 _ROUND = 0.2
 _LINE = 0.985  # an arc of 34 degrees
@@ -45,6 +46,21 @@ def roundness(regions: Regions, xy: Float[Tensor, "P 2"]) -> tuple[Float[Tensor,
     mean = mgx * mgx + mgy * mgy
     spread = ((square - mx * mx - my * my) * (1 - mean)).clamp_min(1e-12).sqrt()
     return mean.sqrt(), (mixed - mx * mgx - my * mgy) / spread
+
+
+def crests(grad: Gradient, cell: Int[Tensor, " P"]) -> Int[Tensor, " Q"]:
+    """Those of the cells, rising, that have about the strongest gradient of their neighbours across the edge."""
+    if cell.numel() == 0:
+        return cell
+    gx, gy = grad.components(cell)
+    width, power = grad.shape[2], gx * gx + gy * gy
+    table = torch.zeros(int(cell[-1]) + 2 * (width + 2), device=cell.device)
+    table[cell + (width + 1)] = power
+    most = torch.maximum(gx.abs(), gy.abs())
+    step = (gx / most).round_() + width * (gy / most).round_()
+    step = step.long()
+    before, after = (table.index_select(0, cell + (width + 1) + sign * step) for sign in (-1, 1))
+    return cell[positions(power >= _CREST * torch.maximum(before, after))]
 
 
 def sorted_out(
