@@ -6,7 +6,7 @@ measurement. The whole ring as one model has no such limit:
     I = paper + slope . x + contrast (E(1) - E(q)),
 
 E(s) the blurred indicator of the ellipse scaled by s, q the ratio of the radii. To first order in the distance it is
-that of a curved edge (`geometry.blurred_edge`). Where the blur is more than a fifth of the inner circle, that is off by
+that of a curved edge (`geometry.blurred_edge`). Where the blur is more than a third of the inner circle, that is off by
 up to a quarter of the contrast, and the ring is fitted once more with the exact integral (`geometry.blurred_ellipse`).
 The circles share their shape; perspective parts their centres by about a^2 (1 - q^2) / f at most (a the semi-major
 axis, f the focal length, px), the standard deviation of a prior at zero. What covers a part of the ring, or touches it,
@@ -51,7 +51,7 @@ _LEAST_KEPT = 0.5  # of the pixels
 _MOST_MOVE = (*[0.7] * 5, 0.1, *[0.7] * 2)  # of an iteration: px, and the ratio
 _START_SIGMA = 0.8  # px, at least
 _OVAL = 0.3  # of a blur's mean variance: what is expected of its lean, which a ring as small as its blur hardly tells
-_BLURRED = 0.2  # blur over inner semi-minor axis above which edges are no edges any more
+_BLURRED = 0.33  # blur over inner semi-minor axis above which edges are no edges any more
 _BLURRED_MARGIN = 2.5  # blurs around the outer ellipse
 _LEAST_EXPLAINED = 0.75  # of the variance of grey around the ring
 _PROMISING = 0.5  # of it, from the first fit, for a second one
@@ -104,9 +104,9 @@ class _Scheme(NamedTuple):
 
 
 # grey levels and weights alone at first, so that a cover does not pull from the start
-_ROUGH = _Scheme(first_order, 1e-3, (_Stage(2, held=True, sectors=False), _Stage(5), _Stage(3, hard=True)))
+_ROUGH = _Scheme(first_order, 1e-3, (_Stage(2, held=True, sectors=False), _Stage(6), _Stage(3, hard=True)))
 # blur, width and contrast of a ring much blurred are hard to tell apart: no step is to be shortened
-_PRECISE = _Scheme(exact, 1e-5, (_Stage(6), _Stage(4, hard=True)))
+_PRECISE = _Scheme(exact, 1e-5, (_Stage(4), _Stage(3, hard=True)))
 
 
 def fit_small_rings(
