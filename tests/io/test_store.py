@@ -30,8 +30,8 @@ from torchpose.io.store import ResultStore
 from torchpose.io.writers import read_rows, read_table, write_rows
 from torchpose.results import Detections, Poses, Reason, Status
 
-CONTRACT = "frame,target,status,tx,ty,tz,rx,ry,rz,sx,sy,sz,srx,sry,srz,rms_px,markers,reason"
-DETECTION_CONTRACT = "frame,target,marker,u,v,su,sv,outer_a,outer_b,outer_theta,inner_a,inner_b,inner_theta"
+CONTRACT = "frame,target,status,tx,ty,tz,rx,ry,rz,sx,sy,sz,srx,sry,srz,rms_px,markers,reason,instance,copies"
+DETECTION_CONTRACT = "frame,target,marker,u,v,su,sv,outer_a,outer_b,outer_theta,inner_a,inner_b,inner_theta,instance"
 NAN = float("nan")
 
 
@@ -50,6 +50,7 @@ def some_poses(frames: int = 3, targets: int = 2, seed: int = 0) -> Poses:
     detections = Detections(
         frame=torch.arange(frames).repeat_interleave(4 * targets),
         target=torch.arange(targets).repeat_interleave(4).repeat(frames),
+        instance=torch.zeros(4 * n, dtype=torch.int64),
         marker=torch.tensor([3, 2, 1, 0]).repeat(n),
         center=100 + normal(k, 2),
         center_cov=torch.diag_embed(normal(k, 2).square()),
@@ -59,6 +60,8 @@ def some_poses(frames: int = 3, targets: int = 2, seed: int = 0) -> Poses:
     return Poses(
         frame=torch.arange(frames).repeat_interleave(targets),
         target=torch.arange(targets).repeat(frames),
+        instance=torch.zeros(n, dtype=torch.int64),
+        copies=torch.ones(n, dtype=torch.int64),
         R=torch.where(gone[:, None, None], NAN, rotations.exp(vectors)),
         t=torch.where(gone[:, None], NAN, 500 * normal(n, 3)),
         covariance=torch.where(gone[:, None, None], NAN, root @ root.mT),
@@ -102,7 +105,7 @@ def test_rows_hold_the_poses_exactly() -> None:
         assert row["solutions"][0]["chi2"] == float(poses.chi2[i])
     assert [len(row["solutions"] or []) for row in rows] == [1, 1, 1, 1, 2, 0]
     assert rows[4]["solutions"][1]["translation"] == poses.t_alt[4].tolist()
-    without = ("status", "reason", "frame", "target", "markers")
+    without = ("status", "reason", "frame", "target", "markers", "instance", "copies")
     assert rows[5]["markers"] == 2
     assert all(value is None for column, value in rows[5].items() if column not in without)
 

@@ -18,7 +18,7 @@ from torchpose.identify.scene import MarkerTable
 
 # px, of the ring's semi-major axis, of the distance to the ring the pose comes from
 _PLACE_TOLERANCE = (2.0, 0.3, 0.05)
-_SIZE_TOLERANCE = 1.25
+SIZE_TOLERANCE = 1.25
 _PARTNERS = 4  # of a ring, plane and marker, the nearest to their places: one is right, the others are neighbours'
 _STEEPEST = 0.1  # of a plane's depth: how near to the camera a circle in it is taken to reach at most
 SAME_PLACE = 2.0  # times the tolerance of a place: two poses that put a marker so near to one ring are of one copy
@@ -104,7 +104,7 @@ def _pairs(
     least = torch.maximum(depth - flat * lean, _STEEPEST * depth)
     scale = matrix[0, 0] * torch.linalg.vector_norm(middle, dim=-1) / depth / least
     px, of_size, of_way = _PLACE_TOLERANCE
-    reach = px + scale * ((1 + of_way) * flat + of_size * _SIZE_TOLERANCE * radius)
+    reach = px + scale * ((1 + of_way) * flat + of_size * SIZE_TOLERANCE * radius)
     center = (middle @ matrix.T)[:, :2] / depth[:, None]
     query, b = near.within(one.row[a] * away.shape[1] + marker, center, torch.where(depth > 0, reach, torch.nan))
     other = one.ring[a[query]] != one.ring[b]
@@ -125,7 +125,7 @@ def _support(
     most = matrix[0, 0] * table.radii[target[pose], marker, 0] * torch.linalg.vector_norm(x, dim=-1) / x[:, 2].square()
     px, of_size, of_way = _PLACE_TOLERANCE
     way = torch.linalg.vector_norm(uv - start, dim=-1)
-    reach = SAME_PLACE * (px + of_size * _SIZE_TOLERANCE * most + of_way * way) / (1 - SAME_PLACE * of_way)
+    reach = SAME_PLACE * (px + of_size * SIZE_TOLERANCE * most + of_way * way) / (1 - SAME_PLACE * of_way)
     query, member = near.within(one.row[origin[pose]] * table.ids.shape[1] + marker, uv, reach)
     away = torch.linalg.vector_norm(one.ellipse[member, :2] - start[query], dim=-1)
     miss = _miss(x[query], one.radius[member], one.ellipse[member], away, matrix)
@@ -149,7 +149,7 @@ def _miss(x: Tensor, radius: Tensor, seen: Tensor, away: Tensor, matrix: Tensor)
     # semi-major axes: that of a circle on the optical axis, and the most that the view off axis makes of it
     least = matrix[0, 0] * radius / x[:, 2]
     most = least * torch.linalg.vector_norm(x, dim=-1) / x[:, 2]
-    fits = (seen[:, 2] > least / _SIZE_TOLERANCE) & (seen[:, 2] < most * _SIZE_TOLERANCE) & (x[:, 2] > 0)
+    fits = (seen[:, 2] > least / SIZE_TOLERANCE) & (seen[:, 2] < most * SIZE_TOLERANCE) & (x[:, 2] > 0)
     return torch.where(fits, miss, torch.inf)
 
 

@@ -75,6 +75,11 @@ class Scene(NamedTuple):
         return self._replace(frame=group // len(self.table), target=group % len(self.table))
 
     @property
+    def groups(self) -> int:
+        """Number of frames times targets."""
+        return len(self.frames) * len(self.table)
+
+    @property
     def group(self) -> Tensor:
         """(N,) int64, frame times T plus target."""
         return self.frame * len(self.table) + self.target

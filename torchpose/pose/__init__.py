@@ -5,12 +5,11 @@ from torchpose.pose.covariance import intrinsics_covariance, pose_covariance
 from torchpose.pose.doubt import crossed_out
 from torchpose.pose.evidence import Evidence, center_rms, gather_evidence, shape_chi2
 from torchpose.pose.outcome import Found, outcome
-from torchpose.pose.solutions import AMBIGUOUS_CHI2, MIN_MARKERS, Solutions
+from torchpose.pose.solutions import AMBIGUOUS_CHI2, Solutions
 from torchpose.pose.solve import solve_poses
 
 __all__ = [
     "AMBIGUOUS_CHI2",
-    "MIN_MARKERS",
     "Evidence",
     "Found",
     "Solutions",
