@@ -16,7 +16,7 @@ from torchpose.camera import Camera
 from torchpose.geometry.rows import Rows, shared
 from torchpose.geometry.segments import marked, rank_in_group
 from torchpose.identify.assignments import Assignments, propose
-from torchpose.identify.copies import MIN_MARKERS, Claims, rank, share_out
+from torchpose.identify.copies import MIN_MARKERS, Claims, Rivals, rank, share_out
 from torchpose.identify.hypotheses import Hypotheses, hypotheses
 from torchpose.identify.scene import MarkerTable
 from torchpose.rings import Rings
@@ -68,10 +68,9 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int, inst
     if len(one) == 0:
         return _nothing(rows, table.ids.shape[1], proposal)
     tried = _tried(one, table, camera.matrix, rows)
-    score, claims, near = _weighed(tried, one, len(rings), table.ids.shape[1])
-    row = one.row[tried.origin]
-    size = (rows, len(rings) * len(table), table.ids.shape[1])
-    copies = share_out(row, score, claims, near, size)
+    rivals = _weighed(tried, one, (rows, len(rings), table.ids.shape[1]))
+    row, score, claims = rivals.row, rivals.score, rivals.claims
+    copies = share_out(rivals)
     found = torch.bincount(row[copies], minlength=rows)
 
     # of each row the best copies, or the best pose where there is none, or no pose
@@ -113,9 +112,9 @@ def _different(row: Tensor, marker: Tensor, size: tuple[int, int]) -> Tensor:
     return marked(row * size[1] + marker, size[0] * size[1]).view(size).sum(-1)
 
 
-def _weighed(tried: Hypotheses, one: Assignments, rings: int, markers: int) -> tuple[Tensor, Claims, Claims]:
-    """Score (H,) of every pose, the nearest ring of each of its markers, and all rings that could be it."""
-    member, pose = tried.member, tried.pose
+def _weighed(tried: Hypotheses, one: Assignments, size: tuple[int, int, int]) -> Rivals:
+    """The poses with the nearest ring of each of their markers; ``size``: number of rows, rings and markers."""
+    member, pose, (rows, rings, markers) = tried.member, tried.pose, size
     every = Claims(pose, one.target[member] * rings + one.ring[member], one.marker[member])
     # the code has its say, too: markers of neighbouring codes must not change places
     cost = torch.where(tried.miss < 1, 0.5 * (tried.miss + one.mismatch[member]), torch.inf)
@@ -125,8 +124,11 @@ def _weighed(tried: Hypotheses, one: Assignments, rings: int, markers: int) -> t
     chosen = (cost == per_marker[slot]) & cost.isfinite()
     per_marker = per_marker.view(-1, markers)
     found = per_marker.isfinite()
-    score = found.sum(-1) - torch.where(found, per_marker, 0.0).sum(-1) / (2 * markers)
-    return score, every.where(chosen), every
+    count = found.sum(-1)
+    score = count - torch.where(found, per_marker, 0.0).sum(-1) / (2 * markers)
+    # another number for a ring in every target
+    size = rows, rings * (int(one.target.max()) + 1), markers
+    return Rivals(one.row[tried.origin], score, count, every.where(chosen), every, size)
 
 
 def _empty(group: Tensor, markers: int, copies: Tensor, proposal: Tensor) -> Identified:

@@ -33,16 +33,16 @@ def render_tray(
         covers: shapes over everything, in camera coordinates (`shapes.moved`).
         psf_sigma: blur, px.
     """
-    marks = Shapes.cat([replace(moved(rings(target), *pose), level=_level(target, 30.0)) for pose in zip(R, t, strict=True)])
+    marks = Shapes.cat(
+        [replace(moved(rings(target), *pose), level=_level(target, 30.0)) for pose in zip(R, t, strict=True)]
+    )
     plates = None
     if plate is not None:
         blank = rectangle((0.0, 0.0), *plate, level=220.0)
         plates = Shapes.cat([moved(blank, *pose) for pose in zip(R, t, strict=True)])
     ground = 220.0 if plate is None else 90.0
     eye, here = torch.eye(3, dtype=t.dtype)[None], t.new_zeros(1, 3)
-    return render(
-        camera, marks, eye, here, psf_sigma=psf_sigma, light=ground, clutter=plates, covers=covers
-    )[0]
+    return render(camera, marks, eye, here, psf_sigma=psf_sigma, light=ground, clutter=plates, covers=covers)[0]
 
 
 def moved(shapes: Shapes, R: Float[Tensor, "3 3"], t: Float[Tensor, " 3"]) -> Shapes:
