@@ -26,6 +26,7 @@ class Assignments(Rows):
         target: of the row.
         marker: number of the marker in the target.
         ring: index into the rings.
+        number: of the ring, another one for every target: targets may claim the same ring.
         mismatch: of the code, 1 at its tolerance.
         ellipse: of the ring's outer circle, ideal px.
         radius: of the marker's outer circle, mm.
@@ -37,6 +38,7 @@ class Assignments(Rows):
     target: Tensor
     marker: Tensor
     ring: Tensor
+    number: Tensor
     mismatch: Tensor
     ellipse: Tensor
     radius: Tensor
@@ -63,4 +65,5 @@ def propose(rings: Rings, table: MarkerTable, matrix: Tensor) -> Assignments:
     # every ring alone has two poses of its plane
     conic = matrix.T @ conics.to_matrix(conics.conic_from_ellipse(ellipse)) @ matrix
     place, axis = conics.circle_poses(conic, radius)
-    return Assignments(row, target, marker, ring, mismatch[ring, target, marker], ellipse, radius, place, axis)
+    number, off = target * len(rings) + ring, mismatch[ring, target, marker]
+    return Assignments(row, target, marker, ring, number, off, ellipse, radius, place, axis)

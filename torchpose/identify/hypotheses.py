@@ -21,6 +21,7 @@ _PLACE_TOLERANCE = (2.0, 0.3, 0.05)
 SIZE_TOLERANCE = 1.25
 _PARTNERS = 4  # of a ring, plane and marker, the nearest to their places: one is right, the others are neighbours'
 _STEEPEST = 0.1  # of a plane's depth: how near to the camera a circle in it is taken to reach at most
+_NEAREST = 1e-3  # mm: what lies behind the camera gets a box that holds nothing of the right place
 SAME_PLACE = 2.0  # times the tolerance of a place: two poses that put a marker so near to one ring are of one copy
 
 
@@ -88,25 +89,25 @@ def _pairs(
     Returns first assignment (P,), which of its planes (P,), second assignment (P,), and where the second marker lies in
     the frame of the first, mm: height (P,) over its plane, and distance (P,) in the plane.
     """
-    markers = table[one.target]
-    every = torch.arange(len(one), device=matrix.device)
-    away = markers.centers - markers.centers[every, one.marker][:, None]
-    height = (away * markers.normals[every, one.marker][:, None]).sum(-1)
-    flat = (away.square().sum(-1) - height.square()).clamp_min(0).sqrt()
-    others = markers.valid & (torch.arange(away.shape[1], device=matrix.device) != one.marker[:, None])
-    a, marker, plane = others[..., None].expand(-1, -1, 2).nonzero().unbind(-1)
-    height, flat, radius = height[a, marker], flat[a, marker], markers.radii[a, marker, 0]
+    # of the layout alone: height and distance of every marker in the frame of every other one
+    away = table.centers[:, None] - table.centers[:, :, None]  # (T, M, M, 3)
+    heights = (away * table.normals[:, :, None]).sum(-1)
+    flats = (away.square().sum(-1) - heights.square()).clamp_min(0).sqrt()
+    pairs = table.valid[:, None] & ~torch.eye(away.shape[1], dtype=torch.bool, device=matrix.device)
+    a, marker, plane = pairs[one.target, one.marker][..., None].expand(-1, -1, 2).nonzero().unbind(-1)
+    of = one.target[a], one.marker[a], marker
+    height, flat, radius = heights[of], flats[of], table.radii[of[0], marker, 0]
     normal = side * one.axis[a, plane]
     middle = one.place[a, plane] + height[:, None] * normal
     # the circle's points are at most so far from the image of its middle, and at least so far from the camera
-    depth = middle[:, 2]
+    depth = middle[:, 2].clamp_min(_NEAREST)
     lean = (1 - normal[:, 2].square()).clamp_min(0).sqrt()
     least = torch.maximum(depth - flat * lean, _STEEPEST * depth)
     scale = matrix[0, 0] * torch.linalg.vector_norm(middle, dim=-1) / depth / least
     px, of_size, of_way = _PLACE_TOLERANCE
     reach = px + scale * ((1 + of_way) * flat + of_size * SIZE_TOLERANCE * radius)
     center = (middle @ matrix.T)[:, :2] / depth[:, None]
-    query, b = near.within(one.row[a] * away.shape[1] + marker, center, torch.where(depth > 0, reach, torch.nan))
+    query, b = near.within(one.row[a] * table.ids.shape[1] + marker, center, reach)
     other = one.ring[a[query]] != one.ring[b]
     query, b = query[other], b[other]
     return a[query], plane[query], b, height[query], flat[query]

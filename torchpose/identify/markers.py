@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.geometry.rows import Rows, shared
-from torchpose.geometry.segments import marked, rank_in_group
+from torchpose.geometry.segments import marked
 from torchpose.identify.assignments import Assignments, propose
 from torchpose.identify.copies import MIN_MARKERS, Claims, Rivals, rank, share_out
 from torchpose.identify.hypotheses import Hypotheses, hypotheses
@@ -67,8 +67,7 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int, inst
     proposal = torch.stack([one.row, one.marker, one.ring], -1)
     if len(one) == 0:
         return _nothing(rows, table.ids.shape[1], proposal)
-    tried = _tried(one, table, camera.matrix, rows)
-    rivals = _weighed(tried, one, (rows, len(rings), table.ids.shape[1]))
+    tried, rivals = _tried(one, table, camera.matrix, (rows, len(rings) * len(table), table.ids.shape[1]))
     row, score, claims = rivals.row, rivals.score, rivals.claims
     copies = share_out(rivals)
     found = torch.bincount(row[copies], minlength=rows)
@@ -77,34 +76,41 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int, inst
     place = rank(row, score, rows)
     best = torch.full((rows,), len(row), device=device).scatter_reduce_(0, row, place, "amin")
     kept = (copies | ((found == 0)[row] & (place == best[row]))).nonzero()[:, 0]
-    kept = kept[rank_in_group(row[kept], by=place[kept]) < instances]
-    kept = kept[torch.argsort(row[kept] * (len(row) + 1) + place[kept])]
-    without = (~marked(row[kept], rows)).nonzero()[:, 0]
-    group, order = torch.cat([row[kept], without]).sort(stable=True)
+    kept = kept[torch.argsort(row[kept] * len(row) + place[kept])]
+    number = torch.arange(len(kept), device=device) - torch.searchsorted(row[kept], row[kept])
+    kept = kept[number < instances]
+    group, at = row[kept], torch.arange(len(kept), device=device)
+    without = (~marked(group, rows)).nonzero()[:, 0]
+    if without.numel():
+        group, order = torch.cat([group, without]).sort(stable=True)
+        at = torch.empty_like(order).index_copy_(0, order, torch.arange(len(order), device=device))[: len(kept)]
     result = _empty(group, table.ids.shape[1], found[group], proposal)
-    at = torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=device))[: len(kept)]
     result.R[at], result.t[at] = tried.R[kept], tried.t[kept]
-    to = torch.full_like(row, -1).index_copy_(0, kept, at)
-    chosen = (to[claims.pose] >= 0).nonzero()[:, 0]
-    result.ring[to[claims.pose[chosen]], claims.marker[chosen]] = claims.ring[chosen] % len(rings)
-    # no pair, no pose: the code is all there is
-    first = torch.full((rows,), -1, device=device).index_copy_(0, group, torch.arange(len(group), device=device))
-    alone = marked(without, rows)[one.row]
-    result.ring[first[one.row[alone]], one.marker[alone]] = one.ring[alone]
+    to = torch.full_like(row, -1).index_copy_(0, kept, at)[claims.pose]
+    chosen = (to >= 0).nonzero()[:, 0]
+    result.ring[to[chosen], claims.marker[chosen]] = claims.ring[chosen] % len(rings)
+    if without.numel():
+        # no pair, no pose: the code is all there is
+        alone = marked(without, rows)[one.row].nonzero()[:, 0]
+        result.ring[torch.searchsorted(group, one.row[alone]), one.marker[alone]] = one.ring[alone]
     return result
 
 
-def _tried(one: Assignments, table: MarkerTable, matrix: Tensor, rows: int) -> Hypotheses:
+def _tried(
+    one: Assignments, table: MarkerTable, matrix: Tensor, size: tuple[int, int, int]
+) -> tuple[Hypotheses, Rivals]:
     """Poses of targets seen from their printed side; from behind too where these explain too few rings."""
     tried = hypotheses(one, table, matrix, 1.0)
-    placed = tried.miss < 1
-    explained = _different(tried.pose[placed], one.marker[tried.member[placed]], (len(tried.R), table.ids.shape[1]))
-    there = marked(one.row[tried.origin[explained >= MIN_MARKERS]], rows)
-    read = _different(one.row, one.marker, (rows, table.ids.shape[1]))
-    behind = (~there & (read >= MIN_MARKERS))[one.row].nonzero()[:, 0]
+    rivals = _weighed(tried, one, size)
+    lacking = ~marked(rivals.row[rivals.count >= MIN_MARKERS], size[0])[one.row]
+    if not bool(lacking.any()):
+        return tried, rivals
+    read = _different(one.row, one.marker, (size[0], size[2]))
+    behind = (lacking & (read >= MIN_MARKERS)[one.row]).nonzero()[:, 0]
     if behind.numel() == 0:
-        return tried
-    return tried.and_of(hypotheses(one[behind], table, matrix, -1.0), behind)
+        return tried, rivals
+    tried = tried.and_of(hypotheses(one[behind], table, matrix, -1.0), behind)
+    return tried, _weighed(tried, one, size)
 
 
 def _different(row: Tensor, marker: Tensor, size: tuple[int, int]) -> Tensor:
@@ -113,9 +119,9 @@ def _different(row: Tensor, marker: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def _weighed(tried: Hypotheses, one: Assignments, size: tuple[int, int, int]) -> Rivals:
-    """The poses with the nearest ring of each of their markers; ``size``: number of rows, rings and markers."""
-    member, pose, (rows, rings, markers) = tried.member, tried.pose, size
-    every = Claims(pose, one.target[member] * rings + one.ring[member], one.marker[member])
+    """The poses with the nearest ring of each of their markers; ``size`` as in `Rivals`."""
+    member, pose, markers = tried.member, tried.pose, size[2]
+    every = Claims(pose, one.number[member], one.marker[member])
     # the code has its say, too: markers of neighbouring codes must not change places
     cost = torch.where(tried.miss < 1, 0.5 * (tried.miss + one.mismatch[member]), torch.inf)
     slot = pose * markers + every.marker
@@ -126,8 +132,6 @@ def _weighed(tried: Hypotheses, one: Assignments, size: tuple[int, int, int]) ->
     found = per_marker.isfinite()
     count = found.sum(-1)
     score = count - torch.where(found, per_marker, 0.0).sum(-1) / (2 * markers)
-    # another number for a ring in every target
-    size = rows, rings * (int(one.target.max()) + 1), markers
     return Rivals(one.row[tried.origin], score, count, every.where(chosen), every, size)
 
 

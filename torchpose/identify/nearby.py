@@ -41,10 +41,11 @@ class Nearby(NamedTuple):
             center: (Q, 2) px.
             reach: (Q,) px, half the side.
         """
-        low, high = (center + sign * reach[:, None] - self.corner for sign in (-1, 1))
-        meets = (high >= 0).all(-1) & (low <= self.size).all(-1)  # not so where NaN
-        first = (low[:, 1].clamp_min(0) / _STRIP).nan_to_num(0.0).long()
-        last = (torch.minimum(high[:, 1], self.size[1]) / _STRIP).nan_to_num(0.0).long()
+        low = center - self.corner - reach[:, None]
+        high = low + 2 * reach[:, None]
+        meets = ((high >= 0) & (low <= self.size)).all(-1)
+        first = (low[:, 1].clamp_min(0) / _STRIP).long()
+        last = (torch.minimum(high[:, 1], self.size[1]) / _STRIP).long()
         box, strip = ragged_arange(torch.where(meets, last - first + 1, 0))
         start = (group[box] * self.strips + first[box] + strip) * (self.size[0] + 2)
         # between the runs of two strips lie two pixels, which the last half of one parts

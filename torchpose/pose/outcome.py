@@ -1,5 +1,6 @@
 """What became of every target in every frame: who owns a ring that two rows claim, the status, the rows returned."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -49,28 +50,38 @@ def outcome(scene: Scene, found: Found) -> Poses:
         return torch.where(kept, out.index_copy(0, solvable, values), torch.nan)
 
     names = ("R", "t", "covariance", "rms", "chi2", "R_alt", "t_alt", "rms_alt", "chi2_alt")
-    values = {name: spread(getattr(solutions, name)) for name in names}
-    kept, instance = _instances(scene, awarded, values["t"])
-    found = found._replace(evidence=found.evidence[kept], identified=found.identified[kept])
-    scene, mask = scene.of_rows(scene.group[kept]), mask[kept]
-    return Poses(
+    every = Poses(
         frame=scene.frame,
         target=scene.target,
-        instance=instance,
-        copies=torch.maximum(found.identified.copies, torch.bincount(scene.group[awarded[kept]], minlength=scene.groups)[scene.group]),
-        status=torch.where(few, few_status, status)[kept],
-        reason=torch.where(few, int(Reason.NONE), reason)[kept],
-        markers=torch.where(few[kept], proposed[kept], mask.sum(-1)),
-        detections=_detections(scene, found, mask, instance),
-        **{name: value[kept] for name, value in values.items()},
+        instance=torch.zeros_like(scene.frame),
+        copies=torch.maximum(
+            found.identified.copies, torch.bincount(scene.group[awarded], minlength=scene.groups)[scene.group]
+        ),
+        status=torch.where(few, few_status, status),
+        reason=torch.where(few, int(Reason.NONE), reason),
+        markers=torch.where(few, proposed, mask.sum(-1)),
+        detections=_detections(scene, found, mask),
+        **{name: spread(getattr(solutions, name)) for name in names},
     )
+    return every if rows == scene.groups else _numbered(scene, every, awarded)
+
+
+def _numbered(scene: Scene, poses: Poses, awarded: Tensor) -> Poses:
+    """The rows with a pose, from left to right, or the best-supported one of a frame and target without any.
+
+    Args:
+        scene: whose each row is.
+        poses: rows of which those of one frame and target are sorted by support; detections have the row for number.
+        awarded: (N,) bool, rows with a pose.
+    """
+    kept, place = _instances(scene, awarded, poses.t)
+    number = torch.full_like(scene.frame, -1).index_copy_(0, kept, place)
+    seen = replace(poses.detections, instance=number[poses.detections.instance])
+    return replace(poses[kept], instance=place, detections=seen[seen.instance >= 0])
 
 
 def _instances(scene: Scene, awarded: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-    """The rows (P,) to return, and their numbers (P,) among the copies of their frame and target, from left to right.
-
-    These are the rows with a pose, or the best-supported one where no copy has one.
-    """
+    """Indices (P,) of the rows to return, see `_numbered`, and their numbers (P,) among those of a frame and target."""
     group = scene.group
     first = torch.cat([awarded.new_ones(1), group.diff() > 0])[: len(group)]
     kept = (awarded | (first & ~marked(group[awarded], scene.groups)[group])).nonzero()[:, 0]
@@ -80,14 +91,15 @@ def _instances(scene: Scene, awarded: Tensor, t: Tensor) -> tuple[Tensor, Tensor
     return kept[order], place[order]
 
 
-def _detections(scene: Scene, found: Found, mask: Tensor, instance: Tensor) -> Detections:
-    """The markers of the rows that the mask (N, M) has."""
+def _detections(scene: Scene, found: Found, mask: Tensor) -> Detections:
+    """The markers of the rows that the mask (N, M) has; each copy has the number of its row, or 0 where there is one."""
     row, marker = mask.nonzero().unbind(-1)
     ring, target = found.rings[found.identified.ring[row, marker]], scene.target[row]
     evidence = found.evidence
     center, covariance = raw_centers(scene.camera, evidence.center[row, marker], evidence.covariance[row, marker])
     ids = scene.table.ids[target, marker]
-    return Detections(scene.frame[row], target, instance[row], ids, center, covariance, ring.outer_raw, ring.inner_raw)
+    number = torch.zeros_like(row) if len(mask) == scene.groups else row
+    return Detections(scene.frame[row], target, number, ids, center, covariance, ring.outer_raw, ring.inner_raw)
 
 
 def _awarded(scene: Scene, support: Tensor, mask: Tensor, ring: Tensor, rings: int) -> tuple[Tensor, Tensor]:
