@@ -81,6 +81,8 @@ def tray(number: int, seed: int, copies: int, kind: str, camera: tp.Camera, targ
     wide, high = columns * pitch + 20, rows * pitch + 20
     z = rng.uniform(1.12, 1.3) * max(wide * FOCAL / WIDTH, high * FOCAL / HEIGHT)
     t = torch.from_numpy(at) @ base.T + torch.tensor([0, 0, z], dtype=F64)
+    while not _in_view(camera, target, R, t):
+        t = t + 0.03 * z * torch.tensor([0, 0, 1.0], dtype=F64)
     hidden = torch.from_numpy(rng.random(copies) < 0.25) & bool(number % 2)
     covers = [moved(_cover(rng, target), *pose) for pose in zip(R[hidden], t[hidden], strict=True)]
     clean = render_tray(
@@ -94,6 +96,15 @@ def tray(number: int, seed: int, copies: int, kind: str, camera: tp.Camera, targ
     )
     frame = add_noise(clean[None], float(rng.uniform(1, 3)), seed * 1_000_003 + number)[0]
     return Tray(frame, R, t, hidden)
+
+
+def _in_view(camera: tp.Camera, target: tp.Target, R: Tensor, t: Tensor) -> bool:
+    """Whether the frame shows all rings of all copies."""
+    x = (R[:, None] @ target.centers[..., None]).squeeze(-1) + t[:, None]
+    reach = 1.5 * FOCAL * target.radii[:, 0] / x[..., 2] + 8
+    edge = torch.tensor([WIDTH - 1.0, HEIGHT - 1.0], dtype=F64)
+    uv = camera.project(x)
+    return bool(((uv > reach[..., None]) & (uv < edge - reach[..., None])).all())
 
 
 def _cover(rng: np.random.Generator, target: tp.Target) -> Shapes:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchpose.geometry.segments import marked, segment_sum
+from torchpose.geometry.segments import marked, pairs_in_group, segment_sum
 
 MIN_MARKERS = 3  # seen, that a pose needs
 _EQUAL = 1e-6  # difference of scores that rounding may make
@@ -38,6 +38,7 @@ class Rivals(NamedTuple):
         row: (H,) frame and target of each.
         score: (H,) number of markers it explains, less a fraction for what they miss by.
         count: (H,) number of markers it explains.
+        place: (H,) `rank` of the score.
         claims: the rings that the poses explain.
         near: the rings near enough to a predicted place to be that marker of the same copy.
         size: number of rows, of rings as they are numbered, and of markers.
@@ -46,93 +47,71 @@ class Rivals(NamedTuple):
     row: Tensor
     score: Tensor
     count: Tensor
+    place: Tensor
     claims: Claims
     near: Claims
     size: tuple[int, int, int]
 
-    def holders(self, copies: Tensor) -> tuple[Tensor, Tensor]:
-        """The copy, -1 for none, that has each claimed ring (E,), and that has each near one (S,) as the same marker."""
-        _, rings, markers = self.size
-        taken = self.claims.where(copies[self.claims.pose])
-        nobody = torch.full((rings * (markers + 1),), -1, device=self.row.device)
-        nobody[taken.ring] = taken.pose
-        nobody[rings + taken.ring * markers + taken.marker] = taken.pose
-        return nobody[self.claims.ring], nobody[rings + self.near.ring * markers + self.near.marker]
-
     def excluded(self, copies: Tensor) -> Tensor:
         """The poses (H,) that share a ring with a copy or are that copy once more, the copies themselves included."""
-        holder, near_holder = self.holders(copies)
-        some = torch.cat([self.claims.pose[holder >= 0], self.near.pose[near_holder >= 0]])
-        return marked(some, len(self.row))
+        _, rings, markers = self.size
+        taken = self.claims.where(copies[self.claims.pose])
+        shared = self.claims.pose[marked(taken.ring, rings)[self.claims.ring]]
+        as_marker = marked(taken.ring * markers + taken.marker, rings * markers)
+        same = self.near.pose[as_marker[self.near.ring * markers + self.near.marker]]
+        return marked(torch.cat([shared, same]), len(self.row))
 
 
 def share_out(rivals: Rivals) -> Tensor:
     """The poses (H,) bool that are copies: with three rings or more that no other copy has.
 
-    First come, by rounds, those that explain most (`_by_support`). Where a copy shares single rings with several poses
-    that exclude each other not, and these explain more rings together, they are copies instead of it: so of the copies
-    of a tray and of what rings of four of them look like together the former stay, covered rings or not.
-    """
-    open_ones, pose = rivals.count >= MIN_MARKERS, rivals.claims.pose
-    copies = _by_support(rivals, open_ones)
-    while True:
-        holder, near_holder = rivals.holders(copies)
-        held = holder >= 0
-        # two rings fix a pose: who shares more than one is the same copy
-        shared = torch.bincount(pose[held], minlength=len(copies))
-        single = open_ones & ~copies & (shared == 1)
-        if not bool(single.any()):
-            return copies
-        of = torch.zeros_like(rivals.row).index_copy_(0, pose[held], holder[held])
-        others = (near_holder >= 0) & (near_holder != of[rivals.near.pose])
-        more = _by_support(rivals, single & ~marked(rivals.near.pose[others], len(copies)))
-        instead = torch.zeros_like(of).index_add_(0, of[more], rivals.count[more])
-        worse = copies & (instead > rivals.count)
-        if not bool(worse.any()):
-            return copies
-        copies = (copies & ~worse) | (more & worse[of])
-        copies |= _by_support(rivals, open_ones & ~rivals.excluded(copies))
-
-
-def _by_support(rivals: Rivals, open_ones: Tensor) -> Tensor:
-    """Of the poses that are ``open_ones`` (H,) those that win all rings that they claim.
-
     In every round each ring backs the best pose that claims it, and the poses that all their rings back are copies.
     They take their rings away, and the poses that would put a marker where a copy has it are that copy once more. A
     round serves all frames and every neighbourhood of a frame at once.
 
-    In a regular tray, rings of four neighbours can have the very layout of one copy. Their rings are claimed twice, each
-    by the phantom and by a copy, and so are those of the copies inside the tray; but those at its edge have rings that
-    nobody else claims. So claims in dispute count less, and a pose of disputed claims only waits while its frame has
-    others: the tray is cleared from its edge.
+    In a regular tray, rings of four neighbours can have the very layout of one copy. Each of their rings is disputed
+    then, by the copy that it is of, and so are those of the copies inside the tray; but those at its edge have rings
+    that nobody else claims. So disputed claims count less, and a pose of nothing else waits while its frame has others:
+    the tray is cleared from its edge.
     """
-    row, score, count, claims, _, (rows, rings, markers) = rivals
-    kind = segment_sum(_scrambled(claims.ring * markers + claims.marker), claims.pose, len(row))
+    row, score, count, _, claims, _, (rows, rings, markers) = rivals
+    open_ones = _different_ones(rivals)
+    claims = claims.where(open_ones[claims.pose])
+    claim, by = _disputes(claims, len(row))
     copies = torch.zeros_like(open_ones)
     while bool(open_ones.any()):
-        some = claims.where(open_ones[claims.pose])
-        disputed = segment_sum(_disputed(some, count, kind, rings).long(), some.pose, len(row))
-        place = rank(row, torch.where(open_ones, score - disputed / (2 * markers), -torch.inf), rows)
+        disputed = torch.bincount(claims.pose[marked(claim[open_ones[by]], len(claims.pose))], minlength=len(row))
+        clear = open_ones & (disputed < count)
+        ready = clear | (open_ones & ~marked(row[clear], rows)[row])
+        place = rank(row, torch.where(ready, score - disputed / (2 * markers), -torch.inf), rows)
+        some = claims.where(ready[claims.pose])
         best = torch.full((rings,), len(row), device=row.device).scatter_reduce_(0, some.ring, place[some.pose], "amin")
-        backed = open_ones & ~marked(some.pose[place[some.pose] > best[some.ring]], len(row))
-        clear = backed & (disputed < count)
-        copies |= backed & (clear | ~marked(row[clear], rows)[row])
+        copies |= ready & ~marked(some.pose[place[some.pose] > best[some.ring]], len(row))
         open_ones = open_ones & ~rivals.excluded(copies)
     return copies
 
 
-def _disputed(claims: Claims, count: Tensor, kind: Tensor, rings: int) -> Tensor:
-    """Claims (E,) bool to rings that a pose of other rings claims with as many of them or more."""
-    weight, of = count[claims.pose], kind[claims.pose]
-    most = torch.zeros(rings, dtype=weight.dtype, device=weight.device).scatter_reduce_(0, claims.ring, weight, "amax")
-    first = weight == most[claims.ring]
-    low, high = (
-        torch.zeros(rings, dtype=of.dtype, device=of.device).scatter_reduce_(
-            0, claims.ring[first], of[first], way, include_self=False
-        )
-        for way in ("amin", "amax")
-    )
-    return ~first | (low != high)[claims.ring]
+def _different_ones(rivals: Rivals) -> Tensor:
+    """The poses (H,) bool that may be copies, of those that claim the same rings the best."""
+    able = (rivals.count >= MIN_MARKERS).nonzero()[:, 0]
+    claims = rivals.claims
+    kind = segment_sum(_scrambled(claims.ring * rivals.size[2] + claims.marker), claims.pose, len(rivals.row))
+    which, group = kind[able].unique(return_inverse=True)
+    place = rivals.place[able]
+    best = torch.full_like(which, len(rivals.row)).scatter_reduce_(0, group, place, "amin")
+    return marked(able[place == best[group]], len(rivals.row))
+
+
+def _disputes(claims: Claims, poses: int) -> tuple[Tensor, Tensor]:
+    """Which claims (D,) are disputed by which poses (D,): those that share the one ring alone.
+
+    Two rings fix a pose: who shares more than one is the same copy, give or take a ring.
+    """
+    ring, order = claims.ring.sort()
+    one, two = (order[index] for index in pairs_in_group(ring, ring))
+    _, pair, shared = (claims.pose[one] * poses + claims.pose[two]).unique(return_inverse=True, return_counts=True)
+    single = (shared[pair] == 1).nonzero()[:, 0]
+    return one[single], claims.pose[two[single]]
 
 
 def _scrambled(number: Tensor) -> Tensor:

@@ -68,12 +68,11 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int, inst
     if len(one) == 0:
         return _nothing(rows, table.ids.shape[1], proposal)
     tried, rivals = _tried(one, table, camera.matrix, (rows, len(rings) * len(table), table.ids.shape[1]))
-    row, score, claims = rivals.row, rivals.score, rivals.claims
+    row, place, claims = rivals.row, rivals.place, rivals.claims
     copies = share_out(rivals)
     found = torch.bincount(row[copies], minlength=rows)
 
     # of each row the best copies, or the best pose where there is none, or no pose
-    place = rank(row, score, rows)
     best = torch.full((rows,), len(row), device=device).scatter_reduce_(0, row, place, "amin")
     kept = (copies | ((found == 0)[row] & (place == best[row]))).nonzero()[:, 0]
     kept = kept[torch.argsort(row[kept] * len(row) + place[kept])]
@@ -132,7 +131,8 @@ def _weighed(tried: Hypotheses, one: Assignments, size: tuple[int, int, int]) ->
     found = per_marker.isfinite()
     count = found.sum(-1)
     score = count - torch.where(found, per_marker, 0.0).sum(-1) / (2 * markers)
-    return Rivals(one.row[tried.origin], score, count, every.where(chosen), every, size)
+    row = one.row[tried.origin]
+    return Rivals(row, score, count, rank(row, score, size[0]), every.where(chosen), every, size)
 
 
 def _empty(group: Tensor, markers: int, copies: Tensor, proposal: Tensor) -> Identified:

@@ -34,7 +34,7 @@ class Nearby(NamedTuple):
         return cls(order, key, corner, size, strips)
 
     def within(self, group: Tensor, center: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
-        """Points in square boxes: box (E,) and point (E,), flat.
+        """Points in square boxes, and above and below to the end of the strip: box (E,) and point (E,), flat.
 
         Args:
             group: (Q,) int64, of each box; only its points count.
