@@ -121,7 +121,7 @@ def _cover(rng: np.random.Generator, target: tp.Target) -> Shapes:
 
 
 def judged(poses: tp.Poses, made: Tray, camera: tp.Camera, target: tp.Target) -> dict[str, int]:
-    """Copies found, with their own rings and a right pose; the others by what is wrong; rows of no copy."""
+    """Copies with their own rings and a right pose, and the others by what is the matter with them."""
     found = poses[poses.ok | (poses.status == tp.Status.AMBIGUOUS)]
     centers = camera.project((made.R[:, None] @ target.centers[..., None]).squeeze(-1) + made.t[:, None])  # (K, M, 2)
     seen = poses.detections
@@ -132,13 +132,17 @@ def judged(poses: tp.Poses, made: Tray, camera: tp.Camera, target: tp.Target) ->
     # a row and its detections share the number of the copy
     of_row = seen.instance[:, None] == found.instance
     mixed = ((owner[:, None] != nearest) & of_row).any(0)
-    off = (errors.nees > NEES_LIMIT) & ~mixed
-    good = (~mixed & ~off & found.ok).nonzero()[:, 0]
-    right = torch.bincount(nearest[good], minlength=len(made.t))
+    off = found.ok & (errors.nees > NEES_LIMIT) & ~mixed
+
+    def copies(rows: Tensor) -> Tensor:
+        return torch.bincount(nearest[rows], minlength=len(made.t))
+
+    right, twofold, every = copies(found.ok & ~mixed & ~off), copies(~found.ok & ~mixed), copies(~mixed)
     return {
-        "found": int((right > 0).sum()),
-        "lost": int((right == 0).sum()),
-        "twice": int((right > 1).sum()),
+        "ok": int((right > 0).sum()),
+        "ambiguous": int((twofold > 0).sum()),
+        "lost": int((every == 0).sum()),
+        "twice": int((every > 1).sum()),
         "mixed": int(mixed.sum()),
         "wrong": int(off.sum()),
     }
@@ -163,8 +167,10 @@ def main() -> int:
         return result
 
     pipeline.identify = timed
-    print("| copies | kind | frames | copies in all | found | lost | twice | mixed | wrong | ms identify | ms all |")
-    print("| --- " * 11 + "|")
+    print(
+        "| copies | kind | frames | copies in all | ok | ambiguous | lost | twice | mixed | wrong | ms identify | ms all |"
+    )
+    print("| --- " * 12 + "|")
     for copies in arguments.copies:
         estimator = tp.PoseEstimator(camera, target, instances=copies + 2, method=arguments.method)
         for kind in KINDS:
@@ -177,14 +183,15 @@ def main() -> int:
                 poses = estimator(made.frame[None])
                 whole.append(1e3 * (time.process_time() - started))
                 result = judged(poses, made, camera, target)
-                if result["found"] < copies or result["twice"] + result["mixed"] + result["wrong"]:
-                    states = [tp.Status(s).name.lower() for s in poses.status.tolist()]
-                    odd = [s for s in states if s != "ok"]
-                    print(f"<!-- {copies} {kind} {number}: {result}, seen {int(poses.copies[0])}, {odd} -->", flush=True)
+                if result["ok"] < copies or result["twice"] + result["mixed"] + result["wrong"]:
+                    print(f"<!-- {copies} {kind} {number}: {result}, seen {int(poses.copies[0])} -->", flush=True)
                 total = {name: total.get(name, 0) + count for name, count in result.items()}
             counts = " | ".join(str(count) for count in total.values())
             times = f"{median(spent):.1f} | {median(whole):.0f}"
-            print(f"| {copies} | {kind} | {arguments.frames} | {arguments.frames * copies} | {counts} | {times} |", flush=True)
+            print(
+                f"| {copies} | {kind} | {arguments.frames} | {arguments.frames * copies} | {counts} | {times} |",
+                flush=True,
+            )
     return 0
 
 

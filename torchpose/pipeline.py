@@ -82,13 +82,13 @@ class PoseEstimator(nn.Module):
         self.camera = camera
         self.targets = (target,) if isinstance(target, Target) else tuple(target)
         _check_targets(self.targets)
-        if isinstance(instances, bool) or instances != int(instances) or instances < 1:
+        if instances < 1:
             raise ConfigError(f"instances: {instances} given; give the most copies of a target in a frame, 1 or more")
         if not float_range > 0:
             raise ConfigError(f"float_range: {float_range} is not positive; use 1.0 or 255.0")
         if method not in get_args(Method):
             raise ConfigError(f"method: {method!r} is not known; choose one of {', '.join(get_args(Method))}")
-        self.instances = int(instances)
+        self.instances = instances
         self.method = method
         self.float_range = float_range
         self.srgb = srgb
