@@ -29,6 +29,7 @@ from torchpose.pose import (
     Evidence,
     Found,
     Solutions,
+    best_copies,
     crossed_out,
     gather_evidence,
     intrinsics_covariance,
@@ -156,9 +157,9 @@ class PoseEstimator(nn.Module):
         candidates = find_candidates(frames)
         candidates = candidates[torch.isin(candidates.polarity, scene.table.polarity)]
         rings = measure_rings(frames, candidates, scene.camera, correct=self._recipe.correct)
-        identified = identify(rings, scene.table, scene.camera, len(frames), self.instances)
+        identified = identify(rings, scene.table, scene.camera, len(frames))
         scene = scene.of_rows(identified.group)
-        found = self._solved(scene, rings, identified)
+        scene, found = best_copies(scene, self._solved(scene, rings, identified), self.instances)
         again = self._second_look(scene, found)
         if len(again[0]) > len(rings):
             found = self._solved(scene, *again)

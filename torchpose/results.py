@@ -80,8 +80,8 @@ class Poses(Rows):
         target: index of the target.
         instance: number of the copy among those of the target in the frame, 0, 1, ... from left to right in the image,
             by the target's origin.
-        copies: of the target that the rings of the frame show, each by three markers or more; the same in all rows of
-            a frame and target. More than there are rows: the others were left out.
+        copies: of the target that the frame shows, each by a pose or by four markers in their places; the same in all
+            rows of a frame and target. More than there are rows: the others were left out, or no pose explains them.
         R, t: target to camera: X_cam = R X_target + t, mm.
         covariance: translation (mm) first, then rotation (rad, left-multiplied: R = exp(w) R_est, that is about the
             camera axes).

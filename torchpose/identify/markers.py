@@ -52,7 +52,7 @@ class Identified(Rows):
         return _different(group[free], marker[free], (count, self.ring.shape[1]))[self.group]
 
 
-def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int, instances: int = 1) -> Identified:
+def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int, instances: int | None = None) -> Identified:
     """Assigns rings to the markers of every target in every frame; two rings at least, three for further copies.
 
     Args:
@@ -60,7 +60,7 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int, inst
         table: the targets.
         camera: for its matrix.
         frames: number of frames.
-        instances: most copies of a target in a frame; the best-supported ones are given.
+        instances: most copies of a target in a frame, the best-supported ones; None for all.
     """
     rows, device = frames * len(table), rings.frame.device
     one = propose(rings, table, camera.matrix)
@@ -76,8 +76,9 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int, inst
     best = torch.full((rows,), len(row), device=device).scatter_reduce_(0, row, place, "amin")
     kept = (copies | ((found == 0)[row] & (place == best[row]))).nonzero()[:, 0]
     kept = kept[torch.argsort(row[kept] * len(row) + place[kept])]
-    number = torch.arange(len(kept), device=device) - torch.searchsorted(row[kept], row[kept])
-    kept = kept[number < instances]
+    if instances is not None:
+        number = torch.arange(len(kept), device=device) - torch.searchsorted(row[kept], row[kept])
+        kept = kept[number < instances]
     group, at = row[kept], torch.arange(len(kept), device=device)
     without = (~marked(group, rows)).nonzero()[:, 0]
     if without.numel():

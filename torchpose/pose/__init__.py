@@ -1,6 +1,7 @@
 """Stage: one pose a target and frame from its identified markers, with covariance and status."""
 
 from torchpose.pose.centers import common_center, compensate, raw_centers
+from torchpose.pose.copies import best_copies
 from torchpose.pose.covariance import intrinsics_covariance, pose_covariance
 from torchpose.pose.doubt import crossed_out
 from torchpose.pose.evidence import Evidence, center_rms, gather_evidence, shape_chi2
@@ -13,6 +14,7 @@ __all__ = [
     "Evidence",
     "Found",
     "Solutions",
+    "best_copies",
     "center_rms",
     "common_center",
     "compensate",
