@@ -387,3 +387,41 @@ def test_places_that_cannot_be_written_are_refused_at_once(tmp_path: Path, place
         ResultStore(tmp_path / place, None, schema=POSE_SCHEMA, targets=1, origin=ORIGIN, resume=False)
     assert "\n" not in str(caught.value)
     assert {p.name for p in tmp_path.iterdir()} == {"folder.csv", "file"}
+
+
+def test_a_journal_from_before_there_were_instances_is_resumed(tmp_path: Path, whole: tuple[bytes, bytes]) -> None:
+    """Its rows are those of the only copy; how many there were is not known."""
+    first = store(tmp_path)
+    first.append([record(name) for name in NAMES[:3]])
+    first.close()
+    journal = tmp_path / "p.csv.partial"
+    lines = [json.loads(line) for line in journal.read_text().splitlines()]
+    for line in lines[1:]:
+        for row in [*line["rows"], *line["detections"]]:
+            row.pop("instance")
+            row.pop("copies", None)
+    journal.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert complete(tmp_path, resume=True, origin=ORIGIN | {"--instances": 1}) == NAMES[:3]
+    rows = read_table(tmp_path / "p.csv")
+    assert [(row["instance"], row["copies"]) for row in rows] == [("0", None)] * 3 + [("0", "0")] * 2
+
+
+def test_copies_without_a_row_are_counted(tmp_path: Path) -> None:
+    """Frames that show more copies than they have rows, of every target the most."""
+    of = store(tmp_path)
+
+    def rows(frame: str, copies: int, count: int) -> dict[str, Any]:
+        row = fault_row(frame, "quad", Status.OK, None) | {"copies": copies}
+        return {"frame": frame, "rows": [row | {"instance": i} for i in range(count)], "detections": []}
+
+    of.append([rows("a", 3, 3), rows("b", 4, 2), rows("c", 6, 1)])
+    of.close()
+    again = store(tmp_path, resume=True)
+    for one in (of, again):
+        assert one.crowded == {"b", "c"}
+        assert one.most == {"quad": 6}
+    again.finish(["a", "b", "c"])
+    done = store(tmp_path, resume=True)
+    assert len(done) == 3
+    assert done.crowded == {"b", "c"}
+    done.close()
