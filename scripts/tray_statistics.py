@@ -9,8 +9,8 @@ noise 1 to 3, of three kinds in turn:
 - phantoms: 80 mm apart and turned alike, so that rings of four neighbours have the very layout of one copy;
 - scattered: loose plates, each turned and tilted (to 20 degrees) its own way.
 
-In every second frame a quarter of the copies is partly covered: one ring wholly and a quarter of the next. The CPU is that
-of the identification alone, one thread, median, and beside it that of the whole estimate.
+In every second frame a quarter of the copies is partly covered: one ring wholly and a quarter of the next. The CPU is
+that of the identification alone, one thread, median, and beside it that of the whole estimate.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import math
 import time
 from dataclasses import dataclass
 from statistics import median
+from unittest import mock
 
 import cv2
 import numpy as np
@@ -30,7 +31,7 @@ import torchpose as tp
 from torchpose import pipeline
 from torchpose.analysis import pose_errors
 from torchpose.geometry import rotations
-from torchpose.identify import Identified
+from torchpose.identify import Identified, identify
 from torchpose.io.truth import Truth
 from torchpose.sim import Shapes, add_noise, shapes
 from torchpose.sim.trays import moved, render_tray
@@ -74,8 +75,8 @@ def tray(number: int, seed: int, copies: int, kind: str, camera: tp.Camera, targ
         turn[:, 2] = rng.uniform(0, 2 * math.pi, copies)
         tilt, way = np.radians(rng.uniform(0, 20, copies)), rng.uniform(0, 2 * math.pi, copies)
         lean[:, 0], lean[:, 1] = tilt * np.cos(way), tilt * np.sin(way)
-    tilt, way, roll = math.radians(rng.uniform(0, 30)), rng.uniform(0, 2 * math.pi), rng.uniform(-0.1, 0.1)
-    base = rotations.exp(torch.tensor([tilt * math.cos(way), tilt * math.sin(way), 0], dtype=F64))
+    slope, side, roll = math.radians(rng.uniform(0, 30)), rng.uniform(0, 2 * math.pi), rng.uniform(-0.1, 0.1)
+    base = rotations.exp(torch.tensor([slope * math.cos(side), slope * math.sin(side), 0], dtype=F64))
     base = base @ rotations.exp(torch.tensor([0, 0, roll], dtype=F64))
     R = base @ rotations.exp(torch.from_numpy(lean)) @ rotations.exp(torch.from_numpy(turn))
     wide, high = columns * pitch + 20, rows * pitch + 20
@@ -158,18 +159,16 @@ def main() -> int:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     camera, target, spent = lens(), tp.Target.load("quad40"), list[float]()
-    exact = pipeline.identify
 
     def timed(*words: object, **more: object) -> Identified:
         started = time.process_time()
-        result: Identified = exact(*words, **more)  # type: ignore[arg-type]  # handed on as they come
+        result = identify(*words, **more)  # type: ignore[arg-type]  # handed on as they come
         spent.append(1e3 * (time.process_time() - started))
         return result
 
-    pipeline.identify = timed
-    print(
-        "| copies | kind | frames | copies in all | ok | ambiguous | lost | twice | mixed | wrong | ms identify | ms all |"
-    )
+    mock.patch.object(pipeline, "identify", timed).start()
+    names = ("copies", "kind", "frames", "in all", "ok", "ambiguous", "lost", "twice", "mixed", "wrong")
+    print("| " + " | ".join((*names, "ms identify", "ms all")) + " |")
     print("| --- " * 12 + "|")
     for copies in arguments.copies:
         estimator = tp.PoseEstimator(camera, target, instances=copies + 2, method=arguments.method)

@@ -1,4 +1,4 @@
-"""``torchpose estimate --instances`` as a user types it, from frames to tables, pictures, a resumed run and evaluate."""
+"""``torchpose estimate --instances`` as a user types it: tables, pictures, a resumed run, evaluate."""
 
 from __future__ import annotations
 
@@ -75,8 +75,10 @@ def test_a_row_for_every_copy_from_left_to_right(run: Callable[..., Any]) -> Non
     assert run("--instances", "5", "--detections", "det.csv", "--overlay", "seen") == (0, "")
     rows = table()
     assert [(row["frame"], row["instance"], row["copies"]) for row in rows] == [
-        ("0.png", "0", "3"), ("0.png", "1", "3"), ("0.png", "2", "3"), ("1.png", "0", "1"), ("2.png", "0", "2"), ("2.png", "1", "2"),
-    ]  # fmt: skip
+        *(("0.png", number, "3") for number in "012"),
+        ("1.png", "0", "1"),
+        *(("2.png", number, "2") for number in "01"),
+    ]
     assert {row["status"] for row in rows} == {"ok"}
     for row, copy in zip(rows, (1, 2, 0, 0, 1, 0), strict=True):
         np.testing.assert_allclose([float(row[c]) for c in ("tx", "ty", "tz")], PLACE[copy], atol=0.1)
@@ -190,7 +192,7 @@ def test_a_table_without_the_column_is_read(run: Callable[..., Any], capfd: pyte
 def test_pictures_number_the_copies(run: Callable[..., Any], trays: list[np.ndarray]) -> None:
     """The axes of every copy are drawn, and one plate says how many there are."""
     assert run("--instances", "3", "--overlay", "seen") == (0, "")
-    drawn = cv2.imread("seen/0.png").astype(int)
+    drawn = np.asarray(cv2.imread("seen/0.png"), dtype=int)
     coloured = (drawn.max(-1) - drawn.min(-1)) > 60
     at = CAMERA.project(PLACE).round().long().tolist()
     for u, v in at:

@@ -66,8 +66,8 @@ def estimate(
 ) -> int:
     """Measure the pose of ring targets in every frame, with its uncertainty.
 
-    One row a frame and target, or one for each copy of it with --instances: status, translation in mm, rotation vector in rad (target to camera), their standard
-    deviations, reprojection RMS in px, number of markers.
+    One row a frame and target, or with --instances one a copy: status, translation in mm, rotation vector in rad
+    (target to camera), their standard deviations, reprojection RMS in px, number of markers.
     """
     from torchpose.camera import Camera
     from torchpose.cli.terminal import native_stderr_silenced

@@ -37,7 +37,7 @@ class Rivals(NamedTuple):
     Attributes:
         row: (H,) frame and target of each.
         score: (H,) number of markers it explains, less a fraction for what they miss by.
-        count: (H,) number of markers it explains.
+        explained: (H,) number of markers of that.
         place: (H,) `rank` of the score.
         claims: the rings that the poses explain.
         near: the rings near enough to a predicted place to be that marker of the same copy.
@@ -46,7 +46,7 @@ class Rivals(NamedTuple):
 
     row: Tensor
     score: Tensor
-    count: Tensor
+    explained: Tensor
     place: Tensor
     claims: Claims
     near: Claims
@@ -93,7 +93,7 @@ def share_out(rivals: Rivals) -> Tensor:
 
 def _different_ones(rivals: Rivals) -> Tensor:
     """The poses (H,) bool that may be copies, of those that claim the same rings the best."""
-    able = (rivals.count >= MIN_MARKERS).nonzero()[:, 0]
+    able = (rivals.explained >= MIN_MARKERS).nonzero()[:, 0]
     claims = rivals.claims
     kind = segment_sum(_scrambled(claims.ring * rivals.size[2] + claims.marker), claims.pose, len(rivals.row))
     which, group = kind[able].unique(return_inverse=True)

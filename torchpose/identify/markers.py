@@ -15,11 +15,13 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.geometry.rows import Rows, shared
 from torchpose.geometry.segments import marked
-from torchpose.identify.assignments import Assignments, propose
+from torchpose.identify.assignments import Assignments, propose, ratio_tolerance
 from torchpose.identify.copies import MIN_MARKERS, Claims, Rivals, rank, share_out
 from torchpose.identify.hypotheses import Hypotheses, hypotheses
 from torchpose.identify.scene import MarkerTable
 from torchpose.rings import Rings
+
+__all__ = ["Identified", "identify", "ratio_tolerance"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +104,7 @@ def _tried(
     """Poses of targets seen from their printed side; from behind too where these explain too few rings."""
     tried = hypotheses(one, table, matrix, 1.0)
     rivals = _weighed(tried, one, size)
-    lacking = ~marked(rivals.row[rivals.count >= MIN_MARKERS], size[0])[one.row]
+    lacking = ~marked(rivals.row[rivals.explained >= MIN_MARKERS], size[0])[one.row]
     if not bool(lacking.any()):
         return tried, rivals
     read = _different(one.row, one.marker, (size[0], size[2]))

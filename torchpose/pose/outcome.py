@@ -92,7 +92,7 @@ def _instances(scene: Scene, awarded: Tensor, t: Tensor) -> tuple[Tensor, Tensor
 
 
 def _detections(scene: Scene, found: Found, mask: Tensor) -> Detections:
-    """The markers of the rows that the mask (N, M) has; each copy has the number of its row, or 0 where there is one."""
+    """The markers of the rows that the mask (N, M) has; their instance is the row, or 0 where each has one."""
     row, marker = mask.nonzero().unbind(-1)
     ring, target = found.rings[found.identified.ring[row, marker]], scene.target[row]
     evidence = found.evidence
