@@ -31,7 +31,7 @@ POSE_SCHEMA: Schema = {
     "solutions": list,
 }
 """Columns of a row: t in mm, rotation vector r in rad, standard deviations s* of t and of the rotation about the camera
-axes; instance counts the copies of a target in its frame from the left, copies says how many of them the frame shows;
+axes; instance counts the copies of a target in its frame from the left, copies says how many of them the frame shows, if any;
 covariance 6x6 (t, then rotation), quaternion w, x, y, z, and the one or two solutions, the row's own first."""
 
 BASE_SCHEMA: Schema = {
@@ -74,7 +74,7 @@ def pose_rows(poses: Poses, frames: Sequence[str], targets: Sequence[str]) -> li
         markers=poses.markers.tolist(),
         reason=[Reason(reason).name.lower() if reason else None for reason in poses.reason.tolist()],
         instance=poses.instance.tolist(),
-        copies=poses.copies.tolist(),
+        copies=[count or None for count in poses.copies.tolist()],
         quaternion=[pose and pose["quaternion"] for pose in own],
         solutions=[a and [a, *([b] if b else [])] for a, b in zip(own, other, strict=True)],
     )
@@ -90,7 +90,7 @@ def fault_row(frame: str, target: str, status: Status, reason: str | None) -> Ro
     """The row of a target in a frame that could not be read or used."""
     row: Row = dict.fromkeys(POSE_SCHEMA)
     known = {"frame": frame, "target": target, "status": status.name.lower(), "markers": 0, "reason": reason}
-    return row | known | dict.fromkeys(("instance", "copies"), 0)
+    return row | known | {"instance": 0}
 
 
 def detection_rows(detections: Detections, frames: Sequence[str], targets: Sequence[str]) -> list[Row]:
