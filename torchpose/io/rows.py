@@ -31,7 +31,7 @@ POSE_SCHEMA: Schema = {
     "solutions": list,
 }
 """Columns of a row: t in mm, rotation vector r in rad, standard deviations s* of t and of the rotation about the camera
-axes; instance counts the copies of a target in its frame from the left, copies says how many of them the frame shows, if any;
+axes; instance counts the copies of a target in its frame from the left, copies says how many it shows, if any;
 covariance 6x6 (t, then rotation), quaternion w, x, y, z, and the one or two solutions, the row's own first."""
 
 BASE_SCHEMA: Schema = {
