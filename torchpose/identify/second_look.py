@@ -13,7 +13,8 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.detect import Candidates, Verdict
 from torchpose.geometry import conics
-from torchpose.identify.markers import Identified, ratio_tolerance
+from torchpose.identify.assignments import ratio_tolerance
+from torchpose.identify.markers import Identified
 from torchpose.identify.scene import MarkerTable, Scene
 from torchpose.rings import Rings, mapped, measure_predicted
 
