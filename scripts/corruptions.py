@@ -39,6 +39,8 @@ PHOTOGRAPHS = (
 # distances in mm, and the lateral room in mm, at which the whole plate is in view
 DISTANCES = {"sample": (145.0, 185.0, 25.0, 12.0), "small": (300.0, 480.0, 80.0, 45.0)}
 
+SCENE = {"dark": DARK, "light": LIGHT, "plate": (PLATE_MM, PLATE_MM)}  # options of `render`
+
 Background = Literal["none", "photo"]
 Way = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Transfer function (H, W) complex or real at frequencies u (W,) and v (H, 1), cycles a px."""
@@ -66,7 +68,8 @@ class Shot:
     """One frame on its way from the scene to the file.
 
     Attributes:
-        camera, target, R, t: the view, with R (3, 3) and t (3,) float64.
+        camera, target, R, t: the view, with R (3, 3) and t (3,) float64; shapes in place of a target where no
+            corruption asks for its rings.
         rng: chance of this frame.
         imaging: options of `torchpose.sim.render`.
         sensor: options of `torchpose.sim.add_noise`.
@@ -76,7 +79,7 @@ class Shot:
     """
 
     camera: tp.Camera
-    target: tp.Target
+    target: Any
     R: Tensor
     t: Tensor
     rng: np.random.Generator
@@ -135,13 +138,17 @@ def view(number: int, seed: int, camera: tp.Camera, kind: str, background: Backg
     """The view of a frame: tilt to 40 degrees, any roll, the plate before grey or before a photograph."""
     rng = np.random.default_rng([seed, number])
     near, far, across, down = DISTANCES[kind]
-    lean, azimuth, roll = math.radians(rng.uniform(0, 40)), *rng.uniform(0, 2 * math.pi, 2)
+    turn = tilted(math.radians(rng.uniform(0, 40)), *rng.uniform(0, 2 * math.pi, 2))
+    place = torch.tensor([rng.uniform(-across, across), rng.uniform(-down, down), rng.uniform(near, far)], dtype=F64)
+    around = photograph(number, camera) if background == "photo" else even(camera)
+    return Shot(camera, tp.Target.load("quad40"), turn, place, rng, SCENE | {"surround": around})
+
+
+def tilted(lean: float, azimuth: float, roll: float) -> Tensor:
+    """Rotation (3, 3) of a plate rolled about its normal, then tilted about an axis of that azimuth; rad."""
     twist = torch.tensor([[lean * math.cos(azimuth), lean * math.sin(azimuth), 0.0], [0.0, 0.0, roll]], dtype=F64)
     turn = rotations.exp(twist)
-    place = torch.tensor([rng.uniform(-across, across), rng.uniform(-down, down), rng.uniform(near, far)], dtype=F64)
-    imaging = {"dark": DARK, "light": LIGHT, "plate": (PLATE_MM, PLATE_MM)}
-    around = photograph(number, camera) if background == "photo" else even(camera)
-    return Shot(camera, tp.Target.load("quad40"), turn[0] @ turn[1], place, rng, imaging | {"surround": around})
+    return turn[0] @ turn[1]
 
 
 def shoot(shot: Shot, corruption: Corruption, value: Any, seed: int) -> tuple[Shot, Tensor]:
