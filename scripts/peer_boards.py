@@ -189,7 +189,7 @@ def _aruco(camera: tp.Camera, tag_mm: float, refinement: int) -> Peer:
 
     def measure(frame: np.ndarray) -> list[Pose]:
         corners, numbers, _ = detector.detectMarkers(frame)
-        every: list[int] = [] if numbers is None else np.asarray(numbers).ravel().tolist()
+        every = [] if numbers is None else [int(n) for n in np.ravel(numbers)]
         found = [(n, np.asarray(c).reshape(4, 2)) for n, c in zip(every, corners, strict=True) if n < 4]
         if not found:
             return []
