@@ -37,7 +37,7 @@ import cv2
 import numpy as np
 import torch
 from corruptions import BLURS, CORRUPTIONS, F64, LIGHT, PLATE_MM, SCENE, Shot, even, photograph, shoot, tilted
-from peer_boards import DARK, TAG_MM, Contender, Pose, apriltag_detector, contenders, prints
+from peer_boards import DARK, NO_APRILTAG, TAG_MM, Contender, Pose, apriltag_detector, contenders, has_apriltag, prints
 
 import torchpose as tp
 from torchpose.geometry import rotations
@@ -49,6 +49,7 @@ TILT_DEG, DISTANCE_MM = 45.0, (140.0, 190.0)
 LATERAL_MM = (10.0, 5.0)  # the whole plate stays in view at any tilt
 # what the ratios may be: torchpose over AprilTag 3, and over ArUco's detector, whichever allows more
 OVER_APRILTAG, OVER_ARUCO = 0.5, 6.0
+NO_TARGET, TRAY_NAME = "photographs, no target", "tray of 48 plates"
 TRAY, TRAY_PITCH_MM, TRAY_DISTANCE_MM = (8, 6), 100.0, 555.0  # plates of 140 px, rings of 10 px radius
 
 
@@ -230,8 +231,13 @@ def tray(camera: tp.Camera) -> tuple[Shot, np.ndarray]:
     return shot, frame.numpy()
 
 
-def cases(camera: tp.Camera, count: int, seed: int) -> Iterable[tuple[str, list[np.ndarray]]]:
-    """Frames of the plate with rings, by name."""
+def cases(camera: tp.Camera, count: int, seed: int, only: list[str]) -> Iterable[tuple[str, list[np.ndarray]]]:
+    """Frames of the plate with rings, by name; ``only`` those with one of these words, all without any."""
+
+    def asked(name: str) -> bool:
+        return not only or any(word in name for word in only)
+
+    target = tp.Target.load("quad40")
     wanted = [
         ("clean", Point("", "")),
         ("before photographs", Point("", "", photo=True)),
@@ -240,11 +246,14 @@ def cases(camera: tp.Camera, count: int, seed: int) -> Iterable[tuple[str, list[
         *[(f"{name} {value}", Point("", "", name, value)) for name, c in BLURS.items() for value in c.values],
     ]
     for name, point in wanted:
-        made = [view(camera, tp.Target.load("quad40"), point, number, seed) for number in range(count)]
-        yield name, [shoot(s, CORRUPTIONS[point.corruption], point.severity, i)[1].numpy() for i, s in enumerate(made)]
-        if point.photo:
-            yield "photographs, no target", [photograph(number, camera).astype(np.uint8) for number in range(count)]
-    yield "tray of 48 plates", [tray(camera)[1]]
+        if asked(name):
+            made = [view(camera, target, point, number, seed) for number in range(count)]
+            shots = [shoot(shot, CORRUPTIONS[point.corruption], point.severity, i) for i, shot in enumerate(made)]
+            yield name, [frame.numpy() for _, frame in shots]
+    if asked(NO_TARGET):
+        yield NO_TARGET, [photograph(number, camera).astype(np.uint8) for number in range(count)]
+    if asked(TRAY_NAME):
+        yield TRAY_NAME, [tray(camera)[1]]
 
 
 def large(seed: int) -> tuple[tp.Camera, np.ndarray]:
@@ -262,15 +271,16 @@ def ratio(name: str, camera: tp.Camera, frames: list[np.ndarray], rounds: int) -
     aruco = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
     works: dict[str, Callable[[np.ndarray], Any]] = {
         "torchpose": lambda frame: estimator(torch.from_numpy(frame)[None]),
-        "apriltag": apriltag_detector().detect,
         "aruco": aruco.detectMarkers,
     }
+    if has_apriltag():
+        works["apriltag"] = apriltag_detector().detect
     times: dict[str, list[float]] = {}
     for key, work in works.items():
         work(frames[0])  # warms up
         times[key] = [timed(work, frame)[1] for _ in range(rounds) for frame in frames]
-    ms = {key: statistics.median(of) for key, of in times.items()}
-    allowed = max(OVER_APRILTAG * ms["apriltag"], OVER_ARUCO * ms["aruco"])
+    ms = {"apriltag": math.nan} | {key: statistics.median(of) for key, of in times.items()}
+    allowed = np.nanmax([OVER_APRILTAG * ms["apriltag"], OVER_ARUCO * ms["aruco"]]).item()
     return {"case": name, "frames": len(frames), **ms, "allowed": allowed}
 
 
@@ -301,11 +311,12 @@ def peak_memory(camera: tp.Camera, frame: np.ndarray) -> float:
 
 def ratios(camera: tp.Camera, options: argparse.Namespace) -> None:
     """Prints the two ratios for every case, and the memory of a large frame."""
+    if not has_apriltag():
+        print(NO_APRILTAG)
     rows = []
-    for name, frames in cases(camera, options.frames, options.seed):
-        if not options.only or any(word in name for word in options.only):
-            rows.append(ratio(name, camera, frames, options.rounds))
-            print(ratio_table(rows[-1:]).splitlines()[-1], flush=True)
+    for name, frames in cases(camera, options.frames, options.seed, options.only):
+        rows.append(ratio(name, camera, frames, options.rounds))
+        print(ratio_table(rows[-1:]).splitlines()[-1], flush=True)
     if not options.small:
         big, frame = large(options.seed)
         rows.append(ratio("20 MP before a photograph", big, [frame], options.rounds))
@@ -319,12 +330,13 @@ def ratios(camera: tp.Camera, options: argparse.Namespace) -> None:
 def sweeps(camera: tp.Camera, options: argparse.Namespace) -> None:
     """Measures every point, writes tables and figure."""
     who = [c for c in contenders(camera, options.tag_mm) if not options.peer or c.name in options.peer]
-    wanted = [p for p in points(camera) if not options.only or any(word in p.axis for word in options.only)]
-    every = prints(options.tag_mm)
-    measured(camera, who, every, Point("", ""), 1, options.seed)  # warms up
+    every = points(camera)
+    wanted = [p for p in every if not options.only or any(word in f"{p.axis} {p.value}" for word in options.only)]
+    drawn = prints(options.tag_mm)
+    measured(camera, who, drawn, Point("", ""), 1, options.seed)  # warms up
     rows: list[dict[str, Any]] = []
     for point in wanted:
-        rows += measured(camera, who, every, point, options.frames, options.seed)
+        rows += measured(camera, who, drawn, point, options.frames, options.seed)
         print(table(rows[-len(who) :]).split("\n", 2)[2], flush=True)
     options.out.mkdir(parents=True, exist_ok=True)
     short = table([r for r in rows if r["value"] == "even"], leading=())
@@ -334,19 +346,19 @@ def sweeps(camera: tp.Camera, options: argparse.Namespace) -> None:
     print(f"\n{short}")
 
 
-def main() -> int:
+def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=12, help="of every point")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True, help="folder of tables, figure and json")
     parser.add_argument("--figure", type=Path, help="file of the figure, in place of the one in --out")
-    parser.add_argument("--only", nargs="+", metavar="WORD", help="axes, or cases of --ratios, with such a word")
+    parser.add_argument("--only", nargs="+", metavar="WORD", default=[], help="points or cases with such a word")
     parser.add_argument("--peer", nargs="+", metavar="NAME", help="these alone")
     parser.add_argument("--tag-mm", type=float, default=TAG_MM, help="side of the tags, up to 30")
     parser.add_argument("--ratios", action="store_true", help="CPU on equal frames in place of the sweeps")
     parser.add_argument("--rounds", type=int, default=3, help="of --ratios over the frames")
     parser.add_argument("--small", action="store_true", help="--ratios without the 20 MP frame")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     camera = tp.Camera.load(CAMERA)

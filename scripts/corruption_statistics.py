@@ -179,7 +179,7 @@ def printed(values: list[str], markdown: bool) -> str:
     return " ".join(f"{value:{width}s}" for value, width in zip(values, widths, strict=True)).rstrip()
 
 
-def main() -> int:
+def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=12)
     parser.add_argument("--seed", type=int, default=1)
@@ -189,7 +189,7 @@ def main() -> int:
     parser.add_argument("--target", nargs="+", choices=list(DISTANCES), default=["sample"])
     parser.add_argument("--json", type=Path, metavar="OUT", help="file of all rows with their frames")
     parser.add_argument("--markdown", action="store_true", help="a table of Markdown")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     camera, target = tp.Camera.load(CAMERA), tp.Target.load("quad40")

@@ -13,6 +13,7 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import cv2
@@ -29,6 +30,7 @@ TAG_MM, TAG_PITCH_MM = 10.0, 40.0  # as large as the rings and in their places
 CHARUCO_CELL_MM, CHARUCO_SQUARES = 0.45, 7  # a square is 20 cells, its marker 14
 CHESS_MM, CHESS_CORNERS = 7.0, (8, 7)  # inner corners; 9 x 8 squares
 GRID_MM, GRID_SIZE, GRID_DISC_MM = 6.0, (4, 11), 2.25  # asymmetric, 42 x 60 mm, and the radius of a disc
+NO_APRILTAG = "AprilTag 3: not installed (pip install torchpose[peers]); its figures are left out"
 
 Pose = tuple[np.ndarray, np.ndarray]
 Peer = Callable[[np.ndarray], list[Pose]]
@@ -59,8 +61,8 @@ def prints(tag_mm: float = TAG_MM) -> dict[str, tp.Target | Shapes]:
 def contenders(camera: tp.Camera, tag_mm: float = TAG_MM) -> list[Contender]:
     """All that are installed; a line on stdout says what is not."""
     out = [Contender(f"torchpose {m}", "rings", _torchpose(camera, m)) for m in ("photometric", "centers")]
-    if importlib.util.find_spec("pupil_apriltags") is None:
-        print("AprilTag 3: not installed (pip install torchpose[peers]); its rows are left out")
+    if not has_apriltag():
+        print(NO_APRILTAG)
     else:
         out.append(Contender("AprilTag 3", "apriltag", _apriltag(camera, tag_mm)))
     return [
@@ -71,6 +73,10 @@ def contenders(camera: tp.Camera, tag_mm: float = TAG_MM) -> list[Contender]:
         Contender("chessboard SB", "chessboard", _chessboard(camera)),
         Contender("circle grid", "circles", _circles(camera)),
     ]
+
+
+def has_apriltag() -> bool:
+    return importlib.util.find_spec("pupil_apriltags") is not None
 
 
 # prints
@@ -162,10 +168,16 @@ def _torchpose(camera: tp.Camera, method: Method) -> Peer:
     return measure
 
 
+@cache
 def apriltag_detector() -> Any:
+    """One detector for the whole process."""
     from pupil_apriltags import Detector
 
-    return Detector(families="tag36h11", nthreads=1, quad_decimate=1.0)
+    class Kept(Detector):  # type: ignore[misc]  # has no types
+        def __del__(self) -> None:
+            """Nothing: what pupil-apriltags 1.0.4 frees here twice corrupts the heap."""
+
+    return Kept(families="tag36h11", nthreads=1, quad_decimate=1.0)
 
 
 def _apriltag(camera: tp.Camera, tag_mm: float) -> Peer:
