@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -26,24 +27,35 @@ def tilted() -> tuple[Tensor, Tensor]:
     return rotations.exp(torch.tensor([[0.5, -0.3, 0.7]], dtype=F64)), torch.tensor([[2.0, -3.0, 190.0]], dtype=F64)
 
 
-def test_is_the_inverse_fisher_information_of_whole_frames() -> None:
+@pytest.mark.parametrize(
+    ("variance", "smear", "disc"),
+    [
+        ((0.64, 0.0, 0.64), (0.0, 0.0), 0.0),
+        ((1.9, -0.8, 1.3), (0.0, 0.0), 0.0),
+        ((0.7, 0.0, 0.6), (2.5, 1.5), 1.2),
+    ],
+)
+def test_is_the_inverse_fisher_information_of_whole_frames(
+    variance: tuple[float, float, float], smear: tuple[float, float], disc: float
+) -> None:
     cam, target = camera((-0.2, 0.05, 1e-3, -1e-3)), Target.load("quad40")
     R, t = tilted()
-    psf, dark, light, noise = 0.8, 40.0, 200.0, 2.0
+    dark, light, noise = 40.0, 200.0, 2.0
 
+    @torch.no_grad()
     def frame(x: Tensor) -> Tensor:
-        image = render(
-            cam, target, rotations.exp(x[3:6]) @ R, t + x[:3], psf_sigma=psf + x[6], dark=dark, light=light
-        )  # fmt: skip
+        covariance = torch.stack([variance[0] + x[6], variance[1] + x[7], variance[1] + x[7], variance[2] + x[8]])
+        look: dict[str, Any] = {"psf_sigma": covariance.view(2, 2), "smear": smear, "disc": disc, "dark": dark, "light": light}
+        image = render(cam, target, rotations.exp(x[3:6]) @ R, t + x[:3], **look)
         return image[0].double().flatten()
 
     # central differences, fourth order; steps that move edges by some hundredths of a pixel
-    steps = torch.tensor([2e-2, 2e-2, 2e-1, 1e-3, 1e-3, 1e-3, 1e-2], dtype=F64)
+    steps = torch.tensor([2e-2, 2e-2, 2e-1, 1e-3, 1e-3, 1e-3, 2e-2, 2e-2, 2e-2], dtype=F64)
     columns = [
         (8 * (frame(d) - frame(-d)) - (frame(2 * d) - frame(-2 * d))) / (12 * d.sum()) for d in torch.diag(steps)
     ]
     # the pixels nearest to a marker share its two grey levels
-    zero = frame(torch.zeros(7, dtype=F64))
+    zero = frame(torch.zeros(9, dtype=F64))
     centers = cam.project(target.centers @ R[0].T + t)
     v, u = torch.meshgrid(torch.arange(301.0), torch.arange(301.0), indexing="ij")
     grid = torch.stack([u, v], -1).reshape(-1, 1, 2)
@@ -56,7 +68,9 @@ def test_is_the_inverse_fisher_information_of_whole_frames() -> None:
     information = jacobian.T @ jacobian / (noise**2 + 1 / 12)
     expected = torch.linalg.inv(information)[:6, :6]
 
-    found = pose_crlb(cam, target, R, t, psf_sigma=psf, dark=dark, light=light, noise_sigma=noise)[0]
+    s11, s12, s22 = variance
+    look: dict[str, Any] = {"psf_sigma": torch.tensor([[s11, s12], [s12, s22]]), "smear": smear, "disc": disc}
+    found = pose_crlb(cam, target, R, t, **look, dark=dark, light=light, noise_sigma=noise)[0]
     # paper far from the markers tells a little more of the light levels: the reason for 1e-3
     std, expected_std = found.diagonal().sqrt(), expected.diagonal().sqrt()
     torch.testing.assert_close(std, expected_std, rtol=1e-3, atol=0)

@@ -16,7 +16,7 @@ from torchpose.camera.model import Model
 from torchpose.errors import ConfigError, FrameError
 from torchpose.geometry import rotations
 from torchpose.sim import add_noise, render
-from torchpose.sim.boundary import Boxes, fill
+from torchpose.sim.boundary import Boxes, Samples, fill
 from torchpose.target import Target
 
 F64 = torch.float64
@@ -301,15 +301,15 @@ def test_fill_gradcheck() -> None:
     theta = torch.arange(20, dtype=F64) * (2 * math.pi / 20)
     position = (6 + 3 * torch.stack([theta.cos(), theta.sin()], 1)).requires_grad_()
     dv = (3 * theta.cos() * (2 * math.pi / 20)).requires_grad_()
-    sigma = torch.full((20,), 0.9, dtype=F64).requires_grad_()
+    sigma = torch.tensor([0.9, 0.7], dtype=F64).repeat(20, 1).requires_grad_()
     shape = torch.zeros(20, dtype=torch.int64)
     boxes = Boxes(torch.tensor([[1, 0]]), torch.tensor([[11, 12]]))
     assert torch.autograd.gradcheck(
-        lambda p, d, s: fill(p, d, s, shape, boxes).flatten()[::5], (position, dv, sigma)
+        lambda p, d, s: fill(Samples(shape, shape, p, d, s), boxes).flatten()[::5], (position, dv, sigma)
     )  # fmt: skip
-    half = torch.full((20,), 0.7, dtype=F64).requires_grad_()
+    half, step = torch.full((20,), 0.7, dtype=F64).requires_grad_(), dv.detach()
     assert torch.autograd.gradcheck(
-        lambda p, s, w: fill(p, dv.detach(), s, shape, boxes, half_chord=w).flatten()[::5], (position, sigma, half)
+        lambda p, s, w: fill(Samples(shape, shape, p, step, s, w), boxes).flatten()[::5], (position, sigma, half)
     )
 
 

@@ -1,6 +1,6 @@
 """Cramer-Rao bound of the target pose: no unbiased estimator from the grey values has a smaller covariance."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -11,20 +11,26 @@ from torchpose.camera import Camera
 from torchpose.geometry import rotations
 from torchpose.geometry.least_squares import scaled_inverse
 from torchpose.sim import boundary, renderer
+from torchpose.sim.blur import Blur, Pair, blur_of, blurred, start
+from torchpose.sim.boundary import Boxes, Samples
 from torchpose.sim.sensor import GREY_MAX
 from torchpose.sim.shapes import rings
 from torchpose.target import Target
 
 _CHUNK_POSES = 16  # poses differentiated at a time
+_UNKNOWN = 9  # translation, rotation, the blur's S11, S22 and S12
 
 
 @dataclass(frozen=True, eq=False)
 class Conditions:
-    """Of B frames, numbers or (B,): Gaussian blur in px, grey levels of 0..255 and their white noise, bits of the
-    sensor, whose step is 255 / (2^bits - 1) grey levels.
+    """Of B frames, numbers or (B,): blur in px, grey levels of 0..255 and their white noise, bits of the sensor, whose
+    step is 255 / (2^bits - 1) grey levels. ``psf_sigma`` (a covariance too), ``smear`` and ``disc`` as in
+    `torchpose.sim.Imaging`.
     """
 
     psf_sigma: float | Tensor = 0.7
+    smear: Pair | None = None
+    disc: float | Tensor = 0.0
     dark: float | Tensor = 30.0
     light: float | Tensor = 220.0
     noise_sigma: float | Tensor = 1.0
@@ -37,69 +43,80 @@ def pose_crlb(camera: Camera, target: Target, R: Tensor, t: Tensor, **conditions
 
     Inverse Fisher information of the grey values (Kay 1993, section 3.9), of all pixels of every marker's bounding box
     and of a margin as wide as the blur reaches; derivatives by forward-mode differentiation of the renderer. Unknown
-    besides the pose: one blur per frame, a dark and a light level per marker. The camera is exact. Quantisation counts
+    besides the pose: the three numbers of the blur's covariance per frame, a dark and a light level per marker. Of
+    smear and disc only the shape is known: whatever changes the covariance, theirs or the Gaussian's, changes the
+    picture alike to first order. The camera is exact. Quantisation counts
     as noise of step^2 / 12, which holds from a noise of about half a step upwards; clipping is not modelled.
 
     Args:
         R: (B, 3, 3), target to camera.
         t: (B, 3), target to camera, mm.
-        conditions: fields of `Conditions`: ``psf_sigma``, ``dark``, ``light``, ``noise_sigma``, ``bits``.
+        conditions: fields of `Conditions`: ``psf_sigma``, ``smear``, ``disc``, ``dark``, ``light``, ``noise_sigma``,
+            ``bits``.
 
     Returns:
         float64, mm and rad: translation, then rotation w with R_true = exp(w) R. NaN where the markers in view do not
         determine the pose.
 
     Raises:
-        ConfigError: ``psf_sigma`` is not above 0. FrameError: shapes of R and t disagree.
+        ConfigError: ``psf_sigma`` is not above 0 or no covariance, ``disc`` is below 0. FrameError: shapes disagree.
     """
     R, t = renderer.check_poses(R, t)
     given = Conditions(**conditions)
-    sigma = renderer.check_blur(given.psf_sigma, t)
+    blur = blur_of(given.psf_sigma, given.smear, given.disc, t)
     dark, light, noise = (renderer.per_frame(level, t) for level in (given.dark, given.light, given.noise_sigma))
     step = GREY_MAX / (2**given.bits - 1)
-    parts = zip(*(x.split(_CHUNK_POSES) for x in (R, t, sigma, light - dark)), strict=True)
-    information = torch.cat([_fisher(camera, target, *part) for part in parts]) if len(t) else t.new_zeros(0, 7, 7)
+    parts = (slice(first, first + _CHUNK_POSES) for first in range(0, len(t), _CHUNK_POSES))
+    information = torch.cat(
+        [t.new_zeros(0, _UNKNOWN, _UNKNOWN)]
+        + [_fisher(camera, target, R[part], t[part], blur[part], (light - dark)[part]) for part in parts]
+    )
     inverse, known = scaled_inverse(information / (noise.square() + step * step / 12)[:, None, None])
     return torch.where(known[:, None, None], inverse, torch.nan)[:, :6, :6]
 
 
-def _fisher(camera: Camera, target: Target, R: Tensor, t: Tensor, sigma: Tensor, contrast: Tensor) -> Tensor:
-    """Fisher information (B, 7, 7) of translation, rotation and blur at unit noise, grey levels eliminated."""
+def _fisher(camera: Camera, target: Target, R: Tensor, t: Tensor, blur: Blur, contrast: Tensor) -> Tensor:
+    """Fisher information (B, 9, 9) of translation, rotation and blur at unit noise, grey levels eliminated."""
     marks = rings(target).to(t).in_frames(torch.arange(t.shape[0], device=t.device))
-    edges = boundary.sample_boundary(camera, marks, R, t, sigma)
-    # windows of one size, its corner at a whole pixel, for every marker in view
+    edges = boundary.sample_boundary(camera, marks, R, t, blur.finest, (blur.reach + blur.disc)[marks.frame])
     pair, window = edges.shape.unique(return_inverse=True)
     if len(pair) == 0:
-        return t.new_zeros(t.shape[0], 7, 7)
+        return t.new_zeros(t.shape[0], _UNKNOWN, _UNKNOWN)
     frame = marks.frame[pair]
-    pixel = boundary.project(camera, edges, R, t)[0]
-    index = window[:, None].expand_as(pixel)
-    low = torch.zeros_like(pixel[: len(pair)]).scatter_reduce(0, index, pixel, "amin", include_self=False)
-    high = torch.zeros_like(low).scatter_reduce(0, index, pixel, "amax", include_self=False)
-    margin = (0.5 + boundary.REACH * sigma[frame, None]).ceil()
-    low, high = low.floor() - margin, high.ceil() + margin
-    size = (high - low).amax(0).long() + 1
-    width, height = size.tolist()
-    boxes = boundary.Boxes(low.long(), size.expand(len(pair), 2))
+    edges = replace(edges, shape=window)
+
+    def sampled(delta: Tensor) -> Samples:
+        """Samples of a pose and a blur that are off by (8,): translation, rotation, S11 and S22."""
+        pixel, dv = boundary.project(camera, edges, rotations.exp(delta[3:6]) @ R, t + delta[:3])
+        varied = replace(blur, sigma=(blur.sigma.square() + delta[6:]).sqrt())
+        return blurred(start(edges, pixel[None], dv[None], varied), varied, blur.disc[frame])
+
+    zero = t.new_zeros(_UNKNOWN - 1)
+    samples = sampled(zero)
+    # windows of one size for every marker in view, of which only its own part counts
+    own = boundary.boxes_around(samples.pixel, samples.shape, (blur.margin + blur.disc)[frame], camera)
+    boxes = Boxes(own.corner, own.size.amax(0).expand(len(pair), 2))
+    width, height = boxes.size[0].tolist()
+
+    def image(rows: Tensor) -> Tensor:
+        return rows.view(len(pair), height, width + 1)[..., :width].flatten(1)
 
     def coverage(delta: Tensor) -> tuple[Tensor, Tensor]:
-        rotation, translation, blur = rotations.exp(delta[3:6]) @ R, t + delta[:3], sigma + delta[6]
-        position, dv = boundary.project(camera, edges, rotation, translation)
-        rows = boundary.fill(position, dv, blur[edges.frame], window, boxes)
-        covered = rows.view(len(pair), height, width + 1)[..., :width]
+        covered = image(boundary.fill(sampled(delta), boxes))
         return covered, covered
 
-    jacobian, c = torch.func.jacfwd(coverage, has_aux=True)(t.new_zeros(7))  # (P, h, w, 7), (P, h, w)
-
-    u = low[:, :1] + torch.arange(width, dtype=t.dtype, device=t.device)
-    v = low[:, 1:] + torch.arange(height, dtype=t.dtype, device=t.device)
-    use_u = (u >= 0) & (u < camera.width) & (u <= high[:, :1])
-    use_v = (v >= 0) & (v < camera.height) & (v <= high[:, 1:])
-    use = (use_v[:, :, None] & use_u[:, None]).flatten(1).to(t)
-    c = c.flatten(1)
-    jacobian = (contrast[frame, None, None] * jacobian.flatten(1, 2)) * use[:, :, None]
+    jacobian, c = torch.func.jacfwd(coverage, has_aux=True)(zero)  # (P, h w, 8), (P, h w)
+    # the derivative by S12, as that of any Gaussian blur
+    mixed = image(boundary.fill(samples, boxes, mixed=True))
+    row, column = (torch.arange(n, device=t.device) for n in (height, width))
+    use = (row[:, None] < own.size[:, 1, None, None]) & (column < own.size[:, 0, None, None])
+    use = use.flatten(1).to(t)
+    jacobian = torch.cat([jacobian, mixed[..., None]], -1) * (contrast[frame, None] * use)[..., None]
     # levels: grey = dark c + light (1 - c) for rings darker than their ground, and the same two columns otherwise
-    levels = torch.stack([c, 1 - c], -1) * use[:, :, None]
+    levels = torch.stack([c, 1 - c], -1) * use[..., None]
     cross = levels.mT @ jacobian
-    fisher = jacobian.mT @ jacobian - cross.mT @ torch.linalg.solve(levels.mT @ levels, cross)
-    return t.new_zeros(t.shape[0], 7, 7).index_add(0, frame, fisher)
+    known, determined = scaled_inverse(levels.mT @ levels)
+    fisher = jacobian.mT @ jacobian - cross.mT @ known @ cross
+    # of a marker that hardly reaches into the frame nothing is known
+    fisher = torch.where(determined[:, None, None], fisher, 0.0)
+    return t.new_zeros(t.shape[0], _UNKNOWN, _UNKNOWN).index_add(0, frame, fisher)

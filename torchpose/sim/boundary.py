@@ -65,6 +65,27 @@ class Boxes(Rows):
 
 
 @dataclass(frozen=True, eq=False)
+class Samples(Rows):
+    """Images of boundary samples and what blurs each of them, px.
+
+    Attributes:
+        frame: pose.
+        shape: window.
+        pixel: position, which may lie outside of the window.
+        dv: v component of the quadrature step.
+        sigma: standard deviations of the Gaussian along rows and columns.
+        half_chord: blur along the rows by a box of twice this width besides, see `on_chords`.
+    """
+
+    frame: Int[Tensor, " N"]
+    shape: Int[Tensor, " N"]
+    pixel: Float[Tensor, "N 2"]
+    dv: Float[Tensor, " N"]
+    sigma: Float[Tensor, "N 2"]
+    half_chord: Float[Tensor, " N"] | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class _Curves(Rows):
     """Images of L boundary curves at A parameters each, with derivatives by the parameter, px."""
 
@@ -87,12 +108,17 @@ class _Curves(Rows):
 
 @torch.no_grad()
 def sample_boundary(
-    camera: Camera, shapes: Shapes, R: Float[Tensor, "B 3 3"], t: Float[Tensor, "B 3"], sigma: Float[Tensor, " B"]
+    camera: Camera,
+    shapes: Shapes,
+    R: Float[Tensor, "B 3 3"],
+    t: Float[Tensor, "B 3"],
+    sigma: Float[Tensor, " B"],
+    reach: Float[Tensor, " S"],
 ) -> Boundary:
     """Boundary samples of the shapes that are in view, at most about one ``sigma`` px apart.
 
     A shape has none where it reaches behind the camera or beyond the radius up to which the distortion model is
-    one-to-one, or where it lies outside of the frame.
+    one-to-one, or where it lies further than ``reach`` px outside of the frame.
     """
     angle = torch.arange(_COARSE_CIRCLE, dtype=t.dtype, device=t.device) * (2 * math.pi / _COARSE_CIRCLE)
     offset, slope = _on_circle(shapes.circles.axes[:, None], angle)
@@ -101,7 +127,7 @@ def sample_boundary(
     first, last = shapes.sides.ends[:, :1], shapes.sides.ends[:, 1:]
     along = (last - first).expand(-1, _COARSE_SIDE, 3)
     straight = _posed(camera, R, t, shapes, shapes.sides.of, (first + fraction * along, along))
-    seen = _in_view(camera, shapes, (round_, straight), sigma)
+    seen = _in_view(camera, shapes, (round_, straight), reach)
 
     # circles: the trapezoidal rule
     trapezoidal = t.new_zeros(1), t.new_ones(1)
@@ -155,38 +181,28 @@ def boxes_around(
     return Boxes(first, (end - first).clamp(min=0))
 
 
-def fill(
-    pixel: Float[Tensor, "N 2"],
-    dv: Float[Tensor, " N"],
-    sigma: Float[Tensor, " N"],
-    shape: Int[Tensor, " N"],
-    boxes: Boxes,
-    *,
-    half_chord: Float[Tensor, " N"] | None = None,
-) -> Float[Tensor, "H W"]:
+def fill(samples: Samples, boxes: Boxes, *, mixed: bool = False) -> Float[Tensor, "H W"]:
     """Blurred regions from their boundary samples: ``sum of - c(p_u - u) k(p_v - v) dv`` at every pixel p.
 
     Args:
-        pixel: samples, which may lie outside of their window.
-        dv: px.
-        sigma: Gaussian blur, px.
-        shape: window of each sample.
-        boxes: the windows.
-        half_chord: px, blur along the rows by a box of twice this width besides, see `on_chords`.
+        samples: of all regions.
+        boxes: their windows.
+        mixed: the second derivative by p_u and p_v instead, per px^2.
 
     Returns:
         (boxes.rows, boxes.stride), of the dtype of the samples; the rows of all windows one below the other, 0 to
         rounding behind their ends.
     """
+    pixel, chord = samples.pixel, samples.half_chord
     if len(pixel) == 0:
         return pixel.new_zeros(boxes.rows, boxes.stride)
-    reach = 1.0 + REACH * float(sigma.detach().max())
-    beside = reach + (0.0 if half_chord is None else float(half_chord.detach().max()))
+    beside, reach = (1.0 + REACH * samples.sigma.detach().amax(0)).tolist()
+    beside += 0.0 if chord is None else float(chord.detach().max())
     rows = torch.arange(-math.floor(reach), math.floor(reach) + 1).to(pixel)
     # the sum along a row ends where the kernel does, which is a pixel further right than left
     columns = torch.arange(-math.floor(beside), math.ceil(beside) + 1).to(pixel)
-    corner, size, stride = boxes.corner[shape], boxes.size[shape], boxes.stride
-    first_row = (boxes.size[:, 1].cumsum(0) - boxes.size[:, 1])[shape]
+    corner, size, stride = boxes.corner[samples.shape], boxes.size[samples.shape], boxes.stride
+    first_row = (boxes.size[:, 1].cumsum(0) - boxes.size[:, 1])[samples.shape]
     increments = pixel.new_zeros(boxes.rows * stride)
     # each chunk copies all windows where a derivative is wanted
     cells = _CHUNK_CELLS * (16 if torch.is_grad_enabled() else 1)
@@ -195,15 +211,15 @@ def fill(
         part = slice(start, start + together)
         nearest = pixel[part].detach().round()
         from_nearest = pixel[part] - nearest
-        scale = sigma[part, None]
-        across = _on_pixel(torch.special.ndtr, rows - from_nearest[:, 1:], scale)
+        across = _on_pixel(1 - mixed, rows - from_nearest[:, 1:], samples.sigma[part, 1:])
         # differences from each column to the next; the first has the column before it as its neighbour
         x = torch.cat([columns[:1] - 1, columns]) - from_nearest[:, :1]
-        along = _row_integral(x, scale, None if half_chord is None else half_chord[part, None]).diff(dim=1)
+        half = None if chord is None else chord[part, None]
+        along = _row_integral(2 - mixed, x, samples.sigma[part, :1], half).diff(dim=1)
         local = nearest.long() - corner[part]
         row, column = local[:, 1:] + rows.long(), local[:, :1] + columns.long()
         inside = (row >= 0) & (row < size[part, 1:])
-        across = across * inside * -dv[part, None]
+        across = across * inside * -samples.dv[part, None]
         # what begins left of the window has its full effect from the first column on
         column = column.clamp(min=0).minimum(size[part, :1])
         cell = (first_row[part, None] + torch.where(inside, row, 0)) * stride
@@ -271,15 +287,14 @@ def _on_circle(axes: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
     return cos * a + sin * b, cos * b - sin * a
 
 
-def _in_view(camera: Camera, shapes: Shapes, curves: Sequence[_Curves], sigma: Tensor) -> Tensor:
-    """(S,) bool, shapes whose outlines are all valid and touch the frame."""
+def _in_view(camera: Camera, shapes: Shapes, curves: Sequence[_Curves], reach: Tensor) -> Tensor:
+    """(S,) bool, shapes whose outlines are all valid and come within reach (S,) of the frame."""
     shape = torch.cat([c.shape for c in curves])
     low, high = (torch.cat([c.pixel.amin(1) for c in curves]), torch.cat([c.pixel.amax(1) for c in curves]))
     low, high = _extent(low, high, shape, len(shapes))
-    reach = 1.0 + REACH * sigma[shapes.frame, None]
     whole = torch.ones(len(shapes), dtype=torch.bool, device=low.device)
     whole[shape[~torch.cat([c.valid.all(1) for c in curves])]] = False
-    return whole & ((high > -reach) & (low < _frame_size(camera, low) + reach)).all(-1)
+    return whole & ((high > -reach[:, None]) & (low < _frame_size(camera, low) + reach[:, None])).all(-1)
 
 
 def _extent(low: Tensor, high: Tensor, index: Tensor, count: int) -> tuple[Tensor, Tensor]:
@@ -299,31 +314,39 @@ def _sign(x: Tensor) -> Tensor:
     return torch.where(x < 0, -1.0, 1.0).to(x)
 
 
-def _on_pixel(function: Callable[[Tensor], Tensor], x: Tensor, sigma: Tensor) -> Tensor:
-    """Difference of a function of x / sigma between the borders of a pixel about x."""
-    return function((x + 0.5) / sigma) - function((x - 0.5) / sigma)
+def _on_pixel(order: int, x: Tensor, sigma: Tensor) -> Tensor:
+    """Integral over the pixel about x of the antiderivative of a Gaussian; the first with ``order`` 1, and so on."""
+    function = _ANTIDERIVATIVES[order]
+    difference = function((x + 0.5) / sigma) - function((x - 0.5) / sigma)
+    return difference if order == 1 else sigma ** (order - 1) * difference
 
 
-def _row_integral(x: Tensor, sigma: Tensor, half: Tensor | None) -> Tensor:
-    """Integral up to x of the Gaussian convolved with the pixel and with a box of a half width and the area 1."""
+def _row_integral(order: int, x: Tensor, sigma: Tensor, half: Tensor | None) -> Tensor:
+    """As `_on_pixel`, of the Gaussian convolved with a box of a half width and the area 1."""
     if half is None:
-        return sigma * _on_pixel(_normal_loss, x, sigma)
-    right, left = (_on_pixel(_normal_loss_integral, x + side, sigma) for side in (half, -half))
-    return sigma * sigma * (right - left) / (2 * half)
+        return _on_pixel(order, x, sigma)
+    return (_on_pixel(order + 1, x + half, sigma) - _on_pixel(order + 1, x - half, sigma)) / (2 * half)
+
+
+def _density(x: Tensor) -> Tensor:
+    """Density phi(x) of the normal distribution."""
+    return (-0.5 * x.square()).exp() / math.sqrt(2 * math.pi)
 
 
 def _normal_loss(x: Tensor) -> Tensor:
     """Integral of the normal distribution function: x Phi(x) + phi(x)."""
-    probability, density = _normal(x)
-    return x * probability + density
+    return x * torch.special.ndtr(x) + _density(x)
 
 
 def _normal_loss_integral(x: Tensor) -> Tensor:
     """Integral of `_normal_loss`: ((x^2 + 1) Phi(x) + x phi(x)) / 2."""
-    probability, density = _normal(x)
-    return 0.5 * ((x.square() + 1) * probability + x * density)
+    return 0.5 * ((x.square() + 1) * torch.special.ndtr(x) + x * _density(x))
 
 
-def _normal(x: Tensor) -> tuple[Tensor, Tensor]:
-    """Distribution function Phi(x) and density phi(x) of the normal distribution."""
-    return torch.special.ndtr(x), (-0.5 * x.square()).exp() / math.sqrt(2 * math.pi)
+# of the normal density, each the antiderivative of the one before
+_ANTIDERIVATIVES: list[Callable[[Tensor], Tensor]] = [
+    _density,
+    torch.special.ndtr,
+    _normal_loss,
+    _normal_loss_integral,
+]

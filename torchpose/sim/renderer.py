@@ -23,13 +23,13 @@ from torchpose.errors import ConfigError, FrameError
 from torchpose.geometry import rotations
 from torchpose.geometry.segments import ragged_arange
 from torchpose.sim import boundary
-from torchpose.sim.boundary import REACH, Boundary, Boxes
+from torchpose.sim.blur import Blur, Level, Pair, blur_of, blurred, start
+from torchpose.sim.boundary import Boundary, Boxes
 from torchpose.sim.sensor import Lighting
 from torchpose.sim.shapes import Shapes, rectangle, rings
 from torchpose.target import Target
 
 _CHUNK_PIXELS = 1 << 24  # pixels rendered at a time
-Level = float | Tensor  # a number for all frames, or (B,)
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,11 @@ class Imaging:
     """Conditions under which B frames are rendered, apart from camera and poses.
 
     Attributes:
-        psf_sigma: Gaussian blur in px, above 0; the pixel's own area comes on top.
+        psf_sigma: Gaussian blur in px, above 0; the pixel's own area comes on top. Or the covariance of an elliptic one
+            in px^2, (B, 2, 2), or (2, 2) for all frames.
+        smear: (B, 2), or (2,) for all frames, motion in the image by so many px during the exposure, of which the pose
+            is the middle: a box along a line, the same everywhere in the frame. None for none.
+        disc: radius in px of a disc, the same everywhere in the frame; not together with ``defocus``.
         dark: grey level of the rings, or of what is around them where ``target.background`` is dark.
         light: grey level of the other one.
         plate: width and height in mm of the plate, centred on the target's origin in its plane z = 0; None: it fills
@@ -80,6 +84,8 @@ class Imaging:
     """
 
     psf_sigma: Level = 0.7
+    smear: Pair | None = None
+    disc: Level = 0.0
     dark: Level = 30.0
     light: Level = 220.0
     plate: Sequence[float] | None = None
@@ -105,12 +111,15 @@ def render(camera: Camera, target: Target | Shapes, R: Tensor, t: Tensor, **imag
         imaging: fields of `Imaging`: ``psf_sigma``, ``dark``, ``light``, ``plate``, ``surround`` and so on.
 
     Raises:
-        ConfigError: ``psf_sigma`` is not above 0, or there are background pictures and no plate.
-        FrameError: shapes of R and t, of ``motion`` or of background pictures disagree.
+        ConfigError: ``psf_sigma`` is not above 0 or no covariance, ``disc`` is below 0 or stands beside ``defocus``, or
+            there are background pictures and no plate.
+        FrameError: shapes of R and t, of blur, ``motion`` or background pictures disagree.
     """
     R, t = check_poses(R, t)
     scene = Imaging(**imaging)
-    sigma, motion = check_blur(scene.psf_sigma, t), scene.motion
+    blur, motion = blur_of(scene.psf_sigma, scene.smear, scene.disc, t), scene.motion
+    if scene.defocus is not None and bool(blur.disc.any()):
+        raise ConfigError("disc: a lens has one defocus; give disc or defocus")
     if motion is not None and motion.shape != (len(t), 6):
         raise FrameError(f"motion: shape {tuple(motion.shape)} is not (B, 6) of {len(t)} poses")
     ink, paper = per_frame(scene.dark, t), per_frame(scene.light, t)
@@ -125,7 +134,7 @@ def render(camera: Camera, target: Target | Shapes, R: Tensor, t: Tensor, **imag
         frames = ground[part].float().expand(len(t[part]), camera.height, camera.width).contiguous()
         twist = None if motion is None else motion[part].to(t)
         for shapes in _layers(target, scene, ink[part], paper[part], part.start):
-            boxes, coverage = cover(camera, shapes, R[part], t[part], sigma[part], scene.defocus, twist)
+            boxes, coverage = cover(camera, shapes, R[part], t[part], blur[part], scene.defocus, twist)
             frames = _paint(frames, shapes, boxes, coverage.float())
         out.append(frames if scene.lighting is None else frames * scene.lighting.gain(camera, R[part], t[part]))
     return torch.cat(out) if len(out) > 1 else out[0]
@@ -151,7 +160,7 @@ def cover(
     shapes: Shapes,
     R: Float[Tensor, "B 3 3"],
     t: Float[Tensor, "B 3"],
-    sigma: Float[Tensor, " B"],
+    blur: Blur,
     defocus: Defocus | None = None,
     motion: Float[Tensor, "B 6"] | None = None,
 ) -> tuple[Boxes, Float[Tensor, "rows stride"]]:
@@ -159,44 +168,42 @@ def cover(
 
     Arguments as in `render` and `Imaging`, in float64.
     """
-    edges = boundary.sample_boundary(camera, shapes, R, t, sigma)
-    shape = edges.shape
-    pixel, dv = boundary.project(camera, edges, R, t)
-    blur = sigma[edges.frame]
-    margin = (0.5 + REACH * sigma)[shapes.frame]
-    if motion is not None:
-        pixel, dv, nodes = _moving(camera, edges, R, t, motion, pixel, sigma)
-        blur, shape = blur.repeat(nodes), shape.repeat(nodes)
-    half = None
+    radius = blur.disc[shapes.frame]
     if defocus is not None:
         center = (R[shapes.frame] @ shapes.center[..., None]).squeeze(-1) + t[shapes.frame]
         radius = defocus.radius(camera, center[:, 2])
-        margin = margin + radius
-        offset, half_chord, weight = boundary.on_chords(radius[shape], blur)
-        half = half_chord.reshape(-1)
-        shift = torch.stack([torch.zeros_like(offset), offset], -1)
-        pixel, dv = (pixel + shift).reshape(-1, 2), (weight * dv).reshape(-1)
-        blur, shape = blur.repeat(len(weight)), shape.repeat(len(weight))
-    boxes = boundary.boxes_around(pixel.detach(), shape, margin.detach(), camera)
-    return boxes, boundary.fill(pixel, dv, blur, shape, boxes, half_chord=half)
+    disc = radius.detach()
+    edges = boundary.sample_boundary(camera, shapes, R, t, blur.finest, blur.reach[shapes.frame] + disc)
+    if motion is None:
+        pixel, dv = (x[None] for x in boundary.project(camera, edges, R, t))
+    else:
+        pixel, dv = _moving(camera, edges, R, t, motion, blur.finest)
+    samples = blurred(start(edges, pixel, dv, blur), blur, radius)
+    boxes = boundary.boxes_around(samples.pixel.detach(), samples.shape, blur.margin[shapes.frame] + disc, camera)
+    covered = boundary.fill(samples, boxes)
+    if blur.cross is not None and torch.is_grad_enabled():
+        with torch.no_grad():
+            mixed = boundary.fill(samples, boxes, mixed=True)
+        covered = covered + blur.cross[shapes.frame].repeat_interleave(boxes.size[:, 1])[:, None] * mixed
+    return boxes, covered
 
 
 def _moving(
-    camera: Camera, edges: Boundary, R: Tensor, t: Tensor, motion: Tensor, middle: Tensor, sigma: Tensor
-) -> tuple[Tensor, Tensor, int]:
-    """Samples at the nodes of a quadrature over the exposure: pixels (K N, 2), weighted dv (K N,) and K."""
+    camera: Camera, edges: Boundary, R: Tensor, t: Tensor, motion: Tensor, sigma: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Samples at the nodes of a quadrature over the exposure: pixels (K, N, 2) and weighted dv (K, N)."""
 
     def posed(time: Tensor) -> tuple[Tensor, Tensor]:
         turn = rotations.exp(time[:, None, None] * motion[:, 3:])
         return turn @ R, t + time[:, None, None] * motion[:, :3]
 
     with torch.no_grad():
-        ends, _ = _project_each(camera, edges, *posed(motion.new_tensor([-0.5, 0.5])))
-        path = (ends - middle).norm(dim=-1) / sigma[edges.frame]
+        before, middle, after = _project_each(camera, edges, *posed(motion.new_tensor([-0.5, 0.0, 0.5])))[0]
+        path = torch.maximum((before - middle).norm(dim=-1), (after - middle).norm(dim=-1)) / sigma[edges.frame]
         nodes = boundary.nodes_across(float(path.max()) if path.numel() else 0.0)
     node, weight = boundary.gauss_legendre(nodes, t)
     pixel, dv = _project_each(camera, edges, *posed(node - 0.5))
-    return pixel.reshape(-1, 2), (weight[:, None] * dv).reshape(-1), nodes
+    return pixel, weight[:, None] * dv
 
 
 def _project_each(camera: Camera, edges: Boundary, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
@@ -236,14 +243,6 @@ def _ground(camera: Camera, t: Tensor, paper: Tensor, scene: Imaging) -> Tensor:
 def per_frame(value: Level, like: Tensor) -> Tensor:
     """(B,) tensor of a number or a (B,) tensor, of the dtype and device of ``like`` (B, ...)."""
     return torch.as_tensor(value, dtype=like.dtype, device=like.device).expand(like.shape[0])
-
-
-def check_blur(psf_sigma: Level, like: Tensor) -> Tensor:
-    """(B,) blur in px, after a check of its sign."""
-    sigma = per_frame(psf_sigma, like)
-    if not bool((sigma > 0).all()):
-        raise ConfigError("psf_sigma: the blur must be above 0 px; give for example 0.3 for a very sharp lens")
-    return sigma
 
 
 def check_poses(R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
