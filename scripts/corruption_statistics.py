@@ -87,7 +87,7 @@ def bound(shot: Shot) -> Tensor:
     full_well = shot.sensor.get("full_well")
     variance = shot.sensor["sigma"] ** 2 + (255.0 * 125.0 / full_well if full_well else 0.0)  # at medium grey
     covariance = pose_crlb(
-        shot.camera, shot.target, shot.R[None], shot.t[None], psf_sigma=shot.blur.sigma, dark=0.0, light=shot.contrast,
+        shot.camera, shot.target, shot.R[None], shot.t[None], **shot.blur.imaging(), dark=0.0, light=shot.contrast,
         noise_sigma=math.sqrt(variance), bits=shot.sensor.get("bits", 8),
     )  # fmt: skip
     return covariance[0].diagonal()

@@ -62,6 +62,12 @@ class Blur:
         own = 0.5 * (self.covariance[0] + self.covariance[2])
         return math.sqrt(own + (self.smear[0] ** 2 + self.smear[1] ** 2) / 24 + self.disc**2 / 4)
 
+    def imaging(self) -> dict[str, Any]:
+        """Options of `torchpose.sim.render` and of the bound."""
+        uu, uv, vv = self.covariance
+        options: dict[str, Any] = {"psf_sigma": torch.tensor([[uu, uv], [uv, vv]], dtype=F64), "disc": self.disc}
+        return options | ({"smear": torch.tensor(self.smear, dtype=F64)} if any(self.smear) else {})
+
 
 @dataclass(frozen=True, eq=False)
 class Shot:
@@ -74,7 +80,7 @@ class Shot:
         imaging: options of `torchpose.sim.render`.
         sensor: options of `torchpose.sim.add_noise`.
         blur: what the bound is computed with.
-        contrast: grey levels between paper and ring, where light or sensor have changed it.
+        contrast: grey levels between paper and ring, as light has changed it.
         picture: (H, W) float32 before noise, or the grey values of the file.
     """
 
@@ -99,6 +105,12 @@ class Shot:
 
     def seen(self, picture: np.ndarray, contrast: float | None = None) -> Shot:
         return replace(self, picture=picture, contrast=self.contrast if contrast is None else contrast)
+
+    def lit(self, gain: np.ndarray) -> Shot:
+        """The shot under light (H, W) that is not the same everywhere; the contrast is RMS over the rings."""
+        at = self.ring_places()[0].round().astype(int).clip(0, np.array(self.size) - 1)
+        there = math.sqrt(np.square(gain[at[:, 1], at[:, 0]]).mean())
+        return self.seen(self.picture * gain, self.contrast * there)
 
     def ring_places(self) -> tuple[np.ndarray, np.ndarray]:
         """Centres (M, 2) and outer radii (M,) of the rings in px."""
@@ -366,7 +378,7 @@ def shadow(shot: Shot, left: float) -> Shot:
     (u, v), turn = _grid(shot), shot.rng.uniform(0, 2 * math.pi)
     at = shot.ring_places()[0].mean(0)
     across = (u - at[0]) * math.cos(turn) + (v - at[1]) * math.sin(turn)
-    return shot.seen(shot.picture * (left + (1 - left) / (1 + np.exp(-across.clip(-80, 80)))))
+    return shot.lit(left + (1 - left) / (1 + np.exp(-across.clip(-80, 80))))
 
 
 def highlight(shot: Shot, amplitude: float) -> Shot:
@@ -383,14 +395,14 @@ def light_gradient(shot: Shot, ratio: float) -> Shot:
     """Light that falls by this ratio across the frame."""
     (u, v), turn = _grid(shot), shot.rng.uniform(0, 2 * math.pi)
     x = (u / shot.size[0] - 0.5) * math.cos(turn) + (v / shot.size[1] - 0.5) * math.sin(turn)
-    return shot.seen(shot.picture * ratio ** -(x + 0.5))
+    return shot.lit(ratio ** -(x + 0.5))
 
 
 def vignetting(shot: Shot, power: float) -> Shot:
     """Fall-off with that power of the cosine of the angle from the axis."""
     (u, v), (width, height) = _grid(shot), shot.size
     squared = ((u - width / 2) ** 2 + (v - height / 2) ** 2) / float(shot.camera.matrix[0, 0]) ** 2
-    return shot.seen(shot.picture * (1 + squared) ** (-power / 2))
+    return shot.lit((1 + squared) ** (-power / 2))
 
 
 def banding(shot: Shot, sigma: float) -> Shot:
