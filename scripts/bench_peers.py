@@ -200,8 +200,13 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
         panel.set(xlabel=axis, yscale="log")
         if axis.startswith(("plate", "contrast")):
             panel.set_xscale("log")
+            values = sorted({r["value"] for r in rows if r["axis"] == axis})
+            panel.set_xticks(values, [f"{value:g}" for value in values])
+            panel.minorticks_off()
         panel.tick_params(axis="x", labelsize=8)
         panel.grid(alpha=0.3, which="both")
+    for panel in panels.flat[len(axes) : -1]:
+        panel.axis("off")
     for panel in panels[:, 0]:
         panel.set_ylabel("RMS error across the axis, um")
     last = panels.flat[-1]
