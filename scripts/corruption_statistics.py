@@ -33,7 +33,7 @@ from typing import Any, get_args
 import cv2
 import numpy as np
 import torch
-from corruptions import CORRUPTIONS, DISTANCES, Background, Corruption, Shot, shoot, view
+from corruptions import CORRUPTIONS, DISTANCES, Background, Corruption, Shot, severity, shoot, view
 from torch import Tensor
 
 import torchpose as tp
@@ -61,9 +61,7 @@ class Line:
 
     @property
     def severity(self) -> str:
-        if self.name == "none":
-            return ""
-        return " x ".join(f"{v:g}" for v in self.value) if isinstance(self.value, tuple) else f"{self.value:g}"
+        return "" if self.name == "none" else severity(self.value)
 
     @property
     def note(self) -> str:

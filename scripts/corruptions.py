@@ -146,6 +146,11 @@ class Corruption:
         return not (kind == "small" and value in self.unseen)
 
 
+def severity(value: float | tuple[float, float]) -> str:
+    """As it stands in tables."""
+    return " x ".join(f"{v:g}" for v in value) if isinstance(value, tuple) else f"{value:g}"
+
+
 def view(number: int, seed: int, camera: tp.Camera, kind: str, background: Background) -> Shot:
     """The view of a frame: tilt to 40 degrees, any roll, the plate before grey or before a photograph."""
     rng = np.random.default_rng([seed, number])
