@@ -36,7 +36,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from corruptions import BLURS, CORRUPTIONS, F64, LIGHT, PLATE_MM, SCENE, Shot, even, photograph, shoot, severity, tilted
+from corruptions import BLURS, CORRUPTIONS, F64, LIGHT, PLATE_MM, SCENE, Shot, even, photograph, severity, shoot, tilted
 from peer_boards import DARK, NO_APRILTAG, TAG_MM, Contender, Pose, apriltag_detector, contenders, has_apriltag, prints
 
 import torchpose as tp
