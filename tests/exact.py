@@ -10,6 +10,7 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import conics, rotations
+from torchpose.geometry.blur import isotropic
 from torchpose.rings import Rings
 from torchpose.target import Target
 
@@ -59,4 +60,5 @@ def rings_of(ellipses: Tensor, frame: Tensor, sigma: float = 0.005, polarity: fl
         return EllipseFit(noisy, covariance, sigma * one, 200 * one)
 
     outer, inner = fit(ellipses[:, 0]), fit(ellipses[:, 1])
-    return Rings(frame, torch.full((count,), polarity, dtype=F64), outer.params, inner.params, outer, inner)
+    side, blur = torch.full((count,), polarity, dtype=F64), isotropic(torch.full((count,), 0.8, dtype=F64))
+    return Rings(frame, side, outer.params, inner.params, outer, inner, blur)

@@ -233,6 +233,7 @@ def _sight(scene: Scene, found: Found, evidence: Evidence) -> Sight:
         evidence.radii,
         scene.frames,
         scene.camera,
+        ring.blur.view(*evidence.mask.shape, 3),
     )
 
 

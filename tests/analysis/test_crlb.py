@@ -45,7 +45,13 @@ def test_is_the_inverse_fisher_information_of_whole_frames(
     @torch.no_grad()
     def frame(x: Tensor) -> Tensor:
         covariance = torch.stack([variance[0] + x[6], variance[1] + x[7], variance[1] + x[7], variance[2] + x[8]])
-        look: dict[str, Any] = {"psf_sigma": covariance.view(2, 2), "smear": smear, "disc": disc, "dark": dark, "light": light}
+        look: dict[str, Any] = {
+            "psf_sigma": covariance.view(2, 2),
+            "smear": smear,
+            "disc": disc,
+            "dark": dark,
+            "light": light,
+        }
         image = render(cam, target, rotations.exp(x[3:6]) @ R, t + x[:3], **look)
         return image[0].double().flatten()
 

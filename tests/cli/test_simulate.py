@@ -155,6 +155,12 @@ def test_depth_of_the_sensor(folder: Path) -> None:
         ({"sensor__noise": [2.0, 1.0]}, ("sensor.noise", "swap")),
         ({"sensor__bits": 9}, ("sensor.bits", "8, 10, 12 or 16")),
         ({"imaging__psf_sigma": 0.0}, ("imaging.psf_sigma",)),
+        ({"imaging__psf_ratio": 0.7}, ("imaging.psf_ratio", "1 or more")),
+        ({"imaging__smear_px": [-1, 2]}, ("imaging.smear_px", "0 or more")),
+        (
+            {"imaging__disc_px": 2, "imaging__defocus": {"f_number": 2, "focal_length": 8, "focus_distance": 100}},
+            ("imaging", "defocus and disc_px"),
+        ),
         ({"imaging__psf_sigmas": 0.7}, ("imaging.psf_sigmas", "did you mean psf_sigma?")),
         ({"noise": 1.0}, ("noise", "unknown key")),
         ({"poses__random__tilt": 1.0}, ("poses.random.tilt", "tilt_deg")),

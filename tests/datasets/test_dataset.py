@@ -10,9 +10,10 @@ import torch
 import yaml
 
 from torchpose.camera import Camera
-from torchpose.datasets.dataset import analytic, write_bop, write_dataset
+from torchpose.datasets.dataset import analytic, bounds, plan_truth, write_bop, write_dataset
 from torchpose.datasets.plan import Plan, load_plan
 from torchpose.errors import ConfigError
+from torchpose.sim import render
 
 F64 = torch.float64
 
@@ -42,6 +43,33 @@ def test_rows_of_a_plan_are_its_frames(plan: Plan) -> None:
     assert torch.equal(part.conditions.psf_sigma, plan.conditions.psf_sigma[which])
     frames = analytic(plan)(which)
     torch.testing.assert_close(analytic(part)(torch.arange(2)), frames, rtol=0, atol=1e-3)
+
+
+def test_blur_with_a_direction_is_drawn_and_recorded(plan: Plan) -> None:
+    look = plan.file.imaging.model_copy(
+        update={"psf_ratio": [1.0, 2.0], "psf_deg": [30.0, 30.0], "smear_px": [4.0, 4.0], "smear_deg": [0.0, 90.0]}
+    )
+    file = plan.file.model_copy(update={"imaging": look})
+    plan.path.with_name("other.yaml").write_text(yaml.safe_dump(file.model_dump(exclude_none=True)))
+    other = load_plan(plan.path.with_name("other.yaml"))
+    # what a plan drew before it knew of directions stays as it was
+    assert torch.equal(other.motion, plan.motion)
+    assert torch.equal(other.conditions.dark, plan.conditions.dark)
+    truth, blur = plan_truth(other).extra, other.conditions.blur
+    assert ((truth["psf_ratio"] > 1) & (truth["psf_ratio"] < 2)).all()
+    major, minor = truth["psf_sigma"] * truth["psf_ratio"], truth["psf_sigma"]
+    values, vectors = torch.linalg.eigh(blur["psf_sigma"])
+    torch.testing.assert_close(values.sqrt(), torch.stack([minor, major], 1))
+    torch.testing.assert_close((vectors[:, 1, 1] / vectors[:, 0, 1]).atan().rad2deg(), truth["psf_deg"])
+    torch.testing.assert_close(blur["smear"].norm(dim=1), truth["smear_px"])
+    every = torch.arange(4)
+    drawn = render(
+        other.camera, other.target, other.R, other.t, **blur, dark=truth["dark"], light=truth["light"],
+        plate=(70, 70), motion=other.motion,
+    )  # fmt: skip
+    torch.testing.assert_close(analytic(other)(every), drawn, rtol=0, atol=1e-3)
+    # the bound knows that blur: 4 px of smear leave less of edges in their direction
+    assert (bounds(other, every) > bounds(plan, every)).all()
 
 
 def test_bop_is_that_of_the_folder(plan: Plan, tmp_path: Path) -> None:

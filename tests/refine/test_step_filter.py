@@ -10,6 +10,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
+from torchpose.geometry.blur import isotropic
 from torchpose.refine.edges.step_filter import StepOffsets, step_offsets, window_correlation
 
 F64 = torch.float64
@@ -40,7 +41,8 @@ def measured(
     one = torch.ones_like(distance)
     bend = one / radius
     zero = torch.zeros(len(angle), dtype=torch.int64)
-    return step_offsets(frame, zero, pixel.long(), normal, distance - (radius - error), bend, blur * one)
+    curve = (normal, distance - (radius - error), bend)
+    return step_offsets(frame, zero, pixel.long(), curve, isotropic(blur * one))
 
 
 @pytest.mark.parametrize(("radius", "offset", "blur"), [(5.0, 0.003, 0.008), (11.0, 0.0015, 0.002)])
@@ -53,7 +55,7 @@ def test_offsets_and_blur_of_discs(radius: float, offset: float, blur: float) ->
     assert found.step == pytest.approx(190.0, rel=0.02)
     wide = measured(disc(radius, center), radius, center, 0.0, BLUR - 0.03)
     mean = (wide.widening * wide.blur_information).sum() / wide.blur_information.sum()
-    assert mean == pytest.approx(0.03, abs=blur)
+    assert mean == pytest.approx(BLUR**2 - (BLUR - 0.03) ** 2, abs=2 * BLUR * blur)
 
 
 def test_grey_levels_are_free() -> None:
@@ -87,14 +89,14 @@ def test_neighbouring_windows_share_noise() -> None:
     pixel = torch.stack([u, v.round()], -1).long()
     normal = torch.tensor([-math.sin(math.radians(20)), math.cos(math.radians(20))], dtype=F64).expand(length, 2)
     distance = (v.round() - v) * math.cos(math.radians(20))
-    bend, blur = torch.zeros(length, dtype=F64), torch.full((length,), 0.75, dtype=F64)
+    bend, blur = torch.zeros(length, dtype=F64), isotropic(torch.full((length,), 0.75, dtype=F64))
     grid_v, grid_u = torch.meshgrid(torch.arange(100, dtype=F64), torch.arange(220, dtype=F64), indexing="ij")
     off = (grid_v - 10 - slope * grid_u) * math.cos(math.radians(20))
     clean = 190 * 0.5 * torch.erfc(-off / (0.75 * math.sqrt(2)))
     means, singles = [], []
     for _ in range(count):
         frame = (clean + 2 * torch.randn(clean.shape, dtype=F64, generator=g))[None]
-        found = step_offsets(frame, torch.zeros(length, dtype=torch.int64), pixel, normal, distance, bend, blur)
+        found = step_offsets(frame, torch.zeros(length, dtype=torch.int64), pixel, (normal, distance, bend), blur)
         weight = found.information / found.information.sum()
         means.append((weight * found.error).sum())
         singles.append(found.error)

@@ -33,7 +33,19 @@ def evidence(r: Tensor, t: Tensor) -> Evidence:
     center, size = shape[:, :, 0, :2], torch.eye(5, dtype=F64).expand(*shape.shape, 5)
     mask = torch.ones(count, len(QUAD), dtype=torch.bool)
     flat = torch.ones(count, dtype=torch.bool)
-    return Evidence(points, normals, radii, center, size[:, :, 0, :2, :2], shape, size, mask, flat, CAMERA.matrix)
+    return Evidence(
+        points,
+        normals,
+        radii,
+        center,
+        size[:, :, 0, :2, :2],
+        shape,
+        size,
+        torch.ones_like(mask, dtype=F64),
+        mask,
+        flat,
+        CAMERA.matrix,
+    )
 
 
 def solutions(r: Tensor, t: Tensor, r_alt: Tensor, t_alt: Tensor, status: Status, reason: Reason) -> Solutions:

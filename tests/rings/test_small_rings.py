@@ -53,7 +53,7 @@ def test_codes_of_much_blurred_rings(blur: float) -> None:
     found = fit_small_rings(frames, frame, rough, start, seen, one, torch.tensor(1111.11))
     code = (found.inner.params[:, 2:4].prod(-1) / found.outer.params[:, 2:4].prod(-1)).sqrt()
     off = (code - truth[:, 1, 3] / truth[:, 0, 3]).abs() / ratio_tolerance(truth[:, 0, 3])
-    assert found.good.double().mean() >= 0.9  # where the blur leaves the code open, the fit says so
+    assert found.good.double().mean() >= 0.8  # where the blur leaves the code open, the fit says so
     assert off[found.good].quantile(0.95) < 1
 
 

@@ -11,6 +11,8 @@ import torch
 from scipy.integrate import quad_vec
 from scipy.special import ndtr
 
+from tests.exact import F64
+from torchpose.geometry.blur import isotropic
 from torchpose.rings import zernike
 from torchpose.rings.zernike import Edges
 
@@ -164,11 +166,12 @@ def test_deblur_straight_edges(edges: tuple[torch.Tensor, torch.Tensor], sigma: 
     angle, distance = edges
     found = locate_middle(edge_frames(angle, distance, sigma=sigma))
     group = torch.zeros(60, dtype=torch.int64)
-    slope = zernike.blur_slope(found.offset, distance, group, 1)
-    # 1 - 3 s^2, s = 2 sigma / N; the areas of the frame's and of the kernel's pixels add 1/12 each
-    assert float(slope) == pytest.approx(1 - 12 * (sigma**2 + 2 / 12) / 49, abs=0.01)
+    blur = zernike.edge_blur(found.offset, distance, found.normal, group, 1)
+    # the areas of the frame's and of the kernel's pixels add 1/12 each
+    torch.testing.assert_close(blur[0], isotropic(torch.tensor(sigma**2 + 2 / 12, dtype=F64).sqrt()), rtol=0, atol=0.05)
+    slope = zernike.slope_across(blur, found.normal)
     before = (found.offset - distance).square().mean().sqrt()
-    after = (zernike.deblur(found.offset, slope[group]) - distance).square().mean().sqrt()
+    after = (zernike.deblur(found.offset, slope) - distance).square().mean().sqrt()
     assert after < 0.01
     assert after < 0.3 * before
 
@@ -182,11 +185,25 @@ def test_deblur_inverts_its_law() -> None:
         torch.testing.assert_close(back, distance, rtol=0, atol=1e-4)
 
 
-def test_blur_slope_of_groups_apart() -> None:
-    distance = torch.linspace(-0.5, 0.5, 10, dtype=torch.float64)
-    offset, group = torch.cat([0.8 * distance, 0.6 * distance]), torch.arange(2).repeat_interleave(10)
-    slope = zernike.blur_slope(offset, distance.repeat(2), group, 4)
-    torch.testing.assert_close(slope, torch.tensor([0.8, 0.6, 1.0, 1.0], dtype=torch.float64))
+def test_edge_blur_by_direction_and_group() -> None:
+    """Offsets by the law for a blur of 1 x 1.4 px at 30 degrees; a group of one direction tells that one."""
+    g = torch.Generator().manual_seed(3)
+    angle = 2 * math.pi * torch.rand(400, dtype=F64, generator=g)
+    angle[300:] = 0.0
+    normal, distance = torch.stack([angle.cos(), angle.sin()], -1), torch.rand(400, dtype=F64, generator=g) - 0.5
+    axis = torch.tensor([math.cos(math.pi / 6), math.sin(math.pi / 6)], dtype=F64)
+    truth = torch.eye(2, dtype=F64) + (1.4**2 - 1) * torch.outer(axis, axis)
+    variance = (normal @ truth * normal).sum(-1)
+    offset = distance * (1 - 12 / zernike.MASK**2 * variance)
+    group = torch.zeros(400, dtype=torch.int64)
+    group[300:] = 1
+    blur = zernike.edge_blur(offset, distance, normal, group, 3)
+    torch.testing.assert_close(blur[0], truth.flatten()[[0, 1, 3]], rtol=0.03, atol=0.03)
+    torch.testing.assert_close(blur[1, 0], truth[0, 0], rtol=0.02, atol=0)
+    assert (blur[2] == 0).all()
+    torch.testing.assert_close(
+        zernike.slope_across(blur[group], normal)[:300], offset[:300] / distance[:300], rtol=0.02, atol=0
+    )
 
 
 def test_edge_correlation() -> None:
@@ -229,6 +246,10 @@ def test_curvature_shift_equals_its_integral(sigma: float) -> None:
     h = np.sqrt(1 - x * x)
     zeroth = (weight * (2 * h * (2 * x * x - 1) + 4 * h**3 / 3)).sum()
     second = (weight * ((2 * x * x - 1) * 2 * h**3 / 3 + 4 * h**5 / 5)).sum()
-    slope = torch.tensor(-1.5 * zeroth / (weight * h**3).sum())
-    expected = -0.5 * (s * s + second / zeroth) * (zernike.MASK / 2) ** 2
-    assert float(zernike.curvature_shift(slope)) == pytest.approx(expected, rel=0.01)
+    slope = -1.5 * zeroth / (weight * h**3).sum()
+    across = (1 - slope) * zernike.MASK**2 / 12  # of an edge whose normal is u
+    normal = torch.tensor([[1.0, 0.0]], dtype=F64)
+    for more in (0.0, 1.5):  # px^2, of the blur along the edge
+        expected = -0.5 * (s * s + second / zeroth) * (zernike.MASK / 2) ** 2 + 0.5 * more
+        blur = torch.tensor([[across, 0.0, across + more]], dtype=F64)
+        assert float(zernike.curvature_shift(blur, normal)) == pytest.approx(expected, rel=0.01)

@@ -18,7 +18,10 @@ from torchpose.sim.shapes import rings
 from torchpose.target import Target
 
 _CHUNK_POSES = 16  # poses differentiated at a time
-_UNKNOWN = 9  # translation, rotation, the blur's S11, S22 and S12
+_UNKNOWN = 9  # translation, rotation, the blur's S11, S12 and S22
+
+# derivatives by u and v and their factors: those of a blurred picture by the blur's S11, S12 and S22
+_HEAT = (((2, 0), 0.5), ((1, 1), 1.0), ((0, 2), 0.5))
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,11 +45,14 @@ def pose_crlb(camera: Camera, target: Target, R: Tensor, t: Tensor, **conditions
     """Lower bound of the pose covariance from frames of `torchpose.sim.render` with white Gaussian noise.
 
     Inverse Fisher information of the grey values (Kay 1993, section 3.9), of all pixels of every marker's bounding box
-    and of a margin as wide as the blur reaches; derivatives by forward-mode differentiation of the renderer. Unknown
-    besides the pose: the three numbers of the blur's covariance per frame, a dark and a light level per marker. Of
-    smear and disc only the shape is known: whatever changes the covariance, theirs or the Gaussian's, changes the
-    picture alike to first order. The camera is exact. Quantisation counts
-    as noise of step^2 / 12, which holds from a noise of about half a step upwards; clipping is not modelled.
+    and of a margin as wide as the blur reaches; derivatives by forward-mode differentiation of the renderer, those by
+    the blur after the heat equation. The camera is exact. Quantisation counts as noise of step^2 / 12, which holds from
+    a noise of about half a step upwards; clipping is not modelled.
+
+    Unknown besides the pose: the three numbers of the blur's covariance per frame, a dark and a light level per marker.
+    Of smear and disc only the shape is known: whatever changes the covariance, theirs or the Gaussian's, changes the
+    picture alike. Three numbers instead of one raise the deviations of quad40 under round blur of 0.7 px by at most
+    0.006 % at 140 to 200 mm and 0.04 % where its rings have radii of 12 px (docs/decisions/0010-imaging-effects.md).
 
     Args:
         R: (B, 3, 3), target to camera.
@@ -86,12 +92,11 @@ def _fisher(camera: Camera, target: Target, R: Tensor, t: Tensor, blur: Blur, co
     edges = replace(edges, shape=window)
 
     def sampled(delta: Tensor) -> Samples:
-        """Samples of a pose and a blur that are off by (8,): translation, rotation, S11 and S22."""
+        """Samples of a pose that is off by (6,), translation and rotation."""
         pixel, dv = boundary.project(camera, edges, rotations.exp(delta[3:6]) @ R, t + delta[:3])
-        varied = replace(blur, sigma=(blur.sigma.square() + delta[6:]).sqrt())
-        return blurred(start(edges, pixel[None], dv[None], varied), varied, blur.disc[frame])
+        return blurred(start(edges, pixel[None], dv[None], blur), blur, blur.disc[frame])
 
-    zero = t.new_zeros(_UNKNOWN - 1)
+    zero = t.new_zeros(6)
     samples = sampled(zero)
     # windows of one size for every marker in view, of which only its own part counts
     own = boundary.boxes_around(samples.pixel, samples.shape, (blur.margin + blur.disc)[frame], camera)
@@ -105,13 +110,14 @@ def _fisher(camera: Camera, target: Target, R: Tensor, t: Tensor, blur: Blur, co
         covered = image(boundary.fill(sampled(delta), boxes))
         return covered, covered
 
-    jacobian, c = torch.func.jacfwd(coverage, has_aux=True)(zero)  # (P, h w, 8), (P, h w)
-    # the derivative by S12, as that of any Gaussian blur
-    mixed = image(boundary.fill(samples, boxes, mixed=True))
+    jacobian, c = torch.func.jacfwd(coverage, has_aux=True)(zero)  # (P, h w, 6), (P, h w)
+    # by S11, S12 and S22, after the heat equation
+    with torch.no_grad():
+        by_blur = [scale * image(boundary.fill(samples, boxes, by)) for by, scale in _HEAT]
     row, column = (torch.arange(n, device=t.device) for n in (height, width))
     use = (row[:, None] < own.size[:, 1, None, None]) & (column < own.size[:, 0, None, None])
     use = use.flatten(1).to(t)
-    jacobian = torch.cat([jacobian, mixed[..., None]], -1) * (contrast[frame, None] * use)[..., None]
+    jacobian = torch.cat([jacobian, torch.stack(by_blur, -1)], -1) * (contrast[frame, None] * use)[..., None]
     # levels: grey = dark c + light (1 - c) for rings darker than their ground, and the same two columns otherwise
     levels = torch.stack([c, 1 - c], -1) * use[..., None]
     cross = levels.mT @ jacobian

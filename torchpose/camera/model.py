@@ -159,6 +159,16 @@ class Camera:
         camera.__dict__.update(moved, _coefficients=(_version(moved["distortion"]), known))
         return camera
 
+    def reduced(self, factor: int) -> Camera:
+        """The camera of frames of which blocks of ``factor`` x ``factor`` px make one; without the covariance."""
+        matrix = self.matrix.clone()
+        matrix[:2, 2] -= 0.5 * (factor - 1)
+        matrix[:2] /= factor
+        camera = copy(self)
+        size = {"width": self.width // factor, "height": self.height // factor}
+        camera.__dict__.update(size, matrix=matrix, covariance=None)
+        return camera
+
     def pinhole(self, R: Tensor | None = None, t: Tensor | None = None) -> PinholeCamera:
         """Kornia's camera of the same matrix at B poses; it has no distortion, its pixels are ideal ones.
 

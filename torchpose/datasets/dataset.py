@@ -43,6 +43,7 @@ Backend = Literal["analytic", "blender"]
 Renderer = Callable[[Int[Tensor, " B"]], Float[Tensor, "B H W"]]
 """Noise-free frames, float32, of the frames numbered."""
 
+BLUR = ("psf_sigma", "psf_ratio", "psf_deg", "smear_px", "smear_deg", "disc_px")
 BOUND = ("sx", "sy", "sz", "srx", "sry", "srz")
 _BATCH_PIXELS = 7_000_000  # larger buffers go back to the system and are cleared anew each time
 
@@ -50,7 +51,8 @@ _BATCH_PIXELS = 7_000_000  # larger buffers go back to the system and are cleare
 def plan_truth(plan: Plan) -> Truth:
     """The truth of a plan, without its bounds.
 
-    Columns besides the pose: tilt_deg, psf_sigma, noise_sigma (read noise), dark, light, motion_mm, motion_deg;
+    Columns besides the pose: tilt_deg, psf_sigma, psf_ratio, psf_deg, smear_px, smear_deg, disc_px, see
+    `torchpose.datasets.plan.Conditions`; noise_sigma (read noise), dark, light, motion_mm, motion_deg;
     markers_in_view, markers that lie in the frame as a whole; in_depth_range, 0 where the plan's range is left.
     """
     taken = plan.conditions
@@ -61,7 +63,7 @@ def plan_truth(plan: Plan) -> Truth:
         rotation_vector=rotations.log(plan.R),
         extra={
             "tilt_deg": plan.R[:, 2, 2].clamp(-1, 1).acos().rad2deg(),
-            "psf_sigma": taken.psf_sigma,
+            **{name: getattr(taken, name) for name in BLUR},
             "noise_sigma": taken.noise,
             "dark": taken.dark,
             "light": taken.light,
@@ -76,8 +78,9 @@ def plan_truth(plan: Plan) -> Truth:
 def bounds(plan: Plan, which: Int[Tensor, " B"]) -> Float[Tensor, "B 6"]:
     """Cramer-Rao standard deviations of the frames numbered ``which``; NaN where no pose is determined.
 
-    Of the evenly lit, sharp frame with the noise of its dark parts, see `torchpose.analysis.pose_crlb`: a bound still,
-    but one that defocus, motion, shot noise, clutter and covers keep any estimator away from.
+    Of the evenly lit frame at rest, blurred by all but ``defocus``, with the noise of its dark parts, see
+    `torchpose.analysis.pose_crlb`: a bound still, but one that defocus, motion, shot noise, clutter and covers keep any
+    estimator away from.
     """
     sensor, part = plan.file.sensor, plan[which]
     taken = part.conditions
@@ -87,7 +90,7 @@ def bounds(plan: Plan, which: Int[Tensor, " B"]) -> Float[Tensor, "B 6"]:
         plan.target,
         part.R,
         part.t,
-        psf_sigma=taken.psf_sigma,
+        **taken.blur,
         dark=taken.dark,
         light=taken.light,
         noise_sigma=variance.sqrt(),
@@ -113,7 +116,7 @@ def analytic(plan: Plan) -> Renderer:
             plan.target,
             part.R,
             part.t,
-            psf_sigma=part.conditions.psf_sigma,
+            **part.conditions.blur,
             dark=part.conditions.dark,
             light=part.conditions.light,
             plate=image.plate,

@@ -69,6 +69,8 @@ Range = Annotated[list[FiniteFloat], BeforeValidator(_range)]
 
 Blur = Annotated[Range, _from(lambda s: s > 0, "the blur must be above 0 px, such as 0.3 for a very sharp lens")]
 Move = Annotated[Range, _from(lambda s: s >= 0, "give the length of the move during the exposure, 0 or more")]
+Ratio = Annotated[Range, _from(lambda s: s >= 1, "give the larger standard deviation over the smaller, 1 or more")]
+Extent = Annotated[Range, _from(lambda s: s >= 0, "give px, 0 or more")]
 Noise = Annotated[Range, _from(lambda s: s >= 0, "give the standard deviation in grey levels, 0 or more")]
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 
@@ -146,6 +148,11 @@ class Imaging(_Section):
     """Conditions of the picture, before the sensor."""
 
     psf_sigma: Blur = [0.7, 0.7]
+    psf_ratio: Ratio = [1.0, 1.0]
+    psf_deg: Range = [0.0, 180.0]
+    smear_px: Extent = [0.0, 0.0]
+    smear_deg: Range = [0.0, 180.0]
+    disc_px: Extent = [0.0, 0.0]
     dark: Range = [30.0, 30.0]
     light: Range = [220.0, 220.0]
     surround: Range = [90.0, 90.0]
@@ -164,6 +171,12 @@ class Imaging(_Section):
         if value is not None and min(value) <= 0:
             raise ValueError("has a side that is not above 0; give its width and height in mm")
         return value
+
+    @model_validator(mode="after")
+    def _one_disc(self) -> Imaging:
+        if self.defocus is not None and self.disc_px[1] > 0:
+            raise ValueError("has both defocus and disc_px; give one of them")
+        return self
 
     @model_validator(mode="after")
     def _behind(self) -> Imaging:
@@ -198,13 +211,37 @@ class PlanFile(_Section):
 
 @dataclass(frozen=True, eq=False)
 class Conditions(Rows):
-    """What every frame has its own value of: blur (px), read noise and grey levels of 0..255."""
+    """What every frame has its own value of: blur, read noise and grey levels of 0..255.
+
+    Attributes:
+        psf_sigma: smaller standard deviation of the Gaussian, px.
+        psf_ratio: the larger one over it.
+        psf_deg: direction of the larger one, from u towards v.
+        smear_px: length of the motion in the image.
+        smear_deg: its direction.
+        disc_px: radius of the disc.
+    """
 
     psf_sigma: Float[Tensor, " N"]
     dark: Float[Tensor, " N"]
     light: Float[Tensor, " N"]
     surround: Float[Tensor, " N"]
     noise: Float[Tensor, " N"]
+    psf_ratio: Float[Tensor, " N"]
+    psf_deg: Float[Tensor, " N"]
+    smear_px: Float[Tensor, " N"]
+    smear_deg: Float[Tensor, " N"]
+    disc_px: Float[Tensor, " N"]
+
+    @property
+    def blur(self) -> dict[str, Tensor]:
+        """Fields of `torchpose.sim.Imaging`: ``psf_sigma``, a covariance where any is elliptic, ``smear``, ``disc``."""
+        variance = self.psf_sigma.square()
+        axis, along = _direction(self.psf_deg), _direction(self.smear_deg)
+        elongation = (variance * (self.psf_ratio.square() - 1))[:, None, None] * axis[:, :, None] * axis[:, None]
+        covariance = torch.diag_embed(variance[:, None].expand(-1, 2)) + elongation
+        sigma = covariance if bool((self.psf_ratio > 1).any()) else self.psf_sigma
+        return {"psf_sigma": sigma, "smear": self.smear_px[:, None] * along, "disc": self.disc_px}
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,9 +309,12 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
         vectors = torch.randn(len(t), 3, dtype=torch.float64, generator=generator)
         return torch.nn.functional.normalize(vectors, dim=1)
 
-    conditions = Conditions(*map(draw, (image.psf_sigma, image.dark, image.light, image.surround, file.sensor.noise)))
+    levels = [draw(x) for x in (image.psf_sigma, image.dark, image.light, image.surround, file.sensor.noise)]
     shift = directions() * draw(image.motion_mm)[:, None]
     motion = torch.cat([shift, directions() * draw(image.motion_deg).deg2rad()[:, None]], 1)
+    # last, so that what came before them draws as it always did
+    directed = (image.psf_ratio, image.psf_deg, image.smear_px, image.smear_deg, image.disc_px)
+    conditions = Conditions(*levels, *map(draw, directed))
     seen = markers_in_view(camera, target, R, t)
     plan = Plan(R, t, conditions, motion, seen, file, path, camera, target, _backgrounds(path, image.background))
     if file.out_of_view == "error":
@@ -379,6 +419,11 @@ def _euler(angles: Tensor) -> Tensor:
 
 def _spread(value: list[float], u: Tensor) -> Tensor:
     return value[0] + (value[1] - value[0]) * u
+
+
+def _direction(degrees: Tensor) -> Tensor:
+    """Unit vectors (N, 2) of angles (N,)."""
+    return torch.stack([degrees.deg2rad().cos(), degrees.deg2rad().sin()], 1)
 
 
 def _floats(values: Any) -> Tensor:

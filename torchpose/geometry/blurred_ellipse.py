@@ -1,12 +1,14 @@
 """Indicator of an ellipse under a Gaussian blur, exact for any ratio of blur to size, with derivatives.
 
-By the divergence theorem it is an integral along the boundary, with r from the point to the boundary:
+By the divergence theorem it is an integral along the boundary. With r from the point to the boundary and the blur's
+covariance S, m = r' S^-1 r,
 
-    E = closed integral of (1 - exp(-r^2 / 2 sigma^2)) / (2 pi r^2) (r . n) dl
+    E = closed integral of (1 - exp(-m / 2)) / (2 pi m sqrt(det S)) (r . n) dl
 
 (the divergence of the radial field in front is the Gaussian). A parameter that moves the boundary by v changes E by
-the integral of the Gaussian of r times (v . n) dl. Both integrands are periodic and as smooth as the blur, so the
-trapezoidal rule converges faster than any power of its step (Trefethen, Weideman, SIAM Review 56, 2014).
+the integral of the Gaussian of r times (v . n) dl; the blur changes it by the heat equation, dE/dS = half the second
+derivatives of E by the point. All integrands are periodic and as smooth as the blur, so the trapezoidal rule converges
+faster than any power of its step (Trefethen, Weideman, SIAM Review 56, 2014).
 """
 
 import math
@@ -19,7 +21,7 @@ _STEP = 1.0  # standard deviations of the blur from node to node: an error below
 
 
 def nodes_needed(semi_major: Float[Tensor, " K"], sigma: Float[Tensor, " K"]) -> int:
-    """Number of nodes for the most demanding of K ellipses with these semi-major axes and blurs."""
+    """Number of nodes for the most demanding of K ellipses with these semi-major axes and (least) blurs."""
     # equal steps of the eccentric anomaly are longest at the ends of the minor axis
     return max(8, int((2 * math.pi / _STEP * semi_major / sigma).max().ceil()))
 
@@ -29,19 +31,19 @@ def blurred_ellipse(
     center: Float[Tensor, "K 2"],
     shape: Float[Tensor, "K 2 2"],
     scale: Float[Tensor, " K"],
-    sigma: Float[Tensor, " K"],
+    blur: Float[Tensor, "K 3"],
     nodes: int,
-) -> tuple[Float[Tensor, "K P"], Float[Tensor, "K P 7"]]:
+) -> tuple[Float[Tensor, "K P"], Float[Tensor, "K P 9"]]:
     """Blurred indicators, in [0, 1], of K ellipses at P points each, and their derivatives.
 
     Args:
         shape: symmetric, see `conics.shape_matrix`.
         scale: factor on the shape.
-        sigma: standard deviation of the blur.
+        blur: covariance s11, s12, s22.
         nodes: of the trapezoidal rule, see `nodes_needed`.
 
     Returns:
-        Values, and derivatives by centre (2), shape s11, s12, s22, scale and sigma.
+        Values, and derivatives by centre (2), shape s11, s12, s22, scale and blur (3).
     """
     angle = torch.arange(nodes, dtype=xy.dtype, device=xy.device) * (2 * math.pi / nodes)
     unit = torch.stack([angle.cos(), angle.sin()])  # (2, M)
@@ -49,16 +51,28 @@ def blurred_ellipse(
     rim = scale[:, None, None] * (shape @ unit)  # (K, 2, M), from the centre
     tangent = scale[:, None, None] * (shape @ turn)
     nx, ny = tangent[:, 1], -tangent[:, 0]  # outward, times the length of a step
-    outward = rim[:, 0] * nx + rim[:, 1] * ny
+    bx, by = rim.unbind(1)
+    outward = bx * nx + by * ny
+    s11, s12, s22 = blur.unbind(-1)
+    area = (s11 * s22 - s12 * s12)[:, None]
+    inverse = torch.stack([s22, -s12, -s12, s11], -1).unflatten(-1, (2, 2)) / area[..., None]
     from_center = xy - center[:, None]
-    square = torch.baddbmm(rim.square().sum(1)[:, None], from_center, rim, alpha=-2)
-    square = square.add_(from_center.square().sum(-1, keepdim=True)).clamp_min_(1e-6)
+    weighted = from_center @ inverse
+    square = torch.baddbmm(((inverse @ rim) * rim).sum(1)[:, None], weighted, rim, alpha=-2)
+    square = square.add_((weighted * from_center).sum(-1, keepdim=True)).clamp_min_(1e-9)
     (ex, ey), q = unit, scale[:, None]
-    columns = torch.stack([nx, ny, q * ex * nx, q * (ey * nx + ex * ny), q * ey * ny, outward / q, outward], -1)
-    variance = sigma.square()[:, None, None]
-    fall = (square * (-0.5 / variance)).expm1_()  # the Gaussian, less one
-    flux = (fall / square) @ columns[..., (0, 1, 6)] / (-2 * math.pi)  # (K, P, 3)
-    by_motion = fall.add_(1) @ columns / (2 * math.pi * variance)  # (K, P, 7)
+    moves = [nx, ny, q * ex * nx, q * (ey * nx + ex * ny), q * ey * ny, outward / q]
+    columns = torch.stack([*moves, bx * nx, by * nx, bx * ny, by * ny, outward], -1)
+    norm = 2 * math.pi * area.sqrt()[..., None]
+    fall = (-0.5 * square).expm1_()  # the Gaussian, less one
+    flux = (fall / square) @ columns[..., (0, 1, 10)] / -norm  # (K, P, 3)
+    by_motion = fall.add_(1) @ columns[..., :10] / norm  # (K, P, 10)
     value = flux[..., 2] - (from_center * flux[..., :2]).sum(-1)
-    by_sigma = ((from_center * by_motion[..., :2]).sum(-1) - by_motion[..., 6]) / sigma[:, None]
-    return value, torch.cat([by_motion[..., :6], by_sigma[..., None]], -1)
+    # integrals of (boundary - point)_k n_i times the Gaussian, by the inverse of the blur their second derivatives
+    x, y = from_center.unbind(-1)
+    along, across = by_motion[..., 0], by_motion[..., 1]
+    xx, yx, xy_, yy = by_motion[..., 6:].unbind(-1)
+    xx, yx, xy_, yy = xx - x * along, yx - y * along, xy_ - x * across, yy - y * across
+    i11, i12, i22 = (inverse[:, i, j, None] for i, j in ((0, 0), (0, 1), (1, 1)))
+    by_blur = [-0.5 * (i11 * xx + i12 * yx), -(i12 * xx + i22 * yx), -0.5 * (i12 * xy_ + i22 * yy)]
+    return value, torch.cat([by_motion[..., :6], torch.stack(by_blur, -1)], -1)

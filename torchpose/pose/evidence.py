@@ -9,13 +9,16 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
 from torchpose.geometry.rows import Rows, shared
 from torchpose.identify import MarkerTable
 from torchpose.pose.centers import common_center
 from torchpose.rings import Rings
 
-_SHAPE_FLOOR = (0.03, 0.5)  # px, and times the curvature a / b^2: what blur and mask do to an ellipse's shape
+# px, and times the curvature a / b^2 and the blur's variance, of a px at least: what blur and mask do to an ellipse's
+# shape. Blur alone draws an edge inwards by half of the product, more where it is wider.
+_SHAPE_FLOOR = (0.03, 0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +33,7 @@ class Evidence(Rows):
         covariance: of these.
         shape: fitted ellipses, outer and inner, ideal px.
         shape_covariance: see `ellipse.EllipseFit`.
+        blur: of the rings, variance along the major axis, px^2.
         mask: marker seen.
         coplanar: whether all markers of the target lie in one plane.
         matrix: of the camera.
@@ -42,6 +46,7 @@ class Evidence(Rows):
     covariance: Float[Tensor, "N M 2 2"]
     shape: Float[Tensor, "N M 2 5"]
     shape_covariance: Float[Tensor, "N M 2 5 5"]
+    blur: Float[Tensor, "N M"]
     mask: Bool[Tensor, "N M"]
     coplanar: Bool[Tensor, " N"]
     matrix: Float[Tensor, "3 3"] = shared()
@@ -86,6 +91,7 @@ def gather_evidence(
         laid_out(covariance, torch.nan),
         laid_out(torch.stack([seen.outer.params, seen.inner.params], 1), 1.0),
         laid_out(torch.stack([seen.outer.covariance, seen.inner.covariance], 1), 1.0),
+        laid_out(blurs.axes(seen.blur)[1], 1.0),
         mask,
         markers.coplanar,
         matrix,
@@ -109,7 +115,8 @@ def shape_chi2(evidence: Evidence, R: Tensor, t: Tensor) -> Tensor:
     change = axes.mT @ difference @ axes
     v = torch.stack([change[..., 0, 0] - change[..., 1, 1], 2 * change[..., 0, 1]], -1)
     pick = torch.tensor([[0, 0, 1, 0, -1], [0, 0, 0, 2, 0]], dtype=v.dtype, device=v.device)
-    floor = _SHAPE_FLOOR[0] + _SHAPE_FLOOR[1] * evidence.shape[..., 2] / evidence.shape[..., 3].square()
+    bend = evidence.shape[..., 2] / evidence.shape[..., 3].square()
+    floor = _SHAPE_FLOOR[0] + _SHAPE_FLOOR[1] * bend * evidence.blur[..., None].clamp_min(1.0)
     eye = torch.eye(2, dtype=v.dtype, device=v.device)
     covariance = pick @ evidence.shape_covariance @ pick.T + floor.square()[..., None, None] * eye
     seen = evidence.mask[..., None, None, None]

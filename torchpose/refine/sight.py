@@ -1,6 +1,9 @@
 """What a refinement looks at, and what it returns."""
 
-from dataclasses import dataclass
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Self
 
 import torch
@@ -8,10 +11,15 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchpose.camera import Camera
+from torchpose.detect.reduce import area_reduce
+from torchpose.geometry import blur as blurs
 from torchpose.geometry.rows import Rows, shared
 from torchpose.target import Target
 
 LEAST_KEPT = 0.5  # of the pixels around the edges that must follow the model for a refinement to count
+QUANTISATION = 1 / 12  # variance of rounding, in grey levels^2, below which no noise estimate falls
+_START_BLUR = 0.8  # px, of rows whose rings tell of none
+_MOST_REDUCTION = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,8 +34,10 @@ class Sight(Rows):
         centers: of the markers, target frame, mm.
         normals: the same.
         radii: outer and inner, mm.
+        blur: of every marker, px^2, see `geometry.blur`; None where nothing is known of it.
         frames: grey values, any real dtype.
         camera: with distortion.
+        reduction: of the frames, by block means: their rounding counts for less.
     """
 
     frame: Int[Tensor, " N"]
@@ -39,6 +49,8 @@ class Sight(Rows):
     radii: Float[Tensor, "N M 2"]
     frames: Shaped[Tensor, "B H W"] = shared()
     camera: Camera = shared()
+    blur: Float[Tensor, "N M 3"] | None = None
+    reduction: int = shared(1)
 
     @classmethod
     def of(cls, frames: Tensor, camera: Camera, target: Target, frame: Tensor, rings: Tensor) -> Self:
@@ -49,6 +61,58 @@ class Sight(Rows):
         mask = torch.ones(rows, dtype=torch.bool, device=rings.device)
         return cls(frame, mask, rings, polarity, centers, normals, radii, frames, camera)
 
+    @property
+    def quantisation(self) -> float:
+        """Variance of rounding, grey levels^2."""
+        return QUANTISATION / self.reduction**2
+
+    @property
+    def common_blur(self) -> Float[Tensor, "N 3"]:
+        """The median of the blurs of the markers of every row that are seen."""
+        start = torch.tensor(_START_BLUR, dtype=torch.float64, device=self.frame.device)
+        if self.blur is None:
+            return blurs.isotropic(start.expand(len(self)))
+        known = torch.where(self.mask[..., None], self.blur, torch.nan)
+        return torch.where(self.mask.any(1, keepdim=True), known.nanmedian(1).values, blurs.isotropic(start))
+
+    def reduced(self, factor: int) -> Sight:
+        """The same rows in frames of which blocks of ``factor`` px make one; only those frames that they need."""
+        if factor == 1:
+            return self
+        which, frame = self.frame.unique(return_inverse=True)
+        rings = torch.cat([(self.rings[..., :2] - 0.5 * (factor - 1)) / factor, self.rings[..., 2:4] / factor], -1)
+        return replace(
+            self,
+            frame=frame,
+            rings=torch.cat([rings, self.rings[..., 4:]], -1),
+            frames=area_reduce(self.frames[which], factor, exact=True),
+            camera=self.camera.reduced(factor),
+            blur=None if self.blur is None else blurs.reduced(self.blur, factor),
+            reduction=self.reduction * factor,
+        )
+
+    def by_blur(self, widest: float, *, minor: bool = False) -> Iterator[tuple[Tensor, Sight]]:
+        """The rows in parts, each in frames so far reduced that its blur is not wider: indices (K,) and the part.
+
+        Args:
+            widest: px, standard deviation along the major axis, or the ``minor`` one.
+        """
+        if len(self) == 0:
+            yield self.frame, self
+            return
+        axis = blurs.axes(self.common_blur)[0 if minor else 1].clamp_min(0).sqrt()
+        factor = torch.ones_like(self.frame)
+        for power in range(1, _MOST_REDUCTION.bit_length()):
+            factor = torch.where(axis > widest * 2 ** (power - 1), 2**power, factor)
+        for value in factor.unique().tolist():
+            index = (factor == value).nonzero()[:, 0]
+            yield index, self[index].reduced(value)
+
+
+def at_full_size(refined: Refined, factor: int) -> Refined:
+    """What was refined in reduced frames: its blur in px of the frames themselves."""
+    return refined if factor == 1 else replace(refined, spread=blurs.enlarged(refined.spread, factor))
+
 
 @dataclass(frozen=True, eq=False)
 class Refined(Rows):
@@ -58,7 +122,7 @@ class Refined(Rows):
         R: target to camera.
         t: mm.
         covariance: as in `results.Poses`.
-        blur: px, standard deviation of the point-spread function with the pixel.
+        spread: blur, px^2, see `geometry.blur`.
         noise: standard deviation of the residuals kept: grey levels (photometric), px (edges).
         kept: share of the pixels, or edge points, kept.
         good: where False the refinement failed and the other fields mean nothing.
@@ -67,7 +131,12 @@ class Refined(Rows):
     R: Float[Tensor, "N 3 3"]
     t: Float[Tensor, "N 3"]
     covariance: Float[Tensor, "N 6 6"]
-    blur: Float[Tensor, " N"]
+    spread: Float[Tensor, "N 3"]
     noise: Float[Tensor, " N"]
     kept: Float[Tensor, " N"]
     good: Bool[Tensor, " N"]
+
+    @property
+    def blur(self) -> Float[Tensor, " N"]:
+        """px, standard deviation of the point-spread function with the pixel: of the round one of the same area."""
+        return blurs.size(self.spread)

@@ -8,7 +8,9 @@ from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.detect import Candidates
+from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
+from torchpose.geometry.least_squares import solve_scaled
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import values_at
 
@@ -18,6 +20,8 @@ _INNERMOST, _OUTERMOST = 0.08, 1.12  # of the outer ellipse, the range of the ra
 _RATIO_RANGE = (0.12, 0.93)  # of inner to outer radius
 _LEAST_PEAK = 0.25  # of the outer edge's slope in the mean radial profile
 _LEAST_EDGE = 0.5  # of the median rise at the outer edge over all directions, for a direction that counts
+_EIGHTHS = 8  # parts of the perimeter in which the blur is looked at
+_MOST_BLUR = 12.0  # px
 _PARTED = 0.02  # of the semi-minor axis: from which shift of the centres on perspective smears the profile
 
 
@@ -31,12 +35,14 @@ class InnerCircles(Rows):
         ellipse: the inner circle, about.
         seen: the directions, evenly spaced in eccentric anomaly from +u on the circle that the candidate is the image
             of, in which its own edge shows.
+        blur: of the outer edge, px^2, about; see `geometry.blur`.
     """
 
     ratio: Float[Tensor, " M"]
     found: Bool[Tensor, " M"]
     ellipse: Float[Tensor, "M 5"]
     seen: Bool[Tensor, "M A"]
+    blur: Float[Tensor, "M 3"]
 
 
 def find_inner(frames: Tensor, candidates: Candidates, camera: Camera | None = None) -> InnerCircles:
@@ -84,7 +90,42 @@ def find_inner(frames: Tensor, candidates: Candidates, camera: Camera | None = N
     center = candidates.ellipse[:, :2] + (1 - ratio.square())[:, None] * apart[first]
     inner = torch.cat([center, candidates.ellipse[:, 2:4] * ratio[:, None], candidates.ellipse[:, 4:]], -1)
     found = (outermost[first] > 0) & (steepest > _LEAST_PEAK * outermost[first])
-    return InnerCircles(ratio, found, inner, seen[first])
+    blur = _edge_blur(grey[first], seen[first], candidates.ellipse, ratio, at)
+    return InnerCircles(ratio, found, inner, seen[first], blur)
+
+
+def _edge_blur(grey: Tensor, seen: Tensor, outer: Tensor, ratio: Tensor, at: Tensor) -> Tensor:
+    """Blurs (M, 3) of outer edges, from the steepest rise of the mean profile of every eighth of the directions.
+
+    A Gaussian's step has the slope step / (sqrt(2 pi) sigma). The two samples between which it is taken, and their
+    rounding to whole pixels, add their own.
+
+    Args:
+        grey: (M, R, A). seen: (M, A). outer: (M, 5). ratio: (M,). at: (R - 2,), radii that have a rise.
+    """
+    eighth = (-1, _EIGHTHS, ANGLES // _EIGHTHS)
+    weight = seen.unflatten(1, eighth[1:]).to(grey)
+    mean = (grey.nan_to_num(nan=0.0).unflatten(2, eighth[1:]) * weight[:, None]).sum(-1)
+    profile = (mean / weight.sum(-1)[:, None]).double()  # NaN where it is not seen
+    outside = (at > 0.5 * (1 + ratio)[:, None])[..., None]
+    rise = (profile[:, 2:] - profile[:, :-2]).abs()
+    inner = torch.where(outside, profile[:, 1:-1], torch.nan).nan_to_num(nan=torch.inf)
+    step = (
+        (profile[:, -1] - inner.amin(1))
+        .abs()
+        .maximum((profile[:, -1] - torch.where(inner == torch.inf, -torch.inf, inner).amax(1)).abs())
+    )
+    steepest = torch.where(outside, rise, -torch.inf).amax(1)
+    angle = (torch.arange(_EIGHTHS, dtype=torch.float64, device=grey.device) + 0.5) * (2 * torch.pi / _EIGHTHS)
+    normal = torch.linalg.inv(conics.shape_matrix(outer)) @ torch.stack([angle.cos(), angle.sin()])  # (M, 2, 8)
+    length = torch.linalg.vector_norm(normal, dim=1)
+    spacing = float(at[2] - at[0]) / length  # px, between the two samples, across the edge
+    variance = (step / steepest * spacing).square() / (2 * torch.pi) - (spacing.square() + 1) / 12
+    known = variance.isfinite()
+    nu, nv = (normal / length[:, None]).unbind(1)
+    rows = torch.stack([nu * nu, 2 * nu * nv, nv * nv], 1) * known[:, None]
+    found = solve_scaled(rows @ rows.mT, (rows @ torch.where(known, variance, 0.0)[..., None]).squeeze(-1))
+    return blurs.limited(found.nan_to_num(nan=0.0), 0.0, _MOST_BLUR**2)
 
 
 def _mean_profile(grey: Tensor, seen: Tensor, gaps: bool) -> Tensor:

@@ -9,13 +9,16 @@ from torch import Tensor
 from torchpose import ellipse
 from torchpose.camera import Camera
 from torchpose.detect import Candidates
+from torchpose.detect.reduce import area_reduce
 from torchpose.ellipse import EllipseFit
+from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
+from torchpose.geometry.blurred_edge import LEAST, MOST
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import segment_mean, segment_sum
 from torchpose.rings import zernike
 from torchpose.rings.edges import REACH, RingEdges, ring_edges
-from torchpose.rings.inner_circles import ANGLES, clear_directions, find_inner
+from torchpose.rings.inner_circles import ANGLES, InnerCircles, clear_directions, find_inner
 from torchpose.rings.lens import ideal_pixels, mapped
 from torchpose.rings.small_rings import fit_small_rings
 
@@ -23,8 +26,9 @@ _LEAST_COVER = (0.4, 0.33)  # of the perimeter with edge points, outer and inner
 _SMALL = 4.0  # px: circles of a smaller semi-minor axis fill the mask of an edge
 _LEAST_SEMI_MINOR = (4.0, 1.2)  # px, outer and inner circle: smaller ones are letters and specks as well as rings
 _LARGE = 20.0  # px, of the outer semi-minor axis, from which on a fit of all pixels costs too much
-_BLURRED = 0.6  # slope of the offsets (`zernike.blur_slope`): a blur above 1.3 px, out of the mask's reach
-_BLURRED_LARGE = 50.0  # px, of the outer semi-major axis of a blurred ring
+_BLURRED = 1.3  # px: a wider blur is out of the reach of an edge's mask; the frame is looked at in half its size
+_MOST_REDUCTION = 4
+_LEAST_REDUCED = 5.0  # px, outer semi-minor axis in a reduced frame: of a smaller one too few pixels are left
 _EDGE_APART = 0.8  # ... and so do two edges closer than 5 px
 _STEP_RANGE = (0.4, 2.5)  # inner to outer grey step
 
@@ -40,6 +44,7 @@ class Rings(Rows):
         inner_raw: the same.
         outer: fits in ideal pixels, that is of the same camera without lens distortion.
         inner: the same.
+        blur: of the ring's edges, px^2, see `geometry.blur`.
     """
 
     frame: Int[Tensor, " K"]
@@ -48,6 +53,7 @@ class Rings(Rows):
     inner_raw: Float[Tensor, "K 5"]
     outer: EllipseFit
     inner: EllipseFit
+    blur: Float[Tensor, "K 3"]
 
     @property
     def ratio(self) -> Tensor:
@@ -68,28 +74,93 @@ def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera, *, cor
         return _no_rings(candidates)
     inside = find_inner(frames, candidates, camera)
     found = inside.found
-    return _measure(frames, candidates[found], inside.ellipse[found], inside.seen[found], camera, correct)[0]
+    return _measured(frames, candidates[found], inside[found], camera, correct)[0]
 
 
 def _no_rings(candidates: Candidates) -> Rings:
     """Of no candidates: frames without any cost nothing here."""
     frame, polarity, none = candidates.frame, candidates.polarity, candidates.ellipse
     fit = EllipseFit(none, none.new_empty(0, 5, 5), polarity, polarity)
-    return Rings(frame, polarity, none, none, fit, fit)
+    return Rings(frame, polarity, none, none, fit, fit, none[:, :3])
 
 
 def measure_predicted(
     frames: Tensor, candidates: Candidates, inner: Tensor, camera: Camera, *, correct: bool = True
 ) -> tuple[Rings, Tensor]:
     """The same where the inner ellipses (M, 5) are known, about; also which candidate each ring is of, (K,) int64."""
-    return _measure(frames, candidates, inner, find_inner(frames, candidates, camera).seen, camera, correct)
+    inside = replace(find_inner(frames, candidates, camera), ellipse=inner)
+    return _measured(frames, candidates, inside, camera, correct)
+
+
+def _measured(
+    frames: Tensor, candidates: Candidates, inside: InnerCircles, camera: Camera, correct: bool
+) -> tuple[Rings, Tensor]:
+    """Rings of candidates, each in frames reduced as far as its blur asks for, and whose they are.
+
+    A mask or a band of a fixed size sees little of an edge that is wider; in a frame of half the size it is not.
+    """
+    wide, room = blurs.axes(inside.blur)[1].sqrt(), candidates.ellipse[:, 3]
+    factor = torch.ones_like(candidates.frame)
+    for power in range(1, _MOST_REDUCTION.bit_length()):
+        factor = torch.where(
+            (wide > _BLURRED * 2 ** (power - 1)) & (room > _LEAST_REDUCED * 2**power), 2**power, factor
+        )
+    rings, which = [], []
+    for value in factor.unique().tolist():
+        index = (factor == value).nonzero()[:, 0]
+        frame, own = candidates.frame[index].unique(return_inverse=True)
+        some = replace(candidates[index], frame=own, ellipse=_reduced(candidates.ellipse[index], value))
+        part = replace(
+            inside[index],
+            ellipse=_reduced(inside.ellipse[index], value),
+            blur=blurs.reduced(inside.blur[index], value),
+        )
+        small = frames if len(frame) == len(frames) else frames[frame]
+        small = small if value == 1 else area_reduce(small, value, exact=True)
+        found, of = _measure(small, some, part, camera.reduced(value), correct)
+        rings.append(_enlarged(replace(found, frame=frame[found.frame]), value))
+        which.append(index[of])
+    if not rings:
+        return _no_rings(candidates), candidates.frame
+    order = torch.argsort(torch.cat(which))
+    return Rings.cat(rings)[order], torch.cat(which)[order]
+
+
+def _reduced(ellipses: Tensor, factor: int) -> Tensor:
+    """Ellipses (K, 5) in pixels of frames of which blocks of ``factor`` px make one."""
+    return torch.cat([(ellipses[:, :2] - 0.5 * (factor - 1)) / factor, ellipses[:, 2:4] / factor, ellipses[:, 4:]], -1)
+
+
+def _enlarged(rings: Rings, factor: int) -> Rings:
+    """Rings measured in such frames, in pixels of the frames themselves."""
+    if factor == 1:
+        return rings
+    move = torch.tensor([0.5 * (factor - 1)] * 2 + [0.0] * 3, dtype=torch.float64, device=rings.frame.device)
+    grow = torch.tensor([factor] * 4 + [1], dtype=torch.float64, device=rings.frame.device)
+
+    def fit(small: EllipseFit) -> EllipseFit:
+        return replace(
+            small,
+            params=small.params * grow + move,
+            covariance=small.covariance * factor**2,
+            sigma=small.sigma * factor,
+        )
+
+    return replace(
+        rings,
+        outer_raw=rings.outer_raw * grow + move,
+        inner_raw=rings.inner_raw * grow + move,
+        outer=fit(rings.outer),
+        inner=fit(rings.inner),
+        blur=blurs.enlarged(rings.blur, factor),
+    )
 
 
 def _measure(
-    frames: Tensor, candidates: Candidates, inner: Tensor, seen: Tensor, camera: Camera, correct: bool
+    frames: Tensor, candidates: Candidates, inside: InnerCircles, camera: Camera, correct: bool
 ) -> tuple[Rings, Tensor]:
-    """Rings of candidates with rough inner ellipses (M, 5), and whose they are; ``seen`` is that of `find_inner`."""
-    outer, clear = candidates.ellipse, clear_directions(seen)
+    """Rings of candidates in the frames as they are, and whose they are."""
+    outer, inner, clear = candidates.ellipse, inside.ellipse, clear_directions(inside.seen)
     ratio = (inner[:, 2:4].prod(-1) / outer[:, 2:4].prod(-1)).sqrt()
     count = len(candidates)
     # no search band may reach the other circle, nor the centre
@@ -102,11 +173,11 @@ def _measure(
     edges = edges[clear.repeat(2, 1)[edges.ring, _direction(edges, rough)]]
 
     raw, keep = ellipse.fit_robust(edges.points, edges.ring, 2 * count, start=rough)
-    points, blurred = edges.points, torch.zeros_like(candidates.frame, dtype=torch.bool)
+    distance = edges.offset - ellipse.distance(edges.points, edges.ring, raw) * outward[edges.ring]
+    blur = zernike.edge_blur(edges.offset[keep], distance[keep], edges.normal[keep], edges.ring[keep] % count, count)
+    points = edges.points
     if correct:
-        distance = edges.offset - ellipse.distance(edges.points, edges.ring, raw) * outward[edges.ring]
-        points = _unbiased(edges, distance, raw, keep, outward, frame, frames.shape[0])
-        blurred = zernike.blur_slope(edges.offset[keep], distance[keep], edges.ring[keep] % count, count) < _BLURRED
+        points = points + _correction(edges, raw, blur, outward)[:, None] * edges.normal
     raw, keep = ellipse.fit_robust(points, edges.ring, 2 * count, start=raw, scales=(0.5,))
     ring, points = edges.ring[keep], points[keep]
     ideal_points = ideal_pixels(camera, points)
@@ -133,14 +204,17 @@ def _measure(
         & (raw[count:, 2] < raw[:count, 2])
     )
     narrow = torch.minimum((1 - ratio) * _EDGE_APART, ratio) * outer[:, 3] < _SMALL
-    small = (narrow & (outer[:, 3] < _LARGE)) | (blurred & (outer[:, 2] < _BLURRED_LARGE))
+    small = narrow & (outer[:, 3] < _LARGE)
     index = (good & ~small).nonzero()[:, 0]
     second = index + count
-    large = Rings(candidates.frame[index], candidates.polarity[index], raw[index], raw[second], fit[index], fit[second])
+    pixel = blurs.isotropic(blur.new_tensor(12**-0.5))  # that of the mask
+    blur = blurs.limited(blur - pixel, LEAST**2, MOST**2)[index]
+    frame, polarity = candidates.frame[index], candidates.polarity[index]
+    large = Rings(frame, polarity, raw[index], raw[second], fit[index], fit[second], blur)
     if not bool(small.any()):
         return large, index
     rest = small.nonzero()[:, 0]
-    measured, which = _measure_small(frames, candidates[rest], ratio[rest], clear[rest], camera)
+    measured, which = _measure_small(frames, candidates[rest], replace(inside, ratio=ratio, seen=clear)[rest], camera)
     return Rings.cat([large, measured]), torch.cat([index, rest[which]])
 
 
@@ -156,11 +230,13 @@ def _direction(edges: RingEdges, ellipses: Tensor) -> Tensor:
 
 
 def _measure_small(
-    frames: Tensor, candidates: Candidates, ratio: Tensor, seen: Tensor, camera: Camera
+    frames: Tensor, candidates: Candidates, inside: InnerCircles, camera: Camera
 ) -> tuple[Rings, Tensor]:
     """The same for rings whose circles are too close to each other, or too small, to be measured one by one."""
     focal = camera.matrix.diagonal()[:2].mean()
-    found = fit_small_rings(frames, candidates.frame, candidates.ellipse, ratio, seen, candidates.polarity, focal)
+    found = fit_small_rings(
+        frames, candidates.frame, candidates.ellipse, inside.ratio, inside.seen, candidates.polarity, focal, inside.blur
+    )
     least_outer, least_inner = _LEAST_SEMI_MINOR
     large = (found.outer.params[:, 3] > least_outer) & (found.inner.params[:, 3] > least_inner)
     index = (found.good & large).nonzero()[:, 0]
@@ -176,16 +252,14 @@ def _measure_small(
         inner.params,
         replace(outer, params=mapped(outer.params, to_ideal)),
         replace(inner, params=mapped(inner.params, to_ideal)),
+        found.blur[index],
     )
     return rings, index
 
 
-def _unbiased(
-    edges: RingEdges, distance: Tensor, fitted: Tensor, keep: Tensor, outward: Tensor, frame: Tensor, frames: int
-) -> Tensor:
-    """Edge points (E, 2) freed from what each frame's blur and the edges' curvature do to their offsets."""
-    group = frame[edges.ring]
-    slope = zernike.blur_slope(edges.offset[keep], distance[keep], group[keep], frames)[group]
-    pushed = zernike.curvature_shift(slope) * ellipse.curvature(edges.points, edges.ring, fitted)
-    change = zernike.deblur(edges.offset, slope) - edges.offset - pushed * outward[edges.ring]
-    return edges.points + change[:, None] * edges.normal
+def _correction(edges: RingEdges, fitted: Tensor, blur: Tensor, outward: Tensor) -> Tensor:
+    """What each ring's blur (M / 2, 3) and the edges' curvature do to their offsets, taken off: (E,) px."""
+    blur = blur[edges.ring % len(blur)]
+    pushed = zernike.curvature_shift(blur, edges.normal) * ellipse.curvature(edges.points, edges.ring, fitted)
+    slope = zernike.slope_across(blur, edges.normal)
+    return zernike.deblur(edges.offset, slope) - edges.offset - pushed * outward[edges.ring]

@@ -1,17 +1,19 @@
-"""What a small ring looks like: E(1) - E(q) of `small_rings`, as an exact integral and to first order.
+"""What a small ring looks like: E(1) - E(q) of `small_rings`, to first order and as an exact integral.
 
-Parameters theta (K, 9) of a ring: centre of the outer ellipse, its shape matrix s11, s12, s22, ratio q of radii, blur,
-and the inner centre from the outer one.
+Parameters (K, 8) of a ring: centre of the outer ellipse, its shape matrix s11, s12, s22, ratio q of radii, and the
+inner centre from the outer one. Pixels are padded planes (K, P) x, y, px about any origin of the ring.
 """
 
-import math
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from torchpose.geometry import blur as blurs
+from torchpose.geometry.blurred_edge import Spread
 from torchpose.geometry.blurred_ellipse import blurred_ellipse, nodes_needed
 
+RING = 8  # parameters
 MOST_NODES = 120  # of the exact integral: enough for a semi-major axis of 19 blurs
 
 
@@ -25,9 +27,9 @@ def outer_ellipses(theta: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class Depth(NamedTuple):
-    """Of pixels (P,) in an ellipse: first-order distance inside, unit normal, S^-1 (x - c), curvature."""
+    """Of pixels (K, P) and an ellipse: first-order distance outside, unit normal, S^-1 (x - c), |grad|, curvature."""
 
-    depth: Tensor
+    distance: Tensor
     nx: Tensor
     ny: Tensor
     u: Tensor
@@ -36,61 +38,56 @@ class Depth(NamedTuple):
     curvature: Tensor
 
 
-def depth(theta: Tensor, index: Tensor, xy: Tensor, inner: bool = False) -> Depth:
-    """Depths of pixels (P, 2) in the outer ellipses, or the inner ones, of their rings ``index`` (P,)."""
+def depth(theta: Tensor, x: Tensor, y: Tensor, inner: bool = False) -> Depth:
+    """Where pixels (K, P) are about the outer ellipses (K, 5 at least), or about the inner ones."""
     cx, cy, s11, s12, s22 = theta[:, :5].unbind(-1)
     if inner:
-        cx, cy = cx + theta[:, 7], cy + theta[:, 8]
+        cx, cy = cx + theta[:, 6], cy + theta[:, 7]
     det = s11 * s22 - s12 * s12
-    i11, i12, i22 = (s22 / det)[index], (-s12 / det)[index], (s11 / det)[index]
-    dx, dy = xy[:, 0] - cx[index], xy[:, 1] - cy[index]
+    i11, i12, i22 = ((s / det)[:, None] for s in (s22, -s12, s11))
+    dx, dy = x - cx[:, None], y - cy[:, None]
     u, v = i11 * dx + i12 * dy, i12 * dx + i22 * dy
-    rho = torch.hypot(u, v).clamp_min(1e-6)
+    rho = (u * u + v * v).sqrt().clamp_min(1e-6)
     gx, gy = (i11 * u + i12 * v) / rho, (i12 * u + i22 * v) / rho
-    length = torch.hypot(gx, gy).clamp_min(1e-9)
-    scale = theta[index, 5] if inner else 1.0
-    curvature = 1 / (length**3 * det[index].square() * scale).clamp_min(1e-9)
-    return Depth((scale - rho) / length, gx / length, gy / length, u, v, length, curvature)
+    length = (gx * gx + gy * gy).sqrt().clamp_min(1e-9)
+    scale = theta[:, 5:6] if inner else 1.0
+    curvature = 1 / (length.pow(3) * det.square()[:, None] * scale).clamp_min(1e-9)
+    return Depth((rho - scale) / length, gx / length, gy / length, u, v, length, curvature)
 
 
-def exact(theta: Tensor, index: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
-    """E(1) - E(q) at every pixel (P,), sorted by ring, and its derivatives (P, 9)."""
-    count = theta.shape[0]
-    size = torch.bincount(index, minlength=count)
-    position = torch.arange(index.numel(), device=index.device) - (size.cumsum(0) - size)[index]
-    near = xy - theta[index, :2]
-    padded = near.new_zeros(count, int(size.max()), 2).index_put((index, position), near)
-    ellipses, (ratio, sigma) = outer_ellipses(theta)[0], theta[:, 5:7].unbind(-1)
-    shape, parted = theta[:, (2, 3, 3, 4)].unflatten(-1, (2, 2)), theta[:, 7:9]
+def first_order(theta: Tensor, spread: Spread, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """E(1) - E(q) (K, P) to first order in the distance, and derivatives (K, 11, P) by theta and the blur; float32."""
+    theta, x, y = theta.float(), x.float(), y.float()
+    row = torch.arange(len(theta), device=theta.device)
+    outer, inner = depth(theta, x, y), depth(theta, x, y, inner=True)
+    # perspective parts the centres by little: both circles have nearly the same normal at a pixel
+    edge = spread.at(row, outer.nx, outer.ny)
+    columns, value = [], []
+    for d in (outer, inner):
+        step, by_distance, by_blur = edge(d.distance, d.curvature)
+        value.append(step)
+        by_x, by_y = by_distance * d.nx, by_distance * d.ny
+        by_shape = (by_x * d.u, by_x * d.v + by_y * d.u, by_y * d.v)
+        columns.append(((by_x, by_y), by_shape, by_distance / d.length, by_blur))
+    (center, shape, _, blur), (own, own_shape, by_ratio, own_blur) = columns
+    difference = [a - b for a, b in zip((*center, *shape, *blur), (*own, *own_shape, *own_blur), strict=True)]
+    # the distance falls where the ellipse grows: E is the inside
+    planes = [*difference[:5], -by_ratio, -own[0], -own[1], *(-b for b in difference[5:])]
+    return value[1] - value[0], torch.stack(planes, 1)
+
+
+def exact(theta: Tensor, spread: Spread, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """The same as exact integrals, in float64."""
+    xy, blur = torch.stack([x, y], -1), spread.covariance
+    ellipses, ratio = outer_ellipses(theta)[0], theta[:, 5]
+    shape, least = theta[:, (2, 3, 3, 4)].unflatten(-1, (2, 2)), blurs.axes(blur)[0].sqrt()
 
     def blurred(center: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
-        nodes = min(nodes_needed(ellipses[:, 2] * scale, sigma), MOST_NODES)
-        return blurred_ellipse(padded, center, shape, scale, sigma, nodes)
+        nodes = min(nodes_needed(ellipses[:, 2] * scale, least), MOST_NODES)
+        return blurred_ellipse(xy, center, shape, scale, blur, nodes)
 
-    outer, by_outer = blurred(torch.zeros_like(parted), torch.ones_like(ratio))
-    inner, by_inner = blurred(parted, ratio)
-    none = torch.zeros_like(by_outer[..., :1])
-    derivative = torch.cat([by_outer[..., :5], none, by_outer[..., 6:], none, none], -1)
-    derivative = derivative - torch.cat([by_inner, by_inner[..., :2]], -1)
-    return (outer - inner)[index, position], derivative[index, position]
-
-
-def first_order(theta: Tensor, index: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
-    """The same to first order in the distance."""
-    sigma = theta[index, 6]
-    value, columns = [], []
-    for inner in (False, True):
-        d = depth(theta, index, xy, inner)
-        # blur draws the edge of a disc of curvature k inwards by sigma^2 k / 2
-        at = d.depth / sigma - 0.5 * sigma * d.curvature
-        value.append(torch.special.ndtr(at))
-        slope = torch.exp(-0.5 * at.square()) / math.sqrt(2 * math.pi)
-        by_d = slope / sigma
-        none = torch.zeros_like(by_d)
-        by_center = (by_d * d.nx, by_d * d.ny)
-        by_shape = (by_d * d.nx * d.u, by_d * (d.nx * d.v + d.ny * d.u), by_d * d.ny * d.v)
-        by_ratio = by_d / d.length if inner else none
-        by_sigma = -slope * (d.depth / sigma.square() + 0.5 * d.curvature)
-        own = by_center if inner else (none, none)
-        columns.append(torch.stack([*by_center, *by_shape, by_ratio, by_sigma, *own], -1))
-    return value[0] - value[1], columns[0] - columns[1]
+    outer, by_outer = blurred(theta[:, :2], torch.ones_like(ratio))
+    inner, by_inner = blurred(theta[:, :2] + theta[:, 6:8], ratio)
+    by_ring = by_outer[..., :5] - by_inner[..., :5]
+    rest = [-by_inner[..., 5:6], -by_inner[..., :2], by_outer[..., 6:] - by_inner[..., 6:]]
+    return outer - inner, torch.cat([by_ring, *rest], -1).mT

@@ -6,26 +6,28 @@ measurement. The whole ring as one model has no such limit:
     I = paper + slope . x + contrast (E(1) - E(q)),
 
 E(s) the blurred indicator of the ellipse scaled by s, q the ratio of the radii. To first order in the distance it is
-Phi(d_s / sigma - sigma k_s / 2), d_s the distance inside the ellipse, k_s its curvature, Phi the normal distribution.
-Where the blur is more than a fifth of the inner circle, that is off by up to a quarter of the contrast, and the ring is
-fitted once more with the exact integral (`geometry.blurred_ellipse`). The circles share their shape; perspective parts
-their centres by about a^2 (1 - q^2) / f at most (a the semi-major axis, f the focal length, px), the standard deviation
-of a prior at zero. What covers a part of the ring, or touches it, is left out by robust weights.
+that of a curved edge (`geometry.blurred_edge`). Where the blur is more than a fifth of the inner circle, that is off by
+up to a quarter of the contrast, and the ring is fitted once more with the exact integral (`geometry.blurred_ellipse`).
+The circles share their shape; perspective parts their centres by about a^2 (1 - q^2) / f at most (a the semi-major
+axis, f the focal length, px), the standard deviation of a prior at zero. What covers a part of the ring, or touches it,
+is left out by robust weights.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import NamedTuple, cast
 
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchpose.ellipse import EllipseFit
+from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
+from torchpose.geometry.blurred_edge import BLUR, MOST, Spread
 from torchpose.geometry.least_squares import (
     Eliminated,
     Normal,
@@ -36,26 +38,30 @@ from torchpose.geometry.least_squares import (
     solve_scaled,
 )
 from torchpose.geometry.rows import Rows
-from torchpose.geometry.segments import ragged_arange, segment_mean, segment_sum
-from torchpose.rings.small_ring_model import MOST_NODES, depth, exact, first_order, outer_ellipses
+from torchpose.geometry.segments import values_at
+from torchpose.rings.small_ring_model import MOST_NODES, RING, depth, exact, first_order, outer_ellipses
 
 _MARGIN = 3.0  # px around the outer ellipse
 _SOFT, _CUT = 2.5, 4.0  # standard deviations: scale of the soft weights, and from where on a pixel is dropped
 _SECTORS, _SECTOR_CUT = 16, 4.0  # and standard deviations of the mean square of a sector
+_MISFIT = (
+    0.05  # of the contrast, RMS in a sector, that a blur of another shape leaves: the most of a box for a Gaussian
+)
 _LEAST_KEPT = 0.5  # of the pixels
-_MOST_MOVE = (*[0.7] * 5, 0.1, *[0.7] * 3)  # of an iteration: px, and the ratio
-_START_SIGMA = 0.8  # px
+_MOST_MOVE = (*[0.7] * 5, 0.1, *[0.7] * 2)  # of an iteration: px, and the ratio
+_START_SIGMA = 0.8  # px, at least
+_OVAL = 0.3  # of a blur's mean variance: what is expected of its lean, which a ring as small as its blur hardly tells
 _BLURRED = 0.2  # blur over inner semi-minor axis above which edges are no edges any more
 _BLURRED_MARGIN = 2.5  # blurs around the outer ellipse
 _LEAST_EXPLAINED = 0.75  # of the variance of grey around the ring
 _PROMISING = 0.5  # of it, from the first fit, for a second one
 _PART = 400_000  # pixels times nodes at a time
+_UNEVEN = 2.0  # most pixels of a window over the least, of those that are padded to one size
 _RATIO_RANGE = (0.12, 0.93)  # beyond it, a plain disc or its rim
 _RATIO_SIGMA = 0.1  # of the ratio: an inner circle that is not sure is none
-_NONLINEAR = 9  # centre 2, shape 3, ratio, blur, inner from outer centre 2
 _LEVELS = 4  # paper, its slope 2, contrast
-_LEAST = (*[-math.inf] * 5, 0.05, 0.3, *[-math.inf] * 2)  # of the unknowns, and the most
-_MOST = (*[math.inf] * 5, 0.97, 6.0, *[math.inf] * 2)
+_LEAST = (*[-math.inf] * 5, 0.05, *[-math.inf] * 2)  # of the ring's parameters, and the most
+_MOST = (*[math.inf] * 5, 0.97, *[math.inf] * 2)
 _LEAST_PARTED = 1e-3  # px, standard deviation of the prior of the smallest rings
 
 
@@ -66,11 +72,13 @@ class SmallRings(Rows):
     Attributes:
         outer: ellipses in raw pixels.
         inner: the same.
+        blur: px^2, see `geometry.blur`.
         good: whether the model explains what is seen.
     """
 
     outer: EllipseFit
     inner: EllipseFit
+    blur: Float[Tensor, "K 3"]
     good: Bool[Tensor, " K"]
 
 
@@ -90,13 +98,13 @@ class _Stage(NamedTuple):
 class _Scheme(NamedTuple):
     """How the rings are modelled and solved."""
 
-    coverage: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+    coverage: Callable[[Tensor, Spread, Tensor, Tensor], tuple[Tensor, Tensor]]
     damping: float
     stages: tuple[_Stage, ...]
 
 
 # grey levels and weights alone at first, so that a cover does not pull from the start
-_ROUGH = _Scheme(first_order, 1e-3, (_Stage(3, held=True, sectors=False), _Stage(7), _Stage(4, hard=True)))
+_ROUGH = _Scheme(first_order, 1e-3, (_Stage(2, held=True, sectors=False), _Stage(5), _Stage(3, hard=True)))
 # blur, width and contrast of a ring much blurred are hard to tell apart: no step is to be shortened
 _PRECISE = _Scheme(exact, 1e-5, (_Stage(6), _Stage(4, hard=True)))
 
@@ -109,6 +117,7 @@ def fit_small_rings(
     seen: Bool[Tensor, "K A"],
     polarity: Float[Tensor, " K"],
     focal: Float[Tensor, ""],
+    blur: Float[Tensor, "K 3"] | None = None,
 ) -> SmallRings:
     """Fits the model above by damped Gauss-Newton from rough rings.
 
@@ -120,40 +129,59 @@ def fit_small_rings(
         seen: the directions in which the outer edge shows, see `inner_circles.find_inner`; the others do not count.
         polarity: +1 for a dark ring.
         focal: px.
+        blur: rough, px^2.
     """
     shape = conics.shape_matrix(outer)
     start = [outer[:, :2], shape[:, 0, :1], shape[:, 0, 1:], shape[:, 1, 1:], ratio[:, None]]
-    theta = torch.cat([*start, torch.full_like(ratio, _START_SIGMA)[:, None], torch.zeros_like(outer[:, :2])], -1)
+    theta = torch.cat([*start, torch.zeros_like(outer[:, :2])], -1)
     parted = (outer[:, 2].square() * (1 - ratio.square()) / focal).clamp_min(_LEAST_PARTED)
-    known = torch.nn.functional.pad(parted.pow(-2)[:, None].expand(-1, 2), (_NONLINEAR - 2, 0))
+    blur = blurs.isotropic(torch.full_like(ratio, _START_SIGMA)) if blur is None else blur
+    begun = _Start(theta, Spread(blurs.limited(blur, _START_SIGMA**2, MOST**2)), seen, parted)
+    fit = _no_fit(begun)
     margin = torch.full_like(ratio, _MARGIN)
-    fit = _fitted(_windows(frames, frame, outer, margin), theta, seen, known, _ROUGH)
-    for part in _blurred(fit, outer, polarity):
-        reach = (_BLURRED_MARGIN * fit.theta[part, 6]).clamp_min(_MARGIN)
-        window = _windows(frames, frame[part], outer[part], reach)
-        fit = fit.replaced(part, _fitted(window, fit.theta[part], seen[part], known[part], _PRECISE))
+    for part in _parts(_pixels(outer, margin), 1):
+        some = _fitted(_windows(frames, frame[part], outer[part], margin[part]), begun[part], _ROUGH)
+        fit = fit.replaced(part, some)
+    which = _blurred(fit, outer, polarity)
+    reach = (_BLURRED_MARGIN * blurs.axes(fit.blur)[1].sqrt()).clamp_min(_MARGIN)
+    begun = replace(begun, theta=fit.theta, spread=Spread(fit.blur))
+    for part in _parts(_pixels(outer[which], reach[which]), MOST_NODES):
+        part = which[part]
+        window = _windows(frames, frame[part], outer[part], reach[part])
+        fit = fit.replaced(part, _fitted(window, begun[part], _PRECISE))
     return _judged(fit, outer, polarity)
 
 
-def _blurred(fit: _Fit, outer: Tensor, polarity: Tensor) -> Sequence[Tensor]:
-    """Which of K fits may be rings whose blur is wide for their size, in parts that fit the cache."""
-    blur, inner = fit.theta[:, 6], fit.theta[:, 5] * outer[:, 3]
-    promising = fit.sound & (fit.contrast * polarity < 0) & (fit.explained > _PROMISING)
-    which = (promising & (blur > _BLURRED * inner)).nonzero()[:, 0]
-    pixels = (2 * (outer[which, 2] + _BLURRED_MARGIN * blur[which]) + 1).square()
-    order = torch.argsort(pixels)  # those of a part are padded to the largest of them
-    part = (pixels[order].cumsum(0) * MOST_NODES / _PART).long()
-    return which[order].split(part.unique_consecutive(return_counts=True)[1].tolist())
+@dataclass(frozen=True, eq=False)
+class _Start(Rows):
+    """Where K fits begin: parameters, blur; directions in which the ring is seen, and how far its centres may be
+    apart, px."""
+
+    theta: Float[Tensor, "K 8"]
+    spread: Spread
+    seen: Bool[Tensor, "K A"]
+    parted: Float[Tensor, " K"]
+
+    @property
+    def known(self) -> Float[Tensor, "K 11 11"]:
+        """Prior information: both centres are one, and the blur is round."""
+        size = self.spread.values[:, 0] + self.spread.values[:, 2]
+        lean, turn = (size.new_zeros(RING + BLUR) for _ in range(2))
+        lean[RING], lean[RING + 2], turn[RING + 1] = 0.5, -0.5, 1.0
+        oval = torch.outer(lean, lean) + torch.outer(turn, turn)
+        centers = torch.nn.functional.pad(self.parted.pow(-2)[:, None].expand(-1, 2), (RING - 2, BLUR))
+        return torch.diag_embed(centers) + oval * (0.5 * _OVAL * size).pow(-2)[:, None, None]
 
 
 @dataclass(frozen=True, eq=False)
 class _Fit(Rows):
-    """K fits: parameters and their covariance, contrast, residual variance, number of pixels kept and their share, the
-    share of the grey values' variance that is explained, and whether the window is on the frame and the data determine
-    all parameters."""
+    """K fits: parameters, blur and the covariance of both, contrast, residual variance, number of pixels kept and their
+    share, the share of the grey values' variance that is explained, and whether the window is on the frame and the data
+    determine all parameters."""
 
-    theta: Float[Tensor, "K 9"]
-    covariance: Float[Tensor, "K 9 9"]
+    theta: Float[Tensor, "K 8"]
+    blur: Float[Tensor, "K 3"]
+    covariance: Float[Tensor, "K 11 11"]
     contrast: Float[Tensor, " K"]
     variance: Float[Tensor, " K"]
     pixels: Float[Tensor, " K"]
@@ -162,13 +190,46 @@ class _Fit(Rows):
     sound: Bool[Tensor, " K"]
 
 
-def _fitted(window: _Window, theta: Tensor, seen: Tensor, known: Tensor, scheme: _Scheme) -> _Fit:
-    """Fits from parameters (K, 9), with ``known`` (K, 9) the information about each that is there before."""
-    pixels, limits = (
-        _Pixels(window, theta, seen, known, scheme),
-        [theta.new_tensor(x) for x in (_LEAST, _MOST, _MOST_MOVE)],
-    )
-    unknowns = Unknowns({"ring": Vector(theta, *limits)})
+def _no_fit(begun: _Start) -> _Fit:
+    """Of rings of which nothing is known yet."""
+    none = torch.zeros_like(begun.theta[:, 0])
+    covariance = none.new_zeros(len(none), RING + BLUR, RING + BLUR)
+    return _Fit(begun.theta, begun.spread.values, covariance, none, none, none, none, none, none > 0)
+
+
+def _pixels(outer: Tensor, margin: Tensor) -> Tensor:
+    """Pixels (K,) of the windows of `_windows`."""
+    return (2 * _half_sides(outer, margin) + 1).prod(-1)
+
+
+def _half_sides(outer: Tensor, margin: Tensor) -> Tensor:
+    """(K, 2) int64, of the windows that hold ellipses with their margins."""
+    shape = conics.shape_matrix(outer)
+    return (shape.square().sum(-1).sqrt() + margin[:, None]).ceil().long()
+
+
+def _parts(pixels: Tensor, nodes: int) -> Iterator[Tensor]:
+    """Indices in parts that fit the cache, each padded to the largest of them."""
+    order = torch.argsort(pixels)
+    size = pixels[order].double()
+    step = (size / size[:1].clamp_min(1)).log().div(math.log(_UNEVEN)).long()
+    part = 1_000_000 * step + (size.cumsum(0) * nodes / _PART).long()
+    yield from order.split(part.unique_consecutive(return_counts=True)[1].tolist() if len(order) else [])
+
+
+def _blurred(fit: _Fit, outer: Tensor, polarity: Tensor) -> Tensor:
+    """Indices of the fits that may be rings whose blur is wide for their size."""
+    blur, inner = blurs.axes(fit.blur)[1].sqrt(), fit.theta[:, 5] * outer[:, 3]
+    promising = fit.sound & (fit.contrast * polarity < 0) & (fit.explained > _PROMISING)
+    return (promising & (blur > _BLURRED * inner)).nonzero()[:, 0]
+
+
+def _fitted(window: _Window, begun: _Start, scheme: _Scheme) -> _Fit:
+    """Fits of K rings to the pixels of their windows."""
+    middle = torch.nn.functional.pad(window.middle, (0, RING - 2))
+    limits = [begun.theta.new_tensor(x) for x in (_LEAST, _MOST, _MOST_MOVE)]
+    unknowns = Unknowns({"ring": Vector(begun.theta - middle, *limits), "blur": begun.spread})
+    pixels = _Pixels(window, unknowns.values("ring"), begun, scheme)
     for stage in scheme.stages:
         pixels.stage = stage
         if stage.held:
@@ -177,63 +238,77 @@ def _fitted(window: _Window, theta: Tensor, seen: Tensor, known: Tensor, scheme:
             continue
         found = minimise(pixels, unknowns, stage.steps, damping=scheme.damping, settle=False)
         unknowns = found.unknowns
-    index, weight, grey, count = window.ring, pixels.weight, window.grey, len(theta)
-    number = segment_sum(weight, index, count)  # the last weights are 0 or 1
-    residual = segment_sum(weight * pixels.residual.square(), index, count)
-    variance = residual / (number - _NONLINEAR - _LEVELS).clamp_min(1)
-    mean = segment_mean(grey, index, count, weight)
-    total = segment_sum(weight * (grey - mean[index]).square(), index, count) / number
+    weight, grey = pixels.weight, window.grey
+    number = weight.sum(-1)  # the last weights are 0 or 1
+    variance = (weight * pixels.residual.square()).sum(-1) / (number - RING - BLUR - _LEVELS).clamp_min(1)
+    mean = (weight * grey).sum(-1, keepdim=True) / number[:, None]
+    total = (weight * (grey - mean).square()).sum(-1) / number
     covariance, determined = found.covariance()
     covariance = covariance * (variance / pixels.spread.square())[:, None, None]
     sound = window.whole & determined & covariance.isfinite().all(-1).all(-1)
-    kept = number / torch.bincount(index, minlength=count)
-    theta = unknowns.values("ring")
-    return _Fit(theta, covariance, pixels.levels[:, 3], variance, number, kept, 1 - variance / total, sound)
+    theta, spread = unknowns.values("ring") + middle, cast(Spread, unknowns.own["blur"])
+    kept, explained = number / window.valid.sum(-1), 1 - variance / total
+    return _Fit(theta, spread.values, covariance, pixels.levels[:, 3], variance, number, kept, explained, sound)
 
 
 class _Pixels:
     """The normal equations of K rings by the pixels of their windows, and what these last showed."""
 
-    def __init__(self, window: _Window, theta: Tensor, seen: Tensor, known: Tensor, scheme: _Scheme) -> None:
-        self.window, self.scheme, self.known, self.stage = window, scheme, known, scheme.stages[0]
-        semi_major = outer_ellipses(theta)[0][:, 2]
-        local = (window.xy - theta[window.ring, :2]) / semi_major[window.ring, None]
-        self.plane = torch.cat([torch.ones_like(local[:, :1]), local], -1)
-        at, directions = depth(theta, window.ring, window.xy), seen.shape[1]
+    def __init__(self, window: _Window, theta: Tensor, begun: _Start, scheme: _Scheme) -> None:
+        self.window, self.scheme, self.known, self.stage = window, scheme, begun.known, scheme.stages[0]
+        semi_major, seen = outer_ellipses(theta)[0][:, 2, None], begun.seen
+        one = torch.ones_like(window.x)
+        self.plane = torch.stack([one, window.x / semi_major, window.y / semi_major], 1)
+        at, directions = depth(theta, window.x, window.y), seen.shape[1]
         direction = (torch.atan2(at.v, at.u) * (directions / (2 * math.pi))).round().long() % directions
-        self.clear = self.weight = seen[window.ring, direction].to(window.grey)
-        self.sector = window.ring * _SECTORS + direction * _SECTORS // directions
+        self.clear = self.weight = seen.to(window.grey).gather(1, direction) * window.valid
+        ring = torch.arange(len(theta), device=theta.device)[:, None]
+        self.sector = ring * _SECTORS + direction * _SECTORS // directions
         self.spread = torch.ones_like(theta[:, 0])
         self.residual, self.levels = window.grey, theta.new_zeros(len(theta), _LEVELS)
 
     def __call__(self, unknowns: Unknowns) -> Normal:
-        theta, (index, xy, grey, _) = unknowns.values("ring"), self.window
-        count, stage = len(theta), self.stage
-        value, derivative = self.scheme.coverage(theta, index, xy)
-        basis = torch.cat([self.plane, value[:, None]], -1)
+        theta, window, stage, n = unknowns.values("ring"), self.window, self.stage, RING + BLUR
+        value, derivative = self.scheme.coverage(theta, cast(Spread, unknowns.own["blur"]), window.x, window.y)
+        basis = torch.cat([self.plane, value.to(self.plane)[:, None]], 1)
         # grey levels first, so that the derivatives have their contrast
-        self.levels = _levels(basis, grey, index, count, self.weight)
-        self.residual = residual = grey - (basis * self.levels[index]).sum(-1)
+        self.levels = _levels(basis, window.grey, self.weight)
+        self.residual = residual = window.grey - (self.levels[:, None] @ basis).squeeze(1)
         if not stage.hard:  # later it would grow with what it lets in
-            self.spread = segment_mean(residual.square(), index, count, self.weight).sqrt()
-        agrees = _agreeing(residual, self.clear, self.sector, count) if stage.sectors else 1.0
-        self.weight = self.clear * agrees * _weights(residual / self.spread[index], keep=stage.hard)
-        jacobian = torch.cat([derivative * self.levels[index, 3:], basis], -1)
-        weighted = jacobian * (self.weight / self.spread.square()[index])[:, None]
-        products = segment_sum((weighted[:, :, None] * jacobian[:, None]).flatten(1), index, count)
-        products = products.unflatten(1, (_NONLINEAR + _LEVELS, -1))
-        right = segment_sum(weighted * residual[:, None], index, count)
-        n = _NONLINEAR
-        owner = torch.arange(count, device=theta.device)
+            mean = (self.weight * residual.square()).sum(-1) / self.weight.sum(-1)
+            self.spread = mean.sqrt()
+        agrees = self._agreeing(residual) if stage.sectors else 1.0
+        self.weight = self.clear * agrees * _weights(residual / self.spread[:, None], keep=stage.hard)
+        columns = torch.cat([derivative.to(basis) * self.levels[:, 3:, None], basis, residual[:, None]], 1)
+        weighted = columns[:, :-1] * (self.weight / self.spread.square()[:, None])[:, None]
+        sums = weighted @ columns.mT
+        products, right = sums[..., :-1], sums[..., -1]
+        owner = torch.arange(len(theta), device=theta.device)
         part = Eliminated(products[:, :n, n:], products[:, n:, n:], right[:, n:], owner)
-        # the prior of the shift between the centres is at zero
-        information = products[:, :n, :n] + torch.diag_embed(self.known)
-        return Normal(information, right[:, :n] - self.known * theta, torch.zeros_like(right[:, 0]), part)
+        blur = cast(Spread, unknowns.own["blur"]).values
+        pull = (self.known @ torch.cat([theta, blur], -1)[..., None]).squeeze(-1)
+        return Normal(products[:, :n, :n] + self.known, right[:, :n] - pull, torch.zeros_like(right[:, 0]), part)
+
+    def _agreeing(self, residual: Tensor) -> Tensor:
+        """Pixels (K, P) 0 or 1 whose sector of the ring leaves no more than the median sector does, chance, and a blur
+        of another shape.
+
+        A cover of nearly the grey of the ring leaves residuals that no single pixel betrays, but all of a sector do.
+        """
+        count = len(residual) * _SECTORS
+        sums = residual.new_zeros(2, count)
+        sums[0].scatter_add_(0, self.sector.flatten(), (self.clear * residual.square()).flatten())
+        sums[1].scatter_add_(0, self.sector.flatten(), self.clear.flatten())
+        square, number = (sums[0] / sums[1]).view(-1, _SECTORS), sums[1].view(-1, _SECTORS)  # NaN where it is not seen
+        chance = 1 + _SECTOR_CUT * (2 / number).sqrt()
+        allowed = (_MISFIT * self.levels[:, 3:]).square()
+        limit = square.nanmedian(-1, keepdim=True).values * chance + allowed
+        return (square <= limit).flatten()[self.sector].to(residual)
 
 
 def _judged(fit: _Fit, outer: Tensor, polarity: Tensor) -> SmallRings:
     """Both ellipses of each fit, and whether it is a ring of this polarity where the rough one (K, 5) was."""
-    theta, covariance = fit.theta, fit.covariance
+    theta, covariance = fit.theta, fit.covariance[:, :RING, :RING]
     params, shape_ok = outer_ellipses(theta)
     ratio = theta[:, 5]
     good = (
@@ -248,81 +323,70 @@ def _judged(fit: _Fit, outer: Tensor, polarity: Tensor) -> SmallRings:
         & (torch.linalg.vector_norm(params[:, :2] - outer[:, :2], dim=-1) < 0.3 * outer[:, 3] + 1)
     )
     to_axes = _to_axes(params)
-    outer_jacobian = theta.new_zeros(theta.shape[0], 5, _NONLINEAR)
+    outer_jacobian = theta.new_zeros(theta.shape[0], 5, RING)
     outer_jacobian[:, :2, :2] = torch.eye(2, dtype=theta.dtype, device=theta.device)
     outer_jacobian[:, 2:, 2:5] = to_axes
     inner_jacobian = outer_jacobian.clone()
-    inner_jacobian[:, :2, 7:] = inner_jacobian[:, :2, :2]
+    inner_jacobian[:, :2, 6:] = inner_jacobian[:, :2, :2]
     inner_jacobian[:, 2:, 2:5] *= ratio[:, None, None]
     inner_jacobian[:, 2, 5], inner_jacobian[:, 4, 5] = params[:, 2], params[:, 3]
-    inner = torch.cat([params[:, :2] + theta[:, 7:], params[:, 2:4] * ratio[:, None], params[:, 4:]], -1)
+    inner = torch.cat([params[:, :2] + theta[:, 6:], params[:, 2:4] * ratio[:, None], params[:, 4:]], -1)
     # both circles tell the same shape and nearly the same centre: as independent ones each has twice the variance
     fits = [
         EllipseFit(p, 2 * j @ covariance @ j.mT, fit.variance.sqrt(), fit.pixels)
         for p, j in ((params, outer_jacobian), (inner, inner_jacobian))
     ]
-    return SmallRings(fits[0], fits[1], good)
+    return SmallRings(fits[0], fits[1], fit.blur, good)
 
 
 class _Window(NamedTuple):
-    """Pixels around K rings: ring (P,), sorted, position (P, 2), grey value (P,) float64.
+    """Pixels around K rings, padded to P: middle (K, 2) of the window; x, y from there, grey and 1 or 0 (K, P) float64.
 
     And whether all of them are on the frame (K,) bool: what the border cuts off leaves the shape open.
     """
 
-    ring: Tensor
-    xy: Tensor
+    middle: Tensor
+    x: Tensor
+    y: Tensor
     grey: Tensor
+    valid: Tensor
     whole: Tensor
 
 
 def _windows(frames: Tensor, frame: Tensor, outer: Tensor, margin: Tensor) -> _Window:
     """Pixels of frames (B, H, W) within a margin (K,) px of rough outer ellipses (K, 5)."""
     height, width = frames.shape[-2:]
-    half = (outer[:, 2] + margin).ceil().long()
+    half = _half_sides(outer, margin)
     side = 2 * half + 1
-    index, position = ragged_arange(side.square())
-    corner = outer[:, :2].round().long() - half[:, None]
-    u, v = corner[index, 0] + position % side[index], corner[index, 1] + position // side[index]
-    xy = torch.stack([u, v], -1).double()
-    theta = torch.cat([outer[:, :2], conics.shape_matrix(outer).flatten(1)[:, [0, 1, 3]]], -1)
-    near = depth(theta, index, xy).depth > -margin[index]
-    seen = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    cut = segment_sum((near & ~seen).double(), index, frame.numel()) > 0
-    keep = near & seen
-    index, xy, u, v = index[keep], xy[keep], u[keep], v[keep]
-    grey = frames.reshape(-1)[(frame[index] * height + v) * width + u].double()
-    return _Window(index, xy, grey, ~cut)
+    position = torch.arange(int(side.prod(-1).max()) if len(side) else 0, device=frames.device)
+    row = torch.div(position, side[:, :1], rounding_mode="floor")
+    column = position - row * side[:, :1]
+    middle = outer[:, :2].round().long()
+    u, v = column - half[:, :1] + middle[:, :1], row - half[:, 1:] + middle[:, 1:]
+    x, y = (u - middle[:, :1]).double(), (v - middle[:, 1:]).double()
+    shape = conics.shape_matrix(outer).flatten(1)[:, [0, 1, 3]]
+    near = depth(torch.cat([outer[:, :2] - middle, shape], -1), x, y).distance < margin[:, None]
+    near &= row < side[:, 1:]
+    on = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    cell = (frame[:, None] * height + v.clamp(0, height - 1)) * width + u.clamp(0, width - 1)
+    grey = values_at(frames, cell).double()
+    sound = grey.isfinite()
+    valid = (near & on & sound).double()
+    return _Window(middle.double(), x, y, torch.where(sound, grey, 0.0), valid, ~(near & ~(on & sound)).any(-1))
 
 
 def _weights(deviation: Tensor, keep: bool) -> Tensor:
-    """Weights (P,) of residuals in standard deviations: Geman-McClure's, or with ``keep`` 1 within the cut, else 0."""
+    """Weights of residuals in standard deviations: Geman-McClure's, or with ``keep`` 1 within the cut, else 0."""
     if keep:
         return (deviation.abs() < _CUT).to(deviation)
     return geman_mcclure(deviation / _SOFT).nan_to_num(nan=0.0)
 
 
-def _agreeing(residual: Tensor, clear: Tensor, sector: Tensor, count: int) -> Tensor:
-    """Pixels (P,) 0 or 1 whose sector of the ring leaves no more than the median sector does, and chance.
-
-    A cover of nearly the grey of the ring leaves residuals that no single pixel betrays, but all of a sector do.
-
-    Args:
-        residual, clear: (P,). sector: (P,) int64, in [0, 16 ``count``).
-    """
-    sums = segment_sum(torch.stack([clear * residual.square(), clear], -1), sector, count * _SECTORS)
-    square = (sums[:, 0] / sums[:, 1]).view(count, _SECTORS)  # NaN for a sector that is not seen
-    limit = square.nanmedian(-1, keepdim=True).values * (1 + _SECTOR_CUT * (2 / sums[:, 1].view_as(square)).sqrt())
-    return (square <= limit).flatten()[sector].to(residual)
-
-
-def _levels(basis: Tensor, grey: Tensor, index: Tensor, count: int, weight: Tensor) -> Tensor:
-    """Weighted least-squares coefficients (count, C) of grey values on a basis (P, C)."""
-    c = basis.shape[1]
+def _levels(basis: Tensor, grey: Tensor, weight: Tensor) -> Tensor:
+    """Weighted least-squares coefficients (K, C) of grey values (K, P) on a basis (K, C, P)."""
     weighted = basis * weight[:, None]
-    gram = segment_sum((weighted[:, :, None] * basis[:, None]).flatten(1), index, count).unflatten(1, (c, c))
-    right = segment_sum(weighted * grey[:, None], index, count)
-    return solve_scaled(gram, right).nan_to_num(nan=0.0)
+    right = (weighted @ grey[..., None]).squeeze(-1)
+    return solve_scaled(weighted @ basis.mT, right).nan_to_num(nan=0.0)
 
 
 def _to_axes(ellipses: Tensor) -> Tensor:

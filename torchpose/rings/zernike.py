@@ -16,6 +16,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from torchpose.geometry import blur as blurs
+from torchpose.geometry.least_squares import solve_scaled
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import segment_sum, values_at
 
@@ -23,6 +25,9 @@ ORDERS = ((0, 0), (1, 1), (2, 0), (2, 2), (3, 1), (3, 3), (4, 0), (4, 2), (4, 4)
 EDGE_ORDERS = ((1, 1), (2, 0))  # all that the edge position needs
 MASK = 7
 _SUBSAMPLES = 128
+_ROUND = (
+    0.01  # information about the blur's direction that is taken for there, in that about its size: an arc tells little
+)
 _LEAST_SLOPE = 0.4  # sigma = 0.22 N; a wider blur is out of the mask's reach and stays uncorrected beyond that
 
 
@@ -145,23 +150,38 @@ def locate(frames: Tensor, frame: Tensor, pixels: Tensor, size: int = MASK) -> E
     return Edges(torch.stack([u + dx, v + dy]).mT, torch.stack([nx, ny]).mT, offset, step, inside)
 
 
-def blur_slope(offset: Tensor, distance: Tensor, group: Tensor, count: int) -> Tensor:
-    """What blur leaves of small offsets, per group: slope (count,) of measured offsets over true distances.
+def edge_blur(offset: Tensor, distance: Tensor, normal: Tensor, group: Tensor, count: int) -> Tensor:
+    """What blur makes of small offsets, per group: its covariance (count, 3) px^2, see `geometry.blur`.
 
-    A Gaussian-blurred edge at distance l (in mask radii) is read as l (1 - 3 s^2 / (1 - l^2)) with s = 2 sigma / N, so
-    the slope of a group of edges with a common blur is 1 - 3 s^2. A fitted ellipse, the mean of hundreds of edges all
-    around, stands in for the truth: errors that change sign with the position in the pixel average out in it.
+    A Gaussian-blurred edge at distance l (in mask radii) is read as l (1 - 3 s^2 / (1 - l^2)), s the blur's deviation
+    across the edge in mask radii; so measured offsets over true distances have the slope 1 - 3 s^2, by direction. A
+    fitted ellipse, the mean of hundreds of edges all around, stands in for the truth: errors that change sign with the
+    position in the pixel average out in it. The areas of the frame's and of the kernel's pixels are in it.
 
     Args:
         offset: (E,) as measured. distance: (E,) from the pixel's centre to the fitted ellipse along the same normal.
-        group: (E,) int64, edges of one blur.
+        normal: (E, 2) unit. group: (E,) int64, edges of one blur.
     """
-    sums = segment_sum(torch.stack([offset * distance, distance.square()], -1), group, count)
-    return (sums[:, 0] / sums[:, 1]).nan_to_num(nan=1.0).clamp(_LEAST_SLOPE, 1.0)
+    nu, nv = normal.unbind(-1)
+    # a mean, and what the two directions of an axis and their diagonals have more or less
+    rows = torch.stack([torch.ones_like(nu), nu * nu - nv * nv, 2 * nu * nv], -1) * distance[:, None]
+    columns = torch.cat([rows, (distance - offset)[:, None]], -1)
+    sums = segment_sum((rows[:, :, None] * columns[:, None]).flatten(1), group, count).unflatten(1, (3, 4))
+    matrix, right = sums[..., :3], sums[..., 3]
+    matrix = matrix + torch.diag_embed(matrix[:, :1, 0] * matrix.new_tensor([0.0, _ROUND, _ROUND]))
+    loss = solve_scaled(matrix, right).nan_to_num(nan=0.0)
+    mean, lean, diagonal = loss.unbind(-1)
+    found = torch.stack([mean + lean, diagonal, mean - lean], -1) * (MASK**2 / 12)
+    return blurs.limited(found, 0.0, (1 - _LEAST_SLOPE) * MASK**2 / 12)
+
+
+def slope_across(blur: Tensor, normal: Tensor) -> Tensor:
+    """Slope (E,) of measured offsets over true distances under blurs (E, 3) at edges of these normals (E, 2)."""
+    return (1 - 12 / MASK**2 * blurs.across(blur, *normal.unbind(-1))).clamp(_LEAST_SLOPE, 1.0)
 
 
 def deblur(offset: Tensor, slope: Tensor, size: int = MASK) -> Tensor:
-    """True offsets (E,) in px from measured ones (E,) and the slope (E,) of their blur: inverts `blur_slope`'s law.
+    """True offsets (E,) in px from measured ones (E,) and the slope (E,) of their blur: inverts `edge_blur`'s law.
 
     Two fixed-point steps; the law holds to |offset| < N / 4, beyond which the curvature term is held.
     """
@@ -173,19 +193,25 @@ def deblur(offset: Tensor, slope: Tensor, size: int = MASK) -> Tensor:
     return true
 
 
-def curvature_shift(slope: Tensor, size: int = MASK) -> Tensor:
+def curvature_shift(blur: Tensor, normal: Tensor, size: int = MASK) -> Tensor:
     """How far edges of unit curvature are read on their convex side, px^2 (px for a curvature of 1/px).
 
-    Derived to first order in the curvature k: the edge x = k y^2 / 2 under a Gaussian of variance s^2 (in mask radii)
-    has the mean offset k (y^2 + s^2) / 2, and the A_20 kernel weighs it by R_20 dy, so a deblurred offset is wrong by
+    Derived to first order in the curvature k: the edge x = k y^2 / 2 under a Gaussian of variances s^2 across and t^2
+    along it (in mask radii) has the mean offset k (y^2 + t^2) / 2, and the A_20 kernel weighs it by R_20 dy, so a
+    deblurred offset is wrong by
 
-        k / 2 (s^2 + <y^2> / <1>), with <f> = integral of R_20 f G_s(x) over the unit disc.
+        k / 2 (t^2 + <y^2> / <1>), with <f> = integral of R_20 f G_s(x) over the unit disc.
 
     The blur alone would draw a disc's edge inwards; the mask's weight on the ends of the arc pushes it out further.
-    The polynomial in 1 - slope (`blur_slope`) stays within 1 % of the integral for blurs up to 1.2 px in a mask of 7.
+    The polynomial in 1 - slope (`edge_blur`) stays within 1 % of the integral for t = s up to 1.2 px in a mask of 7.
+
+    Args:
+        blur: (E, 3) px^2. normal: (E, 2) of the edges.
     """
-    q = 1 - slope
-    return (size / 2) ** 2 * (0.1 + 0.063 * q + 0.155 * q * q)
+    q = 1 - slope_across(blur, normal)
+    nu, nv = normal.unbind(-1)
+    beyond = blurs.across(blur, -nv, nu) - blurs.across(blur, nu, nv)
+    return (size / 2) ** 2 * (0.1 + 0.063 * q + 0.155 * q * q) + 0.5 * beyond
 
 
 @lru_cache(maxsize=8)

@@ -7,7 +7,7 @@ whose axes lie along rows and columns, averaged over shifts along one line:
     S = diag(sigma^2) + line line^T,  line = sqrt(|r|) (sqrt(S11), +-sqrt(S22)),  sigma^2 = (1 - |r|) (S11, S22)
 
 with the correlation r = S12 / sqrt(S11 S22). The line is no function of S as far as derivatives are concerned: at a
-round Gaussian it is zero and has none. Derivatives by S are those of the heat equation instead, dI/dS = grad grad^T I / 2,
+round Gaussian it is zero and has none. Derivatives by S are those of the heat equation, dI/dS = grad grad^T I / 2,
 which hold for any S: by the diagonal through ``sigma``, by S12 through ``cross``.
 """
 

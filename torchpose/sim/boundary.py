@@ -181,13 +181,13 @@ def boxes_around(
     return Boxes(first, (end - first).clamp(min=0))
 
 
-def fill(samples: Samples, boxes: Boxes, *, mixed: bool = False) -> Float[Tensor, "H W"]:
+def fill(samples: Samples, boxes: Boxes, derivative: tuple[int, int] = (0, 0)) -> Float[Tensor, "H W"]:
     """Blurred regions from their boundary samples: ``sum of - c(p_u - u) k(p_v - v) dv`` at every pixel p.
 
     Args:
         samples: of all regions.
         boxes: their windows.
-        mixed: the second derivative by p_u and p_v instead, per px^2.
+        derivative: how often it is differentiated by p_u and by p_v, up to twice, per px or px^2.
 
     Returns:
         (boxes.rows, boxes.stride), of the dtype of the samples; the rows of all windows one below the other, 0 to
@@ -211,11 +211,11 @@ def fill(samples: Samples, boxes: Boxes, *, mixed: bool = False) -> Float[Tensor
         part = slice(start, start + together)
         nearest = pixel[part].detach().round()
         from_nearest = pixel[part] - nearest
-        across = _on_pixel(1 - mixed, rows - from_nearest[:, 1:], samples.sigma[part, 1:])
+        across = _on_pixel(1 - derivative[1], rows - from_nearest[:, 1:], samples.sigma[part, 1:])
         # differences from each column to the next; the first has the column before it as its neighbour
         x = torch.cat([columns[:1] - 1, columns]) - from_nearest[:, :1]
         half = None if chord is None else chord[part, None]
-        along = _row_integral(2 - mixed, x, samples.sigma[part, :1], half).diff(dim=1)
+        along = _row_integral(2 - derivative[0], x, samples.sigma[part, :1], half).diff(dim=1)
         local = nearest.long() - corner[part]
         row, column = local[:, 1:] + rows.long(), local[:, :1] + columns.long()
         inside = (row >= 0) & (row < size[part, 1:])
@@ -315,7 +315,7 @@ def _sign(x: Tensor) -> Tensor:
 
 
 def _on_pixel(order: int, x: Tensor, sigma: Tensor) -> Tensor:
-    """Integral over the pixel about x of the antiderivative of a Gaussian; the first with ``order`` 1, and so on."""
+    """Difference over the pixel about x of a Gaussian's antiderivative: the first with ``order`` 1, and so on."""
     function = _ANTIDERIVATIVES[order]
     difference = function((x + 0.5) / sigma) - function((x - 0.5) / sigma)
     return difference if order == 1 else sigma ** (order - 1) * difference
@@ -326,6 +326,11 @@ def _row_integral(order: int, x: Tensor, sigma: Tensor, half: Tensor | None) -> 
     if half is None:
         return _on_pixel(order, x, sigma)
     return (_on_pixel(order + 1, x + half, sigma) - _on_pixel(order + 1, x - half, sigma)) / (2 * half)
+
+
+def _density_slope(x: Tensor) -> Tensor:
+    """Derivative of the density of the normal distribution."""
+    return -x * _density(x)
 
 
 def _density(x: Tensor) -> Tensor:
@@ -343,10 +348,11 @@ def _normal_loss_integral(x: Tensor) -> Tensor:
     return 0.5 * ((x.square() + 1) * torch.special.ndtr(x) + x * _density(x))
 
 
-# of the normal density, each the antiderivative of the one before
-_ANTIDERIVATIVES: list[Callable[[Tensor], Tensor]] = [
-    _density,
-    torch.special.ndtr,
-    _normal_loss,
-    _normal_loss_integral,
-]
+# of the normal density, by their order, each the antiderivative of the one before
+_ANTIDERIVATIVES: dict[int, Callable[[Tensor], Tensor]] = {
+    -1: _density_slope,
+    0: _density,
+    1: torch.special.ndtr,
+    2: _normal_loss,
+    3: _normal_loss_integral,
+}

@@ -183,7 +183,7 @@ def cover(
     covered = boundary.fill(samples, boxes)
     if blur.cross is not None and torch.is_grad_enabled():
         with torch.no_grad():
-            mixed = boundary.fill(samples, boxes, mixed=True)
+            mixed = boundary.fill(samples, boxes, (1, 1))
         covered = covered + blur.cross[shapes.frame].repeat_interleave(boxes.size[:, 1])[:, None] * mixed
     return boxes, covered
 

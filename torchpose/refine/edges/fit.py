@@ -6,8 +6,9 @@ read at the offset o from its pixel's centre, along the normal of increasing gre
     deblurred(o) - kappa k = l,
 
 l the offset of the projected circle, k its curvature, kappa the shift of `zernike.curvature_shift`. The blur of each
-frame is found along with its pose: the slope of o over l (`zernike.blur_slope`). Once pose and blur are nearly known,
-the last steps read the same edges, and the blur, with matched filters, which scatter less (`step_filter`).
+frame is found along with its pose: the slope of o over l, by direction (`zernike.edge_blur`). Once pose and blur are
+nearly known, the last steps read the same edges, and the blur, with matched filters, which scatter less
+(`step_filter`).
 """
 
 import math
@@ -17,10 +18,19 @@ import torch
 from torch import Tensor
 
 from torchpose.camera import Camera
-from torchpose.geometry.least_squares import Normal, Pose, PosePrior, Unknowns, geman_mcclure, minimise
+from torchpose.geometry import blur as blurs
+from torchpose.geometry.least_squares import (
+    Normal,
+    Pose,
+    PosePrior,
+    Unknowns,
+    geman_mcclure,
+    minimise,
+    solve_scaled,
+)
 from torchpose.geometry.segments import segment_mean, segment_sum
 from torchpose.refine.edges.step_filter import StepOffsets, step_offsets, window_correlation
-from torchpose.refine.sight import Refined, Sight
+from torchpose.refine.sight import Refined, Sight, at_full_size
 from torchpose.rings import zernike
 from torchpose.rings.edges import RingEdges, ring_edges
 
@@ -33,7 +43,10 @@ _STEPS = 6  # on Zernike edges
 _SOFT_STEPS = 2  # of these, the first, that weigh all points instead of leaving some out
 _FILTER_STEPS = 2  # on matched filters
 _LEAST_BLUR = 0.3  # px, point-spread function and pixel: a pixel alone
-_MOST_CHANGE = 0.3  # px, of the blur in a step
+_ROOM = 1.2  # of half the ring's width: a filter that sees the other circle takes it for its own
+_WIDEST = 1.3  # px, of a blur's major axis: a wider one is out of the mask's reach
+_MOST_BLUR = 3.0  # px, about what a window of the filter holds
+_MOST_CHANGE = 0.6  # px, of the blur in a step, times the blur itself: of its variance
 _CUT = 4.0  # robust standard deviations beyond which an edge point is left out
 _CUT_FLOOR = 0.02  # px, added to the cut: what pixels alias to
 
@@ -41,7 +54,18 @@ _CUT_FLOOR = 0.02  # px, added to the cut: what pixels alias to
 def refine_edges(sight: Sight, rotation: Tensor, translation: Tensor, *, prior: Tensor | None = None) -> Refined:
     """Refines N poses on the edge points of their rings; arguments as in `refine_photometric`."""
     start = Pose(rotation, translation)
-    fit = _Fit(sight, None if prior is None else PosePrior(prior, start))
+    known = None if prior is None else PosePrior(prior, start)
+    order, refined = [], []
+    for index, part in sight.by_blur(_WIDEST):
+        some = _refined_in(part, start[index], None if known is None else known[index])
+        order.append(index)
+        refined.append(at_full_size(some, part.reduction))
+    return Refined.cat(refined)[torch.argsort(torch.cat(order))]
+
+
+def _refined_in(sight: Sight, start: Pose, known: PosePrior | None) -> Refined:
+    """Rows refined in the frames as they are."""
+    fit = _Fit(sight, known)
     unknowns = Unknowns({"pose": start})
     for steps, look in ((_SOFT_STEPS, fit.soft), (_STEPS - _SOFT_STEPS, fit.hard), (_FILTER_STEPS, fit.filtered)):
         found = minimise(look, unknowns, steps, settle=False)
@@ -68,14 +92,15 @@ class _Fit:
         block = edges.ring // 2
         radius = sight.radii[row, marker].flatten()[edges.ring]
         circles = (sight.centers[row, marker][block], sight.normals[row, marker][block], radius)
-        self.seen = _seen(edges, sight.camera, outward, row[block], *circles)
+        self.seen = _seen(edges, sight.camera, outward, row[block], *circles)._replace(room=_ROOM * gap[block])
         # the error of an edge point falls with the height of its step, taken from the whole circle: a high one by
         # chance must not count more
         self.step = segment_mean(edges.step, edges.ring, 2 * row.numel())[edges.ring]
         sound, of, rows = self.seen.sound, self.seen.of, len(sight)
         self.trust = sound * (self.step / segment_mean(self.step, of, rows)[of]).square()
         self.spread = torch.full((rows,), _START_SPREAD, dtype=torch.float64, device=both.device)
-        self.blur, self.variance, self.keep, self.correlation = self.spread, self.spread, sound, 1.0
+        self.blur, self.variance = blurs.isotropic(self.spread), self.spread
+        self.keep, self.correlation = sound, 1.0
 
     def soft(self, unknowns: Unknowns) -> Normal:
         """Zernike edges, all of them, by weight."""
@@ -91,23 +116,35 @@ class _Fit:
 
     def filtered(self, unknowns: Unknowns) -> Normal:
         """The same edges by matched filters; the blur follows."""
-        by_pose, found = _filter_errors(self.seen, self.sight, unknowns.pose, self.blur)
+        by_pose, self.across, found = _filter_errors(self.seen, self.sight, unknowns.pose, self.blur)
         self._robust(found.error)
         square = self.keep * self.step.square()
-        change = segment_mean(found.widening, self.seen.of, len(self.sight), square * found.blur_information)
-        self.blur = (self.blur + change.clamp(-_MOST_CHANGE, _MOST_CHANGE)).clamp_min(_LEAST_BLUR)
+        self._widen(found.widening, square * found.blur_information)
         self.correlation = window_correlation()
         return self._normal(unknowns.pose, found.error, by_pose, square * found.information)
+
+    def _widen(self, widening: Tensor, weight: Tensor) -> None:
+        """The blur of each row after widenings (E,) px^2 of these weights across its edges."""
+        nu, nv = self.across.unbind(-1)
+        rows = torch.stack([nu * nu, 2 * nu * nv, nv * nv], -1)
+        columns = torch.cat([rows, widening[:, None]], -1) * weight[:, None]
+        sums = segment_sum((rows[:, :, None] * columns[:, None]).flatten(1), self.seen.of, len(self.sight))
+        matrix, right = sums.unflatten(1, (3, 4)).split([3, 1], -1)
+        change = solve_scaled(matrix, right).squeeze(-1)
+        limit = _MOST_CHANGE * blurs.axes(self.blur)[1].sqrt()
+        change = change * (limit / torch.linalg.vector_norm(change, dim=-1).clamp_min(1e-12)).clamp_max(1.0)[:, None]
+        self.blur = blurs.limited(self.blur + change, _LEAST_BLUR**2, _MOST_BLUR**2)
 
     def _zernike(self, pose: Pose) -> tuple[Tensor, Tensor]:
         """How far Zernike edges lie outside the circles (E,), px, and derivatives (E, 6) of the distance."""
         edges, of, sign, rows = self.seen.edges, self.seen.of, self.seen.sign, len(self.sight)
         distance, bend, _, by_pose = self.seen.circles(pose)
         true = edges.offset - sign * distance  # of the projected circle from the pixel's centre
-        slope = zernike.blur_slope(edges.offset * self.keep, true * self.keep, of, rows)
-        read = zernike.deblur(edges.offset, slope[of]) - zernike.curvature_shift(slope[of]) * bend * sign
-        # the slope tells of two pixels: the image's and the kernel's
-        self.blur = (((1 - slope) * zernike.MASK**2 - 1) / 12).clamp_min(_LEAST_BLUR**2).sqrt()
+        found = zernike.edge_blur(edges.offset * self.keep, true * self.keep, edges.normal, of, rows)
+        pushed = zernike.curvature_shift(found[of], edges.normal) * bend * sign
+        read = zernike.deblur(edges.offset, zernike.slope_across(found[of], edges.normal)) - pushed
+        # that is of two pixels: the image's and the kernel's
+        self.blur = blurs.limited(found - blurs.isotropic(found.new_tensor(12**-0.5)), _LEAST_BLUR**2, _MOST_BLUR**2)
         self.correlation = _CHAIN * zernike.edge_correlation()
         return (sign * (read - true)).nan_to_num(nan=0.0), by_pose
 
@@ -138,7 +175,7 @@ class _Seen(NamedTuple):
     """Edge points, flat, their rows ``of`` and their circles; 0 in ``sound`` where unusable.
 
     ray: (E, 3). warp: (E, 2, 2), d(ray)/d(pixel). center, normal: (E, 3), radius: (E,), of the circle. sign: (E,), +1
-    where grey rises outwards.
+    where grey rises outwards. room: (E,) px, to either side, to what is not this edge.
     """
 
     edges: RingEdges
@@ -150,6 +187,7 @@ class _Seen(NamedTuple):
     radius: Tensor
     sign: Tensor
     sound: Tensor
+    room: Tensor
 
     def circles(self, pose: Pose) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """`circle_distance` of the poses of N rows."""
@@ -164,18 +202,18 @@ def _seen(
     warp = torch.linalg.inv(camera.J_distort(xy))
     ray = torch.cat([xy, torch.ones_like(xy[:, :1])], -1)
     sound = ray.isfinite().all(-1).double()
-    return _Seen(edges, of, ray.nan_to_num(nan=0.0), warp, center, normal, radius, outward[edges.ring], sound)
+    return _Seen(edges, of, ray.nan_to_num(nan=0.0), warp, center, normal, radius, outward[edges.ring], sound, sound)
 
 
-def _filter_errors(seen: _Seen, sight: Sight, pose: Pose, blur: Tensor) -> tuple[Tensor, StepOffsets]:
-    """Derivatives (E, 6) of the distance, and what the matched filters see in the windows of the same pixels."""
+def _filter_errors(seen: _Seen, sight: Sight, pose: Pose, blur: Tensor) -> tuple[Tensor, Tensor, StepOffsets]:
+    """Derivatives (E, 6) of the distance, normals (E, 2), and what the matched filters see in the same windows."""
     edges = seen.edges
     pixel = (edges.points - edges.offset[:, None] * edges.normal).round()
     distance, bend, across, by_pose = seen.circles(pose)
     middle = distance + (across * (pixel - edges.points)).sum(-1)
-    frame = sight.frame[seen.of]
-    found = step_offsets(sight.frames, frame, pixel.long(), across, middle, bend, blur[seen.of])
-    return by_pose, StepOffsets(*(x.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0) for x in found))
+    frame, curve = sight.frame[seen.of], (across, middle, bend)
+    found = step_offsets(sight.frames, frame, pixel.long(), curve, blur[seen.of], seen.room)
+    return by_pose, across, StepOffsets(*(x.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0) for x in found))
 
 
 def circle_distance(

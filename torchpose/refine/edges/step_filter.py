@@ -12,15 +12,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchpose.refine.photometric.ring_model import blurred_step, square_cumulant
+from torchpose.geometry import blur as blurs
+from torchpose.geometry.blurred_edge import blurred_step, square_cumulant
 
 WINDOW = 9  # px; a wider one tells the levels better, but small circles are no longer simple curves in it
 _BEND_REACH = (0.63, 1.2)  # px along an edge: where the fourth order of an ellipse's end is 0.02 px, and at least
 
 
 class StepOffsets(NamedTuple):
-    """Fields (E,): error, px, of the edge outside the curve; widening, px, of the blur beyond the one assumed; the
-    information about both, px^-2, at a noise of one step; step, grey outside less inside."""
+    """Fields (E,): error, px, of the edge outside the curve; widening, px^2, of the blur's variance across the edge
+    beyond the one assumed; the information about both, px^-2 and px^-4, at a noise of one step; step, grey outside less
+    inside."""
 
     error: Tensor
     widening: Tensor
@@ -30,23 +32,32 @@ class StepOffsets(NamedTuple):
 
 
 def step_offsets(
-    frames: Tensor, frame: Tensor, pixel: Tensor, normal: Tensor, distance: Tensor, bend: Tensor, blur: Tensor
+    frames: Tensor,
+    frame: Tensor,
+    pixel: Tensor,
+    curve: tuple[Tensor, Tensor, Tensor],
+    blur: Tensor,
+    room: Tensor | None = None,
 ) -> StepOffsets:
     """Offsets of edges from curves that pass within about a pixel of a window's middle, to first order.
 
     Args:
         frames: (B, H, W) grey. frame: (E,) int64. pixel: (E, 2) int64 u, v of the window's middle; what of the window
             is beyond the border does not count.
-        normal, distance, bend, blur: as in `step_filters`.
+        curve: normal, distance and bend as in `step_filters`. blur: as there.
+        room: (E,) px, of the window's pixels to use to either side of the curve; all by default.
     """
     height, width = frames.shape[-2:]
     du, dv = _window(frames.device)
     u, v = pixel[:, :1] + du, pixel[:, 1:] + dv
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     at = (frame[:, None] * height + v.clamp(0, height - 1)) * width + u.clamp(0, width - 1)
+    if room is not None:
+        across = curve[1][:, None] + curve[0][:, :1] * du + curve[0][:, 1:] * dv
+        inside &= across.abs() < room[:, None]
     grey = frames.reshape(-1)[at].float()
     grey = grey - grey[:, WINDOW * WINDOW // 2, None]  # keeps float32 exact to rounding
-    fraction, slope, widen = step_filters(normal, distance, bend, blur, inside)
+    fraction, slope, widen = step_filters(*curve, blur, inside)
     step = (fraction * grey).sum(-1) / fraction.square().sum(-1)
     information, blur_information = slope.square().sum(-1), widen.square().sum(-1)
     error = -(slope * grey).sum(-1) / (step * information)
@@ -61,20 +72,24 @@ def step_filters(
 
     Args:
         normal: (E, 2) unit, of the curve. distance: (E,) px, of the middle pixel's centre from it, along the normal.
-        bend: (E,) 1/px, its curvature, positive where it bends away from the normal. blur: (E,) px, of the
-            point-spread function and the pixel. inside: (E, P) bool, pixels to use.
+        bend: (E,) 1/px, its curvature, positive where it bends away from the normal. blur: (E, 3)
+            px^2, see `geometry.blur`. inside: (E, P) bool, pixels to use.
 
     Returns:
-        fraction (E, P) float32 less its mean; its derivatives (E, P) by the pixel's distance and by the blur, made
-        orthogonal to a constant and to the fraction.
+        fraction (E, P) float32 less its mean; its derivatives (E, P) by the pixel's distance and by the blur's variance
+        across the edge, made orthogonal to a constant and to the fraction.
     """
     du, dv = _window(normal.device)
-    nu, nv, k, q = (x[:, None].float() for x in (*normal.unbind(-1), bend, blur))
+    nu, nv, k = (x[:, None].float() for x in (*normal.unbind(-1), bend))
+    variance = blurs.across(blur, *normal.unbind(-1))[:, None].float()
+    beside = (blur[:, 0] + blur[:, 2])[:, None].float() - variance  # along the edge
+    q = variance.sqrt()
     across = distance[:, None].float() + nu * du + nv * dv
     along2 = (nu * dv - nv * du).square()
     # from the circle of curvature
     off = (2 * across + k * (across.square() + along2)) / (1 + ((1 + k * across).square() + k.square() * along2).sqrt())
-    fraction, density = blurred_step(off / q + 0.5 * q * k, square_cumulant(nu, nv, q))
+    z = (off + 0.5 * k * beside) / q
+    fraction, density, _ = blurred_step(z, square_cumulant(nu * nv, variance))
     reach, least = _BEND_REACH
     use = along2 < (reach * k.abs().clamp_min(1e-6).pow(-0.75)).clamp_min(least).square()
     weight = (use if inside is None else use & inside).float()
@@ -85,7 +100,7 @@ def step_filters(
 
     fraction = centred(fraction)
     scale = fraction.square().sum(-1, keepdim=True)
-    slope, widen = (centred(x) for x in (density / q, density * (0.5 * k - off / q.square())))
+    slope, widen = (centred(x) for x in (density / q, density * z * (-0.5 / variance)))
     slope, widen = (x - fraction * ((fraction * x).sum(-1, keepdim=True) / scale) for x in (slope, widen))
     return fraction, slope, widen
 
@@ -106,7 +121,9 @@ def window_correlation() -> float:
         pixel = torch.stack([u + 10, v.round()], -1)
         normal = torch.stack([-angle.sin(), angle.cos()]).expand(length, 2)
         distance = (v.round() - v) * angle.cos()
-        slope = step_filters(normal, distance, torch.zeros_like(u), torch.full_like(u, 0.75))[1].double()
+        slope = step_filters(normal, distance, torch.zeros_like(u), blurs.isotropic(torch.full_like(u, 0.75)))[
+            1
+        ].double()
         at = (pixel[:, 1:].long() + dv) * size + pixel[:, :1].long() + du
         total = torch.zeros(size * size, dtype=torch.float64).index_add_(0, at.flatten(), slope.flatten())
         factors.append(total.square().sum() / slope.square().sum())

@@ -3,6 +3,8 @@
 import torch
 from torch import Tensor
 
+from torchpose.geometry import blur as blurs
+from torchpose.geometry.blurred_edge import Spread
 from torchpose.geometry.segments import ragged_arange
 
 BAND = 4.0  # px on either side of an edge, at least
@@ -10,9 +12,10 @@ _PER_BLUR = 4.6  # band of a wide blur, in its standard deviations
 _WIDEST = 12.0  # px, of all bands
 
 
-def band_width(blur: Tensor) -> Tensor:
-    """Band in px that holds edges of this blur (standard deviation, px) and the levels on both sides."""
-    return (_PER_BLUR * blur).clamp(BAND, _WIDEST)
+def band_width(spread: Spread) -> Tensor:
+    """Band (N,) px that holds edges of these blurs and the levels on both sides."""
+    most = blurs.axes(spread.covariance)[1]
+    return (_PER_BLUR * most.sqrt()).clamp(BAND, _WIDEST)
 
 
 def band_pixels(outer: Tensor, inner: Tensor, band: Tensor, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:

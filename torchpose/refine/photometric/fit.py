@@ -4,22 +4,25 @@ Every pixel in a band around the edges of a frame's rings is predicted as
 
     grey = ring + (paper - ring) F
 
-with the fraction of paper F of `ring_model`. Pose and blur (one for each frame) are the unknowns; the two grey levels
-of each marker, with linear gradients over the plane, are eliminated (`grey_levels`, `light`). Frames and markers are
-padded blocks of pixels: one sequence of tensor operations for the whole batch.
+with the fraction of paper F of `ring_model`. Pose and blur (three numbers a frame) are the unknowns; the two grey
+levels of each marker, with linear gradients over the plane, are eliminated (`grey_levels`, `light`). Frames and markers
+are padded blocks of pixels: one sequence of tensor operations for the whole batch.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
 
+from torchpose.geometry import blur as blurs
+from torchpose.geometry.blurred_edge import LEAST, MOST, Kind, Spread
 from torchpose.geometry.least_squares import Block, Minimum, Normal, Pose, PosePrior, Unknowns, Vector, minimise
+from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import segment_sum
-from torchpose.refine.photometric.band import BAND, band_width
+from torchpose.refine.photometric.band import band_width
 from torchpose.refine.photometric.grey_levels import (
     TILE,
     columns_of,
@@ -32,12 +35,11 @@ from torchpose.refine.photometric.grey_levels import (
 from torchpose.refine.photometric.light import LEVELS, POSE, normal_equations
 from torchpose.refine.photometric.ring_model import gather_pixels, ring_model
 from torchpose.refine.photometric.sectors import Sectors, away_from_unclear, clear_sectors, doubtful, sum_sectors, trust
-from torchpose.refine.sight import Refined, Sight
+from torchpose.refine.sight import Refined, Sight, at_full_size
 
 _COARSE = 6  # the first steps take one pixel of so many; both are whole numbers of tiles
+_WIDEST = 2.4  # px, of a blur's minor axis, in frames as they are: a pixel twice as wide adds 4 % of its variance
 _MOST_COARSE = 512  # of a marker whose edges are sharp: the last step, on all pixels, mends what they leave
-_START_BLUR = 0.8  # px
-_BLUR_RANGE = (0.3, 4.0)
 
 
 class _Stage(NamedTuple):
@@ -53,6 +55,9 @@ class _Stage(NamedTuple):
     tempered: bool = False
 
 
+_KINDS: tuple[Kind, ...] = ("gauss", "line", "disc")
+_SIGNIFICANT = 4.0  # standard deviations of a mean square
+_FEWER = 0.02  # of the pixels that a shape of the blur may keep less than a Gaussian, and still explain them better
 _QUICK = (_Stage(3, coarse=True), _Stage(1))
 _THOROUGH = (_Stage(3, coarse=True, wary=True), _Stage(2, wary=True), _Stage(2, wary=True, tempered=True))
 
@@ -67,45 +72,79 @@ def refine_photometric(sight: Sight, rotation: Tensor, translation: Tensor, *, p
         prior: (N, 6, 6), information about the pose besides the frames, that is the inverse covariance of the start:
             from the robot, or to hold what is known.
     """
-    narrow = torch.full_like(translation[:, 0], BAND)
-    start, blur = Pose(rotation, translation), torch.full_like(narrow, _START_BLUR)
+    start = Pose(rotation, translation)
     known = None if prior is None else PosePrior(prior, start)
-    first, doubt = _refined(_Fit(sight, narrow, known, _MOST_COARSE), start, blur, _QUICK)
+    order, refined = [], []
+    for index, part in sight.by_blur(_WIDEST, minor=True):
+        some = _refined_in(part, start[index], None if known is None else known[index])
+        order.append(index)
+        refined.append(at_full_size(some, part.reduction))
+    return Refined.cat(refined)[torch.argsort(torch.cat(order))]
+
+
+@dataclass(frozen=True, eq=False)
+class _Result(Rows):
+    """Refined rows, which of them are `doubtful`, and whether their residuals stand out at the edges."""
+
+    refined: Refined
+    doubt: Tensor
+    misshapen: Tensor
+
+
+def _refined_in(sight: Sight, start: Pose, known: PosePrior | None) -> Refined:
+    """Rows refined in the frames as they are: again with a band or a shape of the blur that suits it better."""
+    spread = Spread(blurs.limited(sight.common_blur, LEAST**2, MOST**2))
+    band = band_width(spread)
+    result = _refined(_Fit(sight, band, known, _MOST_COARSE), start, spread, _QUICK)
+
+    def again(rows: Tensor, kind: Kind, stages: tuple[_Stage, ...]) -> tuple[Tensor, _Result]:
+        index = rows.nonzero()[:, 0]
+        refined = result.refined[index]
+        spread = Spread.of(refined.spread, kind)
+        fit = _Fit(sight[index], band_width(spread), None if known is None else known[index])
+        other = _refined(fit, start[index].where(~refined.good, Pose(refined.R, refined.t)), spread, stages)
+        return index[other.refined.good], other[other.refined.good]
+
     # a wide blur needs a wider band, or it takes the levels on both sides of the edge for its own
-    wide = band_width(first.blur) > BAND + 1
-    for thorough in (False, True):
-        w = (doubt if thorough else wide).nonzero()[:, 0]
-        if w.numel() == 0:
+    wide = band_width(Spread(result.refined.spread)) > band + 1
+    if bool(wide.any()):
+        result = result.replaced(*again(wide, "gauss", _QUICK))
+    kind = torch.zeros_like(sight.frame)
+    misshapen = result.misshapen
+    for number, name in enumerate(_KINDS):
+        if name == "gauss" or not bool(misshapen.any()):
             continue
-        band = torch.where(wide, band_width(first.blur), BAND)[w]
-        fit = _Fit(sight[w], band, None if known is None else known[w])
-        again, still = _refined(fit, start[w], first.blur[w], _THOROUGH if thorough else _QUICK)
-        good = again.good.nonzero()[:, 0]
-        first, doubt = first.replaced(w[good], again[good]), doubt.index_copy(0, w[good], still[good])
-    return first
+        index, other = again(misshapen, name, _QUICK)
+        better = other.refined.noise < result.refined.noise[index]
+        better &= other.refined.kept > result.refined.kept[index] - _FEWER
+        result = result.replaced(index[better], other[better])
+        kind = kind.index_fill(0, index[better], number)
+    for number, name in enumerate(_KINDS):
+        doubt = result.doubt & (kind == number)
+        if bool(doubt.any()):
+            result = result.replaced(*again(doubt, name, _THOROUGH))
+    return result.refined
 
 
-def _refined(fit: _Fit, start: Pose, blur: Tensor, stages: tuple[_Stage, ...]) -> tuple[Refined, Tensor]:
-    """Rows refined in stages from a pose and a blur (N,) px, and which of them are `doubtful`."""
-    found = _minimised(fit, start, blur, stages)
-    pose, owner, rows = found.unknowns.pose, fit.blocks.row, len(blur)
+def _refined(fit: _Fit, start: Pose, spread: Spread, stages: tuple[_Stage, ...]) -> _Result:
+    """Rows refined in stages from poses and blurs."""
+    found = _minimised(fit, start, spread, stages)
+    pose, owner, rows = found.unknowns.pose, fit.blocks.row, len(spread)
     covariance, determined = found.covariance()
     covariance = covariance[:, :6, :6]
     kept, usable = (segment_sum((x > 0).sum(-1), owner, rows) for x in (fit.weight, fit.usable))
     good = determined & covariance.isfinite().all(-1).all(-1)
-    refined = Refined(
-        pose.R, pose.t, covariance, found.unknowns.values("blur")[:, 0], fit.variance.sqrt(), kept / usable, good
-    )
+    spread = cast(Spread, found.unknowns.own["blur"])
+    refined = Refined(pose.R, pose.t, covariance, spread.covariance, fit.variance.sqrt(), kept / usable, good)
     seen, of_them = (segment_sum(b.valid.sum(-1).double(), owner, rows) for b in (fit.blocks, fit.coarse))
     more = (seen / of_them.clamp_min(1)).clamp_min(1)
     doubt = doubtful(fit.sectors, fit.clear, fit.variance[owner], owner, found.step.own_chi2, more)
-    return refined, doubt
+    return _Result(refined, doubt, fit.misshapen)
 
 
-def _minimised(fit: _Fit, start: Pose, blur: Tensor, stages: tuple[_Stage, ...]) -> Minimum:
-    low, high = blur.new_tensor(_BLUR_RANGE).unbind()
-    own: dict[str, Block] = {"pose": start, "blur": Vector(blur[:, None], low, high)}
-    levels = first_levels(fit.coarse, start.R, start.t, blur)
+def _minimised(fit: _Fit, start: Pose, spread: Spread, stages: tuple[_Stage, ...]) -> Minimum:
+    own: dict[str, Block] = {"pose": start, "blur": spread}
+    levels = first_levels(fit.coarse, start.R, start.t, spread)
     unknowns = Unknowns(own, {"levels": Vector(levels)}, fit.blocks.row)
     for stage in stages:
         if stage.tempered:
@@ -125,6 +164,7 @@ class _Fit:
 
     sectors: Sectors
     clear: Tensor
+    misshapen: Tensor
 
     def __init__(self, sight: Sight, band: Tensor, prior: PosePrior | None, most_coarse: int | None = None) -> None:
         self.blocks = gather_pixels(sight, band, TILE * _COARSE)
@@ -132,23 +172,39 @@ class _Fit:
         self.prior = prior
         self.stage = _QUICK[0]
         self.variance = torch.ones_like(band)
+        self.least = torch.full_like(band, sight.quantisation)
         self.usable = self.weight = self.blocks.valid
 
     def __call__(self, unknowns: Unknowns) -> Normal:
         stage, part, pose = self.stage, self.coarse if self.stage.coarse else self.blocks, unknowns.pose
         levels = unknowns.values("levels")
-        model = ring_model(part, pose.R, pose.t, unknowns.values("blur")[:, 0], check=stage.wary)
+        spread = cast(Spread, unknowns.own["blur"])
+        model = ring_model(part, pose.R, pose.t, spread, check=stage.wary)
         columns, slope = columns_of(part, model, levels)
         residual = columns[:, :, -1].flatten(1)
         self.usable, self.weight = inliers(residual, part, model, levels)
         if not stage.coarse:
+            self.misshapen = self._stands_out(residual, slope)
             self.sectors = sum_sectors(residual, slope, self.usable, self.weight, part, model)
             factor = self._trusted(noise_spread(residual, part), model_misfit(levels))
             self.weight = self.weight * self.sectors.of_pixels(factor.to(self.weight.dtype))
         sums = sum_products(columns, self.weight)
         prior = None if self.prior is None else self.prior.at(pose, POSE)
-        normal, self.variance = normal_equations(sums, self.weight.sum(-1), levels, part.row, len(pose), prior)
+        normal, self.variance = normal_equations(sums, self.weight.sum(-1), levels, part.row, self.least, prior)
         return normal
+
+    def _stands_out(self, residual: Tensor, slope: Tensor) -> Tensor:
+        """Rows (N,) bool whose mean square residual is larger at the edges than elsewhere, beyond chance.
+
+        A wrong blur leaves residuals where grey values change, on both sides alike: they pull at no edge.
+        """
+        steep = self.weight * slope.square()
+        square = residual.square()
+        planes = (steep * square, steep, steep * slope.square(), self.weight * square, self.weight)
+        sums = [segment_sum(plane.double().sum(-1), self.blocks.row, len(self.least)) for plane in planes]
+        at_edges, everywhere = sums[0] / sums[1], sums[3] / sums[4]
+        pixels = sums[1].square() / sums[2]
+        return at_edges > everywhere * (1 + _SIGNIFICANT * (2 / pixels).sqrt())
 
     def _trusted(self, spread: Tensor, misfit: Tensor) -> Tensor:
         """Weights (K, 96) of the sectors."""

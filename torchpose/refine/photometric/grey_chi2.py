@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from torchpose.geometry.blurred_edge import Spread
 from torchpose.geometry.least_squares import solve_scaled
 from torchpose.geometry.segments import segment_sum
 from torchpose.refine.photometric.band import band_width
@@ -16,7 +17,7 @@ from torchpose.refine.photometric.grey_levels import (
     noise_spread,
     sum_products,
 )
-from torchpose.refine.photometric.light import POSE, QUANTISATION
+from torchpose.refine.photometric.light import POSE
 from torchpose.refine.photometric.ring_model import gather_pixels, ring_model
 from torchpose.refine.photometric.sectors import clear_sectors, misfit, sum_sectors
 from torchpose.refine.sight import Refined, Sight
@@ -34,12 +35,13 @@ def grey_chi2(sight: Sight, one: Refined, two: Refined) -> tuple[Tensor, Tensor]
     for less, by as much as the displacements of its sectors exceed theirs.
     """
     rows = len(sight.frame)
-    band = band_width(torch.maximum(one.blur, two.blur))
+    spreads = [Spread(pose.spread) for pose in (one, two)]
+    band = torch.maximum(*(band_width(spread) for spread in spreads))
     blocks = gather_pixels(sight, band, TILE)
     squares, weights, variances, misfits, explained = [], [], [], [], []
-    for pose in (one, two):
-        model = ring_model(blocks, pose.R, pose.t, pose.blur, check=True)
-        levels = first_levels(blocks, pose.R, pose.t, pose.blur)
+    for pose, spread in zip((one, two), spreads, strict=True):
+        model = ring_model(blocks, pose.R, pose.t, spread, check=True)
+        levels = first_levels(blocks, pose.R, pose.t, spread)
         for _ in range(_LEVEL_STEPS):
             columns, slope = columns_of(blocks, model, levels)
             residual = columns[:, :, -1].flatten(1)
@@ -50,7 +52,7 @@ def grey_chi2(sight: Sight, one: Refined, two: Refined) -> tuple[Tensor, Tensor]
             sums = sum_products(columns, weight)
             levels = levels + solve_scaled(sums[:, POSE:-1, POSE:-1], sums[:, POSE:-1, -1:]).squeeze(-1)
         used = segment_sum(weight.sum(-1).double(), blocks.row, rows).clamp_min(1)
-        variance = (segment_sum(sums[:, -1, -1], blocks.row, rows) / used).clamp_min(QUANTISATION)
+        variance = (segment_sum(sums[:, -1, -1], blocks.row, rows) / used).clamp_min(sight.quantisation)
         squares.append(residual.square())
         weights.append(weight)
         variances.append(variance)

@@ -9,8 +9,9 @@ import math
 import torch
 from torch import Tensor
 
+from torchpose.geometry.blurred_edge import Spread
 from torchpose.geometry.least_squares import geman_mcclure, solve_scaled
-from torchpose.refine.photometric.light import LEVELS, QUANTISATION
+from torchpose.refine.photometric.light import LEVELS
 from torchpose.refine.photometric.ring_model import PixelBlocks, RingModel, ring_model
 
 TILE = 256  # pixels summed in float32 at a time; sums of tiles are float64, so padding changes no digit that counts
@@ -22,12 +23,12 @@ _NEAR_PURE = 0.05  # of paper in a pixel, beside the most and the least of its m
 _FIRST_STEPS = 3  # reweighted fits of the levels before the pose is moved
 
 
-def first_levels(blocks: PixelBlocks, R: Tensor, t: Tensor, blur: Tensor) -> Tensor:
-    """Grey levels (K, 6) for the poses that come in: medians, then reweighted linear fits.
+def first_levels(blocks: PixelBlocks, R: Tensor, t: Tensor, spread: Spread) -> Tensor:
+    """Grey levels (K, 6) for the poses and blurs that come in: medians, then reweighted linear fits.
 
     A third of a ring may be covered: a least-squares fit of gradients would bend towards the cover and stay there.
     """
-    model = ring_model(blocks, R, t, blur)
+    model = ring_model(blocks, R, t, spread)
     columns = _tiled((*_basis(model), blocks.grey))
     none = torch.zeros_like(model.fraction[:, 0])
     ring, paper = _pure_levels(blocks, model.fraction)
@@ -58,7 +59,7 @@ def _pure_levels(blocks: PixelBlocks, fraction: Tensor) -> tuple[Tensor, Tensor]
 
 
 def columns_of(blocks: PixelBlocks, model: RingModel, levels: Tensor) -> tuple[Tensor, Tensor]:
-    """Derivatives by pose (6), blur (1) and levels (L), and the residual, by tiles: (K, P / 256, 8 + L, 256) float32.
+    """Derivatives by pose (6), blur (3) and levels (L), and the residual, by tiles: (K, P / 256, 10 + L, 256) float32.
 
     Also the derivative by the distance from the edges (K, P).
     """
@@ -72,7 +73,8 @@ def columns_of(blocks: PixelBlocks, model: RingModel, levels: Tensor) -> tuple[T
     by_d = contrast * model.by_d
     residual = blocks.grey - (ring + contrast * model.fraction)
     basis = _basis(model, bool(curved))
-    return _tiled((*(by_d * v for v in model.by_pose), contrast * model.by_q, *basis, residual)), by_d
+    by_blur = (contrast * v for v in model.by_blur)
+    return _tiled((*(by_d * v for v in model.by_pose), *by_blur, *basis, residual)), by_d
 
 
 def _basis(model: RingModel, curved: bool = False) -> tuple[Tensor, ...]:
@@ -113,7 +115,7 @@ def noise_spread(residual: Tensor, blocks: PixelBlocks) -> Tensor:
 
     All markers of a frame share its noise, so none may claim much more than the best of them: cover would.
     """
-    own = (1.4826 * _median(residual.abs(), blocks.valid)).nan_to_num(nan=1.0).clamp_min(math.sqrt(QUANTISATION))
+    own = (1.4826 * _median(residual.abs(), blocks.valid)).nan_to_num(nan=1.0).clamp_min(math.sqrt(blocks.quantisation))
     least = torch.full((int(blocks.row.max()) + 1 if len(own) else 0,), torch.inf, dtype=own.dtype, device=own.device)
     least = least.scatter_reduce(0, blocks.row, own, "amin")
     return torch.minimum(own, _MOST_SPREAD * least[blocks.row])

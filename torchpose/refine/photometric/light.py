@@ -11,40 +11,49 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from torchpose.geometry.blurred_edge import BLUR
 from torchpose.geometry.least_squares import Eliminated, Normal
 from torchpose.geometry.segments import segment_mean, segment_sum
 
-POSE, LEVELS = 7, 6  # unknowns of a frame (translation, rotation, blur) and of a marker, at least
-QUANTISATION = 1 / 12  # variance of rounding, in grey levels^2, below which no noise estimate falls
+POSE, LEVELS = 6 + BLUR, 6  # unknowns of a frame (translation, rotation, blur) and of a marker, at least
 _GRADIENTS = (1, 2, 4, 5)  # among the levels
 _CURVATURES = (6, 7, 8, 9, 10, 11)  # where there are any
+_BLUR_KNOWN = 1e-4  # information about each number of a blur, px^-4: a disc has two, so that the third is open
 _LEAST_WIDTH = 0.01  # variance of the prior over that of a gradient's noise: as good as none
 _RIDGE = 1e-9  # of a marker's information: sums in float32 make up as much
 
 
 def normal_equations(
-    sums: Tensor, used: Tensor, levels: Tensor, owner: Tensor, rows: int, prior: tuple[Tensor, Tensor] | None = None
+    sums: Tensor,
+    used: Tensor,
+    levels: Tensor,
+    owner: Tensor,
+    least: Tensor,
+    prior: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Normal, Tensor]:
     """Normal equations of N frames in units of the noise, with the prior about the levels, and the noise's variance.
 
     Args:
-        sums: (K, 8 + L, 8 + L), of every marker, weight times products of the derivatives by pose (7) and levels (L)
+        sums: (K, 10 + L, 10 + L), of every marker, weight times products of the derivatives by pose (9) and levels (L)
             and the residual.
         used: (K,) sum of weights.
         levels: (K, L) so far, L = 6, or 12 with the light's curvature.
         owner: (K,) int64, frame of every marker.
-        rows: number N of frames.
-        prior: information (N, 7, 7) about the pose, and how far the pose is from the prior's (N, 7).
+        least: (N,) variance below which the noise's does not fall.
+        prior: information (N, 9, 9) about the pose, and how far the pose is from the prior's (N, 9).
     """
+    rows = len(least)
     count = torch.bincount(owner, minlength=rows)
     chi2 = segment_sum(sums[:, -1, -1], owner, rows)
     freedom = segment_sum(used, owner, rows) - POSE - levels.shape[1] * count
-    variance = (chi2 / freedom.clamp_min(1)).clamp_min(QUANTISATION)
+    variance = (chi2 / freedom.clamp_min(1)).maximum(least)
     sums = sums / variance[owner, None, None]
     own, mixed, of_levels = sums[:, :POSE, :POSE], sums[:, :POSE, POSE:-1], sums[:, POSE:-1, POSE:-1]
     ridge = (_RIDGE * of_levels.diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)).expand(levels.shape)
     part = Eliminated(mixed, of_levels + torch.diag_embed(ridge), sums[:, POSE:-1, -1], owner)
-    normal = Normal(segment_sum(own, owner, rows), segment_sum(sums[:, :POSE, -1], owner, rows), chi2 / variance, part)
+    own = segment_sum(own, owner, rows)
+    own.diagonal(dim1=-2, dim2=-1)[:, POSE - BLUR :] += _BLUR_KNOWN
+    normal = Normal(own, segment_sum(sums[:, :POSE, -1], owner, rows), chi2 / variance, part)
     normal = normal if prior is None else normal.with_prior(*prior)
     precision = _precision(normal, part, levels)
     held = replace(

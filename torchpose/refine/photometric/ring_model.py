@@ -1,15 +1,14 @@
 """What the pixels around the edges of a ring should show: prediction and derivatives, for padded blocks of pixels.
 
-    F = Phi(z_outer) + 1 - Phi(z_inner),   z = (d + q^2 k / 2) / q
+    F = E(d_outer) + 1 - E(d_inner)
 
-is the fraction of paper in a pixel; d is its distance in px from the projected circle, k the curvature of the circle's
-image, q the blur (point-spread function and pixel together). The second term of z is the pull of blur on a curved edge;
-Phi carries the fourth cumulant of the square pixel. The distortion of the lens enters once, as the ray of each pixel.
+is the fraction of paper in a pixel; d is its distance in px from the projected circle, and E what the blur makes of an
+edge of that curvature and direction (`geometry.blurred_edge`). The distortion of the lens enters once, as the ray of
+each pixel.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -17,8 +16,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchpose.geometry import blur as blurs
+from torchpose.geometry.blurred_edge import Spread
 from torchpose.geometry.rotations import plane_axes
-from torchpose.geometry.rows import Rows
+from torchpose.geometry.rows import Rows, shared
 from torchpose.geometry.segments import values_at
 from torchpose.refine.photometric.band import band_pixels
 from torchpose.refine.sight import Sight
@@ -46,6 +47,7 @@ class PixelBlocks(Rows):
         normal: the same.
         radii: outer and inner.
         limits: the grey levels at which the frame's noise is clipped, -inf and inf where it is not.
+        quantisation: variance of rounding, grey levels^2.
     """
 
     row: Int[Tensor, " K"]
@@ -60,6 +62,7 @@ class PixelBlocks(Rows):
     normal: Float[Tensor, "K 3"]
     radii: Float[Tensor, "K 2"]
     limits: Float[Tensor, "K 2"]
+    quantisation: float = shared()
 
     def every(self, nth: int, most: int | None = None) -> PixelBlocks:
         """The same with one pixel of ``nth``, or as many fewer as leave ``most`` of each marker."""
@@ -78,14 +81,14 @@ class PixelBlocks(Rows):
 class RingModel(NamedTuple):
     """Prediction and derivatives at one pose; planes (K, P) in float32.
 
-    fraction: of paper, F. by_d, by_q: dF/dd through both circles, dF/dq. by_pose: 6 planes, derivative of d.
+    fraction: of paper, F. by_d: dF/dd through both circles. by_blur: 3 planes. by_pose: 6 planes, derivative of d.
     x, y: plane coordinates over the outer radius. sound: bool, False where the expansions below do not hold: deep in
     a hole that is small for its blur, or where it is flat; None if not asked for.
     """
 
     fraction: Tensor
     by_d: Tensor
-    by_q: Tensor
+    by_blur: tuple[Tensor, ...]
     by_pose: tuple[Tensor, ...]
     x: Tensor
     y: Tensor
@@ -143,6 +146,7 @@ def gather_pixels(sight: Sight, band: Tensor, grain: int) -> PixelBlocks:
         sight.normals[row, marker],
         sight.radii[row, marker],
         limits,
+        sight.quantisation,
     )
 
 
@@ -246,39 +250,20 @@ def _rims(blocks: PixelBlocks, foot: _Foot) -> _Rim:
     return _Rim(per_mm, bend, second, (nu, nv), by_pose)
 
 
-def ring_model(blocks: PixelBlocks, R: Tensor, t: Tensor, blur: Tensor, *, check: bool = False) -> RingModel:
-    """Predicts every pixel at poses (N, 3, 3), (N, 3) and blurs (N,), and with ``check`` says where that is sound."""
+def ring_model(blocks: PixelBlocks, R: Tensor, t: Tensor, spread: Spread, *, check: bool = False) -> RingModel:
+    """Predicts every pixel at poses (N, 3, 3), (N, 3) and N blurs, and with ``check`` says where that is sound."""
     foot = _feet(blocks, R, t)
     rim = _rims(blocks, foot)
-    q = blur[blocks.row, None].float()
     straight = foot.inner * rim.per_mm
     d_outer, d_inner = (d + rim.second * d.square() for d in (foot.outer * rim.per_mm, straight))
     sound = None
     if check:
         near = (-rim.bend * straight < _DEEP) & ((rim.second * straight).abs() < _BENT)
-        sound = near | (d_inner.abs() > _FAR * q)
-    pull = 0.5 * q * rim.bend
-    z_outer, z_inner = d_outer / q + pull, d_inner / q + pull
-    square = square_cumulant(*rim.normal, q)
-    f_outer, p_outer = blurred_step(z_outer, square)
-    f_inner, p_inner = blurred_step(z_inner, square)
-    by_q = p_outer * (rim.bend - z_outer / q) - p_inner * (rim.bend - z_inner / q)
+        variance = blurs.across(spread.covariance[blocks.row, None].float(), *rim.normal)
+        sound = near | (d_inner.square() > _FAR**2 * variance)
+    edge = spread.at(blocks.row, *rim.normal)
+    outer, inner = edge(d_outer, rim.bend), edge(d_inner, rim.bend)
+    by_blur = tuple(one - other for one, other in zip(outer.by_blur, inner.by_blur, strict=True))
     size = blocks.radii[:, :1].float()
-    by_d = (p_outer - p_inner) / q
-    return RingModel(f_outer + 1 - f_inner, by_d, by_q, rim.by_pose, foot.x / size, foot.y / size, sound)
-
-
-def square_cumulant(nu: Tensor, nv: Tensor, blur: Tensor) -> Tensor:
-    """What a pixel, a square and no Gaussian, adds to an edge of the normal (nu, nv): for `blurred_step`.
-
-    Its fourth cumulant along the normal, -(nu^4 + nv^4) / 120 px^4, over -24 blur^4.
-    """
-    return (1 - 2 * (nu * nv).square()) / (24 * 120) / blur.square().square()
-
-
-def blurred_step(z: Tensor, square: Tensor) -> tuple[Tensor, Tensor]:
-    """Blurred step and its slope at ``z`` standard deviations: the normal law and its fourth-order Edgeworth term."""
-    z2 = z.square()
-    density = torch.exp(-0.5 * z2) * (1 / math.sqrt(2 * math.pi))
-    step = 0.5 * torch.erfc(-z * math.sqrt(0.5)) + square * density * z * (z2 - 3)
-    return step, density * (1 - square * (z2 * (z2 - 6) + 3))
+    fraction, by_d = outer.fraction + 1 - inner.fraction, outer.by_distance - inner.by_distance
+    return RingModel(fraction, by_d, by_blur, rim.by_pose, foot.x / size, foot.y / size, sound)

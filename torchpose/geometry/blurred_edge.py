@@ -1,0 +1,228 @@
+"""What a blur makes of an edge: a Gaussian of any covariance, a line (motion), a disc (defocus).
+
+With p displaced by the blur's (X, Y) along and across the normal n of an edge of curvature k, the share of the blur
+that falls outside is, to first order in k,
+
+    F = P(d + X + k Y^2 / 2 > 0),
+
+d the distance of the pixel outside the edge. For a Gaussian X + k Y^2 / 2 has the mean k t'St / 2, the variance n'Sn
+and the third cumulant 3 k (n'St)^2 (the second and third terms of its Edgeworth series). A line or a disc is averaged
+over nodes along the normal, each of them a narrow Gaussian.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple, Self
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchpose.geometry import blur as blurs
+from torchpose.geometry.rows import Rows, shared
+
+Kind = Literal["gauss", "line", "disc"]
+BLUR = 3  # numbers of a blur
+LEAST, MOST = 0.3, 12.0  # px, standard deviations: a pixel alone has 0.289; beyond the widest band nothing is left
+_NODES_A_SIGMA = 1.9  # Gauss-Legendre nodes a half length in narrow Gaussians: an edge to 1e-5 (`sim.boundary`)
+_MOST_NODES = 40
+_CORE = 0.6  # px, of what is not the line or the disc, to begin with: a pixel, and a sharp lens
+_MOST_STEP = 0.6  # of the size of a blur that it may change by in a step: the derivatives hold no farther
+
+
+@dataclass(frozen=True, eq=False)
+class Spread(Rows):
+    """Blurs of N rows as a block of unknowns (`geometry.least_squares`).
+
+    Attributes:
+        values: gauss: the covariance s11, s12, s22, px^2; line: variance of the Gaussian core, and the line's vector,
+            px; disc: variance of the core, radius of the disc, px, and nothing.
+        kind: of all rows.
+    """
+
+    values: Float[Tensor, "N 3"]
+    kind: Kind = shared("gauss")
+
+    @classmethod
+    def of(cls, blur: Float[Tensor, "N 3"], kind: Kind = "gauss") -> Self:
+        """The blur of a kind that has about this covariance."""
+        if kind == "gauss":
+            return cls(blur, kind)
+        least, most = blurs.axes(blur)
+        if kind == "disc":
+            core = torch.full_like(least, _CORE**2).minimum(0.5 * least)
+            radius = 2 * (0.5 * (least + most) - core).clamp_min(0).sqrt()
+            return cls(torch.stack([core, radius, torch.zeros_like(core)], -1), kind)
+        length = (12 * (most - least)).clamp_min(0).sqrt()
+        s11, s12, s22 = blur.unbind(-1)
+        turn = 0.5 * torch.atan2(2 * s12, s11 - s22)
+        return cls(torch.stack([least, length * turn.cos(), length * turn.sin()], -1), kind)
+
+    @property
+    def size(self) -> int:
+        return BLUR
+
+    @property
+    def covariance(self) -> Float[Tensor, "N 3"]:
+        """s11, s12, s22, px^2."""
+        if self.kind == "gauss":
+            return self.values
+        core, one, two = self.values.unbind(-1)
+        if self.kind == "disc":
+            return blurs.isotropic((core + one.square() / 4).sqrt())
+        return torch.stack([core + one * one / 12, one * two / 12, core + two * two / 12], -1)
+
+    def moved(self, step: Tensor) -> Self:
+        if self.kind == "gauss":
+            limit = _MOST_STEP * (self.values[:, 0] + self.values[:, 2])[:, None]
+            long = torch.linalg.vector_norm(step, dim=-1, keepdim=True)
+            step = step * (limit / long.clamp_min(1e-12)).clamp_max(1.0)
+            return replace(self, values=blurs.limited(self.values + step, LEAST**2, MOST**2))
+        core, one, two = (self.values + step).unbind(-1)
+        core = core.maximum(0.25 * self.values[:, 0]).minimum(4 * self.values[:, 0]).clamp(LEAST**2, MOST**2)
+        one = one.abs() if self.kind == "disc" else one
+        return replace(self, values=torch.stack([core, one, two], -1))
+
+    def at(self, row: Tensor, nu: Tensor, nv: Tensor) -> Callable[[Tensor, Tensor], Edge]:
+        """Edges, of distances and curvatures (K, P), under the blurs of rows (K,) where the normals are nu, nv."""
+        values = self.values[row].float()
+        if self.kind == "gauss":
+            return _Gauss(values, nu, nv)
+        return _Line(values, nu, nv) if self.kind == "line" else _Disc(values)
+
+
+class Edge(NamedTuple):
+    """Share of the outside in pixels, and its derivatives by the distance and by the three numbers of the blur."""
+
+    fraction: Tensor
+    by_distance: Tensor
+    by_blur: tuple[Tensor, Tensor, Tensor]
+
+
+class _Gauss:
+    """Planes (K, P) of what the blur is across and along edges of the normals nu, nv."""
+
+    def __init__(self, values: Tensor, nu: Tensor, nv: Tensor) -> None:
+        s11, s12, s22 = values.split(1, -1)
+        self.uu, self.vv, uv = nu * nu, nv * nv, nu * nv
+        self.uv2 = 2 * uv
+        self.across = s11 * self.uu + s12 * self.uv2 + s22 * self.vv
+        self.along = s11 + s22 - self.across
+        self.over = self.across.rsqrt()
+        mixed = (s22 - s11) * uv + s12 * (self.uu - self.vv)
+        self.lean = 0.5 * mixed.square() * self.over.pow(3)
+        self.square = square_cumulant(uv, self.across)
+
+    def __call__(self, distance: Tensor, bend: Tensor) -> Edge:
+        over, half = self.over, 0.5 * bend
+        z = (distance + half * self.along) * over
+        step, slope, density = blurred_step(z, self.square)
+        skew = bend * self.lean * density
+        z2 = z.square()
+        step = step + skew * (z2 - 1)
+        by_distance = (slope + skew * z * (3 - z2)) * over
+        by_across = slope * z * (-0.5 * over.square())
+        by_along = half * slope * over
+        # the variance along is the trace less that across
+        change = by_across - by_along
+        by_blur = (change * self.uu + by_along, change * self.uv2, change * self.vv + by_along)
+        return Edge(step, by_distance, by_blur)
+
+
+class _Nodes(NamedTuple):
+    """Sums over nodes: their places along the normal and half their mean squares along the edge (K, P) or numbers."""
+
+    step: Tensor
+    slope: Tensor
+    by_core: Tensor
+    by_place: Tensor
+    by_square: Tensor
+
+
+def _averaged(distance: Tensor, bend: Tensor, core: Tensor, nodes: list[tuple[float, float, Tensor, Tensor]]) -> _Nodes:
+    """Means of narrow edges over nodes: weight, share, place along the normal and square along the edge of each.
+
+    by_place: mean slope times share; by_square: mean slope times k / 2 times share^2.
+    """
+    sigma = core.sqrt()
+    out = [torch.zeros_like(distance) for _ in range(5)]
+    for weight, share, place, square in nodes:
+        z = (distance + place + 0.5 * bend * (core + square)) / sigma
+        slope = torch.exp(-0.5 * z.square()) * (weight / math.sqrt(2 * math.pi)) / sigma
+        out[0] += (0.5 * weight) * torch.erfc(-z * math.sqrt(0.5))
+        out[1] += slope
+        out[2] += slope * (0.5 * bend - 0.5 * z / sigma)
+        out[3] += share * slope
+        out[4] += share * share * slope
+    return _Nodes(*out)
+
+
+class _Line:
+    """A line of the vector m: displaced evenly from -m / 2 to m / 2."""
+
+    def __init__(self, values: Tensor, nu: Tensor, nv: Tensor) -> None:
+        self.core, self.mu, self.mv = values.split(1, -1)
+        self.nu, self.nv = nu, nv
+        self.normal, self.along = nu * self.mu + nv * self.mv, nu * self.mv - nv * self.mu
+        self.node, self.weight = _rule(0.5 * torch.hypot(self.mu, self.mv), self.core)
+
+    def __call__(self, distance: Tensor, bend: Tensor) -> Edge:
+        square = self.along.square()
+        nodes = [
+            (float(w), float(x), float(x) * self.normal, float(x) ** 2 * square)
+            for w, x in zip(0.5 * self.weight, 0.5 * self.node, strict=True)
+        ]
+        mean = _averaged(distance, bend, self.core, nodes)
+        lean = bend * self.along * mean.by_square
+        by_blur = (mean.by_core, mean.by_place * self.nu - lean * self.nv, mean.by_place * self.nv + lean * self.nu)
+        return Edge(mean.step, mean.slope, by_blur)
+
+
+class _Disc:
+    """A disc of a radius r: chords across the normal, of mean square (r^2 - x^2) / 3 along it."""
+
+    def __init__(self, values: Tensor) -> None:
+        self.core, self.radius, _ = values.split(1, -1)
+        count = len(_rule(self.radius, self.core)[0])
+        angle = torch.arange(1, count + 1, dtype=torch.float64) * (math.pi / (count + 1))
+        # Gauss-Chebyshev of the second kind, whose weight is the length of the chord
+        self.node, self.weight = angle.cos(), angle.sin().square() * (2 / (count + 1))
+
+    def __call__(self, distance: Tensor, bend: Tensor) -> Edge:
+        radius = self.radius
+        nodes = [
+            (float(w), float(x), float(x) * radius, (1 - float(x) ** 2) / 3 * radius.square())
+            for w, x in zip(self.weight, self.node, strict=True)
+        ]
+        mean = _averaged(distance, bend, self.core, nodes)
+        by_radius = mean.by_place + bend * radius / 3 * (mean.slope - mean.by_square)
+        return Edge(mean.step, mean.slope, (mean.by_core, by_radius, torch.zeros_like(by_radius)))
+
+
+def _rule(half: Tensor, core: Tensor) -> tuple[Tensor, Tensor]:
+    """Gauss-Legendre nodes on [-1, 1] for the longest of half lengths (K, 1) beside cores (K, 1)."""
+    ratio = float((half / core.sqrt()).max()) if half.numel() else 0.0
+    count = min(_MOST_NODES, 2 + math.ceil(_NODES_A_SIGMA * ratio))
+    k = torch.arange(1, count, dtype=torch.float64)
+    off = k / (4 * k * k - 1).sqrt()
+    node, vector = torch.linalg.eigh(off.diag(1) + off.diag(-1))  # Golub and Welsch 1969
+    return node, 2 * vector[0].square()
+
+
+def square_cumulant(product: Tensor, variance: Tensor) -> Tensor:
+    """What a pixel, a square and no Gaussian, adds to an edge whose normal has that ``product`` nu nv.
+
+    Its fourth cumulant along the normal, -(nu^4 + nv^4) / 120 px^4, over -24 variance^2.
+    """
+    return (1 - 2 * product.square()) / (24 * 120) / variance.square()
+
+
+def blurred_step(z: Tensor, square: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Step and slope at ``z`` standard deviations, the normal law and its fourth-order term, and its density."""
+    z2 = z.square()
+    density = torch.exp(-0.5 * z2) * (1 / math.sqrt(2 * math.pi))
+    step = 0.5 * torch.erfc(-z * math.sqrt(0.5)) + square * density * z * (z2 - 3)
+    return step, density * (1 - square * (z2 * (z2 - 6) + 3)), density
