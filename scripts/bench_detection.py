@@ -3,6 +3,7 @@
     python scripts/bench_detection.py [--frames 16] [--seed 0] [--only blur noise]
     python scripts/bench_detection.py --noise-frames 10000
     python scripts/bench_detection.py --megapixels 20
+    python scripts/bench_detection.py --clutter [--scale 3]
 
 Frames are rendered with the target quad40 on the 2 MP camera; a marker counts as found if an ellipse lies within
 0.3 semi-minor axes of its outer circle and within 20 % of its size. Given are recall of the outer circles, ellipses
@@ -13,7 +14,10 @@ scikit-image's hough_ellipse votes with pairs of all edge pixels, hours for a fr
 fits ellipses to the contours of OpenCV's Canny edges.
 
 --noise-frames counts single ellipses, and rings, in frames of noise alone, half of them white, half correlated, 320 x
-240 px. --megapixels 20 times candidates alone, 8 large frames at once, and gives their memory.
+240 px. --megapixels 20 times candidates alone, 8 large frames at once, and gives their memory. --clutter times the
+candidates of single frames whose plate lies among 0 to 1,000 discs, 10,000 specks, or before pictures of scikit-image:
+all of them, and those that the estimator asks for, beside OpenCV's ArUco detector and AprilTag 3 (optional, `pip
+install pupil_apriltags`; no decimation, one thread) on the same frame; --scale 3 makes frames of 20 megapixels of it.
 """
 
 from __future__ import annotations
@@ -26,6 +30,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -35,7 +40,7 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from torchpose.camera import Camera
-from torchpose.detect import find_candidates
+from torchpose.detect import Wanted, find_candidates
 from torchpose.detect.reduce import reduction_factor
 from torchpose.geometry import conics, rotations
 from torchpose.rings import measure_rings
@@ -293,6 +298,79 @@ def large(megapixels: float) -> None:
     )
 
 
+def discs(shape: tuple[int, int], count: int, radii: tuple[float, float]) -> np.ndarray:
+    """A picture (H, W) of dark and light discs."""
+    rng = np.random.default_rng(count)
+    picture = np.full(shape, 128, np.uint8)
+    for _ in range(count):
+        x, y, radius = rng.uniform(0, shape[1]), rng.uniform(0, shape[0]), rng.uniform(*radii)
+        cv2.circle(
+            picture, (int(16 * x), int(16 * y)), int(16 * radius), int(rng.choice([20, 240])), -1, cv2.LINE_AA, 4
+        )
+    return picture
+
+
+def surrounds(shape: tuple[int, int]) -> Iterator[tuple[str, np.ndarray]]:
+    """What lies around the plate, by name."""
+    import skimage.data
+
+    for count in (0, 10, 50, 200, 1000):
+        yield f"{count} discs", discs(shape, count, (3, 15))
+    yield "10000 specks", discs(shape, 10_000, (1, 3))
+    for name in (
+        "camera",
+        "page",
+        "text",
+        "coins",
+        "brick",
+        "grass",
+        "gravel",
+        "astronaut",
+        "coffee",
+        "chelsea",
+        "moon",
+    ):
+        picture = getattr(skimage.data, name)()
+        picture = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) if picture.ndim == 3 else picture
+        yield name, cv2.resize(picture, shape[::-1])
+
+
+def median_cpu(work: Callable[[], object], times: int = 5) -> float:
+    """Median CPU time in ms, after one run that does not count."""
+    spent = []
+    for _ in range(times + 1):
+        start = time.process_time()
+        work()
+        spent.append(1e3 * (time.process_time() - start))
+    return sorted(spent[1:])[times // 2]
+
+
+def clutter(scale: int) -> None:
+    """CPU time of the candidates of one frame against what else is in it, beside detectors of tags."""
+    lens, target = camera(scale), Target.load("quad40")
+    asked = Wanted.of(torch.tensor([1.0], dtype=F64), 3.0)
+    aruco = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
+    tags = None
+    if importlib.util.find_spec("pupil_apriltags"):
+        tags = importlib.import_module("pupil_apriltags").Detector(families="tag36h11", nthreads=1, quad_decimate=1.0)
+    r = rotations.exp(torch.tensor([[0.3, -0.2, 0.5]], dtype=F64))
+    t = torch.tensor([[5.0, -4.0, 160.0]], dtype=F64)
+    for name, picture in surrounds((lens.height, lens.width)):
+        around = torch.from_numpy(picture)[None].float()
+        clean = render(lens, target, r, t, psf_sigma=0.8, dark=30.0, light=220.0, plate=(70.0, 70.0), surround=around)
+        frames = add_noise(clean, 2.0, 0)
+        grey = np.ascontiguousarray(frames[0].numpy())
+        every, some = (median_cpu(partial(find_candidates, frames, wanted=w)) for w in (Wanted(), asked))
+        peers = [("ArUco", median_cpu(partial(aruco.detectMarkers, grey)))]
+        peers += [("AprilTag 3", median_cpu(partial(tags.detect, grey)))] if tags else []
+        found, wanted = len(find_candidates(frames)), len(find_candidates(frames, wanted=asked))
+        beside = ", ".join(f"{some / cpu:.2f} of {peer} ({cpu:.0f} ms)" for peer, cpu in peers)
+        print(
+            f"{name:13s} all {found:4d} in {every:6.0f} ms, asked for {wanted:4d} in {some:6.0f} ms: {beside}",
+            flush=True,
+        )
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=16, help="of each condition")
@@ -300,9 +378,14 @@ def main() -> int:
     parser.add_argument("--only", nargs="*", choices=sorted(SWEEPS), default=sorted(SWEEPS))
     parser.add_argument("--megapixels", type=float, help="time large frames instead")
     parser.add_argument("--noise-frames", type=int, help="count false alarms in so many frames of noise instead")
+    parser.add_argument("--clutter", action="store_true", help="time single frames full of other things instead")
+    parser.add_argument("--scale", type=int, default=1, help="of the frames of --clutter")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
+    if arguments.clutter:
+        clutter(arguments.scale)
+        return 0
     if arguments.megapixels:
         large(arguments.megapixels)
         return 0

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from torchpose.camera import Camera
 from torchpose.camera.model import Model
-from torchpose.detect import find_candidates
+from torchpose.detect import Wanted, find_candidates
 from torchpose.errors import ConfigError, FrameError
 from torchpose.geometry.grey import grey
 from torchpose.identify import Identified, MarkerTable, Scene, identify, look_again
@@ -32,6 +32,9 @@ from torchpose.results import Poses, Reason, Status
 from torchpose.rings import Rings, measure_rings
 from torchpose.target import Target
 
+_LEAST_CANDIDATE = (
+    3.0  # px of semi-minor axis: rings below 4 are refused (`rings.measure`); candidates of covered ones err
+)
 _FRAME_TYPES = (torch.uint8, torch.uint16, torch.float16, torch.bfloat16, torch.float32, torch.float64)
 Method = Literal["photometric", "edges", "centers", "paper"]
 
@@ -142,7 +145,7 @@ class PoseEstimator(nn.Module):
         """
         frames = self._checked(frames)
         scene = Scene(frames, self.camera.to(frames.device), self.table.to(frames.device))
-        candidates = find_candidates(frames)
+        candidates = find_candidates(frames, wanted=Wanted.of(scene.table.polarity, _LEAST_CANDIDATE))
         candidates = candidates[torch.isin(candidates.polarity, scene.table.polarity)]
         rings = measure_rings(frames, candidates, scene.camera, correct=self._recipe.correct)
         found = self._solved(scene, rings, identify(rings, scene.table, scene.camera, len(frames)))

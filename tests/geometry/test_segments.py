@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from torchpose.geometry.segments import (
     Tiles,
+    near_pairs,
     positions,
     ragged_arange,
     rank_in_group,
@@ -84,3 +85,42 @@ def test_ragged_arange(sizes: list[int]) -> None:
 def test_rank_in_group(members: list[int]) -> None:
     rank = rank_in_group(torch.tensor(members, dtype=torch.int64), 6)
     assert rank.tolist() == [members[:i].count(g) for i, g in enumerate(members)]
+
+
+@pytest.mark.parametrize("reach", [0.5, 8.0, 300.0])
+@pytest.mark.parametrize("seed", range(5))
+def test_near_pairs_are_all_that_are_near(seed: int, reach: float) -> None:
+    generator = torch.Generator().manual_seed(seed)
+
+    def points(count: int) -> torch.Tensor:
+        spread = torch.tensor([900.0, 600.0], dtype=torch.float64)
+        some = torch.rand(count, 2, generator=generator, dtype=torch.float64) * spread - 40
+        # some on whole numbers, some at the same place, some nowhere
+        some[::3] = some[::3].round()
+        some[1::7] = some[0]
+        some[2::11, 1] = torch.nan
+        return some
+
+    first, second = points(300), points(400)
+    second[::5] = first[:80] + 0.1
+    group, other = (torch.randint(0, 3, (n,), generator=generator) for n in (300, 400))
+    span = reach * torch.rand(300, generator=generator, dtype=torch.float64).pow(3)
+    i, j = near_pairs(first, second, span, (group, other))
+    near = (first[:, None] - second).abs().amax(-1) <= span[:, None]
+    near &= group[:, None] == other
+    found = torch.zeros_like(near)
+    found[i, j] = True
+    assert found.sum() == len(i) > 0  # each once
+    assert not (near & ~found).any()
+    # what else is there lies no farther off than a row is wide
+    beyond = (first[i] - second[j]).abs().amax(-1) - span[i]
+    assert (group[i] == other[j]).all()
+    assert (beyond <= 2.1 * span.median() + 1).all()
+
+
+def test_near_pairs_of_nothing() -> None:
+    none, one = torch.zeros(0, 2, dtype=torch.float64), torch.zeros(1, 2, dtype=torch.float64)
+    for first, second in ((none, one), (one, none), (none, none)):
+        groups = (torch.zeros(len(first), dtype=torch.int64), torch.zeros(len(second), dtype=torch.int64))
+        i, j = near_pairs(first, second, torch.ones(len(first), dtype=torch.float64), groups)
+        assert len(i) == len(j) == 0

@@ -3,6 +3,6 @@
 from torchpose.detect.candidates import find_candidates
 from torchpose.detect.lines import Segments
 from torchpose.detect.shapes import Shapes, find_shapes
-from torchpose.detect.validation import Candidates, Verdict
+from torchpose.detect.validation import Candidates, Verdict, Wanted
 
-__all__ = ["Candidates", "Segments", "Shapes", "Verdict", "find_candidates", "find_shapes"]
+__all__ = ["Candidates", "Segments", "Shapes", "Verdict", "Wanted", "find_candidates", "find_shapes"]

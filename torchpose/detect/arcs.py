@@ -84,14 +84,15 @@ def describe_arcs(regions: Regions, xy: Float[Tensor, "P 2"]) -> Arcs:
     return Arcs(regions.frame, middle, normal, curvature, turn, size)
 
 
-def chain_pairs(arcs: Arcs) -> Int[Tensor, "Q 2"]:
+def chain_pairs(arcs: Arcs, polarity: float = 0.0) -> Int[Tensor, "Q 2"]:
     """Pairs of arcs that may be of one ellipse: same turning sense, each on the inner side of the other.
 
-    The middles are no farther apart than the two circles of curvature allow. Arcs are sorted by frame.
+    The middles are no farther apart than the two circles of curvature allow. Arcs are sorted by frame. With a
+    ``polarity`` only those count that belong to ellipses of this one.
     """
     curved = arcs.turn > _LEAST_TURN
     rank = segments.rank_in_group(arcs.frame, by=torch.where(curved, -arcs.size, 0))
-    index = positions(curved & (rank < _MOST_ARCS))
+    index = positions(curved & (rank < _MOST_ARCS) & (arcs.curvature * polarity >= 0))
     i, j = segments.pairs_in_group(arcs.frame[index], arcs.frame[index])
     ahead = positions(i < j)
     i, j = index[i[ahead]], index[j[ahead]]
@@ -113,6 +114,25 @@ def chain_pairs(arcs: Arcs) -> Int[Tensor, "Q 2"]:
     return torch.stack([i[fits], j[fits]], -1)
 
 
+def fit_pairs(
+    regions: Regions, about: Arcs, xy: Float[Tensor, "P 2"], pair: Int[Tensor, "Q 2"]
+) -> Float[Tensor, "Q 5"]:
+    """`fit_joint` of the cells of pairs of arcs, each arc summed once however many pairs it is in."""
+    arc, member = pair.flatten().unique(return_inverse=True)
+    number = torch.full((len(about),), -1, device=pair.device).index_copy(0, arc, torch.arange(len(arc)))
+    own = number.index_select(0, regions.region)
+    cell = positions(own >= 0)
+    own, gradient, xy = own[cell], regions.gradient[cell], xy[cell]
+    middle, first = about.middle[arc], member.view(-1, 2)
+    sums = scatter_sums(xy, gradient, own, middle, torch.linalg.vector_norm(gradient, dim=-1))
+    weight = sums[:, 5, 5]
+    mean = middle + sums[:, 3:5, 5] / weight[:, None]
+    share = weight[first] / weight[first].sum(-1, keepdim=True)
+    center = (share[..., None] * mean[first]).sum(1)
+    step = (middle[first] - center[:, None]).flatten(0, 1)
+    return fit_scatter(moved_sums(sums[member], step).view(-1, 2, 6, 6).sum(1), center)
+
+
 def fit_joint(xy: Tensor, gradient: Tensor, index: Tensor, count: int, weights: Tensor) -> Float[Tensor, "M 5"]:
     """Ellipses from positions (P, 2) and gradient directions (P, 2), NaN where the conic is no ellipse.
 
@@ -121,34 +141,50 @@ def fit_joint(xy: Tensor, gradient: Tensor, index: Tensor, count: int, weights: 
     """
     w = weights.double()
     center = segment_mean(xy, index, count, w)
-    scale = segment_mean((xy - center[index]).square().sum(-1), index, count, w).sqrt()
-    rows = direction_rows(xy, gradient, index, center, scale)
-    return fit_scatter(segment_sum(rows * w[:, None], index, count), center, scale)
+    return fit_scatter(scatter_sums(xy, gradient, index, center, w), center)
 
 
-def direction_rows(xy: Tensor, gradient: Tensor, index: Tensor, center: Tensor, scale: Tensor) -> Float[Tensor, "P 21"]:
-    """What points (P, 2) add to the scatter that `fit_scatter` solves, its upper triangle.
+def scatter_sums(
+    xy: Tensor, gradient: Tensor, index: Tensor, center: Tensor, weights: Tensor, size: int = 32
+) -> Float[Tensor, "M 6 6"]:
+    """What points (P, 2) add to the scatter that `fit_scatter` solves, summed by their index, about centres (M, 2).
 
-    Conics are sought in units of their ``center`` and ``scale``.
+    ``size`` is that of the tiles of points that are summed at once, about as many as a centre has.
     """
-    x, y = ((xy - center[index]) / scale[index, None]).unbind(-1)
-    g = gradient.double()
-    g = g / torch.linalg.vector_norm(g, dim=-1, keepdim=True).clamp_min(1e-12)
-    tx, ty = -g[:, 1], g[:, 0]
-    one, zero = torch.ones_like(x), torch.zeros_like(x)
-    on = torch.stack([x * x, x * y, y * y, x, y, one], -1)
-    along = torch.stack([2 * x * tx, x * ty + y * tx, 2 * y * ty, tx, ty, zero], -1)
-    along = along * (_TANGENT_PX / scale)[index, None]
-    upper = torch.triu_indices(6, 6, device=xy.device)
-    return on[:, upper[0]] * on[:, upper[1]] + along[:, upper[0]] * along[:, upper[1]]
+    (x, y), (gx, gy) = xy.unbind(-1), gradient.double().unbind(-1)
+    x, y = (v - c.contiguous().index_select(0, index) for v, c in zip((x, y), center.unbind(-1), strict=True))
+    root = weights.double().sqrt()
+    turn = _TANGENT_PX * root / (gx * gx + gy * gy).sqrt().clamp_min(1e-12)
+    tiles = segments.Tiles.of(index, len(center), size)
+    x, y, gx, gy, root = tiles.planes(x, y, gx * turn, gy * turn, root).unbind(1)
+    tx, ty = -gy, gx
+    on = torch.stack([x * x, x * y, y * y, x, y, torch.ones_like(x)], 1) * root[:, None]
+    along = torch.stack([2 * x * tx, x * ty + y * tx, 2 * y * ty, tx, ty, torch.zeros_like(x)], 1)
+    rows = torch.cat([on, along], -1)
+    return tiles.sums(rows @ rows.mT)
 
 
-def fit_scatter(sums: Float[Tensor, "M 21"], center: Tensor, scale: Tensor) -> Float[Tensor, "M 5"]:
-    """Ellipses of summed `direction_rows`, NaN where the conic is no ellipse."""
-    upper = torch.triu_indices(6, 6, device=sums.device)
-    scatter = torch.zeros(sums.shape[0], 6, 6, dtype=sums.dtype, device=sums.device)
-    scatter[:, upper[0], upper[1]] = sums
-    scatter[:, upper[1], upper[0]] = sums
+def moved_sums(sums: Float[Tensor, "M 6 6"], step: Float[Tensor, "M 2"]) -> Float[Tensor, "M 6 6"]:
+    """The same sums about other centres, from which the old ones lie a step away: monomials of x + step."""
+    dx, dy = step.unbind(-1)
+    change = torch.eye(6, dtype=sums.dtype, device=sums.device).repeat(len(sums), 1, 1)
+    change[:, 0, 3], change[:, 0, 5] = 2 * dx, dx * dx
+    change[:, 1, 3], change[:, 1, 4], change[:, 1, 5] = dy, dx, dx * dy
+    change[:, 2, 4], change[:, 2, 5] = 2 * dy, dy * dy
+    change[:, 3, 5], change[:, 4, 5] = dx, dy
+    return change @ sums @ change.mT
+
+
+def fit_scatter(sums: Float[Tensor, "M 6 6"], center: Tensor, scale: Tensor | None = None) -> Float[Tensor, "M 5"]:
+    """Ellipses of `scatter_sums` about centres (M, 2), NaN where the conic is no ellipse.
+
+    Conics are of unit length in units of their scale (M,), by default the extent of the points about the centre.
+    """
+    if scale is None:  # directions have no part in the last row
+        scale = ((sums[:, 0, 5] + sums[:, 2, 5]) / sums[:, 5, 5]).sqrt()
+    one = torch.ones_like(scale)
+    unit = 1 / torch.stack([scale * scale, scale * scale, scale * scale, scale, scale, one], -1)
+    scatter = sums * unit[:, :, None] * unit[:, None]
     sound = scatter.isfinite().all(-1).all(-1)
     conic = torch.linalg.eigh(torch.where(sound[:, None, None], scatter, 0.0)).eigenvectors[..., 0]
     params = conics.ellipse_from_conic(conic)
@@ -191,19 +227,24 @@ def perimeter_samples(ellipses: Float[Tensor, "M 5"], most: int | None = None, m
 def cells_at(grad: Gradient, frame: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Flat cells (...) of the frame nearest to positions, their columns and rows, and which positions lie on it."""
     _, height, width = grad.shape
-    x, y = (x - 0.5).round(), (y - 0.5).round()
+    x, y = (x - 0.5).round_(), (y - 0.5).round_()
     on_x, on_y = x.clamp(0, width - 2), y.clamp(0, height - 2)
-    return ((frame * height + on_y) * width + on_x).long(), on_x, on_y, (x == on_x) & (y == on_y)
+    inside = (x == on_x).logical_and_(y == on_y)
+    cell = torch.add(on_y, frame, alpha=height, out=y).mul_(width).add_(on_x).long()
+    return cell, on_x, on_y, inside
 
 
 def edge_band(grad: Gradient, frame: Tensor, polarity: Tensor, at: Perimeter, reach: int) -> Band:
     """Edges of the right direction up to ``reach`` cells to either side of samples of ellipses, as for `follow`."""
     across = torch.arange(-reach, reach + 1, dtype=torch.float64, device=at.xy.device)
-    beside = (p[:, None] + n[:, None] * across for p, n in zip(at.xy.unbind(-1), at.normal.unbind(-1), strict=True))
+    planes = zip(at.xy.unbind(-1), at.normal.unbind(-1), strict=True)
+    beside = (torch.addcmul(p[:, None], n[:, None], across) for p, n in planes)
     cell, column, row, inside = cells_at(grad, frame.index_select(0, at.of)[:, None], *beside)
     gx, gy = (g.view_as(column) for g in grad.components(cell.flatten()))
     nx, ny = (n[:, None].float() for n in at.normal.unbind(-1))
-    rise = (gx * nx + gy * ny) * polarity.index_select(0, at.of)[:, None].float()
-    power, least = gx * gx + gy * gy, (0.5 * grad.threshold[frame]).square()
-    good = inside & (rise > 0) & (rise * rise > _BAND_COS**2 * power) & (power > least[at.of, None])
-    return Band(at, column + 0.5, row + 0.5, gx, gy, torch.where(good, rise, 0.0))
+    outward = polarity.index_select(0, at.of)[:, None].float()
+    rise = (gx * nx).addcmul_(gy, ny).mul_(outward)
+    power, least = (gx * gx).addcmul_(gy, gy), (0.5 * grad.threshold[frame]).square()
+    steep = rise.square() > _BAND_COS**2 * power
+    good = inside.logical_and_(rise > 0).logical_and_(steep).logical_and_(power > least[at.of, None])
+    return Band(at, column + 0.5, row + 0.5, gx, gy, rise.masked_fill_(~good, 0.0))

@@ -8,20 +8,24 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from torchpose import ellipse
-from torchpose.detect.arcs import chain_pairs, describe_arcs, fit_joint, follow
-from torchpose.detect.finer import SIDE, cut_outs, promising_places
+from torchpose.detect.arcs import chain_pairs, describe_arcs, fit_pairs, follow
+from torchpose.detect.finer import LARGER, SHIFT, SIDE, cut_outs, promising_places
 from torchpose.detect.partial import free_of_stumps
 from torchpose.detect.reduce import area_reduce, reduction_factor
 from torchpose.detect.regions import Gradient, Regions, gradient, level_line_regions, region_polarity, strong_cells
 from torchpose.detect.validation import (
+    ANYTHING,
     SAME,
     WHOLE,
     Candidates,
+    Place,
     Verdict,
+    Wanted,
     accepted,
     explain_once,
     merge_duplicates,
     score,
+    without_known,
 )
 from torchpose.geometry import conics
 from torchpose.geometry.segments import marked, members, positions, segment_mean
@@ -37,10 +41,13 @@ _FOLLOW = ((0.4, 1), (0.5, 2))  # least cover to be followed further, and rounds
 _ON_ELLIPSE = 1.5  # reduced px
 _TAPER = 3.0  # reduced px, where the weight of a cell in the second fit has fallen to 0
 _FLANK, _FLANK_COS = 4.0, 0.8  # reduced px, and of the gradient with the normal: a blurred edge of a whole ellipse
+_LENGTH = 1.5  # of a place: semi-major axis over the least semi-minor axis that is wanted
 _ARC_RMS = 1.2  # reduced px, of the cells of an arc, which is a few cells wide
 
 
-def find_candidates(frames: Shaped[Tensor, "B H W"], factor: int | None = None, *, explain: bool = False) -> Candidates:
+def find_candidates(
+    frames: Shaped[Tensor, "B H W"], factor: int | None = None, *, explain: bool = False, wanted: Wanted = ANYTHING
+) -> Candidates:
     """Ellipses in grey frames, one pass for the whole batch.
 
     Args:
@@ -50,38 +57,47 @@ def find_candidates(frames: Shaped[Tensor, "B H W"], factor: int | None = None, 
             smallest semi-minor axis found is 2 reduced pixels. The same is looked for once more at twice the
             reduction, where blurred and noisy edges stand out four times as much.
         explain: also return what was looked at and rejected, see `Candidates.verdict`.
+        wanted: what is asked for; of other ellipses only whole ones are found, and left out.
     """
     factor = reduction_factor(*frames.shape[-2:]) if factor is None else factor
     reduced = area_reduce(frames, factor)
     grad = gradient(reduced)
-    coarse = find_ellipses(grad)
-    found = [find_finer(frames, factor, grad.threshold, coarse)] if factor > 1 else []
+    coarse = find_ellipses(grad, wanted.reduced(factor))
+    found = [find_finer(frames, factor, grad.threshold, coarse, wanted)] if factor > 1 else []
     known = accepted(coarse)
     known = replace(known, ellipse=rescaled(known.ellipse, 0.5))
-    blurred = find_ellipses(gradient(area_reduce(reduced, 2, exact=True)), known)
+    blurred = find_ellipses(gradient(area_reduce(reduced, 2, exact=True)), wanted.reduced(2 * factor), known)
     for scale, some in ((factor, coarse), (2 * factor, blurred)):
         found.append(replace(some, ellipse=rescaled(some.ellipse, scale)))
     every = Candidates.cat(found)
+    every = every[(every.verdict != Verdict.ACCEPTED) | wanted.admits(every)]
     return merge_duplicates(every if explain else accepted(every), explain=explain)
 
 
-def find_finer(frames: Tensor, factor: int, threshold: Tensor, coarse: Candidates) -> Candidates:
+def find_finer(
+    frames: Tensor, factor: int, threshold: Tensor, coarse: Candidates, wanted: Wanted = ANYTHING
+) -> Candidates:
     """Small ellipses of a finer scale, full px, where the coarse one has something round that is no whole ellipse.
 
     ``factor``, ``threshold`` (B,) of the gradient and what was looked at are of the coarse scale.
     """
     fine = factor // 2
     whole = (coarse.verdict == Verdict.ACCEPTED) & (coarse.cover > WHOLE)
-    place = promising_places(coarse.frame, coarse.ellipse, whole)
+    # an arc of what is wanted turns as it does, though its own ellipse may be flatter
+    asked = (coarse.polarity * wanted.polarity >= 0) & (coarse.ellipse[:, 2] >= _LENGTH * wanted.semi_minor / factor)
+    place = promising_places(coarse.frame, coarse.ellipse, whole, asked)
     height, width = frames.shape[-2:]
     if place.numel() == 0 or min(height, width) < SIDE * fine:
         return coarse[place[:0]]
-    frame = coarse.frame[place]
-    cut, corner = cut_outs(frames, frame, rescaled(coarse.ellipse[place], factor)[:, :2], fine)
+    frame, middle = coarse.frame[place], rescaled(coarse.ellipse[place], factor)[:, :2]
+    cut, corner = cut_outs(frames, frame, middle, fine)
     grad = gradient(cut)
     # where edges fill most of a cut-out, the noise of the whole frame tells more than the median of their gradients
     grad = replace(grad, threshold=torch.minimum(grad.threshold, factor / fine * threshold[frame]))
-    found = accepted(find_ellipses(grad))
+    if wanted is not ANYTHING:  # what lies elsewhere in a cut-out is a place of its own
+        reach = SHIFT + LARGER * factor / fine * coarse.ellipse[place, 2]
+        wanted = replace(wanted.reduced(fine), place=Place((middle - corner - 0.5 * (fine - 1)) / fine, SHIFT, reach))
+    found = accepted(find_ellipses(grad, wanted))
     ellipses = rescaled(found.ellipse, fine)
     ellipses = torch.cat([ellipses[:, :2] + corner[found.frame], ellipses[:, 2:]], -1)
     # the ellipses that might have been tried are those of the frame, not those of the cut-out
@@ -96,17 +112,20 @@ def rescaled(ellipses: Float[Tensor, "M 5"], factor: int | float) -> Float[Tenso
     return torch.cat([center, factor * ellipses[:, 2:4], ellipses[:, 4:]], -1)
 
 
-def find_ellipses(grad: Gradient, known: Candidates | None = None) -> Candidates:
+def find_ellipses(grad: Gradient, wanted: Wanted = ANYTHING, known: Candidates | None = None) -> Candidates:
     """Ellipses of one scale, in its own pixels, with what became of them.
 
+    What is not ``wanted`` is among them where it is seen whole, and explains its edges.
     ``known`` are accepted ellipses of a finer scale in the pixels of this one, which may explain edges better.
     """
-    regions = level_line_regions(grad, strong_cells(grad), MIN_PIXELS)
-    whole, explained = fit_regions(grad, regions)
+    regions = level_line_regions(grad, wanted.within_reach(grad, strong_cells(grad)), MIN_PIXELS)
+    whole, explained = fit_regions(grad, regions, wanted)
     rest = regions.cell[~explained].sort().values
-    pieces = fit_arcs(grad, level_line_regions(grad, rest, MIN_PIXELS, _SECTORS, _PHASE))
+    pieces = fit_arcs(grad, level_line_regions(grad, rest, MIN_PIXELS, _SECTORS, _PHASE), wanted)
     found = merge_duplicates(Candidates.cat([whole, pieces]), explain=True)
-    valid = positions(found.verdict == Verdict.ACCEPTED)
+    if known is not None:
+        found = without_known(found, known)
+    valid = positions((found.verdict == Verdict.ACCEPTED) & wanted.admits(found))
     some = found[valid]
     freed = free_of_stumps(grad, some.frame, some.ellipse, some.polarity)
     moved = positions((freed != some.ellipse).any(-1) & (plausible(grad, freed) == Verdict.ACCEPTED))
@@ -116,7 +135,7 @@ def find_ellipses(grad: Gradient, known: Candidates | None = None) -> Candidates
     return explain_once(grad, merge_duplicates(found, explain=True), known)
 
 
-def fit_regions(grad: Gradient, regions: Regions) -> tuple[Candidates, Tensor]:
+def fit_regions(grad: Gradient, regions: Regions, wanted: Wanted = ANYTHING) -> tuple[Candidates, Tensor]:
     """Ellipses that single regions follow, and which of the cells (P,) bool of the regions they explain."""
     xy = grad.centers(regions.cell)
     count = regions.frame.numel()
@@ -137,7 +156,11 @@ def fit_regions(grad: Gradient, regions: Regions) -> tuple[Candidates, Tensor]:
     found = score(grad, regions.frame[good], params[good], polarity[good])
     # a region that is not a whole ellipse runs along something else as well: only what lies along the ellipse counts
     beyond = edge < WHOLE * torch.bincount(regions.region, minlength=count)
-    part = positions((found.cover <= WHOLE) | beyond[good])
+    partial = (found.cover <= WHOLE) | beyond[good]
+    admitted = wanted.admits(found)
+    lost = partial & ~admitted & (found.verdict == Verdict.ACCEPTED)
+    found = replace(found, verdict=torch.where(lost, int(Verdict.UNWANTED), found.verdict))
+    part = positions(partial & admitted)
     if part.numel():
         again, sound = _followed(grad, found[part], _PART_ROUNDS)
         found = found.replaced(part[sound], again)
@@ -151,6 +174,8 @@ def fit_regions(grad: Gradient, regions: Regions) -> tuple[Candidates, Tensor]:
 
 def _followed(grad: Gradient, found: Candidates, rounds: int) -> tuple[Candidates, Tensor]:
     """Those that are still ellipses when they have been followed along their edge, and their indices (K,)."""
+    if len(found) == 0:
+        return found, found.frame
     refit = follow(grad, found.frame, found.ellipse, found.polarity, rounds)
     sound = positions(plausible(grad, refit) == Verdict.ACCEPTED)
     return score(grad, found.frame[sound], refit[sound], found.polarity[sound]), sound
@@ -170,27 +195,28 @@ def _on_ellipses(
     return follows, follows | ((off < _FLANK) & (rise > _FLANK_COS * magnitude))
 
 
-def fit_arcs(grad: Gradient, arcs: Regions) -> Candidates:
+def fit_arcs(grad: Gradient, arcs: Regions, wanted: Wanted = ANYTHING) -> Candidates:
     """Ellipses of pairs of arcs, followed along their whole perimeter."""
     xy = grad.centers(arcs.cell)
     about = describe_arcs(arcs, xy)
-    pair = chain_pairs(about)
-    count = len(pair)
-    if count == 0:
+    pair = chain_pairs(about, wanted.polarity)
+    if len(pair) == 0:
         return score(grad, about.frame[:0], xy.new_zeros(0, 5), xy.new_zeros(0))
+    params = fit_pairs(arcs, about, xy, pair)
+    some = positions(plausible(grad, params) == Verdict.ACCEPTED)
+    pair, params = pair[some], params[some]
     # the cells of both members, flat
     which, cell = members(about.size, pair.flatten())
-    cell = torch.argsort(arcs.region, stable=True)[cell]
     index = which // 2
     xy, gradient = xy[cell], arcs.gradient[cell]
     weight = torch.linalg.vector_norm(gradient, dim=-1)
-    params = fit_joint(xy, gradient, index, count, weight)
     r = ellipse.distance(xy, index, params)
-    rms = segment_mean(r.square(), index, count, weight.double()).sqrt()
-    good = positions((plausible(grad, params) == Verdict.ACCEPTED) & (rms < _ARC_RMS))
+    rms = segment_mean(r.square(), index, len(pair), weight.double()).sqrt()
+    good = positions(rms < _ARC_RMS)
     frame, polarity = about.frame[pair[good, 0]], about.curvature[pair[good, 0]].sign()
     found = score(grad, frame, params[good], polarity)
-    for least_cover, rounds in _FOLLOW:
+    found = found[wanted.admits(found)]
+    for least_cover, rounds in _FOLLOW if len(found) else ():
         found = merge_duplicates(found[found.cover > least_cover], 2 * SAME)
         found, _ = _followed(grad, found, rounds)
     return accepted(found)

@@ -5,9 +5,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.detect.reduce import area_reduce
-from torchpose.geometry.segments import earlier_in_group, marked, pairs_in_group, positions, rank_in_group
+from torchpose.geometry.segments import marked, near_pairs, positions, rank_in_group
 
 SIDE = 64  # px of a cut-out
+SHIFT = 16.0  # px of a cut-out: how far from its middle the ellipse that it is made for may have its centre
+LARGER = 1.2  # than the place itself, what it is a part of, beside its shift
 _LARGEST = 10.0  # reduced px of semi-major axis: whatever is larger needs no finer look
 _SMALLEST = 1.2  # reduced px of semi-minor axis
 _LEAST_ASPECT = 0.15
@@ -16,23 +18,26 @@ _MOST_PLACES = 160  # in a frame, the largest
 
 
 def promising_places(
-    frame: Int[Tensor, " M"], ellipses: Float[Tensor, "M 5"], whole: Bool[Tensor, " M"]
+    frame: Int[Tensor, " M"], ellipses: Float[Tensor, "M 5"], whole: Bool[Tensor, " M"], asked: Bool[Tensor, " M"]
 ) -> Int[Tensor, " P"]:
     """Indices of the small ellipses, of whatever verdict, worth a finer look; ellipses are sorted by frame.
 
-    Those within one that was seen whole are not, nor those beside a larger one of the same place.
+    Those within one that was seen whole are not, nor those beside a larger one of the same place, nor those that are
+    not asked for.
     """
     a, b = ellipses[:, 2], ellipses[:, 3]
-    place = positions((a < _LARGEST) & (b > _SMALLEST) & (b > _LEAST_ASPECT * a) & ~whole)
+    place = positions((a < _LARGEST) & (b > _SMALLEST) & (b > _LEAST_ASPECT * a) & ~whole & asked)
     place = place[torch.argsort(a[place], descending=True, stable=True)]
     place = place[torch.argsort(frame[place], stable=True)]
     known = positions(whole)
-    i, j = pairs_in_group(frame[place], frame[known])
+    center = ellipses[:, :2]
+    j, i = near_pairs(center[known], center[place], 0.5 * b[known], (frame[known], frame[place]))
     apart = torch.linalg.vector_norm(ellipses[place[i], :2] - ellipses[known[j], :2], dim=-1)
     place = place[~marked(i[apart < 0.5 * b[known[j]]], len(place))]
-    i, j = earlier_in_group(frame[place])
-    apart = torch.linalg.vector_norm(ellipses[place[i], :2] - ellipses[place[j], :2], dim=-1)
-    place = place[~marked(i[apart < _SAME_PLACE], len(place))]
+    near = torch.full_like(b[place], _SAME_PLACE)
+    i, j = near_pairs(center[place], center[place], near, (frame[place], frame[place]))
+    apart = torch.linalg.vector_norm(center[place[i]] - center[place[j]], dim=-1)
+    place = place[~marked(i[(j < i) & (apart < _SAME_PLACE)], len(place))]
     return place[rank_in_group(frame[place]) < _MOST_PLACES]
 
 

@@ -6,14 +6,15 @@ half of it, and the one that most of the perimeter agrees with is kept: a consen
 samples are the runs, few enough to try them all.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchpose.detect.arcs import direction_rows, edge_band, fit_scatter, perimeter_samples
+from torchpose.detect.arcs import edge_band, fit_scatter, perimeter_samples, scatter_sums
 from torchpose.detect.regions import Gradient
+from torchpose.geometry import conics
 from torchpose.geometry.rows import Rows, shared
 from torchpose.geometry.segments import positions, segment_sum
 
@@ -23,7 +24,9 @@ _REACH = 3  # cells to either side in which the ridge of an edge is looked for
 _MOST_SAMPLES = 96  # of an ellipse, a multiple of the sectors
 _WELL = 0.9  # support from which on an ellipse is left as it is
 _ROUNDS = 2
+_TRIALS = 4  # fits of runs that are compared at the frame itself
 _SETTLE = 4  # fits to what agrees
+_STILL = 0.01  # cells: less than the edges' own error
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,24 +48,66 @@ def free_of_stumps(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Te
 
     The polarity is +1 where the gradient points outwards.
     """
-    for _ in range(_ROUNDS):
-        ridge = find_ridge(grad, frame, ellipses, polarity)
-        part = positions(ridge.support < _WELL)
+    part = torch.arange(len(ellipses), device=ellipses.device)
+    for _ in range(_ROUNDS if len(part) else 0):
+        ridge = find_ridge(grad, frame[part], ellipses[part], polarity[part])
+        weak = positions(ridge.support < _WELL)
+        part, ridge = part[weak], _ridge_of(ridge, weak)
         if part.numel() == 0:
             break
-        fits = torch.cat([_runs(ridge, ellipses)[part], ellipses[part, None]], 1)
-        of = torch.arange(part.numel(), device=part.device)
-        each = part.repeat_interleave(fits.shape[1])
-        again = find_ridge(grad, frame[each], fits.flatten(0, 1), polarity[each])
-        fits = fits[of, again.support.view(fits.shape[:2]).argmax(1)]
-        # and again with all of the perimeter that agrees, until it stays as it is: the runs' borders leave no trace
-        for _ in range(_SETTLE):
-            near = find_ridge(grad, frame[part], fits, polarity[part])
-            sums = segment_sum(_rows(near, fits, near.found & (near.offset.abs() < 1)), near.of, len(fits))
-            refit = fit_scatter(sums, fits[:, :2], fits[:, 2])
-            fits = torch.where(refit.isfinite().all(-1, keepdim=True), refit, fits)
-        ellipses = ellipses.index_copy(0, part, fits)
+        fits, changed = _best_fits(grad, frame[part], ellipses[part], polarity[part], ridge)
+        ellipses = ellipses.index_copy(0, part, _settled(grad, frame[part], fits, polarity[part]))
+        part = part[positions(changed)]  # what was best as it was would be so again
     return ellipses
+
+
+def _ridge_of(ridge: Ridge, some: Tensor) -> Ridge:
+    """The ridge of some (K,) of its ellipses only."""
+    number = torch.full_like(ridge.support, -1).index_copy(0, some, torch.arange(len(some)).to(ridge.support))
+    of = number.long().index_select(0, ridge.of)
+    sample = positions(of >= 0)
+    return replace(ridge[sample], of=of[sample], support=ridge.support[some])
+
+
+def _best_fits(
+    grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor, ridge: Ridge
+) -> tuple[Tensor, Tensor]:
+    """The best of each ellipse and the fits to its runs (M, 5), and whether it is one of a run.
+
+    Which runs are worth a look at the frame is judged by the edges beside the ellipse as it was.
+    """
+    runs = _runs(ridge, ellipses)
+    likely = _agreement(ridge, runs).topk(_TRIALS, 1).indices
+    fits = torch.cat([runs.gather(1, likely[..., None].expand(-1, -1, 5)), ellipses[:, None]], 1)
+    each = torch.arange(len(ellipses), device=ellipses.device)
+    of = each.repeat_interleave(fits.shape[1])
+    again = find_ridge(grad, frame[of], fits.flatten(0, 1), polarity[of])
+    best = again.support.view(fits.shape[:2]).argmax(1)
+    return fits[each, best], best < _TRIALS
+
+
+def _agreement(ridge: Ridge, fits: Float[Tensor, "M F 5"]) -> Float[Tensor, "M F"]:
+    """How much of the ridge of each ellipse lies on each of its fits."""
+    conic = conics.conic_from_ellipse(fits)[ridge.of].unbind(-1)
+    off, _, _ = conics.signed_distance(conic, *(v[:, None] for v in ridge.xy.unbind(-1)))
+    on = (1 - off.square()).nan_to_num(nan=0.0).clamp_min(0) * ridge.found[:, None]
+    return segment_sum(on, ridge.of, len(fits))
+
+
+def _settled(grad: Gradient, frame: Tensor, fits: Tensor, polarity: Tensor) -> Float[Tensor, "M 5"]:
+    """Fitted again to all of the perimeter that agrees, until they stay: the borders of the runs leave no trace."""
+    moving = torch.arange(len(fits), device=fits.device)
+    for _ in range(_SETTLE):
+        now = fits[moving]
+        near = find_ridge(grad, frame[moving], now, polarity[moving])
+        on = (near.found & (near.offset.abs() < 1)).double()
+        refit = fit_scatter(scatter_sums(near.xy, near.gradient, near.of, now[:, :2], on), now[:, :2], now[:, 2])
+        refit = torch.where(refit.isfinite().all(-1, keepdim=True), refit, now)
+        fits = fits.index_copy(0, moving, refit)
+        moving = moving[positions(((refit - now)[:, :4].abs() > _STILL).any(-1))]
+        if moving.numel() == 0:
+            break
+    return fits
 
 
 def find_ridge(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> Ridge:
@@ -88,14 +133,9 @@ def find_ridge(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor
 def _runs(ridge: Ridge, ellipses: Tensor) -> Float[Tensor, "M 16 5"]:
     """Ellipses fitted to the ridge of every run of sectors, NaN where it is none."""
     count = len(ellipses)
-    rows = _rows(ridge, ellipses, ridge.found)
-    sums = segment_sum(rows, ridge.of * _SECTORS + ridge.sector, count * _SECTORS).view(count, _SECTORS, -1)
-    runs = torch.cat([sums, sums[:, : _RUN - 1]], 1).unfold(1, _RUN, 1).sum(-1)
+    sector = ridge.of * _SECTORS + ridge.sector
     center, scale = (v.repeat_interleave(_SECTORS, 0) for v in (ellipses[:, :2], ellipses[:, 2]))
+    sums = scatter_sums(ridge.xy, ridge.gradient, sector, center, ridge.found, _MOST_SAMPLES // _SECTORS)
+    sums = sums.view(count, _SECTORS, 6, 6)
+    runs = torch.cat([sums, sums[:, : _RUN - 1]], 1).unfold(1, _RUN, 1).sum(-1)
     return fit_scatter(runs.flatten(0, 1), center, scale).view(count, _SECTORS, 5)
-
-
-def _rows(ridge: Ridge, ellipses: Tensor, use: Tensor) -> Tensor:
-    """`direction_rows` of the samples of a ridge, 0 for those that are not of use."""
-    rows = direction_rows(ridge.xy, ridge.gradient, ridge.of, ellipses[:, :2], ellipses[:, 2])
-    return torch.where(use[:, None], rows, 0.0)

@@ -10,14 +10,14 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.detect.arcs import cells_at, perimeter_samples
 from torchpose.detect.regions import Gradient
 from torchpose.geometry import conics
 from torchpose.geometry.rows import Rows
-from torchpose.geometry.segments import earlier_in_group, marked, members, pairs_in_group, positions, segment_sum
+from torchpose.geometry.segments import marked, members, near_pairs, positions, segment_sum
 
 WHOLE = 0.9  # cover from which on an ellipse is seen whole
 SAME = 0.08  # of the semi-minor axis, plus a pixel: ellipses nearer than that are one
@@ -41,6 +41,7 @@ class Verdict(IntEnum):
     FRAGMENT = 7  # too little of its perimeter is there
     POLYGON = 8  # straight sides explain it better
     EXPLAINED = 9  # it is put together from edges of better ellipses
+    UNWANTED = 10  # seen in part, and not what was asked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +62,63 @@ class Candidates(Rows):
     log10_nfa: Float[Tensor, " M"]
     cover: Float[Tensor, " M"]
     verdict: Int[Tensor, " M"]
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Where an ellipse is looked for in each of B frames, in their px."""
+
+    center: Float[Tensor, "B 2"]
+    shift: float  # how far off its centre may be
+    reach: Float[Tensor, " B"]  # how far from there its edge may run
+
+
+@dataclass(frozen=True, eq=False)
+class Wanted:
+    """What is asked for: by default every ellipse. The rest costs little, and need not be found.
+
+    Attributes:
+        polarity: +1 dark inside, -1 light inside, 0 either.
+        semi_minor: px, the least.
+        place: where in each frame; None for anywhere.
+    """
+
+    polarity: float = 0.0
+    semi_minor: float = 0.0
+    place: Place | None = None
+
+    @classmethod
+    def of(cls, polarities: Float[Tensor, " T"], semi_minor: float) -> "Wanted":
+        """Ellipses of any of these polarities, of at least such a semi-minor axis, px."""
+        each = polarities.unique()
+        return cls(float(each) if each.numel() == 1 else 0.0, semi_minor)
+
+    def reduced(self, factor: int) -> "Wanted":
+        """The same in a frame reduced by a factor, anywhere in it."""
+        return Wanted(self.polarity, self.semi_minor / factor)
+
+    def admits(self, found: Candidates) -> Bool[Tensor, " M"]:
+        """Which candidates are asked for."""
+        good = found.ellipse[:, 3] >= self.semi_minor
+        if self.polarity:
+            good &= found.polarity == self.polarity
+        if self.place is not None:
+            away = found.ellipse[:, :2] - self.place.center[found.frame]
+            good &= torch.linalg.vector_norm(away, dim=-1) < self.place.shift
+        return good
+
+    def within_reach(self, grad: Gradient, cells: Int[Tensor, " P"]) -> Int[Tensor, " P"]:
+        """Those of the cells that an ellipse of the place may run through."""
+        if self.place is None:
+            return cells
+        frame = torch.div(cells, grad.shape[1] * grad.shape[2], rounding_mode="floor")
+        (column, row), center = grad.grid(cells), self.place.center.mT.float().contiguous()
+        x = column.float() + 0.5 - center[0].index_select(0, frame)
+        y = row.float() + 0.5 - center[1].index_select(0, frame)
+        return cells[positions(x * x + y * y < self.place.reach.float().square().index_select(0, frame))]
+
+
+ANYTHING = Wanted()
 
 
 def accepted(found: Candidates) -> Candidates:
@@ -133,17 +191,33 @@ def merge_duplicates(found: Candidates, tolerance: float = SAME, *, explain: boo
     """
     order = torch.argsort(found.log10_nfa, stable=True)  # NaN, of those rejected without a score, comes last
     found = found[order[torch.argsort(found.frame[order], stable=True)]]
-    # each against those before it in its frame, which have fewer false alarms
-    later, better = earlier_in_group(found.frame)
-    p, q = found.ellipse[later], found.ellipse[better]
-    shape = (conics.shape_matrix(p) - conics.shape_matrix(q)).flatten(1).abs().amax(-1)
-    apart = torch.maximum(torch.linalg.vector_norm(p[:, :2] - q[:, :2], dim=-1), shape)
-    same = (found.polarity[later] == found.polarity[better]) & (apart < 1.0 + tolerance * q[:, 3])
-    if explain:
-        same &= (found.verdict[later] == Verdict.ACCEPTED) & (found.verdict[better] == Verdict.ACCEPTED)
-    again = marked(later[same], len(found))
+    # each against those near it that come before it in its frame, which have fewer false alarms
+    some = positions(found.verdict == Verdict.ACCEPTED) if explain else torch.arange(len(found)).to(found.frame)
+    better, later = same_ellipses(found[some], found[some], tolerance)
+    later = later[positions(better < later)]
+    again = marked(some[later], len(found))
     if not explain:
         return found[~again]
+    return replace(found, verdict=torch.where(again, int(Verdict.DUPLICATE), found.verdict))
+
+
+def same_ellipses(ones: Candidates, others: Candidates, tolerance: float = SAME) -> tuple[Tensor, Tensor]:
+    """Pairs (i, j) that are the same ellipse of the same frame, to within a part of the minor axis of ``ones``."""
+    reach = 1.0 + tolerance * ones.ellipse[:, 3]
+    i, j = near_pairs(ones.ellipse[:, :2], others.ellipse[:, :2], reach, (ones.frame, others.frame))
+    alike = positions(ones.polarity[i] == others.polarity[j])
+    i, j = i[alike], j[alike]
+    p, q = ones.ellipse[i], others.ellipse[j]
+    shape = (conics.shape_matrix(p) - conics.shape_matrix(q)).flatten(1).abs().amax(-1)
+    apart = torch.maximum(torch.linalg.vector_norm(p[:, :2] - q[:, :2], dim=-1), shape)
+    same = positions(apart < reach[i])
+    return i[same], j[same]
+
+
+def without_known(found: Candidates, known: Candidates) -> Candidates:
+    """The same candidates; those accepted that are among ``known``, with fewer false alarms there, are duplicates."""
+    i, j = same_ellipses(known, found)
+    again = marked(j[known.log10_nfa[i] < found.log10_nfa[j]], len(found)) & (found.verdict == Verdict.ACCEPTED)
     return replace(found, verdict=torch.where(again, int(Verdict.DUPLICATE), found.verdict))
 
 
@@ -168,11 +242,22 @@ def explain_once(grad: Gradient, found: Candidates, known: Candidates | None = N
     return replace(found, verdict=torch.where(kept[: len(found)], found.verdict, int(Verdict.EXPLAINED)))
 
 
+def _overlapping(some: Candidates, others: Candidates) -> tuple[Tensor, Tensor]:
+    """Pairs (i, j) of the same frame whose circumscribed circles overlap, or nearly: a few others are among them."""
+    a, b = some.ellipse[:, 2] + _NEAR, others.ellipse[:, 2] + _NEAR
+    frames = some.frame, others.frame
+    # the centres are nearer than twice the larger of both
+    i, j = near_pairs(some.ellipse[:, :2], others.ellipse[:, :2], 2 * a, frames)
+    larger = positions(a[i] >= b[j])
+    q, p = near_pairs(others.ellipse[:, :2], some.ellipse[:, :2], 2 * b, frames[::-1])
+    smaller = positions(a[p] < b[q])
+    return torch.cat([i[larger], p[smaller]]), torch.cat([j[larger], q[smaller]])
+
+
 def _explained(samples: Samples, weak: Candidates, every: Candidates) -> tuple[Tensor, Tensor]:
     """Which of the samples of ``weak`` (Q,) lie on the edges of which better ones of ``every`` (Q,)."""
     best = positions(every.verdict == Verdict.ACCEPTED)
-    best = best[torch.argsort(every.frame[best], stable=True)]
-    i, j = pairs_in_group(weak.frame, every.frame[best])
+    i, j = _overlapping(weak, every[best])
     j = best[j]
     apart = torch.linalg.vector_norm(weak.ellipse[i, :2] - every.ellipse[j, :2], dim=-1)
     meet = (every.log10_nfa[j] < weak.log10_nfa[i]) & (apart < weak.ellipse[i, 2] + every.ellipse[j, 2] + _NEAR)

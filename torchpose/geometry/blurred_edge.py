@@ -1,13 +1,14 @@
 """What a blur makes of an edge: a Gaussian of any covariance, a line (motion), a disc (defocus).
 
 With p displaced by the blur's (X, Y) along and across the normal n of an edge of curvature k, the share of the blur
-that falls outside is, to first order in k,
+that falls outside is, to second order in k,
 
-    F = P(d + X + k Y^2 / 2 > 0),
+    F = P(d + T > 0),   T = X + k Y^2 / 2 - k^2 X Y^2 / 2,
 
-d the distance of the pixel outside the edge. For a Gaussian X + k Y^2 / 2 has the mean k t'St / 2, the variance n'Sn
-and the third cumulant 3 k (n'St)^2 (the second and third terms of its Edgeworth series). A line or a disc is averaged
-over nodes along the normal, each of them a narrow Gaussian.
+d the distance of the pixel outside the edge, k the curvature of the edge's level curve through the pixel. For a
+Gaussian of the variances s = n'Sn, t = t'St and the covariance m, T has the mean k t / 2, the variance
+s + k^2 (t^2 / 2 - s t - 2 m^2), and the cumulants 3 k m^2 and 12 k^2 m^2 (t - s) (derived), of which F is the Edgeworth
+series. A line or a disc is averaged over nodes along the normal, each of them a narrow Gaussian.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ LEAST, MOST = 0.3, 12.0  # px, standard deviations: a pixel alone has 0.289; bey
 _NODES_A_SIGMA = 1.9  # Gauss-Legendre nodes a half length in narrow Gaussians: an edge to 1e-5 (`sim.boundary`)
 _MOST_NODES = 40
 _CORE = 0.6  # px, of what is not the line or the disc, to begin with: a pixel, and a sharp lens
+_SQUARE = 1 / (24 * 120)  # fourth cumulant of a pixel along its side, over -24
+_LEAST_SHARE = 0.25  # of a variance that terms of second order may leave: beyond, the expansion has failed
 _MOST_STEP = 0.6  # of the size of a blur that it may change by in a step: the derivatives hold no farther
 
 
@@ -111,25 +114,35 @@ class _Gauss:
         self.uv2 = 2 * uv
         self.across = s11 * self.uu + s12 * self.uv2 + s22 * self.vv
         self.along = s11 + s22 - self.across
-        self.over = self.across.rsqrt()
-        mixed = (s22 - s11) * uv + s12 * (self.uu - self.vv)
-        self.lean = 0.5 * mixed.square() * self.over.pow(3)
-        self.square = square_cumulant(uv, self.across)
+        mixed2 = ((s22 - s11) * uv + s12 * (self.uu - self.vv)).square()
+        # the cumulants of X + k Y^2 / 2 - k^2 X Y^2 / 2: what follows is times k or its square
+        self.more = (0.5 * self.along - self.across) * self.along - 2 * mixed2
+        self.third, self.fourth = 0.5 * mixed2, 0.5 * mixed2 * (self.along - self.across)
+        self.square = (1 - 2 * uv.square()) * _SQUARE
 
     def __call__(self, distance: Tensor, bend: Tensor) -> Edge:
-        over, half = self.over, 0.5 * bend
+        half, bend2 = 0.5 * bend, bend.square()
+        variance = (self.across + bend2 * self.more).maximum(_LEAST_SHARE * self.across)
+        over2 = variance.reciprocal()
+        over = over2.sqrt()
         z = (distance + half * self.along) * over
-        step, slope, density = blurred_step(z, self.square)
-        skew = bend * self.lean * density
         z2 = z.square()
-        step = step + skew * (z2 - 1)
-        by_distance = (slope + skew * z * (3 - z2)) * over
-        by_across = slope * z * (-0.5 * over.square())
-        by_along = half * slope * over
+        density = torch.exp(-0.5 * z2) * (1 / math.sqrt(2 * math.pi))
+        third = self.third * bend * over2 * over
+        fourth = (self.fourth * bend2 - self.square) * over2.square()
+        he3, he4 = z * (z2 - 3), z2 * (z2 - 6) + 3
+        correction, change = third * (z2 - 1) - fourth * he3, fourth * he4 - third * he3
+        sixth = 0.5 * third.square()
+        correction = correction - sixth * (z * he4 - 4 * he3)
+        change = change + sixth * (z2 * he4 - 4 * z * he3 - 5 * he4)
+        step = 0.5 * torch.erfc(-z * math.sqrt(0.5)) + density * correction
+        slope = density * (1 + change) * over
+        by_across = slope * z * over * -0.5
+        by_along = half * slope
         # the variance along is the trace less that across
         change = by_across - by_along
         by_blur = (change * self.uu + by_along, change * self.uv2, change * self.vv + by_along)
-        return Edge(step, by_distance, by_blur)
+        return Edge(step, slope, by_blur)
 
 
 class _Nodes(NamedTuple):
@@ -150,7 +163,7 @@ def _averaged(distance: Tensor, bend: Tensor, core: Tensor, nodes: list[tuple[fl
     sigma = core.sqrt()
     out = [torch.zeros_like(distance) for _ in range(5)]
     for weight, share, place, square in nodes:
-        z = (distance + place + 0.5 * bend * (core + square)) / sigma
+        z = (distance + place + 0.5 * bend * (core + square * (1 - bend * place))) / sigma
         slope = torch.exp(-0.5 * z.square()) * (weight / math.sqrt(2 * math.pi)) / sigma
         out[0] += (0.5 * weight) * torch.erfc(-z * math.sqrt(0.5))
         out[1] += slope
@@ -217,12 +230,12 @@ def square_cumulant(product: Tensor, variance: Tensor) -> Tensor:
 
     Its fourth cumulant along the normal, -(nu^4 + nv^4) / 120 px^4, over -24 variance^2.
     """
-    return (1 - 2 * product.square()) / (24 * 120) / variance.square()
+    return (1 - 2 * product.square()) * _SQUARE / variance.square()
 
 
-def blurred_step(z: Tensor, square: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Step and slope at ``z`` standard deviations, the normal law and its fourth-order term, and its density."""
+def blurred_step(z: Tensor, square: Tensor) -> tuple[Tensor, Tensor]:
+    """Step and its slope at ``z`` standard deviations: the normal law and its fourth-order term."""
     z2 = z.square()
     density = torch.exp(-0.5 * z2) * (1 / math.sqrt(2 * math.pi))
     step = 0.5 * torch.erfc(-z * math.sqrt(0.5)) + square * density * z * (z2 - 3)
-    return step, density * (1 - square * (z2 * (z2 - 6) + 3)), density
+    return step, density * (1 - square * (z2 * (z2 - 6) + 3))

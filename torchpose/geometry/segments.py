@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Int, Real, Shaped
+from jaxtyping import Bool, Float32, Float64, Int, Real, Shaped
 from torch import Tensor
+
+_MOST_ROWS = 4096  # of a grid of near points: more would cost more than they save
 
 
 def values_at(frames: Real[Tensor, "B H W"], cell: Int[Tensor, "*S"]) -> Float32[Tensor, "*S"]:
@@ -127,3 +129,41 @@ def earlier_in_group(group: Int[Tensor, " E"]) -> tuple[Int[Tensor, " P"], Int[T
     start = (size.cumsum(0) - size)[group]
     i, offset = ragged_arange(torch.arange(len(group), device=group.device) - start)
     return i, start[i] + offset
+
+
+def near_pairs(
+    first: Float64[Tensor, "E 2"],
+    second: Float64[Tensor, "F 2"],
+    reach: Float64[Tensor, " E"],
+    groups: tuple[Int[Tensor, " E"], Int[Tensor, " F"]],
+) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"]]:
+    """All pairs (i, j) of the same group of which neither coordinate differs by more than reach[i], and few others.
+
+    Points may be NaN, which are near nothing. The second points are laid in rows of about the usual reach, sorted along
+    each: what is near a first point is one run in each of the rows that it reaches. So the work grows with the pairs
+    found, not with the square of the points.
+    """
+    sound, known = positions((first.sum(-1) + reach).isfinite()), positions(second.isfinite().all(-1))
+    if sound.numel() == 0 or known.numel() == 0:
+        return sound[:0], known[:0]
+    (x, y), span = first[sound].unbind(-1), reach[sound]
+    other_x, other_y = second[known].unbind(-1)
+    left, top = other_x.amin(), other_y.amin()
+    x, y, other_x, other_y = x - left, y - top, other_x - left, other_y - top
+    width, height = float(other_x.amax()) + 1, float(other_y.amax())
+    step = max(2 * float(span.median()), height / _MOST_ROWS, 1e-9)
+    rows = int(height / step) + 1
+
+    def place(group: Tensor, row: Tensor, along: Tensor) -> Tensor:
+        return (group * rows + row) * width + along
+
+    key, order = place(groups[1][known], (other_y / step).long(), other_x).sort()
+    upper = ((y - span) / step).floor().clamp(0, rows - 1).long()
+    lower = ((y + span) / step).floor().clamp(0, rows - 1).long()
+    i, down = ragged_arange(lower - upper + 1)
+    group, row = groups[0][sound[i]], upper[i] + down
+    slack = 1e-15 * float(key[-1])  # what the keys' rounding could hide
+    from_left = torch.searchsorted(key, place(group, row, (x - span)[i].clamp(0, width - 0.5) - slack))
+    to_right = torch.searchsorted(key, place(group, row, (x + span)[i].clamp(0, width - 0.5) + slack), right=True)
+    run, offset = ragged_arange((to_right - from_left).clamp_min(0))
+    return sound[i[run]], known[order[from_left[run] + offset]]

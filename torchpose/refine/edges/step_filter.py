@@ -89,7 +89,7 @@ def step_filters(
     # from the circle of curvature
     off = (2 * across + k * (across.square() + along2)) / (1 + ((1 + k * across).square() + k.square() * along2).sqrt())
     z = (off + 0.5 * k * beside) / q
-    fraction, density, _ = blurred_step(z, square_cumulant(nu * nv, variance))
+    fraction, density = blurred_step(z, square_cumulant(nu * nv, variance))
     reach, least = _BEND_REACH
     use = along2 < (reach * k.abs().clamp_min(1e-6).pow(-0.75)).clamp_min(least).square()
     weight = (use if inside is None else use & inside).float()

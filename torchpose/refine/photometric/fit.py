@@ -179,7 +179,7 @@ class _Fit:
         stage, part, pose = self.stage, self.coarse if self.stage.coarse else self.blocks, unknowns.pose
         levels = unknowns.values("levels")
         spread = cast(Spread, unknowns.own["blur"])
-        model = ring_model(part, pose.R, pose.t, spread, check=stage.wary)
+        model = ring_model(part, pose.R, pose.t, spread, check=True)
         columns, slope = columns_of(part, model, levels)
         residual = columns[:, :, -1].flatten(1)
         self.usable, self.weight = inliers(residual, part, model, levels)

@@ -25,7 +25,7 @@ from torchpose.refine.photometric.band import band_pixels
 from torchpose.refine.sight import Sight
 
 _FULL_SCALES = (255.0, 1023.0, 4095.0, 16383.0, 65520.0, 65535.0)  # of 8 to 16 bits; 12 bits in the upper ones of 16
-_DEEP = 0.7  # of the radius of curvature: nearer to its centre a pixel sees edges on all sides
+_CURVED = 0.2  # blur's variance over the squared radius of curvature: nearer to its centre a pixel sees edges on all sides
 _BENT = 0.4  # of a distance from an edge: the most that its second-order term may be
 _FAR = 3.5  # standard deviations of the blur from an edge, from where on neither matters
 
@@ -258,9 +258,10 @@ def ring_model(blocks: PixelBlocks, R: Tensor, t: Tensor, spread: Spread, *, che
     d_outer, d_inner = (d + rim.second * d.square() for d in (foot.outer * rim.per_mm, straight))
     sound = None
     if check:
-        near = (-rim.bend * straight < _DEEP) & ((rim.second * straight).abs() < _BENT)
-        variance = blurs.across(spread.covariance[blocks.row, None].float(), *rim.normal)
-        sound = near | (d_inner.square() > _FAR**2 * variance)
+        blur = spread.covariance[blocks.row].float()
+        most = blurs.axes(blur)[1][:, None]
+        near = (rim.bend.square() * most < _CURVED) & ((rim.second * straight).abs() < _BENT)
+        sound = near | (d_inner.square() > _FAR**2 * blurs.across(blur[:, None], *rim.normal))
     edge = spread.at(blocks.row, *rim.normal)
     outer, inner = edge(d_outer, rim.bend), edge(d_inner, rim.bend)
     by_blur = tuple(one - other for one, other in zip(outer.by_blur, inner.by_blur, strict=True))
