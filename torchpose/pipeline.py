@@ -12,9 +12,10 @@ from torch import Tensor, nn
 
 from torchpose.camera import Camera
 from torchpose.camera.model import Model
-from torchpose.detect import Wanted, find_candidates
+from torchpose.detect import Candidates, Wanted, find_candidates, find_coarse
 from torchpose.errors import ConfigError, FrameError
 from torchpose.geometry.grey import grey
+from torchpose.geometry.segments import marked
 from torchpose.identify import (
     MIN_MARKERS,
     Identified,
@@ -157,10 +158,7 @@ class PoseEstimator(nn.Module):
         """
         frames = self._checked(frames)
         scene = Scene.of(frames, self.camera.to(frames.device), self.table.to(frames.device))
-        candidates = find_candidates(frames, wanted=Wanted.of(scene.table.polarity, _LEAST_CANDIDATE))
-        candidates = candidates[torch.isin(candidates.polarity, scene.table.polarity)]
-        rings = measure_rings(frames, candidates, scene.camera, correct=self._recipe.correct)
-        identified = identify(rings, scene.table, scene.camera, len(frames))
+        rings, identified = self._identified(scene)
         scene = scene.of_rows(identified.group)
         scene, found = best_copies(scene, self._solved(scene, rings, identified), self.instances)
         again = self._second_look(scene, found)
@@ -191,6 +189,33 @@ class PoseEstimator(nn.Module):
             # the detector's least contrast counts in 1/255 of white
             frames = frames.float() * (255.0 / self.float_range)
         return frames.contiguous()
+
+    def _identified(self, scene: Scene) -> tuple[Rings, Identified]:
+        """Rings of all frames and which markers they are: from the coarse scale alone where that shows every target."""
+        frames, wanted = scene.frames, Wanted.of(scene.table.polarity, _LEAST_CANDIDATE)
+
+        def measured(candidates: Candidates, frame: Tensor | None = None) -> Rings:
+            if frame is not None:
+                candidates = replace(candidates, frame=frame[candidates.frame])
+            candidates = candidates[torch.isin(candidates.polarity, scene.table.polarity)]
+            return measure_rings(frames, candidates, scene.camera, correct=self._recipe.correct)
+
+        def named(rings: Rings) -> Identified:
+            return identify(rings, scene.table, scene.camera, len(frames))
+
+        if self.instances > 1:  # a copy may be too small for the coarse scale
+            rings = measured(find_candidates(frames, wanted=wanted))
+            return rings, named(rings)
+        rings = measured(find_coarse(frames, wanted=wanted))
+        identified = named(rings)
+        missing = scene.table.valid[identified.group % len(scene.table)] & (identified.ring < 0)
+        whole = marked(identified.group[~missing.any(1)], scene.groups).view(len(frames), len(scene.table)).all(1)
+        if bool(whole.all()):
+            return rings, identified
+        rest = (~whole).nonzero()[:, 0]
+        finer = measured(find_candidates(frames[rest], wanted=wanted), rest)
+        rings = Rings.cat([rings[whole[rings.frame]], finer])
+        return rings, named(rings)
 
     def _solved(self, scene: Scene, rings: Rings, identified: Identified) -> Found:
         """The evidence of every row, and the solutions of those rows that have enough of it."""

@@ -1,8 +1,8 @@
 """Stage: candidate ellipses in whole batches of frames, by parallel region growing and a-contrario validation."""
 
-from torchpose.detect.candidates import find_candidates
+from torchpose.detect.candidates import find_candidates, find_coarse
 from torchpose.detect.lines import Segments
 from torchpose.detect.shapes import Shapes, find_shapes
 from torchpose.detect.validation import Candidates, Verdict, Wanted
 
-__all__ = ["Candidates", "Segments", "Shapes", "Verdict", "Wanted", "find_candidates", "find_shapes"]
+__all__ = ["Candidates", "Segments", "Shapes", "Verdict", "Wanted", "find_candidates", "find_coarse", "find_shapes"]

@@ -6,6 +6,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
+from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
 from torchpose.geometry.rows import Rows
 from torchpose.identify.scene import MarkerTable
@@ -46,16 +47,26 @@ class Assignments(Rows):
     axis: Tensor
 
 
-def ratio_tolerance(semi_minor: Ratio) -> Ratio:
-    """Largest error of a ring's inner/outer ratio with which its code is read; ``semi_minor``: outer axis, px."""
-    return _RATIO_TOLERANCE + _RATIO_TOLERANCE_PX / semi_minor
+def ratio_tolerance(semi_minor: Ratio, blur: Ratio | float = 1.0) -> Ratio:
+    """Largest error of a ring's inner/outer ratio with which its code is read.
+
+    Args:
+        semi_minor: of the outer ellipse, px.
+        blur: standard deviation, px; edges of a wider one are off in proportion, whatever its shape is.
+    """
+    return _RATIO_TOLERANCE + _RATIO_TOLERANCE_PX * blur / semi_minor
+
+
+def tolerance_of(rings: Rings) -> Tensor:
+    """`ratio_tolerance` (K,) of measured rings."""
+    return ratio_tolerance(rings.outer.params[:, 3], blurs.axes(rings.blur)[1].sqrt().clamp_min(1.0))
 
 
 def propose(rings: Rings, table: MarkerTable, matrix: Tensor) -> Assignments:
     """Every marker whose code a ring has."""
     outer = rings.outer.params
     expected = table.radii[..., 1] / table.radii[..., 0]
-    mismatch = (rings.ratio[:, None, None] - expected).abs() / ratio_tolerance(outer[:, 3])[:, None, None]
+    mismatch = (rings.ratio[:, None, None] - expected).abs() / tolerance_of(rings)[:, None, None]
     fits = (mismatch < 1) & table.valid & (rings.polarity[:, None, None] == table.polarity[:, None])
     ring, target, marker = fits.nonzero().unbind(-1)
     row = rings.frame[ring] * len(table) + target

@@ -21,9 +21,10 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, cast
 
 import torch
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
+from torchpose.detect import Candidates
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
@@ -39,6 +40,7 @@ from torchpose.geometry.least_squares import (
 )
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import values_at
+from torchpose.rings.inner_circles import InnerCircles
 from torchpose.rings.small_ring_model import MOST_NODES, RING, depth, exact, first_order, outer_ellipses
 
 _MARGIN = 3.0  # px around the outer ellipse
@@ -106,37 +108,32 @@ class _Scheme(NamedTuple):
 # grey levels and weights alone at first, so that a cover does not pull from the start
 _ROUGH = _Scheme(first_order, 1e-3, (_Stage(2, held=True, sectors=False), _Stage(6), _Stage(3, hard=True)))
 # blur, width and contrast of a ring much blurred are hard to tell apart: no step is to be shortened
-_PRECISE = _Scheme(exact, 1e-5, (_Stage(4), _Stage(3, hard=True)))
+_PRECISE = _Scheme(exact, 1e-5, (_Stage(6), _Stage(4, hard=True)))
 
 
 def fit_small_rings(
-    frames: Shaped[Tensor, "B H W"],
-    frame: Int[Tensor, " K"],
-    outer: Float[Tensor, "K 5"],
-    ratio: Float[Tensor, " K"],
-    seen: Bool[Tensor, "K A"],
-    polarity: Float[Tensor, " K"],
-    focal: Float[Tensor, ""],
-    blur: Float[Tensor, "K 3"] | None = None,
+    frames: Shaped[Tensor, "B H W"], candidates: Candidates, inside: InnerCircles, focal: Float[Tensor, ""]
 ) -> SmallRings:
     """Fits the model above by damped Gauss-Newton from rough rings.
 
     Args:
         frames: grey, any real dtype.
-        frame: of each ring.
-        outer: rough outer ellipses, px.
-        ratio: rough, of the radii.
-        seen: the directions in which the outer edge shows, see `inner_circles.find_inner`; the others do not count.
-        polarity: +1 for a dark ring.
+        candidates: the outer circles, about.
+        inside: what is inside of them, about; directions in which the outer edge does not show do not count.
         focal: px.
-        blur: rough, px^2.
     """
+    frame, outer, polarity, ratio, seen = (
+        candidates.frame,
+        candidates.ellipse,
+        candidates.polarity,
+        inside.ratio,
+        inside.seen,
+    )
     shape = conics.shape_matrix(outer)
     start = [outer[:, :2], shape[:, 0, :1], shape[:, 0, 1:], shape[:, 1, 1:], ratio[:, None]]
     theta = torch.cat([*start, torch.zeros_like(outer[:, :2])], -1)
     parted = (outer[:, 2].square() * (1 - ratio.square()) / focal).clamp_min(_LEAST_PARTED)
-    blur = blurs.isotropic(torch.full_like(ratio, _START_SIGMA)) if blur is None else blur
-    begun = _Start(theta, Spread(blurs.limited(blur, _START_SIGMA**2, MOST**2)), seen, parted)
+    begun = _Start(theta, Spread(blurs.limited(inside.blur, _START_SIGMA**2, MOST**2)), seen, parted)
     fit = _no_fit(begun)
     margin = torch.full_like(ratio, _MARGIN)
     for part in _parts(_pixels(outer, margin), 1):
