@@ -20,7 +20,7 @@ def detections(count: int = 3) -> Detections:
         return torch.randn(count, *shape, generator=generator, dtype=torch.float64)
 
     index = torch.arange(count)
-    return Detections(index % 2, 0 * index, index + 2**40, floats(2), floats(2, 2), floats(5), floats(5))
+    return Detections(index % 2, 0 * index, 0 * index, index + 2**40, floats(2), floats(2, 2), floats(5), floats(5))
 
 
 @pytest.fixture
@@ -35,6 +35,8 @@ def poses() -> Poses:
     result = Poses(
         frame=torch.arange(4),
         target=torch.zeros(4, dtype=torch.int64),
+        instance=torch.zeros(4, dtype=torch.int64),
+        copies=torch.ones(4, dtype=torch.int64),
         R=rotations.exp(floats(3)),
         t=100 * floats(3),
         covariance=root @ root.mT,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
+from itertools import combinations
 from typing import Any, Literal, get_args
 
 import torch
@@ -11,16 +12,25 @@ from torch import Tensor, nn
 
 from torchpose.camera import Camera
 from torchpose.camera.model import Model
-from torchpose.detect import Wanted, find_candidates
+from torchpose.detect import Candidates, Wanted, find_candidates, find_coarse
 from torchpose.errors import ConfigError, FrameError
 from torchpose.geometry.grey import grey
-from torchpose.identify import Identified, MarkerTable, Scene, identify, look_again
+from torchpose.geometry.segments import marked
+from torchpose.identify import (
+    MIN_MARKERS,
+    Identified,
+    MarkerTable,
+    Scene,
+    identify,
+    indistinguishable,
+    look_again,
+)
 from torchpose.kernels import find_compiler
 from torchpose.pose import (
-    MIN_MARKERS,
     Evidence,
     Found,
     Solutions,
+    best_copies,
     crossed_out,
     gather_evidence,
     intrinsics_covariance,
@@ -45,6 +55,8 @@ class PoseEstimator(nn.Module):
     Args:
         camera: intrinsics and distortion; frames must have its size.
         target: one target or several; each gets a row for every frame.
+        instances: most copies of a target that a frame is searched for. Every further copy that has a pose adds a row;
+            without it the best-supported copy counts, and `Poses.copies` says how many were seen.
         method: "photometric" refines every pose on the grey values around its rings, "edges" on all their edge points;
             "centers" stops at the pose of the centres of their ellipses; "paper" is the paper's chain: Zernike edges as
             read, centres by eq. (7), PnP.
@@ -54,7 +66,8 @@ class PoseEstimator(nn.Module):
         compile: solve small problems in compiled loops (`torchpose.kernels`), on the CPU; the first call takes seconds.
 
     Raises:
-        ConfigError: no target, or two of one name; an unknown method; ``compile`` without a C++ compiler.
+        ConfigError: no target, two of one name, or two that cannot be told apart; ``instances`` below 1; an unknown
+            method; ``compile`` without a C++ compiler.
     """
 
     made_for: Tensor
@@ -64,6 +77,7 @@ class PoseEstimator(nn.Module):
         camera: Camera,
         target: Target | Sequence[Target],
         *,
+        instances: int = 1,
         method: Method = "photometric",
         float_range: float = 1.0,
         srgb: bool = False,
@@ -72,16 +86,14 @@ class PoseEstimator(nn.Module):
         super().__init__()
         self.camera = camera
         self.targets = (target,) if isinstance(target, Target) else tuple(target)
-        if not self.targets:
-            raise ConfigError("target: none given; pass at least one Target")
-        names = [t.name for t in self.targets]
-        twice = sorted({n for n in names if names.count(n) > 1})
-        if twice:
-            raise ConfigError(f"target: name {twice[0]!r} given twice; rename one, rows are told apart by it")
+        _check_targets(self.targets)
+        if instances < 1:
+            raise ConfigError(f"instances: {instances} given; give the most copies of a target in a frame, 1 or more")
         if not float_range > 0:
             raise ConfigError(f"float_range: {float_range} is not positive; use 1.0 or 255.0")
         if method not in get_args(Method):
             raise ConfigError(f"method: {method!r} is not known; choose one of {', '.join(get_args(Method))}")
+        self.instances = instances
         self.method = method
         self.float_range = float_range
         self.srgb = srgb
@@ -138,17 +150,17 @@ class PoseEstimator(nn.Module):
                 floating point with white at ``float_range``.
 
         Returns:
-            B * T rows, frame-major, on the device of the frames.
+            Rows sorted by frame, target and instance, on the device of the frames: B * T of them with
+            ``instances=1``. With more, every frame and target has at least one row, and one for each copy with a pose.
 
         Raises:
             FrameError: wrong shape, size or dtype.
         """
         frames = self._checked(frames)
-        scene = Scene(frames, self.camera.to(frames.device), self.table.to(frames.device))
-        candidates = find_candidates(frames, wanted=Wanted.of(scene.table.polarity, _LEAST_CANDIDATE))
-        candidates = candidates[torch.isin(candidates.polarity, scene.table.polarity)]
-        rings = measure_rings(frames, candidates, scene.camera, correct=self._recipe.correct)
-        found = self._solved(scene, rings, identify(rings, scene.table, scene.camera, len(frames)))
+        scene = Scene.of(frames, self.camera.to(frames.device), self.table.to(frames.device))
+        rings, identified = self._identified(scene)
+        scene = scene.of_rows(identified.group)
+        scene, found = best_copies(scene, self._solved(scene, rings, identified), self.instances)
         again = self._second_look(scene, found)
         if len(again[0]) > len(rings):
             found = self._solved(scene, *again)
@@ -177,6 +189,33 @@ class PoseEstimator(nn.Module):
             # the detector's least contrast counts in 1/255 of white
             frames = frames.float() * (255.0 / self.float_range)
         return frames.contiguous()
+
+    def _identified(self, scene: Scene) -> tuple[Rings, Identified]:
+        """Rings of all frames and which markers they are: from the coarse scale alone where that shows every target."""
+        frames, wanted = scene.frames, Wanted.of(scene.table.polarity, _LEAST_CANDIDATE)
+
+        def measured(candidates: Candidates, frame: Tensor | None = None) -> Rings:
+            if frame is not None:
+                candidates = replace(candidates, frame=frame[candidates.frame])
+            candidates = candidates[torch.isin(candidates.polarity, scene.table.polarity)]
+            return measure_rings(frames, candidates, scene.camera, correct=self._recipe.correct)
+
+        def named(rings: Rings) -> Identified:
+            return identify(rings, scene.table, scene.camera, len(frames))
+
+        if self.instances > 1:  # a copy may be too small for the coarse scale
+            rings = measured(find_candidates(frames, wanted=wanted))
+            return rings, named(rings)
+        rings = measured(find_coarse(frames, wanted=wanted))
+        identified = named(rings)
+        missing = scene.table.valid[identified.group % len(scene.table)] & (identified.ring < 0)
+        whole = marked(identified.group[~missing.any(1)], scene.groups).view(len(frames), len(scene.table)).all(1)
+        if bool(whole.all()):
+            return rings, identified
+        rest = (~whole).nonzero()[:, 0]
+        finer = measured(find_candidates(frames[rest], wanted=wanted), rest)
+        rings = Rings.cat([rings[whole[rings.frame]], finer])
+        return rings, named(rings)
 
     def _solved(self, scene: Scene, rings: Rings, identified: Identified) -> Found:
         """The evidence of every row, and the solutions of those rows that have enough of it."""
@@ -211,6 +250,21 @@ class PoseEstimator(nn.Module):
         used = replace(evidence, mask=solutions.mask)
         more = intrinsics_covariance(used, solutions.R, solutions.t, scene.camera, refined=self._recipe.on_rims)
         return replace(solutions, covariance=solutions.covariance + more)
+
+
+def _check_targets(targets: Sequence[Target]) -> None:
+    if not targets:
+        raise ConfigError("target: none given; pass at least one Target")
+    names = [t.name for t in targets]
+    twice = sorted({n for n in names if names.count(n) > 1})
+    if twice:
+        raise ConfigError(f"target: name {twice[0]!r} given twice; rename one, rows are told apart by it")
+    for one, other in combinations(targets, 2):
+        if indistinguishable(one, other):
+            raise ConfigError(
+                f"target: {one.name!r} and {other.name!r} cannot be told apart, their codes and layout agree; give one "
+                "of them and instances (--instances) for its copies, or change the ratios or places of its rings"
+            )
 
 
 def _doubted(scene: Scene, found: Found) -> Solutions:

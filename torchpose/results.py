@@ -49,6 +49,7 @@ class Detections(Rows):
     Attributes:
         frame: index of the frame in the batch.
         target: index of the target.
+        instance: number of the copy, as in `Poses`.
         marker: marker id as in the target file.
         center: image of the marker's centre, compensated for perspective, px.
         center_cov: its covariance, px^2.
@@ -57,6 +58,7 @@ class Detections(Rows):
 
     frame: Int[Tensor, " K"]
     target: Int[Tensor, " K"]
+    instance: Int[Tensor, " K"]
     marker: Int[Tensor, " K"]
     center: Float[Tensor, "K 2"]
     center_cov: Float[Tensor, "K 2 2"]
@@ -66,13 +68,20 @@ class Detections(Rows):
 
 @dataclass(frozen=True, eq=False)
 class Poses(Rows):
-    """Poses of T targets in B frames as N = B * T rows, frame-major; with one target, row = frame.
+    """Poses of T targets in B frames, frame-major.
 
-    Where there is no pose, R, t, covariance and rms are NaN and `status` says why.
+    N = B * T rows; with one target, row = frame. Where an estimator looks for several copies of a target (its
+    ``instances`` above 1), every frame and target has at least one row and a further one for each further copy with a
+    pose: count by `frame`, `target` and `instance` then. Where there is no pose, R, t, covariance and rms are NaN and
+    `status` says why.
 
     Attributes:
         frame: index of the frame in the batch.
         target: index of the target.
+        instance: number of the copy among those of the target in the frame, 0, 1, ... from left to right in the image,
+            by the target's origin.
+        copies: of the target that the frame shows, each by a pose or by four markers in their places; the same in all
+            rows of a frame and target. More than there are rows: the others were left out, or no pose explains them.
         R, t: target to camera: X_cam = R X_target + t, mm.
         covariance: translation (mm) first, then rotation (rad, left-multiplied: R = exp(w) R_est, that is about the
             camera axes).
@@ -82,12 +91,14 @@ class Poses(Rows):
         chi2: of all evidence (centres and ring shapes) at the pose.
         R_alt, t_alt, rms_alt, chi2_alt: the other minimum of the same evidence (the second planar solution); NaN
             where both coincide or there is none.
-        detections: the markers of the whole batch; selecting rows leaves them alone, their `frame` and `target` say
-            whose they are.
+        detections: the markers of the whole batch; selecting rows leaves them alone, their `frame`, `target` and
+            `instance` say whose they are.
     """
 
     frame: Int[Tensor, " N"]
     target: Int[Tensor, " N"]
+    instance: Int[Tensor, " N"]
+    copies: Int[Tensor, " N"]
     R: Float[Tensor, "N 3 3"]
     t: Float[Tensor, "N 3"]
     covariance: Float[Tensor, "N 6 6"]

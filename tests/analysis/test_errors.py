@@ -108,12 +108,13 @@ def test_poses_and_truth_are_what_is_compared() -> None:
     """The result type of the pipeline and the truth file fit the two arguments."""
     rows = 2
     zeros = {name: torch.zeros(rows, dtype=torch.float64) for name in ("rms", "chi2", "rms_alt", "chi2_alt")}
-    whole = {n: torch.zeros(rows, dtype=torch.int64) for n in ("frame", "target", "status", "reason", "markers")}
+    names = ("frame", "target", "instance", "copies", "status", "reason", "markers")
+    whole = {n: torch.zeros(rows, dtype=torch.int64) for n in names}
     eye = torch.eye(3, dtype=torch.float64).repeat(rows, 1, 1)
     t = torch.ones(rows, 3, dtype=torch.float64)
     covariance = torch.eye(6, dtype=torch.float64).repeat(rows, 1, 1)
     none = Detections(
-        **{name: torch.zeros(0, dtype=torch.int64) for name in ("frame", "target", "marker")},
+        **{name: torch.zeros(0, dtype=torch.int64) for name in ("frame", "target", "instance", "marker")},
         **{name: torch.zeros(0, size) for name, size in (("center", 2), ("outer", 5), ("inner", 5))},
         center_cov=torch.zeros(0, 2, 2),
     )

@@ -192,7 +192,7 @@ def test_frames_without_a_target_say_so(run: Callable[..., Any], kind: str) -> N
     assert run("f") == (0, "")
     (row,) = table()
     assert row["status"] == "no_target"
-    assert all(row[c] == "" for c in row if c not in ("frame", "target", "status", "markers", "reason"))
+    assert all(row[c] == "" for c in row if c not in ("frame", "target", "status", "markers", "reason", "instance"))
 
 
 def test_several_targets_have_a_row_each(run: Callable[..., Any], pictures: np.ndarray) -> None:

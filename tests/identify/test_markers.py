@@ -32,7 +32,7 @@ def scene(target: Target, count: int, tilt_deg: float = 60.0, seed: int = 0) -> 
 
 
 def found(rings: Rings, targets: list[Target], frames: int) -> Identified:
-    return identify(rings, MarkerTable.of(targets), CAMERA, frames)
+    return identify(rings, MarkerTable.of(targets), CAMERA, frames, 1)
 
 
 @pytest.mark.parametrize("name", ["quad40", "hexa50"])

@@ -12,7 +12,7 @@ from torch import Tensor
 import torchpose as tp
 from tests.exact import pinhole, random_poses
 from torchpose import pipeline
-from torchpose.detect import find_candidates
+from torchpose.detect import Wanted, find_candidates
 from torchpose.sim import add_noise, render
 from torchpose.target import Target
 
@@ -33,14 +33,15 @@ def estimate(monkeypatch: pytest.MonkeyPatch, scene: Scene, lost: int, frames: T
     camera, target, r, t, pictures = scene
     pictures = pictures if frames is None else frames
 
-    def lossy(frames: Tensor) -> tp.detect.Candidates:
-        found = find_candidates(frames)
+    def lossy(frames: Tensor, *, wanted: Wanted) -> tp.detect.Candidates:
+        found = find_candidates(frames, wanted=wanted)
         for marker in range(len(target) - lost, len(target)):
             at = camera.project((r @ target.centers[marker]) + t)
             found = found[torch.linalg.vector_norm(found.ellipse[:, :2] - at[found.frame], dim=-1) > 20]
         return found
 
-    monkeypatch.setattr(pipeline, "find_candidates", lossy)
+    for search in ("find_coarse", "find_candidates"):
+        monkeypatch.setattr(pipeline, search, lossy)
     return tp.PoseEstimator(camera, target)(pictures)
 
 

@@ -30,8 +30,8 @@ from torchpose.io.store import ResultStore
 from torchpose.io.writers import read_rows, read_table, write_rows
 from torchpose.results import Detections, Poses, Reason, Status
 
-CONTRACT = "frame,target,status,tx,ty,tz,rx,ry,rz,sx,sy,sz,srx,sry,srz,rms_px,markers,reason"
-DETECTION_CONTRACT = "frame,target,marker,u,v,su,sv,outer_a,outer_b,outer_theta,inner_a,inner_b,inner_theta"
+CONTRACT = "frame,target,status,tx,ty,tz,rx,ry,rz,sx,sy,sz,srx,sry,srz,rms_px,markers,reason,instance,copies"
+DETECTION_CONTRACT = "frame,target,marker,u,v,su,sv,outer_a,outer_b,outer_theta,inner_a,inner_b,inner_theta,instance"
 NAN = float("nan")
 
 
@@ -50,6 +50,7 @@ def some_poses(frames: int = 3, targets: int = 2, seed: int = 0) -> Poses:
     detections = Detections(
         frame=torch.arange(frames).repeat_interleave(4 * targets),
         target=torch.arange(targets).repeat_interleave(4).repeat(frames),
+        instance=torch.zeros(4 * n, dtype=torch.int64),
         marker=torch.tensor([3, 2, 1, 0]).repeat(n),
         center=100 + normal(k, 2),
         center_cov=torch.diag_embed(normal(k, 2).square()),
@@ -59,6 +60,8 @@ def some_poses(frames: int = 3, targets: int = 2, seed: int = 0) -> Poses:
     return Poses(
         frame=torch.arange(frames).repeat_interleave(targets),
         target=torch.arange(targets).repeat(frames),
+        instance=torch.zeros(n, dtype=torch.int64),
+        copies=torch.ones(n, dtype=torch.int64),
         R=torch.where(gone[:, None, None], NAN, rotations.exp(vectors)),
         t=torch.where(gone[:, None], NAN, 500 * normal(n, 3)),
         covariance=torch.where(gone[:, None, None], NAN, root @ root.mT),
@@ -102,7 +105,7 @@ def test_rows_hold_the_poses_exactly() -> None:
         assert row["solutions"][0]["chi2"] == float(poses.chi2[i])
     assert [len(row["solutions"] or []) for row in rows] == [1, 1, 1, 1, 2, 0]
     assert rows[4]["solutions"][1]["translation"] == poses.t_alt[4].tolist()
-    without = ("status", "reason", "frame", "target", "markers")
+    without = ("status", "reason", "frame", "target", "markers", "instance", "copies")
     assert rows[5]["markers"] == 2
     assert all(value is None for column, value in rows[5].items() if column not in without)
 
@@ -384,3 +387,41 @@ def test_places_that_cannot_be_written_are_refused_at_once(tmp_path: Path, place
         ResultStore(tmp_path / place, None, schema=POSE_SCHEMA, targets=1, origin=ORIGIN, resume=False)
     assert "\n" not in str(caught.value)
     assert {p.name for p in tmp_path.iterdir()} == {"folder.csv", "file"}
+
+
+def test_a_journal_from_before_there_were_instances_is_resumed(tmp_path: Path, whole: tuple[bytes, bytes]) -> None:
+    """Its rows are those of the only copy; how many there were is not known."""
+    first = store(tmp_path)
+    first.append([record(name) for name in NAMES[:3]])
+    first.close()
+    journal = tmp_path / "p.csv.partial"
+    lines = [json.loads(line) for line in journal.read_text().splitlines()]
+    for line in lines[1:]:
+        for row in [*line["rows"], *line["detections"]]:
+            row.pop("instance")
+            row.pop("copies", None)
+    journal.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert complete(tmp_path, resume=True, origin=ORIGIN | {"--instances": 1}) == NAMES[:3]
+    rows = read_table(tmp_path / "p.csv")
+    assert [(row["instance"], row["copies"]) for row in rows] == [("0", None)] * 5
+
+
+def test_copies_without_a_row_are_counted(tmp_path: Path) -> None:
+    """Frames that show more copies than they have rows, of every target the most."""
+    of = store(tmp_path)
+
+    def rows(frame: str, copies: int, count: int) -> dict[str, Any]:
+        row = fault_row(frame, "quad", Status.OK, None) | {"copies": copies}
+        return {"frame": frame, "rows": [row | {"instance": i} for i in range(count)], "detections": []}
+
+    of.append([rows("a", 3, 3), rows("b", 4, 2), rows("c", 6, 1)])
+    of.close()
+    again = store(tmp_path, resume=True)
+    for one in (of, again):
+        assert one.crowded == {"b", "c"}
+        assert one.most == {"quad": 6}
+    again.finish(["a", "b", "c"])
+    done = store(tmp_path, resume=True)
+    assert len(done) == 3
+    assert done.crowded == {"b", "c"}
+    done.close()

@@ -39,6 +39,7 @@ def one_pose(
     detections = Detections(
         frame=zero,
         target=zero,
+        instance=zero,
         marker=torch.tensor([0, 3]),
         center=center,
         center_cov=1e-4 * torch.eye(2, dtype=torch.float64).repeat(2, 1, 1),
@@ -48,6 +49,8 @@ def one_pose(
     return Poses(
         frame=zero[:1],
         target=zero[:1],
+        instance=zero[:1],
+        copies=zero[:1] + 1,
         R=rotations.exp(torch.tensor([rotation], dtype=torch.float64)),
         t=torch.tensor([translation], dtype=torch.float64),
         covariance=1e-6 * torch.eye(6, dtype=torch.float64)[None],

@@ -4,12 +4,25 @@ from __future__ import annotations
 
 import pytest
 import torch
+from torch import Tensor
 
 from tests.exact import exact_ellipses, pinhole, random_poses
-from torchpose.identify.markers import ratio_tolerance
+from torchpose.detect import Candidates
+from torchpose.geometry.blur import isotropic
+from torchpose.identify.assignments import ratio_tolerance
+from torchpose.rings.inner_circles import InnerCircles
 from torchpose.rings.small_rings import fit_small_rings
 from torchpose.sim import add_noise, render
 from torchpose.target import Target
+
+
+def begun(frame: Tensor, outer: Tensor, ratio: Tensor) -> tuple[Candidates, InnerCircles]:
+    """Rough dark rings, seen all around, of a blur of 0.8 px."""
+    one = torch.ones_like(ratio)
+    candidates = Candidates(frame, outer, one, -one, one, torch.zeros_like(frame))
+    inner = torch.cat([outer[:, :2], outer[:, 2:4] * ratio[:, None], outer[:, 4:]], -1)
+    seen = torch.ones(len(frame), 64, dtype=torch.bool)
+    return candidates, InnerCircles(ratio, one > 0, inner, seen, isotropic(0.8 * one))
 
 
 @pytest.mark.parametrize("tilt", [0.1, 40.0])
@@ -25,8 +38,7 @@ def test_within_their_own_covariance(tilt: float, noise: float) -> None:
     rough[:, :2] += 0.4
     rough[:, 2:4] += 0.3
     ratio = truth[:, 1, 3] / truth[:, 0, 3] + 0.05
-    seen, one = torch.ones(48, 64, dtype=torch.bool), torch.ones(48, dtype=torch.float64)
-    found = fit_small_rings(frames, frame, rough, ratio, seen, one, torch.tensor(1111.11))
+    found = fit_small_rings(frames, *begun(frame, rough, ratio), torch.tensor(1111.11))
     assert found.good.all()
     for fit, exact in ((found.outer, truth[:, 0]), (found.inner, truth[:, 1])):
         error = fit.params[:, :2] - exact[:, :2]
@@ -48,9 +60,8 @@ def test_codes_of_much_blurred_rings(blur: float) -> None:
     truth = exact_ellipses(target, camera, r, t).flatten(0, 1)
     rough = truth[:, 0].clone()
     rough[:, 2:4] += 0.5
-    seen, one = torch.ones(40, 64, dtype=torch.bool), torch.ones(40, dtype=torch.float64)
     frame, start = torch.arange(10).repeat_interleave(4), torch.full((40,), 0.45, dtype=torch.float64)
-    found = fit_small_rings(frames, frame, rough, start, seen, one, torch.tensor(1111.11))
+    found = fit_small_rings(frames, *begun(frame, rough, start), torch.tensor(1111.11))
     code = (found.inner.params[:, 2:4].prod(-1) / found.outer.params[:, 2:4].prod(-1)).sqrt()
     off = (code - truth[:, 1, 3] / truth[:, 0, 3]).abs() / ratio_tolerance(truth[:, 0, 3])
     assert found.good.double().mean() >= 0.8  # where the blur leaves the code open, the fit says so
@@ -64,9 +75,8 @@ def test_codes_without_noise() -> None:
     frame = render(camera, target, r, torch.tensor([[0.0, 0, 790]], dtype=torch.float64), psf_sigma=2.6)
     truth = exact_ellipses(target, camera, r, torch.tensor([[0.0, 0, 790]], dtype=torch.float64))[0]
     rough = truth[:, 0] + torch.tensor([0.2, -0.1, 0.4, 0.4, 0], dtype=torch.float64)
-    seen, one = torch.ones(4, 64, dtype=torch.bool), torch.ones(4, dtype=torch.float64)
     nought, start = torch.zeros(4, dtype=torch.int64), torch.full((4,), 0.4, dtype=torch.float64)
-    found = fit_small_rings(frame, nought, rough, start, seen, one, torch.tensor(1111.11))
+    found = fit_small_rings(frame, *begun(nought, rough, start), torch.tensor(1111.11))
     code = (found.inner.params[:, 2:4].prod(-1) / found.outer.params[:, 2:4].prod(-1)).sqrt()
     assert found.good.all()
     assert (code - truth[:, 1, 3] / truth[:, 0, 3])[:3].abs().max() < 0.005
@@ -79,7 +89,7 @@ def test_refuses_what_is_no_ring() -> None:
     v, u = torch.meshgrid(torch.arange(80), torch.arange(80), indexing="ij")
     frames[0] -= 100 * torch.sigmoid(3 * (7 - torch.hypot(u - 60.0, v - 60.0)))  # a disc without a hole
     rough = [[20.0, 20, 7, 7, 0], [40, 40, 9, 9, 0], [1, 40, 7, 7, 0], [60, 60, 7, 7, 0]]
-    half, one = torch.full((4,), 0.5, dtype=torch.float64), torch.ones(4, dtype=torch.float64)
-    frame, seen = torch.zeros(4, dtype=torch.int64), torch.ones(4, 64, dtype=torch.bool)
-    found = fit_small_rings(frames, frame, torch.tensor(rough).double(), half, seen, one, torch.tensor(1111.11))
+    half = torch.full((4,), 0.5, dtype=torch.float64)
+    frame = torch.zeros(4, dtype=torch.int64)
+    found = fit_small_rings(frames, *begun(frame, torch.tensor(rough).double(), half), torch.tensor(1111.11))
     assert not found.good.any()

@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchpose.analysis.errors import PoseErrors, pose_errors, rms
 from torchpose.geometry import rotations
+from torchpose.io.rows import Row
 from torchpose.io.truth import Truth
 
 AXES = ("x", "y", "z", "pitch", "yaw", "roll")
@@ -100,7 +101,38 @@ def evaluate(estimates: Estimates, truth: Truth) -> Evaluation:
     )
 
 
-def estimates_of(rows: Sequence[dict[str, object]]) -> Estimates:
+def match_copies(
+    keys: Sequence[tuple[str, str]], places: Float[Tensor, "N 3"], table: Mapping[tuple[str, str], Sequence[Row]]
+) -> tuple[list[Row], int]:
+    """The row of each true pose, and how many rows with a pose are left over.
+
+    Args:
+        keys: frame and target of each true pose; a copy of a target has the same.
+        places: of the true poses, mm.
+        table: rows of each frame and target. Nearest ones belong together, the nearest pair first; a true pose that
+            none is left for gets a row without a pose, ``no_target`` where there is no such row.
+    """
+    wanted: dict[tuple[str, str], list[int]] = {}
+    for number, key in enumerate(keys):
+        wanted.setdefault(key, []).append(number)
+    matched: dict[int, Row] = {}
+    more = 0
+    for key, numbers in wanted.items():
+        found = [row for row in table[key] if row["tx"] is not None]
+        others = iter([row for row in table[key] if row["tx"] is None])
+        at = torch.tensor([[float(str(row[name])) for name in ("tx", "ty", "tz")] for row in found], dtype=places.dtype)
+        apart = torch.cdist(places[numbers], at.reshape(-1, 3))
+        for _ in range(min(apart.shape)):
+            i, j = divmod(int(apart.argmin()), apart.shape[1])
+            matched[numbers[i]] = found[j]
+            apart[i], apart[:, j] = torch.inf, torch.inf
+        more += max(0, len(found) - len(numbers))
+        blank = dict.fromkeys(table[key][0]) | {"frame": key[0], "target": key[1], "status": "no_target"}
+        matched |= {number: next(others, blank) for number in numbers if number not in matched}
+    return [matched[number] for number in range(len(keys))], more
+
+
+def estimates_of(rows: Sequence[Row]) -> Estimates:
     """Estimates from rows of a result table; cells may be None."""
 
     def cells(names: Sequence[str]) -> Tensor:

@@ -38,7 +38,7 @@ def find_rings(names: Sequence[str], frames: Tensor, cameras: Sequence[Camera], 
     rings = measure_rings(_grey(frames), candidates, cameras[0])
     every = []
     for camera in cameras:
-        ring = identify(rings, table, camera, len(frames)).ring
+        ring = identify(rings, table, camera, len(frames), 1).ring
         view, marker = (ring >= 0).nonzero().unbind(-1)
         at = ring[view, marker]
         center, covariance = common_center(rings.outer[at], rings.inner[at], target.radii[marker])

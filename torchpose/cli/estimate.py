@@ -44,6 +44,7 @@ _METHODS = "photometric|edges|centers|paper"  # torchpose.pipeline.Method, which
 _METHOD = "Last stage: grey values, edge points, ring centres, or the paper's own chain."
 _HAND_EYE = "Calibrated camera-to-base or camera-to-tool transform; adds the poses in the robot base."
 _RESUME = "Keep the frames that an earlier run finished and do the rest."
+_INSTANCES = "Most copies of a target in a frame (a tray of equal parts): up to as many rows, column instance."
 _DETECTIONS = "Table of the markers found: .csv, .jsonl or .parquet."
 
 
@@ -54,6 +55,7 @@ def estimate(
     out: Annotated[Path, typer.Option(help="Table of the poses: .csv, .jsonl or .parquet.")],
     detections: Annotated[Path | None, typer.Option(help=_DETECTIONS)] = None,
     overlay: Overlay = None,
+    instances: Annotated[int, typer.Option(min=1, metavar="K", help=_INSTANCES)] = 1,
     resume: Annotated[bool, typer.Option("--resume", help=_RESUME)] = False,
     hand_eye: Annotated[Path | None, typer.Option(help=_HAND_EYE)] = None,
     method: Annotated[str, typer.Option(metavar=_METHODS, help=_METHOD)] = "photometric",
@@ -64,8 +66,8 @@ def estimate(
 ) -> int:
     """Measure the pose of ring targets in every frame, with its uncertainty.
 
-    One row a frame and target: status, translation in mm, rotation vector in rad (target to camera), their standard
-    deviations, reprojection RMS in px, number of markers.
+    One row a frame and target, or with --instances one a copy: status, translation in mm, rotation vector in rad
+    (target to camera), their standard deviations, reprojection RMS in px, number of markers.
     """
     from torchpose.camera import Camera
     from torchpose.cli.terminal import native_stderr_silenced
@@ -77,7 +79,7 @@ def estimate(
         if path is not None:
             check_table_path(path, option)
     lens, targets, sources = Camera.load(camera), [Target.load(name) for name in target], find_sources(inputs)
-    work = _Work(lens, targets, sources, _load_hand_eye(hand_eye, sources), method, srgb)
+    work = _Work(lens, targets, sources, _load_hand_eye(hand_eye, sources), method, srgb, instances)
     check_outputs(inputs, sources, [p for p in (out, detections) if p is not None], overlay)
     with native_stderr_silenced():
         return _run(work, out, detections, overlay, resume=resume, batch=batch, threads=threads or cores(), quiet=quiet)
@@ -93,6 +95,7 @@ class _Work:
     hand_eye: HandEye | None
     method: str
     srgb: bool
+    instances: int
 
     def origin(self, detections: bool) -> dict[str, Any]:
         """The same for `ResultStore`. Names are those that its error messages shall say."""
@@ -105,6 +108,7 @@ class _Work:
             "--hand-eye": None if self.hand_eye is None else _digest(self.hand_eye),
             "--method": self.method,
             "--srgb": self.srgb,
+            "--instances": self.instances,
             "--detections": detections,
             "INPUT": sorted({str(source.root) for source in self.sources}),
         }
@@ -137,7 +141,8 @@ def _run(
     # decoding is the larger part of the work; torch's threads wait actively and would take its cores away
     torch.set_num_threads(max(1, threads // 2))
     camera, targets, sources = work.camera, work.targets, work.sources
-    estimator = PoseEstimator(camera, targets, method=work.method, srgb=work.srgb)  # type: ignore[arg-type]  # it checks
+    method: Any = work.method  # it checks
+    estimator = PoseEstimator(camera, targets, instances=work.instances, method=method, srgb=work.srgb)
     painter = None if overlay is None else Overlay(camera, targets, overlay, threads=threads)
     schema = POSE_SCHEMA | (BASE_SCHEMA if work.hand_eye else {})
     origin = work.origin(detections is not None)
@@ -159,7 +164,23 @@ def _run(
     finally:
         store.close()
     progress.summary(store.counts, out)
+    if not quiet:
+        _tell_crowded(store.crowded, store.most, work)
     return ended(store.unreadable)
+
+
+def _tell_crowded(frames: set[str], most: dict[str, int], work: _Work) -> None:
+    """Tells, in a line on stderr, of copies that were seen and have no row."""
+    if not frames:
+        return
+    seen = ", ".join(f"{count} of {target}" for target, count in most.items())
+    more = max(most.values()) > work.instances
+    fix = f"--instances {max(most.values())} looks for all" if more else "no pose explains the others"
+    typer.echo(
+        f"torchpose: {len(frames)} of {len(work.sources)} frames show more copies of a target than they have rows, "
+        f"up to {seen}; {fix}",
+        err=True,
+    )
 
 
 def _records(batch: reader.Batch, estimator: PoseEstimator, work: _Work, painter: pictures.Overlay | None) -> list[Row]:

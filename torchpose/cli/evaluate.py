@@ -12,6 +12,7 @@ from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:
     from torchpose.analysis.evaluation import Evaluation
+    from torchpose.io.rows import Schema
     from torchpose.io.truth import Truth
 
 _POSES = "Table of torchpose estimate: .csv, .jsonl, .parquet."
@@ -31,11 +32,14 @@ def evaluate(
     from torchpose.io.truth import read_truth
 
     known = read_truth(truth / "truth.csv" if truth.is_dir() else truth)
-    estimates = estimates_of(_rows_of(poses, known))
+    rows, more = _rows_of(poses, known)
+    estimates = estimates_of(rows)
     result = evaluate_poses(estimates, known)
     _show(result, estimates.full_covariance)
+    if more:
+        typer.echo(f"{more} further rows with a pose are of copies that the truth does not have")
     if out is not None:
-        _write_errors(out, result, known, estimates.status)
+        _write_errors(out, result, known, rows)
     if plots is not None:
         from torchpose.report.evaluation import save_plots
 
@@ -44,16 +48,20 @@ def evaluate(
     return 0
 
 
-def _rows_of(path: Path, truth: Truth) -> list[dict[str, Any]]:
-    """Rows of the table in the order of the truth.
+def _rows_of(path: Path, truth: Truth) -> tuple[list[dict[str, Any]], int]:
+    """Rows of the table in the order of the truth, and how many with a pose are left over.
 
-    Names of frames may have a folder before them, as they do where the data set itself was the input.
+    Names of frames may have a folder before them, as they do where the data set itself was the input. Of several copies
+    of a target in a frame those that lie nearest belong together.
     """
+    from torchpose.analysis.evaluation import match_copies
     from torchpose.io.writers import read_table
 
     rows = read_table(path)
+    table: dict[tuple[str, str], list[dict[str, Any]]] = {}
     try:
-        table = {(str(row["frame"]), str(row["target"])): row for row in rows}
+        for row in rows:
+            table.setdefault((str(row["frame"]), str(row["target"])), []).append(row)
         missing = [name for name in ("status", "tx", "rz", "sx", "srz") if rows and name not in rows[0]]
     except (KeyError, TypeError) as error:
         raise ConfigError(f"{path}: POSES: cannot be read ({error!r}); give what torchpose estimate wrote") from None
@@ -61,14 +69,14 @@ def _rows_of(path: Path, truth: Truth) -> list[dict[str, Any]]:
         raise ConfigError(f"{path}: {missing[0]}: column is missing; give what torchpose estimate wrote")
     keys = list(zip(truth.frame, truth.target, strict=True))
     if not any(key in table for key in keys):
-        table = {(frame.rsplit("/", 1)[-1], target): row for (frame, target), row in table.items()}
+        table = {(frame.rsplit("/", 1)[-1], target): copies for (frame, target), copies in table.items()}
     lost = [key for key in keys if key not in table]
     if lost:
         raise ConfigError(
             f"{path}: frame: {lost[0][0]} with target {lost[0][1]} and {len(lost) - 1} more rows of the truth are "
             "missing; estimate all frames of the data set with its target.yaml"
         )
-    return [table[key] for key in keys]
+    return match_copies(keys, truth.t, table)
 
 
 def _show(result: Evaluation, full_covariance: bool) -> None:
@@ -86,7 +94,7 @@ def _show(result: Evaluation, full_covariance: bool) -> None:
     console.print(f"mean NEES {result.nees:.2f}; {low:.2f} to {high:.2f} where the covariances are right{note}")
 
 
-def _write_errors(path: Path, result: Evaluation, truth: Truth, status: list[str]) -> None:
+def _write_errors(path: Path, result: Evaluation, truth: Truth, rows: list[dict[str, Any]]) -> None:
     import torch
 
     from torchpose.analysis.evaluation import AXES, UNITS
@@ -96,9 +104,10 @@ def _write_errors(path: Path, result: Evaluation, truth: Truth, status: list[str
     axes = [f"{axis}_{unit}" for axis, unit in zip(AXES, UNITS, strict=True)]
     columns = [*(f"{kind}{axis}" for kind in ("", "claimed_", "bound_") for axis in axes), "nees"]
     values = torch.cat([result.error, result.predicted, result.bound, result.errors.nees[:, None]], 1).tolist()
-    rows = (
-        {"frame": frame, "target": target, "status": state}
+    errors = (
+        {"frame": frame, "target": target, "status": row["status"], "instance": int(row.get("instance") or 0)}
         | {name: None if number != number else number for name, number in zip(columns, numbers, strict=True)}
-        for frame, target, state, numbers in zip(truth.frame, truth.target, status, values, strict=True)
+        for frame, target, row, numbers in zip(truth.frame, truth.target, rows, values, strict=True)
     )
-    write_rows(path, rows, dict.fromkeys(("frame", "target", "status"), str) | dict.fromkeys(columns, float))
+    schema: Schema = dict.fromkeys(("frame", "target", "status"), str) | {"instance": int}
+    write_rows(path, errors, schema | dict.fromkeys(columns, float))

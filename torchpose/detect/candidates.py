@@ -84,11 +84,12 @@ def find_candidates(
     return merge_duplicates(every if explain else accepted(every), explain=explain)
 
 
-def find_coarse(
-    frames: Shaped[Tensor, "B H W"], factor: int | None = None, *, wanted: Wanted = ANYTHING
-) -> Candidates:
-    """What `find_candidates` finds at twice its reduction alone, at a fraction of its cost; arguments as there."""
-    factor = reduction_factor(*frames.shape[-2:]) if factor is None else factor
+def find_coarse(frames: Shaped[Tensor, "B H W"], *, wanted: Wanted = ANYTHING) -> Candidates:
+    """What `find_candidates` finds at the coarser of its scales, at a fraction of its cost, and without its exclusion.
+
+    Large rings are seen whole there, and texture, letters and noise are not seen at all.
+    """
+    factor = reduction_factor(*frames.shape[-2:])
     reduced = area_reduce(area_reduce(frames, factor), 2, exact=True)
     found = accepted(find_ellipses(gradient(reduced), wanted.reduced(2 * factor)))
     found = replace(found, ellipse=rescaled(found.ellipse, 2 * factor))

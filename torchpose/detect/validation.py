@@ -113,7 +113,7 @@ class Wanted:
             good &= torch.linalg.vector_norm(away, dim=-1) < self.place.shift
         return good
 
-    def within_reach(self, grad: Gradient, cells: Int[Tensor, " P"]) -> Int[Tensor, " P"]:
+    def within_reach(self, grad: Gradient, cells: Int[Tensor, " P"]) -> Int[Tensor, " Q"]:
         """Those of the cells that an ellipse of the place may run through."""
         if self.place is None:
             return cells

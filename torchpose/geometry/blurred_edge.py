@@ -28,7 +28,7 @@ from torchpose.geometry.rows import Rows, shared
 Kind = Literal["gauss", "line", "disc"]
 BLUR = 3  # numbers of a blur
 LEAST, MOST = 0.3, 12.0  # px, standard deviations: a pixel alone has 0.289; beyond the widest band nothing is left
-_NODES_A_SIGMA = 1.9  # Gauss-Legendre nodes a half length in narrow Gaussians: an edge to 1e-5 (`sim.boundary`)
+_NODES_A_SIGMA = 1.1  # Gauss-Legendre nodes a half length in narrow Gaussians: an edge to 1e-3
 _MOST_NODES = 40
 _CORE = 0.6  # px, of what is not the line or the disc, to begin with: a pixel, and a sharp lens
 _SQUARE = 1 / (24 * 120)  # fourth cumulant of a pixel along its side, over -24

@@ -1,7 +1,9 @@
-"""Stage: which ring is which marker, and a second look for those that were not found."""
+"""Stage: which ring is which marker of which copy, and a second look for those that were not found."""
 
+from torchpose.identify.alike import indistinguishable
+from torchpose.identify.copies import MIN_MARKERS
 from torchpose.identify.markers import Identified, identify
 from torchpose.identify.scene import MarkerTable, Scene
 from torchpose.identify.second_look import look_again
 
-__all__ = ["Identified", "MarkerTable", "Scene", "identify", "look_again"]
+__all__ = ["MIN_MARKERS", "Identified", "MarkerTable", "Scene", "identify", "indistinguishable", "look_again"]

@@ -52,21 +52,34 @@ class MarkerTable(Rows):
 
 
 class Scene(NamedTuple):
-    """B frames (B, H, W) in grey levels, the camera that took them, and the targets looked for.
+    """B frames (B, H, W) in grey levels, the camera that took them, the targets looked for, and whose each row is.
 
-    Every frame and target is a row, N = B * T, frame-major.
+    frame (N,) and target (N,) int64: before identification every frame and target is a row, N = B * T, frame-major;
+    then every copy of a target that was found, in the same order.
     """
 
     frames: Tensor
     camera: Camera
     table: MarkerTable
+    frame: Tensor
+    target: Tensor
+
+    @classmethod
+    def of(cls, frames: Tensor, camera: Camera, table: MarkerTable) -> Self:
+        """With a row for every frame and target."""
+        every = torch.arange(len(frames) * len(table), device=frames.device)
+        return cls(frames, camera, table, every // len(table), every % len(table))
+
+    def of_rows(self, group: Tensor) -> Self:
+        """The same with other rows, of the frames and targets ``group`` (N,): frame times T plus target."""
+        return self._replace(frame=group // len(self.table), target=group % len(self.table))
 
     @property
-    def frame(self) -> Tensor:
-        """(N,) int64, of each row."""
-        return torch.arange(len(self.frames), device=self.frames.device).repeat_interleave(len(self.table))
+    def groups(self) -> int:
+        """Number of frames times targets."""
+        return len(self.frames) * len(self.table)
 
     @property
-    def target(self) -> Tensor:
-        """(N,) int64, of each row."""
-        return torch.arange(len(self.table), device=self.frames.device).repeat(len(self.frames))
+    def group(self) -> Tensor:
+        """(N,) int64, frame times T plus target."""
+        return self.frame * len(self.table) + self.target

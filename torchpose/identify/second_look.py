@@ -13,7 +13,8 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.detect import Candidates, Verdict
 from torchpose.geometry import conics
-from torchpose.identify.markers import Identified, ratio_tolerance
+from torchpose.identify.assignments import tolerance_of
+from torchpose.identify.markers import Identified
 from torchpose.identify.scene import MarkerTable, Scene
 from torchpose.rings import Rings, mapped, measure_predicted
 
@@ -55,7 +56,7 @@ def look_again(
     miss = torch.linalg.vector_norm(measured[:, :2] - ideal[:, :2], dim=-1)
     off = (found.ratio - markers.radii[row, marker, 1] / markers.radii[row, marker, 0]).abs()
     px, of_size = _PLACE_TOLERANCE
-    good = (miss < px + of_size * measured[:, 2]) & (off < ratio_tolerance(measured[:, 3]))
+    good = (miss < px + of_size * measured[:, 2]) & (off < tolerance_of(found))
     # of several poses of a row, the one that was nearest
     slot = row * identified.ring.shape[1] + marker
     nearest = torch.full((identified.ring.numel(),), torch.inf, dtype=miss.dtype, device=miss.device)

@@ -24,12 +24,15 @@ POSE_SCHEMA: Schema = {
     **dict.fromkeys((*_POSE, *_STD, "rms_px"), float),
     "markers": int,
     "reason": str,
+    "instance": int,
+    "copies": int,
     "covariance": list,
     "quaternion": list,
     "solutions": list,
 }
 """Columns of a row: t in mm, rotation vector r in rad, standard deviations s* of t and of the rotation about the camera
-axes; covariance 6x6 (t, then rotation), quaternion w, x, y, z, and the one or two solutions, the row's own first."""
+axes; instance counts the copies of a target in its frame from the left, copies says how many it shows, if any;
+covariance 6x6 (t, then rotation), quaternion w, x, y, z, and the one or two solutions, the row's own first."""
 
 BASE_SCHEMA: Schema = {
     **dict.fromkeys(tuple(f"base_{c}" for c in (*_POSE, *_STD)), float),
@@ -44,8 +47,12 @@ DETECTION_SCHEMA: Schema = {
     **dict.fromkeys(
         ("u", "v", "su", "sv", "outer_a", "outer_b", "outer_theta", "inner_a", "inner_b", "inner_theta"), float
     ),
+    "instance": int,
 }
 """One row a marker: compensated centre with standard deviation, semi-axes and direction of both ellipses (px, rad)."""
+
+SINCE_INSTANCES: Row = {"instance": 0, "copies": None}
+"""Cells of rows that were written before a frame could have several copies of a target."""
 
 
 def pose_rows(poses: Poses, frames: Sequence[str], targets: Sequence[str]) -> list[Row]:
@@ -66,6 +73,8 @@ def pose_rows(poses: Poses, frames: Sequence[str], targets: Sequence[str]) -> li
         rms_px=[pose and pose["rms_px"] for pose in own],
         markers=poses.markers.tolist(),
         reason=[Reason(reason).name.lower() if reason else None for reason in poses.reason.tolist()],
+        instance=poses.instance.tolist(),
+        copies=[count or None for count in poses.copies.tolist()],
         quaternion=[pose and pose["quaternion"] for pose in own],
         solutions=[a and [a, *([b] if b else [])] for a, b in zip(own, other, strict=True)],
     )
@@ -80,18 +89,21 @@ def base_cells(poses: Poses) -> list[Row]:
 def fault_row(frame: str, target: str, status: Status, reason: str | None) -> Row:
     """The row of a target in a frame that could not be read or used."""
     row: Row = dict.fromkeys(POSE_SCHEMA)
-    return row | {"frame": frame, "target": target, "status": status.name.lower(), "markers": 0, "reason": reason}
+    known = {"frame": frame, "target": target, "status": status.name.lower(), "markers": 0, "reason": reason}
+    return row | known | {"instance": 0}
 
 
 def detection_rows(detections: Detections, frames: Sequence[str], targets: Sequence[str]) -> list[Row]:
-    """Rows of `DETECTION_SCHEMA`, frame by frame, target by target, in the order of the marker ids."""
+    """Rows of `DETECTION_SCHEMA`, by frame, target and instance, in the order of the marker ids."""
     found = detections.cpu()
     std = found.center_cov.diagonal(dim1=-2, dim2=-1).sqrt()
     numbers = torch.cat([found.center, std, found.outer[:, 2:], found.inner[:, 2:]], 1)
-    keys = torch.stack([found.frame, found.target, found.marker], 1).tolist()
+    keys = torch.stack([found.frame, found.target, found.instance, found.marker], 1).tolist()
     return [
-        dict(zip(DETECTION_SCHEMA, (frames[frame], targets[target], marker, *map(finite, cells)), strict=True))
-        for (frame, target, marker), cells in sorted(zip(keys, numbers.tolist(), strict=True))
+        dict(
+            zip(DETECTION_SCHEMA, (frames[frame], targets[target], marker, *map(finite, cells), instance), strict=True)
+        )
+        for (frame, target, instance, marker), cells in sorted(zip(keys, numbers.tolist(), strict=True))
     ]
 
 

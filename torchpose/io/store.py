@@ -22,9 +22,10 @@ from filelock import lock_descriptor
 from pydantic import BaseModel, Field, ValidationError
 
 from torchpose.errors import ConfigError
-from torchpose.io.rows import DETECTION_SCHEMA, Row, Schema
+from torchpose.io.rows import DETECTION_SCHEMA, SINCE_INSTANCES, Row, Schema
 from torchpose.io.writers import atomic_path, check_table_path, read_rows, write_rows
 
+_UNSAID = {"--instances": 1}  # in what older runs were made from
 Origin = Mapping[str, Any]
 """What rows are made from (versions, digests of the files, inputs), as JSON values by name."""
 
@@ -44,13 +45,15 @@ class ResultStore:
         out: table of the poses.
         detections: table of the markers, or None.
         schema: columns of ``out``.
-        targets: rows that every frame has in ``out``.
+        targets: that every frame has a row of in ``out``, or several.
         origin: what the rows are made from; a resumed run must agree.
         resume: whether to keep the frames that an earlier run finished, instead of starting over.
 
     Attributes:
         counts: number of rows by status, those of an earlier run included.
         unreadable: frames that could not be read, with their reason.
+        crowded: frames that show more copies of a target than they have rows.
+        most: by target, the most copies of it that one of these frames shows.
 
     Raises:
         ConfigError: a place cannot be written, another run is writing there, or there is an earlier run that cannot be
@@ -67,6 +70,8 @@ class ResultStore:
                 raise ConfigError(f"{detections}: --detections: is the file of --out too; give another")
         self.counts: Counter[str] = Counter()
         self.unreadable: dict[str, str] = {}
+        self.crowded: set[str] = set()
+        self.most: dict[str, int] = {}
         self._out, self._detections = out, detections
         self._schema, self._targets = schema, targets
         self._origin = json.loads(json.dumps(origin))
@@ -169,6 +174,11 @@ class ResultStore:
         self.counts.update(row["status"] for row in record["rows"])
         if record["rows"][0]["status"] == "unreadable":
             self.unreadable[record["frame"]] = record["rows"][0]["reason"]
+        rows = Counter(row["target"] for row in record["rows"])
+        for row in record["rows"]:
+            if (row.get("copies") or 0) > rows[row["target"]]:
+                self.crowded.add(record["frame"])
+                self.most[row["target"]] = max(self.most.get(row["target"], 0), row["copies"])
 
     def _load(self) -> bool:
         """Reads the journal of a killed run and drops a torn end; False if not even its first line is whole."""
@@ -197,7 +207,10 @@ class ResultStore:
             for frame in frames:
                 offset, length = self._places[frame]
                 journal.seek(offset)
-                yield json.loads(journal.read(length))
+                record = json.loads(journal.read(length))
+                for part in ("rows", "detections"):
+                    record[part] = [SINCE_INSTANCES | row for row in record[part]]
+                yield record
 
     def _finished(self) -> Iterator[Row]:
         """Records of the tables of a run that was completed."""
@@ -217,7 +230,7 @@ class ResultStore:
             for row in read_rows(self._detections, DETECTION_SCHEMA):
                 if row["frame"] in records:
                     records[row["frame"]]["detections"].append(row)
-        yield from (record for record in records.values() if len(record["rows"]) == self._targets)
+        yield from (r for r in records.values() if len({row["target"] for row in r["rows"]}) == self._targets)
 
     def _foreign(self, path: Path) -> ConfigError:
         return ConfigError(f"{path}: --resume: not written by torchpose; run without --resume")
@@ -225,7 +238,7 @@ class ResultStore:
     def _check_origin(self, origin: Any, path: Path) -> None:
         if not isinstance(origin, dict):
             raise self._foreign(path)
-        changed = [name for name in self._origin if origin.get(name) != self._origin[name]]
+        changed = [name for name in self._origin if origin.get(name, _UNSAID.get(name)) != self._origin[name]]
         if changed:
             raise ConfigError(
                 f"{path}: --resume: the rows there were made with another {' and '.join(changed)}; "

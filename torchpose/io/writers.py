@@ -9,7 +9,7 @@ from itertools import islice
 from pathlib import Path
 
 from torchpose.errors import ConfigError
-from torchpose.io.rows import Row, Schema
+from torchpose.io.rows import SINCE_INSTANCES, Row, Schema
 
 TABLE_SUFFIXES = (".csv", ".jsonl", ".parquet")
 _ROW_GROUP = 4096
@@ -44,17 +44,19 @@ def write_rows(path: Path, rows: Iterable[Row], schema: Schema) -> None:
 
 
 def read_rows(path: Path, schema: Schema) -> Iterator[Row]:
-    """Rows of a table that `write_rows` wrote.
+    """Rows of a table that `write_rows` wrote, before there were instances too.
 
     Raises:
         ConfigError: the file is not such a table.
     """
     columns = _cells(schema) if path.suffix.lower() == ".csv" else list(schema)
+    older = [column for column in columns if column not in SINCE_INSTANCES]
     try:
         for row in _READERS[path.suffix.lower()](path):
-            if list(row) != columns:
+            if list(row) not in (columns, older):
                 raise ValueError("columns")
-            yield {column: None if cell is None else schema[column](cell) for column, cell in row.items()}
+            cells = {column: row[column] if column in row else SINCE_INSTANCES[column] for column in columns}
+            yield {column: None if cell is None else schema[column](cell) for column, cell in cells.items()}
     except (ValueError, KeyError, TypeError, OSError, csv.Error):
         raise ConfigError(
             f"{path}: --resume: not a table that torchpose wrote for these options; run without --resume"

@@ -1,19 +1,20 @@
 """Stage: one pose a target and frame from its identified markers, with covariance and status."""
 
 from torchpose.pose.centers import common_center, compensate, raw_centers
+from torchpose.pose.copies import best_copies
 from torchpose.pose.covariance import intrinsics_covariance, pose_covariance
 from torchpose.pose.doubt import crossed_out
 from torchpose.pose.evidence import Evidence, center_rms, gather_evidence, shape_chi2
 from torchpose.pose.outcome import Found, outcome
-from torchpose.pose.solutions import AMBIGUOUS_CHI2, MIN_MARKERS, Solutions
+from torchpose.pose.solutions import AMBIGUOUS_CHI2, Solutions
 from torchpose.pose.solve import solve_poses
 
 __all__ = [
     "AMBIGUOUS_CHI2",
-    "MIN_MARKERS",
     "Evidence",
     "Found",
     "Solutions",
+    "best_copies",
     "center_rms",
     "common_center",
     "compensate",

@@ -1,14 +1,16 @@
-"""What became of every target in every frame: who owns a ring that two targets claim, the status, the rows returned."""
+"""What became of every target in every frame: who owns a ring that two rows claim, the status, the rows returned."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchpose.identify import Identified, Scene
+from torchpose.geometry.segments import marked, rank_in_group
+from torchpose.identify import MIN_MARKERS, Identified, Scene
 from torchpose.pose.centers import raw_centers
 from torchpose.pose.evidence import Evidence
-from torchpose.pose.solutions import MIN_MARKERS, Solutions
+from torchpose.pose.solutions import Solutions
 from torchpose.results import Detections, Poses, Reason, Status
 from torchpose.rings import Rings
 
@@ -27,14 +29,14 @@ class Found(NamedTuple):
 
 
 def outcome(scene: Scene, found: Found) -> Poses:
-    """Rows of every frame and target."""
+    """Rows of every frame and target: at least one, and one for each copy that has a pose."""
     rows, solvable, solutions = len(found.evidence), found.solvable, found.solutions
     device = solvable.device
     mask = found.evidence.mask.index_copy(0, solvable, solutions.mask)
     status = torch.full((rows,), int(Status.REJECTED), device=device).index_copy(0, solvable, solutions.status)
     reason = torch.full((rows,), int(Reason.RESIDUAL), device=device).index_copy(0, solvable, solutions.reason)
     support = torch.where(status == Status.REJECTED, 0, mask.sum(-1))
-    awarded, claimed = _awarded(support, mask, found.identified.ring, len(found.rings))
+    awarded, claimed = _awarded(scene, support, mask, found.identified.ring, len(found.rings))
 
     # without a pose: the rings that nobody else explains tell why
     proposed = found.identified.proposed(~claimed)
@@ -48,33 +50,66 @@ def outcome(scene: Scene, found: Found) -> Poses:
         return torch.where(kept, out.index_copy(0, solvable, values), torch.nan)
 
     names = ("R", "t", "covariance", "rms", "chi2", "R_alt", "t_alt", "rms_alt", "chi2_alt")
-    return Poses(
+    every = Poses(
         frame=scene.frame,
         target=scene.target,
+        instance=torch.zeros_like(scene.frame),
+        copies=torch.maximum(
+            found.identified.copies, torch.bincount(scene.group[awarded], minlength=scene.groups)[scene.group]
+        ),
         status=torch.where(few, few_status, status),
         reason=torch.where(few, int(Reason.NONE), reason),
         markers=torch.where(few, proposed, mask.sum(-1)),
         detections=_detections(scene, found, mask),
         **{name: spread(getattr(solutions, name)) for name in names},
     )
+    return every if rows == scene.groups else _numbered(scene, every, awarded)
+
+
+def _numbered(scene: Scene, poses: Poses, awarded: Tensor) -> Poses:
+    """The rows with a pose, from left to right, or the best-supported one of a frame and target without any.
+
+    Args:
+        scene: whose each row is.
+        poses: rows of which those of one frame and target are sorted by support; detections have the row for number.
+        awarded: (N,) bool, rows with a pose.
+    """
+    kept, place = _instances(scene, awarded, poses.t)
+    number = torch.full_like(scene.frame, -1).index_copy_(0, kept, place)
+    seen = replace(poses.detections, instance=number[poses.detections.instance])
+    return replace(poses[kept], instance=place, detections=seen[seen.instance >= 0])
+
+
+def _instances(scene: Scene, awarded: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+    """Indices (P,) of the rows to return, see `_numbered`, and their numbers (P,) among those of a frame and target."""
+    group = scene.group
+    first = torch.cat([awarded.new_ones(1), group.diff() > 0])[: len(group)]
+    kept = (awarded | (first & ~marked(group[awarded], scene.groups)[group])).nonzero()[:, 0]
+    left = scene.camera.project(t[kept])[:, 0].nan_to_num(nan=torch.inf)
+    place = rank_in_group(group[kept], by=left)
+    order = torch.argsort(group[kept] * len(group) + place)
+    return kept[order], place[order]
 
 
 def _detections(scene: Scene, found: Found, mask: Tensor) -> Detections:
-    """The markers of the rows that the mask (N, M) has."""
+    """The markers of the rows that the mask (N, M) has; their instance is the row, or 0 where each has one."""
     row, marker = mask.nonzero().unbind(-1)
     ring, target = found.rings[found.identified.ring[row, marker]], scene.target[row]
     evidence = found.evidence
     center, covariance = raw_centers(scene.camera, evidence.center[row, marker], evidence.covariance[row, marker])
     ids = scene.table.ids[target, marker]
-    return Detections(scene.frame[row], target, ids, center, covariance, ring.outer_raw, ring.inner_raw)
+    number = torch.zeros_like(row) if len(mask) == scene.groups else row
+    return Detections(scene.frame[row], target, number, ids, center, covariance, ring.outer_raw, ring.inner_raw)
 
 
-def _awarded(support: Tensor, mask: Tensor, ring: Tensor, rings: int) -> tuple[Tensor, Tensor]:
+def _awarded(scene: Scene, support: Tensor, mask: Tensor, ring: Tensor, rings: int) -> tuple[Tensor, Tensor]:
     """Rows (N,) bool that keep their pose, and rings (K,) bool that these explain.
 
-    A ring belongs to one target: where two claim it, to the one that explains more rings.
+    A ring belongs to one copy of one target: where two claim it, to the one that explains more rings; of two copies of
+    one target that explain as many, to the better-supported one.
 
     Args:
+        scene: whose each row is.
         support: (N,) int64, number of rings the pose explains, 0 without one.
         mask: (N, M) bool, which markers' rings.
         ring: (N, M) int64, index into the ``rings`` K.
@@ -84,7 +119,10 @@ def _awarded(support: Tensor, mask: Tensor, ring: Tensor, rings: int) -> tuple[T
     of = ring[row, marker]
     best = torch.zeros(rings, dtype=support.dtype, device=support.device)
     best.scatter_reduce_(0, of, support[row], "amax")
-    outdone = torch.zeros_like(support).index_add_(0, row, (support[row] < best[of]).to(support.dtype)) > 0
-    claimed = torch.zeros(rings, dtype=torch.bool, device=support.device)
-    claimed[of[~outdone[row]]] = True
+    less = support[row] < best[of]
+    slot = of * len(scene.table) + scene.target[row]
+    first = torch.full((rings * len(scene.table),), len(mask), device=row.device)
+    first.scatter_reduce_(0, slot[~less], row[~less], "amin")
+    outdone = marked(row[less | (row > first[slot])], len(mask))
+    claimed = marked(of[~outdone[row]], rings)
     return (support > 0) & ~outdone, claimed

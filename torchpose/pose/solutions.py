@@ -12,7 +12,6 @@ from torchpose.geometry.rows import Rows
 from torchpose.results import Status
 
 AMBIGUOUS_CHI2 = 20.0  # contract: two poses are ambiguous where their chi-squared differs by less
-MIN_MARKERS = 3  # seen, that a pose needs
 
 
 @dataclass(frozen=True, eq=False)

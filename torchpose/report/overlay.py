@@ -119,8 +119,25 @@ class Overlay:
         for row in rows:
             for axis, colour in zip(lines[row], _AXES, strict=True):
                 draw_polyline(picture, axis, colour, max(1, round(1.5 * unit)))
-        _banners(picture, [self._banner(poses, row) for row in rows], name, unit)
+        target = poses.target[rows]
+        banners = [
+            self._banner(poses, row) if of == 1 else self._numbered(picture, poses, row, lines[row, 0, 0], unit)
+            for row, of in zip(rows, (target[:, None] == target).sum(1).tolist(), strict=True)
+        ]
+        # the banners of many copies would hide the picture: the plate of a target says how many there are
+        _banners(picture, list(dict.fromkeys(banner for banner in banners if banner)), name, unit)
         return picture
+
+    def _numbered(self, picture: np.ndarray, poses: Poses, row: int, at: np.ndarray, unit: float) -> tuple[str, Colour]:
+        """Writes the number of a copy at its origin, and gives text and colour of the plate of all of them."""
+        status = Status(int(poses.status[row]))
+        if np.isfinite(at).all():
+            place = (float(at[0]) + 4 * unit, float(at[1]) - 4 * unit)
+            draw_text(picture, f"#{int(poses.instance[row])}", place, unit, _STATUS_COLOUR.get(status, _RED))
+        every = (poses.frame == poses.frame[row]) & (poses.target == poses.target[row])
+        ok = int(poses.ok[every].sum())
+        text = f"{self._names[int(poses.target[row])]}: {int(every.sum())} copies, {ok} ok"
+        return text, _GREEN if ok == int(every.sum()) else _AMBER
 
     def _banner(self, poses: Poses, row: int) -> tuple[str, Colour]:
         """Text and colour of the plate of one pose."""

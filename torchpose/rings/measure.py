@@ -234,9 +234,7 @@ def _measure_small(
 ) -> tuple[Rings, Tensor]:
     """The same for rings whose circles are too close to each other, or too small, to be measured one by one."""
     focal = camera.matrix.diagonal()[:2].mean()
-    found = fit_small_rings(
-        frames, candidates.frame, candidates.ellipse, inside.ratio, inside.seen, candidates.polarity, focal, inside.blur
-    )
+    found = fit_small_rings(frames, candidates, inside, focal)
     least_outer, least_inner = _LEAST_SEMI_MINOR
     large = (found.outer.params[:, 3] > least_outer) & (found.inner.params[:, 3] > least_inner)
     index = (found.good & large).nonzero()[:, 0]

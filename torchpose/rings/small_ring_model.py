@@ -14,6 +14,7 @@ from torchpose.geometry.blurred_edge import Spread
 from torchpose.geometry.blurred_ellipse import blurred_ellipse, nodes_needed
 
 RING = 8  # parameters
+_DEEPEST = 0.4  # of a radius of curvature: nearer to the centre a pixel sees the edge on all sides
 MOST_NODES = 120  # of the exact integral: enough for a semi-major axis of 19 blurs
 
 
@@ -27,7 +28,8 @@ def outer_ellipses(theta: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class Depth(NamedTuple):
-    """Of pixels (K, P) and an ellipse: first-order distance outside, unit normal, S^-1 (x - c), |grad|, curvature."""
+    """Of pixels (K, P) and an ellipse: first-order distance outside, unit normal, S^-1 (x - c), |grad|, and the
+    curvature of the level curve through the pixel."""
 
     distance: Tensor
     nx: Tensor
@@ -51,8 +53,10 @@ def depth(theta: Tensor, x: Tensor, y: Tensor, inner: bool = False) -> Depth:
     gx, gy = (i11 * u + i12 * v) / rho, (i12 * u + i22 * v) / rho
     length = (gx * gx + gy * gy).sqrt().clamp_min(1e-9)
     scale = theta[:, 5:6] if inner else 1.0
+    distance = (rho - scale) / length
     curvature = 1 / (length.pow(3) * det.square()[:, None] * scale).clamp_min(1e-9)
-    return Depth((rho - scale) / length, gx / length, gy / length, u, v, length, curvature)
+    curvature = curvature / (1 + curvature * distance).clamp_min(_DEEPEST)
+    return Depth(distance, gx / length, gy / length, u, v, length, curvature)
 
 
 def first_order(theta: Tensor, spread: Spread, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:

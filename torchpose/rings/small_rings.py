@@ -6,7 +6,7 @@ measurement. The whole ring as one model has no such limit:
     I = paper + slope . x + contrast (E(1) - E(q)),
 
 E(s) the blurred indicator of the ellipse scaled by s, q the ratio of the radii. To first order in the distance it is
-that of a curved edge (`geometry.blurred_edge`). Where the blur is more than a fifth of the inner circle, that is off by
+that of a curved edge (`geometry.blurred_edge`). Where the blur is more than a third of the inner circle, that is off by
 up to a quarter of the contrast, and the ring is fitted once more with the exact integral (`geometry.blurred_ellipse`).
 The circles share their shape; perspective parts their centres by about a^2 (1 - q^2) / f at most (a the semi-major
 axis, f the focal length, px), the standard deviation of a prior at zero. What covers a part of the ring, or touches it,
@@ -21,9 +21,10 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, cast
 
 import torch
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
+from torchpose.detect import Candidates
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
@@ -39,6 +40,7 @@ from torchpose.geometry.least_squares import (
 )
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import values_at
+from torchpose.rings.inner_circles import InnerCircles
 from torchpose.rings.small_ring_model import MOST_NODES, RING, depth, exact, first_order, outer_ellipses
 
 _MARGIN = 3.0  # px around the outer ellipse
@@ -51,7 +53,7 @@ _LEAST_KEPT = 0.5  # of the pixels
 _MOST_MOVE = (*[0.7] * 5, 0.1, *[0.7] * 2)  # of an iteration: px, and the ratio
 _START_SIGMA = 0.8  # px, at least
 _OVAL = 0.3  # of a blur's mean variance: what is expected of its lean, which a ring as small as its blur hardly tells
-_BLURRED = 0.2  # blur over inner semi-minor axis above which edges are no edges any more
+_BLURRED = 0.33  # blur over inner semi-minor axis above which edges are no edges any more
 _BLURRED_MARGIN = 2.5  # blurs around the outer ellipse
 _LEAST_EXPLAINED = 0.75  # of the variance of grey around the ring
 _PROMISING = 0.5  # of it, from the first fit, for a second one
@@ -104,39 +106,34 @@ class _Scheme(NamedTuple):
 
 
 # grey levels and weights alone at first, so that a cover does not pull from the start
-_ROUGH = _Scheme(first_order, 1e-3, (_Stage(2, held=True, sectors=False), _Stage(5), _Stage(3, hard=True)))
+_ROUGH = _Scheme(first_order, 1e-3, (_Stage(2, held=True, sectors=False), _Stage(6), _Stage(3, hard=True)))
 # blur, width and contrast of a ring much blurred are hard to tell apart: no step is to be shortened
 _PRECISE = _Scheme(exact, 1e-5, (_Stage(6), _Stage(4, hard=True)))
 
 
 def fit_small_rings(
-    frames: Shaped[Tensor, "B H W"],
-    frame: Int[Tensor, " K"],
-    outer: Float[Tensor, "K 5"],
-    ratio: Float[Tensor, " K"],
-    seen: Bool[Tensor, "K A"],
-    polarity: Float[Tensor, " K"],
-    focal: Float[Tensor, ""],
-    blur: Float[Tensor, "K 3"] | None = None,
+    frames: Shaped[Tensor, "B H W"], candidates: Candidates, inside: InnerCircles, focal: Float[Tensor, ""]
 ) -> SmallRings:
     """Fits the model above by damped Gauss-Newton from rough rings.
 
     Args:
         frames: grey, any real dtype.
-        frame: of each ring.
-        outer: rough outer ellipses, px.
-        ratio: rough, of the radii.
-        seen: the directions in which the outer edge shows, see `inner_circles.find_inner`; the others do not count.
-        polarity: +1 for a dark ring.
+        candidates: the outer circles, about.
+        inside: what is inside of them, about; directions in which the outer edge does not show do not count.
         focal: px.
-        blur: rough, px^2.
     """
+    frame, outer, polarity, ratio, seen = (
+        candidates.frame,
+        candidates.ellipse,
+        candidates.polarity,
+        inside.ratio,
+        inside.seen,
+    )
     shape = conics.shape_matrix(outer)
     start = [outer[:, :2], shape[:, 0, :1], shape[:, 0, 1:], shape[:, 1, 1:], ratio[:, None]]
     theta = torch.cat([*start, torch.zeros_like(outer[:, :2])], -1)
     parted = (outer[:, 2].square() * (1 - ratio.square()) / focal).clamp_min(_LEAST_PARTED)
-    blur = blurs.isotropic(torch.full_like(ratio, _START_SIGMA)) if blur is None else blur
-    begun = _Start(theta, Spread(blurs.limited(blur, _START_SIGMA**2, MOST**2)), seen, parted)
+    begun = _Start(theta, Spread(blurs.limited(inside.blur, _START_SIGMA**2, MOST**2)), seen, parted)
     fit = _no_fit(begun)
     margin = torch.full_like(ratio, _MARGIN)
     for part in _parts(_pixels(outer, margin), 1):

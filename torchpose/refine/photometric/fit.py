@@ -21,7 +21,7 @@ from torchpose.geometry import blur as blurs
 from torchpose.geometry.blurred_edge import LEAST, MOST, Kind, Spread
 from torchpose.geometry.least_squares import Block, Minimum, Normal, Pose, PosePrior, Unknowns, Vector, minimise
 from torchpose.geometry.rows import Rows
-from torchpose.geometry.segments import segment_sum
+from torchpose.geometry.segments import segment_mean, segment_sum
 from torchpose.refine.photometric.band import band_width
 from torchpose.refine.photometric.grey_levels import (
     TILE,
@@ -56,7 +56,9 @@ class _Stage(NamedTuple):
 
 
 _KINDS: tuple[Kind, ...] = ("gauss", "line", "disc")
+_LONG = 1.7  # variance along the major axis over the minor one: a motion of 2 px, from which on it may be a line
 _SIGNIFICANT = 4.0  # standard deviations of a mean square
+_MATTERS = 0.004  # of the contrast, RMS at the edges: that of a disc of 2 px, which costs a tenth in the covariance
 _FEWER = 0.02  # of the pixels that a shape of the blur may keep less than a Gaussian, and still explain them better
 _QUICK = (_Stage(3, coarse=True), _Stage(1))
 _THOROUGH = (_Stage(3, coarse=True, wary=True), _Stage(2, wary=True), _Stage(2, wary=True, tempered=True))
@@ -110,11 +112,12 @@ def _refined_in(sight: Sight, start: Pose, known: PosePrior | None) -> Refined:
     if bool(wide.any()):
         result = result.replaced(*again(wide, "gauss", _QUICK))
     kind = torch.zeros_like(sight.frame)
-    misshapen = result.misshapen
-    for number, name in enumerate(_KINDS):
-        if name == "gauss" or not bool(misshapen.any()):
+    least, most = blurs.axes(result.refined.spread)
+    long = most > _LONG * least
+    for number, rows in ((1, result.misshapen & long), (2, result.misshapen & ~long)):
+        if not bool(rows.any()):
             continue
-        index, other = again(misshapen, name, _QUICK)
+        index, other = again(rows, _KINDS[number], _QUICK)
         better = other.refined.noise < result.refined.noise[index]
         better &= other.refined.kept > result.refined.kept[index] - _FEWER
         result = result.replaced(index[better], other[better])
@@ -184,7 +187,7 @@ class _Fit:
         residual = columns[:, :, -1].flatten(1)
         self.usable, self.weight = inliers(residual, part, model, levels)
         if not stage.coarse:
-            self.misshapen = self._stands_out(residual, slope)
+            self.misshapen = self._stands_out(residual, slope, levels)
             self.sectors = sum_sectors(residual, slope, self.usable, self.weight, part, model)
             factor = self._trusted(noise_spread(residual, part), model_misfit(levels))
             self.weight = self.weight * self.sectors.of_pixels(factor.to(self.weight.dtype))
@@ -193,18 +196,21 @@ class _Fit:
         normal, self.variance = normal_equations(sums, self.weight.sum(-1), levels, part.row, self.least, prior)
         return normal
 
-    def _stands_out(self, residual: Tensor, slope: Tensor) -> Tensor:
-        """Rows (N,) bool whose mean square residual is larger at the edges than elsewhere, beyond chance.
+    def _stands_out(self, residual: Tensor, slope: Tensor, levels: Tensor) -> Tensor:
+        """Rows (N,) bool whose mean square residual is larger at the edges than elsewhere, beyond chance and by so much
+        of the contrast that it matters.
 
         A wrong blur leaves residuals where grey values change, on both sides alike: they pull at no edge.
         """
+        contrast = segment_mean((levels[:, 3] - levels[:, 0]).abs(), self.blocks.row, len(self.least))
         steep = self.weight * slope.square()
         square = residual.square()
         planes = (steep * square, steep, steep * slope.square(), self.weight * square, self.weight)
         sums = [segment_sum(plane.double().sum(-1), self.blocks.row, len(self.least)) for plane in planes]
         at_edges, everywhere = sums[0] / sums[1], sums[3] / sums[4]
         pixels = sums[1].square() / sums[2]
-        return at_edges > everywhere * (1 + _SIGNIFICANT * (2 / pixels).sqrt())
+        matters = at_edges - everywhere > (_MATTERS * contrast).square()
+        return matters & (at_edges > everywhere * (1 + _SIGNIFICANT * (2 / pixels).sqrt()))
 
     def _trusted(self, spread: Tensor, misfit: Tensor) -> Tensor:
         """Weights (K, 96) of the sectors."""

@@ -25,7 +25,7 @@ from torchpose.refine.photometric.band import band_pixels
 from torchpose.refine.sight import Sight
 
 _FULL_SCALES = (255.0, 1023.0, 4095.0, 16383.0, 65520.0, 65535.0)  # of 8 to 16 bits; 12 bits in the upper ones of 16
-_CURVED = 0.2  # blur's variance over the squared radius of curvature: nearer to its centre a pixel sees edges on all sides
+_CURVED = 0.2  # blur's variance over the squared radius of curvature: nearer to its centre edges are on all sides
 _BENT = 0.4  # of a distance from an edge: the most that its second-order term may be
 _FAR = 3.5  # standard deviations of the blur from an edge, from where on neither matters
 
