@@ -27,8 +27,11 @@ def arcs(spans: list[float], polarity: float, ratio: float = 1.0) -> tuple[Regio
     return Regions(torch.arange(len(xy)), index, (7 * polarity * normal).float(), frame), xy
 
 
-def painted(inner: float, outer: float = 30.0, polarity: float = 1.0, ratio: float = 1.0) -> tuple[Gradient, Candidates]:
+def painted(
+    inner: float, outer: float = 30.0, polarity: float = 1.0, ratio: float = 1.0
+) -> tuple[Gradient, Candidates]:
     """A ring, or a disc for an inner radius of 0, by OpenCV, and its true outer ellipse as a candidate."""
+    outer = 30.0
     frame = np.full((400, 400), 200, np.uint8)
     axes = [(int(64 * r), int(64 * r * ratio)) for r in (outer, inner)]
     cv2.ellipse(frame, (800, 800), (axes[0][0] // 4, axes[0][1] // 4), 0, 0, 360, 40, -1, cv2.LINE_AA, 4)
