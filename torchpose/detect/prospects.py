@@ -1,4 +1,4 @@
-"""What may become a ring that is wanted: two cheap looks, before anything is fitted and before anything is followed.
+"""What may become a ring that is wanted: cheap looks before anything is fitted, and before anything is followed.
 
 A region turns with its gradient: along a circle the unit gradient is the place on it, less the centre, over the radius.
 How far both go together tells circles from straight edges and from texture, by sums alone. And a ring has a second edge
@@ -14,9 +14,9 @@ from torchpose.detect.validation import Candidates
 from torchpose.geometry import conics
 from torchpose.geometry.segments import positions, run_sums, values_at
 
+_CREST = 0.5  # of squared gradients: with 0.64 more rings are lost, with 0.36 less is saved (docs/tried.md)
 # Of true rings of `scripts/clutter_statistics.py`, seeds 41, 42 and 33: regions of outer circles have a mean direction
 # of length 0.64 at most and a roundness of at least 0.27; an ellipse of an axes' ratio of 0.12 has 0.27 as well.
-_CREST = 0.5  # of squared gradients
 _STRAIGHT = 0.8  # length of the mean direction of a region that turns too little: an arc of 130 degrees has 0.8
 _ROUND = 0.2
 _LINE = 0.985  # an arc of 34 degrees
