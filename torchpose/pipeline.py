@@ -158,11 +158,9 @@ class PoseEstimator(nn.Module):
         """
         frames = self._checked(frames)
         scene = Scene.of(frames, self.camera.to(frames.device), self.table.to(frames.device))
-        rings, identified = self._identified(scene)
-        scene = scene.of_rows(identified.group)
-        scene, found = best_copies(scene, self._solved(scene, rings, identified), self.instances)
+        scene, found = self._found(scene)
         again = self._second_look(scene, found)
-        if len(again[0]) > len(rings):
+        if len(again[0]) > len(found.rings):
             found = self._solved(scene, *again)
         if found.solvable.numel():
             found = found._replace(solutions=self._refined(scene, found))
@@ -190,32 +188,31 @@ class PoseEstimator(nn.Module):
             frames = frames.float() * (255.0 / self.float_range)
         return frames.contiguous()
 
-    def _identified(self, scene: Scene) -> tuple[Rings, Identified]:
-        """Rings of all frames and which markers they are: from the coarse scale alone where that shows every target."""
+    def _found(self, scene: Scene) -> tuple[Scene, Found]:
+        """What is found in all frames: at the coarse scale alone where that shows every target whole."""
         frames, wanted = scene.frames, Wanted.of(scene.table.polarity, _LEAST_CANDIDATE)
 
-        def measured(candidates: Candidates, frame: Tensor | None = None) -> Rings:
-            if frame is not None:
-                candidates = replace(candidates, frame=frame[candidates.frame])
+        def measured(candidates: Candidates) -> Rings:
             candidates = candidates[torch.isin(candidates.polarity, scene.table.polarity)]
             return measure_rings(frames, candidates, scene.camera, correct=self._recipe.correct)
 
-        def named(rings: Rings) -> Identified:
-            return identify(rings, scene.table, scene.camera, len(frames))
-
         if self.instances > 1:  # a copy may be too small for the coarse scale
-            rings = measured(find_candidates(frames, wanted=wanted))
-            return rings, named(rings)
+            return self._read(scene, measured(find_candidates(frames, wanted=wanted)))
         rings = measured(find_coarse(frames, wanted=wanted))
-        identified = named(rings)
-        missing = scene.table.valid[identified.group % len(scene.table)] & (identified.ring < 0)
-        whole = marked(identified.group[~missing.any(1)], scene.groups).view(len(frames), len(scene.table)).all(1)
-        if bool(whole.all()):
-            return rings, identified
-        rest = (~whole).nonzero()[:, 0]
-        finer = measured(find_candidates(frames[rest], wanted=wanted), rest)
-        rings = Rings.cat([rings[whole[rings.frame]], finer])
-        return rings, named(rings)
+        coarse = self._read(scene, rings)
+        settled = _settled(*coarse)
+        if bool(settled.all()):
+            return coarse
+        rest = (~settled).nonzero()[:, 0]
+        finer = find_candidates(frames[rest], wanted=wanted)
+        finer = replace(finer, frame=rest[finer.frame])
+        return self._read(scene, Rings.cat([rings[settled[rings.frame]], measured(finer)]))
+
+    def _read(self, scene: Scene, rings: Rings) -> tuple[Scene, Found]:
+        """Rows of the rings of all frames, identified and solved."""
+        identified = identify(rings, scene.table, scene.camera, len(scene.frames))
+        scene = scene.of_rows(identified.group)
+        return best_copies(scene, self._solved(scene, rings, identified), self.instances)
 
     def _solved(self, scene: Scene, rings: Rings, identified: Identified) -> Found:
         """The evidence of every row, and the solutions of those rows that have enough of it."""
@@ -250,6 +247,14 @@ class PoseEstimator(nn.Module):
         used = replace(evidence, mask=solutions.mask)
         more = intrinsics_covariance(used, solutions.R, solutions.t, scene.camera, refined=self._recipe.on_rims)
         return replace(solutions, covariance=solutions.covariance + more)
+
+
+def _settled(scene: Scene, found: Found) -> Tensor:
+    """Frames (B,) bool in which every target has a row with all of its markers and a pose that they agree on."""
+    agreed = found.solvable[found.solutions.status == Status.OK]
+    missing = scene.table.valid[scene.target] & (found.identified.ring < 0)
+    good = marked(agreed, len(scene.frame)) & ~missing.any(1)
+    return marked(scene.group[good], scene.groups).view(len(scene.frames), len(scene.table)).all(1)
 
 
 def _check_targets(targets: Sequence[Target]) -> None:
