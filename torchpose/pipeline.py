@@ -198,13 +198,16 @@ class PoseEstimator(nn.Module):
 
         if self.instances > 1:  # a copy may be too small for the coarse scale
             return self._read(scene, measured(find_candidates(frames, wanted=wanted)))
-        rings = measured(find_coarse(frames, wanted=wanted))
-        coarse = self._read(scene, rings)
-        settled = _settled(*coarse)
+        coarse = find_coarse(frames, wanted=wanted)
+        rings = measured(coarse)
+        first = self._read(scene, rings)
+        settled = _settled(*first)
         if bool(settled.all()):
-            return coarse
-        rest = (~settled).nonzero()[:, 0]
-        finer = find_candidates(frames[rest], wanted=wanted)
+            return first
+        rest, number = (~settled).nonzero()[:, 0], (~settled).cumsum(0) - 1
+        known = coarse[~settled[coarse.frame]]
+        known = replace(known, frame=number[known.frame])
+        finer = find_candidates(frames[rest], wanted=wanted, coarse=known)
         finer = replace(finer, frame=rest[finer.frame])
         return self._read(scene, Rings.cat([rings[settled[rings.frame]], measured(finer)]))
 
