@@ -14,6 +14,7 @@ from torchpose.camera import Camera
 from torchpose.camera.model import Model
 from torchpose.detect import Candidates, Wanted, find_candidates, find_coarse
 from torchpose.errors import ConfigError, FrameError
+from torchpose.geometry import blur as blurs
 from torchpose.geometry.grey import grey
 from torchpose.geometry.segments import marked
 from torchpose.identify import (
@@ -39,12 +40,13 @@ from torchpose.pose import (
 )
 from torchpose.refine import METHODS, Recipe, Sight
 from torchpose.results import Poses, Reason, Status
-from torchpose.rings import Rings, measure_rings
+from torchpose.rings import Circles, Rings, find_circles, measure_circles, measure_rings, rough_rings
 from torchpose.target import Target
 
 _LEAST_CANDIDATE = (
     3.0  # px of semi-minor axis: rings below 4 are refused (`rings.measure`); candidates of covered ones err
 )
+_LEGIBLE = 1.8  # px, of blur, up to which the mean profile of a ring tells its code
 _FRAME_TYPES = (torch.uint8, torch.uint16, torch.float16, torch.bfloat16, torch.float32, torch.float64)
 Method = Literal["photometric", "edges", "centers", "paper"]
 
@@ -191,16 +193,11 @@ class PoseEstimator(nn.Module):
     def _found(self, scene: Scene) -> tuple[Scene, Found]:
         """What is found in all frames: at the coarse scale alone where that shows every target whole."""
         frames, wanted = scene.frames, Wanted.of(scene.table.polarity, _LEAST_CANDIDATE)
-
-        def measured(candidates: Candidates) -> Rings:
-            candidates = candidates[torch.isin(candidates.polarity, scene.table.polarity)]
-            return measure_rings(frames, candidates, scene.camera, correct=self._recipe.correct)
-
         if self.instances > 1:  # a copy may be too small for the coarse scale
-            return self._read(scene, measured(find_candidates(frames, wanted=wanted)))
+            return self._read(scene, self._rings(scene, find_candidates(frames, wanted=wanted)))
         coarse = find_coarse(frames, wanted=wanted)
-        rings = measured(coarse)
-        first = self._read(scene, rings)
+        rings, copies = self._likely(scene, coarse)
+        first = self._read(scene, rings, copies)
         settled = _settled(*first)
         if bool(settled.all()):
             return first
@@ -208,12 +205,39 @@ class PoseEstimator(nn.Module):
         known = coarse[~settled[coarse.frame]]
         known = replace(known, frame=number[known.frame])
         finer = find_candidates(frames[rest], wanted=wanted, coarse=known)
-        finer = replace(finer, frame=rest[finer.frame])
-        return self._read(scene, Rings.cat([rings[settled[rings.frame]], measured(finer)]))
+        finer = self._rings(scene, replace(finer, frame=rest[finer.frame]))
+        return self._read(scene, Rings.cat([rings[settled[rings.frame]], finer]), copies)
 
-    def _read(self, scene: Scene, rings: Rings) -> tuple[Scene, Found]:
-        """Rows of the rings of all frames, identified and solved."""
+    def _rings(self, scene: Scene, candidates: Candidates) -> Rings:
+        candidates = candidates[torch.isin(candidates.polarity, scene.table.polarity)]
+        return measure_rings(scene.frames, candidates, scene.camera, correct=self._recipe.correct)
+
+    def _likely(self, scene: Scene, candidates: Candidates) -> tuple[Rings, Tensor]:
+        """The rings that the best copy of every target has by its circles' rough places and codes, measured.
+
+        Also how many copies (B T,) were seen.
+        """
+        candidates = candidates[torch.isin(candidates.polarity, scene.table.polarity)]
+        circles = find_circles(scene.frames, candidates, scene.camera)
+        # the code of a much blurred ring is not to be read off its profile
+        blurred = blurs.axes(circles.inside.blur)[1] > _LEGIBLE**2
+
+        def measured(some: Circles) -> Rings:
+            how = {"correct": self._recipe.correct, "precise": not self._recipe.on_rims}
+            return measure_circles(scene.frames, some, scene.camera, **how)
+
+        sharp, known = circles[~blurred], measured(circles[blurred])
+        rough = Rings.cat([rough_rings(sharp, scene.camera), known])
+        likely = identify(rough, scene.table, scene.camera, len(scene.frames), instances=1)
+        named = marked(likely.ring[likely.ring >= 0], len(rough))
+        rings = Rings.cat([measured(sharp[named[: len(sharp)]]), known[named[len(sharp) :]]])
+        return rings, likely.copies
+
+    def _read(self, scene: Scene, rings: Rings, copies: Tensor | None = None) -> tuple[Scene, Found]:
+        """Rows of the rings of all frames, identified and solved; at least so many ``copies`` (B T,) were seen."""
         identified = identify(rings, scene.table, scene.camera, len(scene.frames))
+        if copies is not None:
+            identified = replace(identified, copies=identified.copies.maximum(copies[identified.group]))
         scene = scene.of_rows(identified.group)
         return best_copies(scene, self._solved(scene, rings, identified), self.instances)
 

@@ -112,7 +112,12 @@ _PRECISE = _Scheme(exact, 1e-5, (_Stage(6), _Stage(4, hard=True)))
 
 
 def fit_small_rings(
-    frames: Shaped[Tensor, "B H W"], candidates: Candidates, inside: InnerCircles, focal: Float[Tensor, ""]
+    frames: Shaped[Tensor, "B H W"],
+    candidates: Candidates,
+    inside: InnerCircles,
+    focal: Float[Tensor, ""],
+    *,
+    precise: bool = True,
 ) -> SmallRings:
     """Fits the model above by damped Gauss-Newton from rough rings.
 
@@ -121,6 +126,7 @@ def fit_small_rings(
         candidates: the outer circles, about.
         inside: what is inside of them, about; directions in which the outer edge does not show do not count.
         focal: px.
+        precise: fit rings of a wide blur by the exact integral; else a code may be off by a fifth of its tolerance.
     """
     frame, outer, polarity, ratio, seen = (
         candidates.frame,
@@ -139,6 +145,8 @@ def fit_small_rings(
     for part in _parts(_pixels(outer, margin), 1):
         some = _fitted(_windows(frames, frame[part], outer[part], margin[part]), begun[part], _ROUGH)
         fit = fit.replaced(part, some)
+    if not precise:
+        return _judged(fit, outer, polarity)
     which = _blurred(fit, outer, polarity)
     reach = (_BLURRED_MARGIN * blurs.axes(fit.blur)[1].sqrt()).clamp_min(_MARGIN)
     begun = replace(begun, theta=fit.theta, spread=Spread(fit.blur))
