@@ -205,8 +205,8 @@ class PoseEstimator(nn.Module):
         known = coarse[~settled[coarse.frame]]
         known = replace(known, frame=number[known.frame])
         finer = find_candidates(frames[rest], wanted=wanted, coarse=known)
-        finer = self._rings(scene, replace(finer, frame=rest[finer.frame]))
-        return self._read(scene, Rings.cat([rings[settled[rings.frame]], finer]), copies)
+        more = self._rings(scene, replace(finer, frame=rest[finer.frame]))
+        return self._read(scene, Rings.cat([rings[settled[rings.frame]], more]), copies)
 
     def _rings(self, scene: Scene, candidates: Candidates) -> Rings:
         candidates = candidates[torch.isin(candidates.polarity, scene.table.polarity)]

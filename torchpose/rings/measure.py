@@ -223,8 +223,7 @@ def _measure(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tup
         if index.numel():
             rings, of = measured(frames, circles[index], camera, how)
             parts.append((rings, index[of]))
-    rings, which = zip(*parts, strict=True)
-    return Rings.cat(rings), torch.cat(which)
+    return Rings.cat([rings for rings, _ in parts]), torch.cat([which for _, which in parts])
 
 
 def _by_edges(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tuple[Rings, Tensor]:
