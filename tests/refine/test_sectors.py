@@ -114,7 +114,8 @@ def test_grey_values_tell_a_tilt_from_its_mirror_image() -> None:
     flip = torch.eye(3, dtype=F64) - 2 * line[:, :, None] * line[:, None]
     normal = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=F64))
     mirrored = Refined(flip @ r @ normal, t, right.covariance, right.spread, right.noise, right.kept, right.good)
-    chi2, explained = grey_chi2(given[0], right, mirrored)
+    chi2, there, explained = grey_chi2(given[0], right, mirrored)
     assert (chi2 > 20).all()
+    assert there[:, 0].all()
     assert explained[:, 0].all()
     torch.testing.assert_close(grey_chi2(given[0], mirrored, right)[0], -chi2)

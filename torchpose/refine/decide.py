@@ -19,6 +19,7 @@ from torchpose.refine.sight import LEAST_KEPT, Refined, Sight
 from torchpose.results import Reason, Status
 
 _FLOOR = 0.03  # px, of a centre: what blur, covers and clutter do to it beyond its covariance
+_CLOSE = 200.0  # difference of chi-squared that small blurred rings were seen to be wrong by 37 of
 _MOST_CHI2 = 5.0  # per degree of freedom, above which the better pose does not explain the centres itself
 
 
@@ -60,7 +61,8 @@ def decide_on_grey(solutions: Solutions, evidence: Evidence, sight: Sight) -> So
 
     Both are refined. If they meet, there was one minimum; else the one that explains the grey values better wins. Rows
     that were rejected for the shapes of their rings, which blur, glare and covers bend, are `Status.OK` if beyond that
-    the grey values of most of the edges of every marker agree with the pose.
+    the grey values of most of the edges of every marker agree with the pose. Rows whose centres and shapes leave the
+    other pose close behind are turned where the grey values say so.
 
     Args:
         solutions: N rows.
@@ -68,19 +70,21 @@ def decide_on_grey(solutions: Solutions, evidence: Evidence, sight: Sight) -> So
         sight: the same rows in their frames.
     """
     shape = (solutions.status == Status.REJECTED) & (solutions.reason == Reason.RING_SHAPE)
-    row = ((solutions.status == Status.AMBIGUOUS) | shape).nonzero()[:, 0]
+    close = (solutions.status == Status.OK) & (solutions.chi2_alt - solutions.chi2 < _CLOSE)
+    row = ((solutions.status == Status.AMBIGUOUS) | shape | close).nonzero()[:, 0]
     if row.numel() == 0:
         return solutions
-    open_ones, shape = solutions[row], shape[row]
+    open_ones, shape, close = solutions[row], shape[row], close[row]
     sight = replace(sight[row], mask=open_ones.mask)
     one, two = (refine_photometric(sight, R, t) for R, t in _both(open_ones))
-    chi2, explained = grey_chi2(sight, one, two)
+    chi2, there, explained = grey_chi2(sight, one, two)
     swap = chi2 < 0
     better = two.where(swap, one)
     # whatever becomes of the other's fit, this one must show every ring
-    shows = torch.where(swap, explained[:, 1], explained[:, 0])
+    shows = torch.where(shape[:, None], explained, there)
+    shows = torch.where(swap, shows[:, 1], shows[:, 0])
     told = shape | (one.good & two.good & _meet(one, two)) | (chi2.abs() > AMBIGUOUS_CHI2)
-    sure = better.good & (better.kept > LEAST_KEPT) & shows & told
+    sure = better.good & (better.kept > LEAST_KEPT) & shows & told & (swap | ~close)
     decided = open_ones.swapped(swap).marked(sure, Status.OK, Reason.NONE)
     # the covariance is that of the pose which it stands beside
     own = pose_covariance(replace(evidence[row], mask=open_ones.mask), decided.R, decided.t)[0]

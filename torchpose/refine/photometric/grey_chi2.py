@@ -25,10 +25,11 @@ from torchpose.refine.sight import Refined, Sight
 _LEVEL_STEPS = 3  # of the grey levels alone
 
 
-def grey_chi2(sight: Sight, one: Refined, two: Refined) -> tuple[Tensor, Tensor]:
+def grey_chi2(sight: Sight, one: Refined, two: Refined) -> tuple[Tensor, Tensor, Tensor]:
     """Chi-squared (N,) of the grey values under the refined poses ``two`` less that under ``one``.
 
-    Also whether each of the two (N, 2) explains most of the sectors of every marker, by a ring that is there.
+    Also whether under each of the two (N, 2) every marker has a ring that differs from its paper, and whether that
+    explains most of its sectors.
 
     Both are judged on the same pixels, those that either explains, each with grey levels of its own; no pixel counts
     for more than an outlier would. Where not even the better pose explains them within noise the difference counts
@@ -38,7 +39,7 @@ def grey_chi2(sight: Sight, one: Refined, two: Refined) -> tuple[Tensor, Tensor]
     spreads = [Spread(pose.spread) for pose in (one, two)]
     band = torch.maximum(*(band_width(spread) for spread in spreads))
     blocks = gather_pixels(sight, band, TILE)
-    squares, weights, variances, misfits, explained = [], [], [], [], []
+    squares, weights, variances, misfits, there, explained = [], [], [], [], [], []
     for pose, spread in zip((one, two), spreads, strict=True):
         model = ring_model(blocks, pose.R, pose.t, spread, check=True)
         levels = first_levels(blocks, pose.R, pose.t, spread)
@@ -48,7 +49,7 @@ def grey_chi2(sight: Sight, one: Refined, two: Refined) -> tuple[Tensor, Tensor]
             usable, weight = inliers(residual, blocks, model, levels)
             sectors = sum_sectors(residual, slope, usable, weight, blocks, model)
             clear = clear_sectors(sectors, noise_spread(residual, blocks), model_misfit(levels))
-            weight = weight * sectors.of_pixels(clear.to(weight.dtype))
+            every, weight = weight, weight * sectors.of_pixels(clear.to(weight.dtype))
             sums = sum_products(columns, weight)
             levels = levels + solve_scaled(sums[:, POSE:-1, POSE:-1], sums[:, POSE:-1, -1:]).squeeze(-1)
         used = segment_sum(weight.sum(-1).double(), blocks.row, rows).clamp_min(1)
@@ -57,14 +58,16 @@ def grey_chi2(sight: Sight, one: Refined, two: Refined) -> tuple[Tensor, Tensor]
         weights.append(weight)
         variances.append(variance)
         misfits.append(misfit(sectors, clear, variance[blocks.row], blocks.row, rows))
-        shows = clear.any(-1) & _has_contrast(levels, sums[:, POSE:-1, POSE:-1], variance[blocks.row])
-        explained.append(segment_sum((~shows).double(), blocks.row, rows) == 0)
+        information = sum_products(columns, every)[:, POSE:-1, POSE:-1]
+        shows = _has_contrast(levels, information, variance[blocks.row])
+        there.append(segment_sum((~shows).double(), blocks.row, rows) == 0)
+        explained.append(segment_sum((~(shows & clear.any(-1))).double(), blocks.row, rows) == 0)
     variance = torch.minimum(*variances)
     most = (CUT**2 * variance[blocks.row, None]).to(squares[0].dtype)
     of_one, of_two = (torch.minimum(s, most) for s in squares)
     difference = (torch.maximum(*weights) * (of_two - of_one)).sum(-1).double()
     chi2 = segment_sum(difference, blocks.row, rows) / variance / torch.minimum(*misfits).clamp_min(1)
-    return chi2, torch.stack(explained, -1)
+    return chi2, torch.stack(there, -1), torch.stack(explained, -1)
 
 
 def _has_contrast(levels: Tensor, information: Tensor, variance: Tensor) -> Tensor:
