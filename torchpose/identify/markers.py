@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.geometry.rows import Rows, shared
-from torchpose.geometry.segments import marked
+from torchpose.geometry.segments import marked, pairs_in_group
 from torchpose.identify.assignments import Assignments, propose, ratio_tolerance
 from torchpose.identify.copies import MIN_MARKERS, Claims, Rivals, rank, share_out
 from torchpose.identify.hypotheses import Hypotheses, hypotheses
@@ -81,6 +81,7 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int, inst
     if instances is not None:
         number = torch.arange(len(kept), device=device) - torch.searchsorted(row[kept], row[kept])
         kept = kept[number < instances]
+    kept = kept[~_contested(rivals, kept, rings.clipped.repeat(len(table)))]
     group, at = row[kept], torch.arange(len(kept), device=device)
     without = (~marked(group, rows)).nonzero()[:, 0]
     if without.numel():
@@ -96,6 +97,23 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int, inst
         alone = marked(without, rows)[one.row].nonzero()[:, 0]
         result.ring[torch.searchsorted(group, one.row[alone]), one.marker[alone]] = one.ring[alone]
     return result
+
+
+def _contested(rivals: Rivals, kept: Tensor, clipped: Tensor) -> Tensor:
+    """Poses ``kept`` (P,) bool that another one explains as well by other codes of the same rings (K,) ``clipped``.
+
+    Codes read up to a displacement let a small target turn, by a code and a corner: of two such poses none is better.
+    """
+    claims = rivals.claims.where(clipped[rivals.claims.ring])
+    number = torch.full_like(rivals.row, -1).index_copy_(0, kept, torch.arange(len(kept), device=kept.device))
+    own = claims.where(number[claims.pose] >= 0)
+    ring, order = claims.ring.sort()
+    i, j = pairs_in_group(own.ring, ring)
+    j = order[j]
+    other = (claims.marker[j] != own.marker[i]) & (
+        rivals.explained[claims.pose[j]] >= rivals.explained[own.pose[i]]
+    )
+    return marked(number[own.pose[i[other]]], len(kept))
 
 
 def _tried(
@@ -125,7 +143,9 @@ def _weighed(tried: Hypotheses, one: Assignments, size: tuple[int, int, int]) ->
     member, pose, markers = tried.member, tried.pose, size[2]
     every = Claims(pose, one.number[member], one.marker[member])
     # the code has its say, too: markers of neighbouring codes must not change places
-    cost = torch.where(tried.miss < 1, 0.5 * (tried.miss + one.mismatch[member]), torch.inf)
+    # and clipping moves the edges of all rings as far as those of the one that the pose comes from
+    off = one[member].mismatch_under(one.clipping[tried.origin[pose]])
+    cost = torch.where((tried.miss < 1) & (off < 1), 0.5 * (tried.miss + off), torch.inf)
     slot = pose * markers + every.marker
     per_marker = torch.full((len(tried.R) * markers,), torch.inf, dtype=cost.dtype, device=cost.device)
     per_marker.scatter_reduce_(0, slot, cost, "amin")

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose import ellipse
@@ -45,6 +45,7 @@ class Rings(Rows):
         outer: fits in ideal pixels, that is of the same camera without lens distortion.
         inner: the same.
         blur: of the ring's edges, px^2, see `geometry.blur`.
+        clipped: whether the lighter side of the edges is clipped, which moves them all towards the darker side.
     """
 
     frame: Int[Tensor, " K"]
@@ -54,6 +55,7 @@ class Rings(Rows):
     outer: EllipseFit
     inner: EllipseFit
     blur: Float[Tensor, "K 3"]
+    clipped: Bool[Tensor, " K"]
 
     @property
     def ratio(self) -> Tensor:
@@ -81,7 +83,7 @@ def _no_rings(candidates: Candidates) -> Rings:
     """Of no candidates: frames without any cost nothing here."""
     frame, polarity, none = candidates.frame, candidates.polarity, candidates.ellipse
     fit = EllipseFit(none, none.new_empty(0, 5, 5), polarity, polarity)
-    return Rings(frame, polarity, none, none, fit, fit, none[:, :3])
+    return Rings(frame, polarity, none, none, fit, fit, none[:, :3], frame > 0)
 
 
 def measure_predicted(
@@ -210,7 +212,7 @@ def _measure(
     pixel = blurs.isotropic(blur.new_tensor(12**-0.5))  # that of the mask
     blur = blurs.limited(blur - pixel, LEAST**2, MOST**2)[index]
     frame, polarity = candidates.frame[index], candidates.polarity[index]
-    large = Rings(frame, polarity, raw[index], raw[second], fit[index], fit[second], blur)
+    large = Rings(frame, polarity, raw[index], raw[second], fit[index], fit[second], blur, inside.clipped[index])
     if not bool(small.any()):
         return large, index
     rest = small.nonzero()[:, 0]
@@ -251,6 +253,7 @@ def _measure_small(
         replace(outer, params=mapped(outer.params, to_ideal)),
         replace(inner, params=mapped(inner.params, to_ideal)),
         found.blur[index],
+        inside.clipped[index],
     )
     return rings, index
 
