@@ -94,7 +94,7 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int, inst
     result.ring[to[chosen], claims.marker[chosen]] = claims.ring[chosen] % len(rings)
     if without.numel():
         # no pair, no pose: the code is all there is
-        alone = marked(without, rows)[one.row].nonzero()[:, 0]
+        alone = (marked(without, rows) & ~marked(row, rows))[one.row].nonzero()[:, 0]
         result.ring[torch.searchsorted(group, one.row[alone]), one.marker[alone]] = one.ring[alone]
     return result
 
