@@ -40,7 +40,7 @@ class Assignments(Rows):
         clipping: px, by how far clipping must have moved the ring's edges for the code to be right; NaN for rings that
             are not clipped.
         per_px: mismatch that a px of that makes.
-        ellipse: of the ring's outer circle, ideal px.
+        ellipse: of the ring's outer circle, ideal px; of a clipped one as the code tells it.
         radius: of the marker's outer circle, mm.
         place: both centres (A, 2, 3) that a circle of this image can have, mm, camera frame.
         axis: the normals (A, 2, 3) that belong to them, away from the camera.
@@ -118,7 +118,12 @@ def propose(rings: Rings, table: MarkerTable, matrix: Tensor) -> Assignments:
     row = rings.frame[ring] * len(table) + target
     order = torch.argsort(row, stable=True)
     ring, target, marker, row = ring[order], target[order], marker[order], row[order]
-    ellipse, radius = outer[ring], table.radii[target, marker, 0]
+    # where a clipped edge would be for the code to be right: one drawn inwards all around looks steeper than it is
+    drawn = (rings.polarity[ring] * codes.clipping[ring, target, marker]).nan_to_num(nan=0.0)[:, None]
+    ellipse, radius = (
+        torch.cat([outer[ring, :2], outer[ring, 2:4] + drawn, outer[ring, 4:]], -1),
+        table.radii[target, marker, 0],
+    )
     # every ring alone has two poses of its plane
     conic = matrix.T @ conics.to_matrix(conics.conic_from_ellipse(ellipse)) @ matrix
     place, axis = conics.circle_poses(conic, radius)

@@ -93,8 +93,8 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int, inst
     chosen = (to >= 0).nonzero()[:, 0]
     result.ring[to[chosen], claims.marker[chosen]] = claims.ring[chosen] % len(rings)
     if without.numel():
-        # no pair, no pose: the code is all there is
-        alone = (marked(without, rows) & ~marked(row, rows))[one.row].nonzero()[:, 0]
+        # no pair, no pose: the code is all there is, where it is not clipped
+        alone = (marked(without, rows)[one.row] & one.clipping.isnan()).nonzero()[:, 0]
         result.ring[torch.searchsorted(group, one.row[alone]), one.marker[alone]] = one.ring[alone]
     return result
 
@@ -110,9 +110,7 @@ def _contested(rivals: Rivals, kept: Tensor, clipped: Tensor) -> Tensor:
     ring, order = claims.ring.sort()
     i, j = pairs_in_group(own.ring, ring)
     j = order[j]
-    other = (claims.marker[j] != own.marker[i]) & (
-        rivals.explained[claims.pose[j]] >= rivals.explained[own.pose[i]]
-    )
+    other = (claims.marker[j] != own.marker[i]) & (rivals.explained[claims.pose[j]] >= rivals.explained[own.pose[i]])
     return marked(number[own.pose[i[other]]], len(kept))
 
 
