@@ -21,7 +21,7 @@ from torchpose.rings import Rings
 Ratio = TypeVar("Ratio", float, Tensor)
 
 _RATIO_TOLERANCE = 0.02  # of the ratio of radii, for a large ring
-# blurs: a Gaussian edge of which the share f is not clipped is read at its f / 2; at 1 % that is 2.6 deviations of 0.8 px
+# blurs: an edge of which the share f is not clipped is read at its f / 2; at 1 % that is 2.6 deviations of 0.8 px
 _MOST_CLIPPING = 2.0
 _RATIO_TOLERANCE_PX = 0.35  # over the semi-minor axis of the outer ellipse: what edge offsets do to a small ring
 

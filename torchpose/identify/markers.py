@@ -21,6 +21,10 @@ from torchpose.identify.hypotheses import Hypotheses, hypotheses
 from torchpose.identify.scene import MarkerTable
 from torchpose.rings import Rings
 
+# of the tolerances, mean over the markers: a false code of rings of 13 px misses by 0.2 more (derived), a right one by
+# less than 0.1 (the frames of `corruption_statistics.py --only over-exposure`)
+_AS_WELL = 0.1
+
 __all__ = ["Identified", "identify", "ratio_tolerance"]
 
 
@@ -102,7 +106,8 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int, inst
 def _contested(rivals: Rivals, kept: Tensor, clipped: Tensor) -> Tensor:
     """Poses ``kept`` (P,) bool that another one explains as well by other codes of the same rings (K,) ``clipped``.
 
-    Codes read up to a displacement let a small target turn, by a code and a corner: of two such poses none is better.
+    Codes read up to a displacement let a small target turn, by a code and a corner. What it costs is that the rings'
+    size, moved with their edges, no longer suits their distances.
     """
     claims = rivals.claims.where(clipped[rivals.claims.ring])
     number = torch.full_like(rivals.row, -1).index_copy_(0, kept, torch.arange(len(kept), device=kept.device))
@@ -110,8 +115,10 @@ def _contested(rivals: Rivals, kept: Tensor, clipped: Tensor) -> Tensor:
     ring, order = claims.ring.sort()
     i, j = pairs_in_group(own.ring, ring)
     j = order[j]
-    other = (claims.marker[j] != own.marker[i]) & (rivals.explained[claims.pose[j]] >= rivals.explained[own.pose[i]])
-    return marked(number[own.pose[i[other]]], len(kept))
+    one, two = own.pose[i], claims.pose[j]
+    worse = (rivals.score[one] - rivals.score[two]) * (2 * rivals.size[2]) / rivals.explained[one]
+    other = (claims.marker[j] != own.marker[i]) & (rivals.explained[two] >= rivals.explained[one]) & (worse < _AS_WELL)
+    return marked(number[one[other]], len(kept))
 
 
 def _tried(

@@ -240,7 +240,7 @@ def _fitted(window: _Window, begun: _Start, scheme: _Scheme) -> _Fit:
     weight, grey = pixels.weight, window.grey
     number = weight.sum(-1)  # the last weights are 0 or 1
     variance = (weight * pixels.residual.square()).sum(-1) / (number - RING - BLUR - _LEVELS).clamp_min(1)
-    # clipped pixels have no noise; at the edges there is what their profile, no Gaussian's any more, leaves of the model
+    # clipped pixels have no noise; at the edges is what a profile cut off, no Gaussian's, leaves of the model
     steep = weight * pixels.steepness
     at_edges = (steep * pixels.residual.square()).sum(-1) / steep.sum(-1)
     misfit = torch.where(begun.clipped, (at_edges - variance).clamp_min(0), 0.0)
