@@ -40,7 +40,7 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from torchpose.camera import Camera
-from torchpose.detect import Wanted, find_candidates
+from torchpose.detect import Wanted, find_candidates, find_coarse
 from torchpose.detect.reduce import reduction_factor
 from torchpose.geometry import conics, rotations
 from torchpose.rings import measure_rings
@@ -361,12 +361,14 @@ def clutter(scale: int) -> None:
         frames = add_noise(clean, 2.0, 0)
         grey = np.ascontiguousarray(frames[0].numpy())
         every, some = (median_cpu(partial(find_candidates, frames, wanted=w)) for w in (Wanted(), asked))
+        coarse = median_cpu(partial(find_coarse, frames, wanted=asked))
         peers = [("ArUco", median_cpu(partial(aruco.detectMarkers, grey)))]
         peers += [("AprilTag 3", median_cpu(partial(tags.detect, grey)))] if tags else []
         found, wanted = len(find_candidates(frames)), len(find_candidates(frames, wanted=asked))
-        beside = ", ".join(f"{some / cpu:.2f} of {peer} ({cpu:.0f} ms)" for peer, cpu in peers)
+        beside = ", ".join(f"{coarse / cpu:.2f} and {some / cpu:.2f} of {peer} ({cpu:.0f} ms)" for peer, cpu in peers)
         print(
-            f"{name:13s} all {found:4d} in {every:6.0f} ms, asked for {wanted:4d} in {some:6.0f} ms: {beside}",
+            f"{name:13s} all {found:4d} in {every:6.0f} ms, asked for {wanted:4d}: coarse {coarse:6.0f} ms, "
+            f"whole {some:6.0f} ms: {beside}",
             flush=True,
         )
 

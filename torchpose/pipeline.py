@@ -14,6 +14,7 @@ from torchpose.camera import Camera
 from torchpose.camera.model import Model
 from torchpose.detect import Candidates, Wanted, find_candidates, find_coarse
 from torchpose.errors import ConfigError, FrameError
+from torchpose.geometry import blur as blurs
 from torchpose.geometry.grey import grey
 from torchpose.geometry.segments import marked
 from torchpose.identify import (
@@ -39,12 +40,13 @@ from torchpose.pose import (
 )
 from torchpose.refine import METHODS, Recipe, Sight
 from torchpose.results import Poses, Reason, Status
-from torchpose.rings import Rings, measure_rings
+from torchpose.rings import Circles, Rings, find_circles, measure_circles, measure_rings, rough_rings
 from torchpose.target import Target
 
 _LEAST_CANDIDATE = (
     3.0  # px of semi-minor axis: rings below 4 are refused (`rings.measure`); candidates of covered ones err
 )
+_LEGIBLE = 1.8  # px, of blur, up to which the mean profile of a ring tells its code
 _FRAME_TYPES = (torch.uint8, torch.uint16, torch.float16, torch.bfloat16, torch.float32, torch.float64)
 Method = Literal["photometric", "edges", "centers", "paper"]
 
@@ -158,11 +160,9 @@ class PoseEstimator(nn.Module):
         """
         frames = self._checked(frames)
         scene = Scene.of(frames, self.camera.to(frames.device), self.table.to(frames.device))
-        rings, identified = self._identified(scene)
-        scene = scene.of_rows(identified.group)
-        scene, found = best_copies(scene, self._solved(scene, rings, identified), self.instances)
+        scene, found = self._found(scene)
         again = self._second_look(scene, found)
-        if len(again[0]) > len(rings):
+        if len(again[0]) > len(found.rings):
             found = self._solved(scene, *again)
         if found.solvable.numel():
             found = found._replace(solutions=self._refined(scene, found))
@@ -190,32 +190,56 @@ class PoseEstimator(nn.Module):
             frames = frames.float() * (255.0 / self.float_range)
         return frames.contiguous()
 
-    def _identified(self, scene: Scene) -> tuple[Rings, Identified]:
-        """Rings of all frames and which markers they are: from the coarse scale alone where that shows every target."""
+    def _found(self, scene: Scene) -> tuple[Scene, Found]:
+        """What is found in all frames: at the coarse scale alone where that shows every target whole."""
         frames, wanted = scene.frames, Wanted.of(scene.table.polarity, _LEAST_CANDIDATE)
-
-        def measured(candidates: Candidates, frame: Tensor | None = None) -> Rings:
-            if frame is not None:
-                candidates = replace(candidates, frame=frame[candidates.frame])
-            candidates = candidates[torch.isin(candidates.polarity, scene.table.polarity)]
-            return measure_rings(frames, candidates, scene.camera, correct=self._recipe.correct)
-
-        def named(rings: Rings) -> Identified:
-            return identify(rings, scene.table, scene.camera, len(frames))
-
         if self.instances > 1:  # a copy may be too small for the coarse scale
-            rings = measured(find_candidates(frames, wanted=wanted))
-            return rings, named(rings)
-        rings = measured(find_coarse(frames, wanted=wanted))
-        identified = named(rings)
-        missing = scene.table.valid[identified.group % len(scene.table)] & (identified.ring < 0)
-        whole = marked(identified.group[~missing.any(1)], scene.groups).view(len(frames), len(scene.table)).all(1)
-        if bool(whole.all()):
-            return rings, identified
-        rest = (~whole).nonzero()[:, 0]
-        finer = measured(find_candidates(frames[rest], wanted=wanted), rest)
-        rings = Rings.cat([rings[whole[rings.frame]], finer])
-        return rings, named(rings)
+            return self._read(scene, self._rings(scene, find_candidates(frames, wanted=wanted)))
+        coarse = find_coarse(frames, wanted=wanted)
+        rings, copies = self._likely(scene, coarse)
+        first = self._read(scene, rings, copies)
+        settled = _settled(*first)
+        if bool(settled.all()):
+            return first
+        rest, number = (~settled).nonzero()[:, 0], (~settled).cumsum(0) - 1
+        known = coarse[~settled[coarse.frame]]
+        known = replace(known, frame=number[known.frame])
+        finer = find_candidates(frames[rest], wanted=wanted, coarse=known)
+        more = self._rings(scene, replace(finer, frame=rest[finer.frame]))
+        return self._read(scene, Rings.cat([rings[settled[rings.frame]], more]), copies)
+
+    def _rings(self, scene: Scene, candidates: Candidates) -> Rings:
+        candidates = candidates[torch.isin(candidates.polarity, scene.table.polarity)]
+        return measure_rings(scene.frames, candidates, scene.camera, correct=self._recipe.correct)
+
+    def _likely(self, scene: Scene, candidates: Candidates) -> tuple[Rings, Tensor]:
+        """The rings that the best copy of every target has by its circles' rough places and codes, measured.
+
+        Also how many copies (B T,) were seen.
+        """
+        candidates = candidates[torch.isin(candidates.polarity, scene.table.polarity)]
+        circles = find_circles(scene.frames, candidates, scene.camera)
+        # the code of a much blurred ring is not to be read off its profile
+        blurred = blurs.axes(circles.inside.blur)[1] > _LEGIBLE**2
+
+        def measured(some: Circles) -> Rings:
+            how = {"correct": self._recipe.correct, "precise": not self._recipe.on_rims}
+            return measure_circles(scene.frames, some, scene.camera, **how)
+
+        sharp, known = circles[~blurred], measured(circles[blurred])
+        rough = Rings.cat([rough_rings(sharp, scene.camera), known])
+        likely = identify(rough, scene.table, scene.camera, len(scene.frames), instances=1)
+        named = marked(likely.ring[likely.ring >= 0], len(rough))
+        rings = Rings.cat([measured(sharp[named[: len(sharp)]]), known[named[len(sharp) :]]])
+        return rings, likely.copies
+
+    def _read(self, scene: Scene, rings: Rings, copies: Tensor | None = None) -> tuple[Scene, Found]:
+        """Rows of the rings of all frames, identified and solved; at least so many ``copies`` (B T,) were seen."""
+        identified = identify(rings, scene.table, scene.camera, len(scene.frames))
+        if copies is not None:
+            identified = replace(identified, copies=identified.copies.maximum(copies[identified.group]))
+        scene = scene.of_rows(identified.group)
+        return best_copies(scene, self._solved(scene, rings, identified), self.instances)
 
     def _solved(self, scene: Scene, rings: Rings, identified: Identified) -> Found:
         """The evidence of every row, and the solutions of those rows that have enough of it."""
@@ -250,6 +274,14 @@ class PoseEstimator(nn.Module):
         used = replace(evidence, mask=solutions.mask)
         more = intrinsics_covariance(used, solutions.R, solutions.t, scene.camera, refined=self._recipe.on_rims)
         return replace(solutions, covariance=solutions.covariance + more)
+
+
+def _settled(scene: Scene, found: Found) -> Tensor:
+    """Frames (B,) bool in which every target has a row with all of its markers and a pose that they agree on."""
+    agreed = found.solvable[found.solutions.status == Status.OK]
+    missing = scene.table.valid[scene.target] & (found.identified.ring < 0)
+    good = marked(agreed, len(scene.frame)) & ~missing.any(1)
+    return marked(scene.group[good], scene.groups).view(len(scene.frames), len(scene.table)).all(1)
 
 
 def _check_targets(targets: Sequence[Target]) -> None:

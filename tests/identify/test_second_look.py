@@ -12,7 +12,7 @@ from torch import Tensor
 import torchpose as tp
 from tests.exact import pinhole, random_poses
 from torchpose import pipeline
-from torchpose.detect import Wanted, find_candidates
+from torchpose.detect import Candidates, Wanted, find_candidates
 from torchpose.sim import add_noise, render
 from torchpose.target import Target
 
@@ -33,8 +33,8 @@ def estimate(monkeypatch: pytest.MonkeyPatch, scene: Scene, lost: int, frames: T
     camera, target, r, t, pictures = scene
     pictures = pictures if frames is None else frames
 
-    def lossy(frames: Tensor, *, wanted: Wanted) -> tp.detect.Candidates:
-        found = find_candidates(frames, wanted=wanted)
+    def lossy(frames: Tensor, *, wanted: Wanted, coarse: Candidates | None = None) -> tp.detect.Candidates:
+        found = find_candidates(frames, wanted=wanted, coarse=coarse)
         for marker in range(len(target) - lost, len(target)):
             at = camera.project((r @ target.centers[marker]) + t)
             found = found[torch.linalg.vector_norm(found.ellipse[:, :2] - at[found.frame], dim=-1) > 20]

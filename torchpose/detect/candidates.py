@@ -4,13 +4,14 @@ import math
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchpose import ellipse
 from torchpose.detect.arcs import chain_pairs, describe_arcs, fit_pairs, follow
 from torchpose.detect.finer import LARGER, SHIFT, SIDE, cut_outs, promising_places
-from torchpose.detect.partial import free_of_stumps
+from torchpose.detect.partial import SETTLE, free_of_stumps
+from torchpose.detect.prospects import crests, hints, rings, sorted_out
 from torchpose.detect.reduce import area_reduce, reduction_factor
 from torchpose.detect.regions import Gradient, Regions, gradient, level_line_regions, region_polarity, strong_cells
 from torchpose.detect.validation import (
@@ -31,12 +32,14 @@ from torchpose.geometry import conics
 from torchpose.geometry.segments import marked, members, positions, segment_mean
 
 MIN_PIXELS = 10
+_MIN_CRESTS = 7  # of cells that are left where edges are thinned
 _SECTORS = 8  # arcs turn by up to 45 degrees
 _PHASE = 0.5  # sectors centred on the axes and diagonals turn into each other when a frame is mirrored or transposed
 _MIN_SEMI_MINOR = 2.0  # reduced px
 _MIN_ASPECT = 0.12
 _MIN_CELLS = 0.35  # of a region on its ellipse, a pixel of perimeter; an edge is two to three cells wide
 _PART_ROUNDS = 2  # of following the ellipse of a region that is only a part of it
+_RING_SETTLE = 2  # fits of a ring to what agrees: its edges are measured later
 _FOLLOW = ((0.4, 1), (0.5, 2))  # least cover to be followed further, and rounds of it
 _ON_ELLIPSE = 1.5  # reduced px
 _TAPER = 3.0  # reduced px, where the weight of a cell in the second fit has fallen to 0
@@ -46,7 +49,12 @@ _ARC_RMS = 1.2  # reduced px, of the cells of an arc, which is a few cells wide
 
 
 def find_candidates(
-    frames: Shaped[Tensor, "B H W"], factor: int | None = None, *, explain: bool = False, wanted: Wanted = ANYTHING
+    frames: Shaped[Tensor, "B H W"],
+    factor: int | None = None,
+    *,
+    explain: bool = False,
+    wanted: Wanted = ANYTHING,
+    coarse: Candidates | None = None,
 ) -> Candidates:
     """Ellipses in grey frames, one pass for the whole batch.
 
@@ -58,18 +66,20 @@ def find_candidates(
             reduction, where blurred and noisy edges stand out four times as much.
         explain: also return what was looked at and rejected, see `Candidates.verdict`.
         wanted: what is asked for; of other ellipses only whole ones are found, and left out.
+        coarse: what `find_coarse` found in these frames, if it is known.
     """
     factor = reduction_factor(*frames.shape[-2:]) if factor is None else factor
     reduced = area_reduce(frames, factor)
     grad = gradient(reduced)
-    coarse = find_ellipses(grad, wanted.reduced(factor))
-    found = [find_finer(frames, factor, grad.threshold, coarse, wanted)] if factor > 1 else []
-    known = accepted(coarse)
-    known = replace(known, ellipse=rescaled(known.ellipse, 0.5))
-    blurred = find_ellipses(gradient(area_reduce(reduced, 2, exact=True)), wanted.reduced(2 * factor), known)
-    for scale, some in ((factor, coarse), (2 * factor, blurred)):
-        found.append(replace(some, ellipse=rescaled(some.ellipse, scale)))
-    every = Candidates.cat(found)
+    sharp = find_ellipses(grad, wanted.reduced(factor))
+    found = [find_finer(frames, factor, grad, sharp, wanted)] if factor > 1 else []
+    found.append(replace(sharp, ellipse=rescaled(sharp.ellipse, factor)))
+    if coarse is None:
+        known = accepted(sharp)
+        known = replace(known, ellipse=rescaled(known.ellipse, 0.5))
+        blurred = find_ellipses(gradient(area_reduce(reduced, 2, exact=True)), wanted.reduced(2 * factor), known)
+        coarse = replace(blurred, ellipse=rescaled(blurred.ellipse, 2 * factor))
+    every = Candidates.cat([*found, coarse])
     every = every[(every.verdict != Verdict.ACCEPTED) | wanted.admits(every)]
     return merge_duplicates(every if explain else accepted(every), explain=explain)
 
@@ -79,42 +89,45 @@ def find_coarse(frames: Shaped[Tensor, "B H W"], *, wanted: Wanted = ANYTHING) -
 
     Large rings are seen whole there, and texture, letters and noise are not seen at all.
     """
-    factor = 2 * reduction_factor(*frames.shape[-2:])
-    found = accepted(find_ellipses(gradient(area_reduce(frames, factor, exact=True)), wanted.reduced(factor)))
-    found = replace(found, ellipse=rescaled(found.ellipse, factor))
-    return merge_duplicates(found[wanted.admits(found)])
+    factor = reduction_factor(*frames.shape[-2:])
+    reduced = area_reduce(area_reduce(frames, factor), 2, exact=True)
+    found = accepted(find_ellipses(gradient(reduced), wanted.reduced(2 * factor)))
+    found = replace(found, ellipse=rescaled(found.ellipse, 2 * factor))
+    return found[wanted.admits(found)]
 
 
 def find_finer(
-    frames: Tensor, factor: int, threshold: Tensor, coarse: Candidates, wanted: Wanted = ANYTHING
+    frames: Tensor, factor: int, sharp: Gradient, found: Candidates, wanted: Wanted = ANYTHING
 ) -> Candidates:
-    """Small ellipses of a finer scale, full px, where the coarse one has something round that is no whole ellipse.
+    """Small ellipses of a finer scale, full px, where a coarser one has something round that is no whole ellipse.
 
-    ``factor``, ``threshold`` (B,) of the gradient and what was looked at are of the coarse scale.
+    ``factor``, the gradient and what was looked at are of the coarser scale.
     """
     fine = factor // 2
-    whole = (coarse.verdict == Verdict.ACCEPTED) & (coarse.cover > WHOLE)
+    whole = (found.verdict == Verdict.ACCEPTED) & (found.cover > WHOLE)
     # an arc of what is wanted turns as it does, though its own ellipse may be flatter
-    asked = (coarse.polarity * wanted.polarity >= 0) & (coarse.ellipse[:, 2] >= _LENGTH * wanted.semi_minor / factor)
-    place = promising_places(coarse.frame, coarse.ellipse, whole, asked)
+    asked = (found.polarity * wanted.polarity >= 0) & (found.ellipse[:, 2] >= _LENGTH * wanted.semi_minor / factor)
+    place = promising_places(found.frame, found.ellipse, whole, asked)
+    if wanted.concentric:
+        place = place[hints(sharp, found[place])]
     height, width = frames.shape[-2:]
     if place.numel() == 0 or min(height, width) < SIDE * fine:
-        return coarse[place[:0]]
-    frame, middle = coarse.frame[place], rescaled(coarse.ellipse[place], factor)[:, :2]
+        return found[place[:0]]
+    frame, middle = found.frame[place], rescaled(found.ellipse[place], factor)[:, :2]
     cut, corner = cut_outs(frames, frame, middle, fine)
     grad = gradient(cut)
     # where edges fill most of a cut-out, the noise of the whole frame tells more than the median of their gradients
-    grad = replace(grad, threshold=torch.minimum(grad.threshold, factor / fine * threshold[frame]))
+    grad = replace(grad, threshold=torch.minimum(grad.threshold, factor / fine * sharp.threshold[frame]))
     if wanted is not ANYTHING:  # what lies elsewhere in a cut-out is a place of its own
-        reach = SHIFT + LARGER * factor / fine * coarse.ellipse[place, 2]
+        reach = SHIFT + LARGER * factor / fine * found.ellipse[place, 2]
         wanted = replace(wanted.reduced(fine), place=Place((middle - corner - 0.5 * (fine - 1)) / fine, SHIFT, reach))
-    found = accepted(find_ellipses(grad, wanted))
-    ellipses = rescaled(found.ellipse, fine)
-    ellipses = torch.cat([ellipses[:, :2] + corner[found.frame], ellipses[:, 2:]], -1)
+    finer = accepted(find_ellipses(grad, wanted))
+    ellipses = rescaled(finer.ellipse, fine)
+    ellipses = torch.cat([ellipses[:, :2] + corner[finer.frame], ellipses[:, 2:]], -1)
     # the ellipses that might have been tried are those of the frame, not those of the cut-out
     more = 2.5 * math.log10(height * width / (SIDE * fine) ** 2)
-    found = replace(found, ellipse=ellipses, frame=frame[found.frame], log10_nfa=found.log10_nfa + more)
-    return found[found.log10_nfa < 0]
+    finer = replace(finer, ellipse=ellipses, frame=frame[finer.frame], log10_nfa=finer.log10_nfa + more)
+    return finer[finer.log10_nfa < 0]
 
 
 def rescaled(ellipses: Float[Tensor, "M 5"], factor: int | float) -> Float[Tensor, "M 5"]:
@@ -129,16 +142,25 @@ def find_ellipses(grad: Gradient, wanted: Wanted = ANYTHING, known: Candidates |
     What is not ``wanted`` is among them where it is seen whole, and explains its edges.
     ``known`` are accepted ellipses of a finer scale in the pixels of this one, which may explain edges better.
     """
-    regions = level_line_regions(grad, wanted.within_reach(grad, strong_cells(grad)), MIN_PIXELS)
+    cell = wanted.within_reach(grad, strong_cells(grad))
+    least = MIN_PIXELS
+    if wanted.concentric:
+        cell, least = crests(grad, cell), _MIN_CRESTS
+    regions = level_line_regions(grad, cell, least)
+    aside = regions.cell[:0]
+    if wanted.concentric:
+        fit, arcs = sorted_out(regions, grad.centers(regions.cell), wanted.polarity)
+        regions, aside = regions.of(fit), regions.cells_of(arcs)
     whole, explained = fit_regions(grad, regions, wanted)
-    rest = regions.cell[~explained].sort().values
-    pieces = fit_arcs(grad, level_line_regions(grad, rest, MIN_PIXELS, _SECTORS, _PHASE), wanted)
+    rest = torch.cat([regions.cell[~explained], aside]).sort().values
+    pieces = fit_arcs(grad, level_line_regions(grad, rest, least, _SECTORS, _PHASE), wanted)
     found = merge_duplicates(Candidates.cat([whole, pieces]), explain=True)
     if known is not None:
         found = without_known(found, known)
-    valid = positions((found.verdict == Verdict.ACCEPTED) & wanted.admits(found))
+    valid = positions(asked_for(grad, found, wanted, found.verdict == Verdict.ACCEPTED))
     some = found[valid]
-    freed = free_of_stumps(grad, some.frame, some.ellipse, some.polarity)
+    settle = _RING_SETTLE if wanted.concentric else SETTLE
+    freed = free_of_stumps(grad, some.frame, some.ellipse, some.polarity, settle)
     moved = positions((freed != some.ellipse).any(-1) & (plausible(grad, freed) == Verdict.ACCEPTED))
     if moved.numel():
         again = score(grad, some.frame[moved], freed[moved], some.polarity[moved])
@@ -168,10 +190,10 @@ def fit_regions(grad: Gradient, regions: Regions, wanted: Wanted = ANYTHING) -> 
     # a region that is not a whole ellipse runs along something else as well: only what lies along the ellipse counts
     beyond = edge < WHOLE * torch.bincount(regions.region, minlength=count)
     partial = (found.cover <= WHOLE) | beyond[good]
-    admitted = wanted.admits(found)
+    admitted = partial & asked_for(grad, found, wanted, partial)
     lost = partial & ~admitted & (found.verdict == Verdict.ACCEPTED)
     found = replace(found, verdict=torch.where(lost, int(Verdict.UNWANTED), found.verdict))
-    part = positions(partial & admitted)
+    part = positions(admitted)
     if part.numel():
         again, sound = _followed(grad, found[part], _PART_ROUNDS)
         found = found.replaced(part[sound], again)
@@ -225,12 +247,22 @@ def fit_arcs(grad: Gradient, arcs: Regions, wanted: Wanted = ANYTHING) -> Candid
     rms = segment_mean(r.square(), index, len(pair), weight.double()).sqrt()
     good = positions(rms < _ARC_RMS)
     frame, polarity = about.frame[pair[good, 0]], about.curvature[pair[good, 0]].sign()
-    found = score(grad, frame, params[good], polarity)
-    found = found[wanted.admits(found)]
+    mine = wanted.admits_ellipses(frame, params[good], polarity)
+    found = score(grad, frame[mine], params[good][mine], polarity[mine])
+    found = found[asked_for(grad, found, wanted, found.cover > _FOLLOW[0][0])]
     for least_cover, rounds in _FOLLOW if len(found) else ():
         found = merge_duplicates(found[found.cover > least_cover], 2 * SAME)
         found, _ = _followed(grad, found, rounds)
     return accepted(found)
+
+
+def asked_for(grad: Gradient, found: Candidates, wanted: Wanted, among: Bool[Tensor, " M"]) -> Bool[Tensor, " M"]:
+    """Which candidates among these are what is wanted, as far as their frames tell."""
+    good = among & wanted.admits(found)
+    if wanted.concentric:
+        some = positions(good)
+        good = good.index_copy(0, some, rings(grad, found[some]))
+    return good
 
 
 def plausible(grad: Gradient, ellipses: Float[Tensor, "M 5"]) -> Int[Tensor, " M"]:

@@ -25,7 +25,7 @@ _MOST_SAMPLES = 96  # of an ellipse, a multiple of the sectors
 _WELL = 0.9  # support from which on an ellipse is left as it is
 _ROUNDS = 2
 _TRIALS = 4  # fits of runs that are compared at the frame itself
-_SETTLE = 4  # fits to what agrees
+SETTLE = 4  # fits to what agrees
 _STILL = 0.01  # cells: less than the edges' own error
 
 
@@ -43,10 +43,12 @@ class Ridge(Rows):
     support: Float[Tensor, " M"] = shared()
 
 
-def free_of_stumps(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> Float[Tensor, "M 5"]:
+def free_of_stumps(
+    grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor, settle: int = SETTLE
+) -> Float[Tensor, "M 5"]:
     """Ellipses, those that are well supported as they are, the others by the run of sectors that fits best.
 
-    The polarity is +1 where the gradient points outwards.
+    The polarity is +1 where the gradient points outwards. ``settle`` is the number of fits to what agrees.
     """
     part = torch.arange(len(ellipses), device=ellipses.device)
     for _ in range(_ROUNDS if len(part) else 0):
@@ -56,7 +58,7 @@ def free_of_stumps(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Te
         if part.numel() == 0:
             break
         fits, changed = _best_fits(grad, frame[part], ellipses[part], polarity[part], ridge)
-        ellipses = ellipses.index_copy(0, part, _settled(grad, frame[part], fits, polarity[part]))
+        ellipses = ellipses.index_copy(0, part, _settled(grad, frame[part], fits, polarity[part], settle))
         part = part[positions(changed)]  # what was best as it was would be so again
     return ellipses
 
@@ -78,12 +80,13 @@ def _best_fits(
     """
     runs = _runs(ridge, ellipses)
     likely = _agreement(ridge, runs).topk(_TRIALS, 1).indices
-    fits = torch.cat([runs.gather(1, likely[..., None].expand(-1, -1, 5)), ellipses[:, None]], 1)
+    fits = runs.gather(1, likely[..., None].expand(-1, -1, 5))
     each = torch.arange(len(ellipses), device=ellipses.device)
-    of = each.repeat_interleave(fits.shape[1])
+    of = each.repeat_interleave(_TRIALS)
     again = find_ridge(grad, frame[of], fits.flatten(0, 1), polarity[of])
-    best = again.support.view(fits.shape[:2]).argmax(1)
-    return fits[each, best], best < _TRIALS
+    support, best = again.support.view(-1, _TRIALS).max(1)
+    changed = support >= ridge.support
+    return torch.where(changed[:, None], fits[each, best], ellipses), changed
 
 
 def _agreement(ridge: Ridge, fits: Float[Tensor, "M F 5"]) -> Float[Tensor, "M F"]:
@@ -94,10 +97,10 @@ def _agreement(ridge: Ridge, fits: Float[Tensor, "M F 5"]) -> Float[Tensor, "M F
     return segment_sum(on, ridge.of, len(fits))
 
 
-def _settled(grad: Gradient, frame: Tensor, fits: Tensor, polarity: Tensor) -> Float[Tensor, "M 5"]:
+def _settled(grad: Gradient, frame: Tensor, fits: Tensor, polarity: Tensor, settle: int) -> Float[Tensor, "M 5"]:
     """Fitted again to all of the perimeter that agrees, until they stay: the borders of the runs leave no trace."""
     moving = torch.arange(len(fits), device=fits.device)
-    for _ in range(_SETTLE):
+    for _ in range(settle):
         now = fits[moving]
         near = find_ridge(grad, frame[moving], now, polarity[moving])
         on = (near.found & (near.offset.abs() < 1)).double()

@@ -6,12 +6,12 @@ connected components are found by parallel min-hooking and pointer jumping (Shil
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int, Real
+from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
 from torchpose.geometry.rows import Rows, shared
@@ -72,6 +72,15 @@ class Regions(Rows):
     region: Int[Tensor, " P"]
     gradient: Float[Tensor, "P 2"]
     frame: Int[Tensor, " R"] = shared()  # of each region
+
+    def of(self, some: Bool[Tensor, " R"]) -> "Regions":
+        """Some of the regions."""
+        kept, number = self[positions(some.index_select(0, self.region))], some.cumsum(0) - 1
+        return replace(kept, region=number.index_select(0, kept.region), frame=self.frame[some])
+
+    def cells_of(self, some: Bool[Tensor, " R"]) -> Int[Tensor, " Q"]:
+        """Their cells alone."""
+        return self.cell[positions(some.index_select(0, self.region))]
 
 
 def gradient(frames: Real[Tensor, "B h w"]) -> Gradient:
@@ -176,8 +185,7 @@ def level_line_regions(
         x, y = gx * scale, gy * scale
         cos = x.index_select(0, a) * x.index_select(0, b) + y.index_select(0, a) * y.index_select(0, b)
         agree = cos > _JOIN_COS
-    joined = positions(agree)
-    label = connected_components(a.index_select(0, joined), b.index_select(0, joined), cell.numel())
+    label = _labels(a, b, agree, cell.numel())
 
     large = torch.bincount(label, minlength=cell.numel()) >= min_pixels
     number = large.cumsum(0) - 1
@@ -188,6 +196,22 @@ def level_line_regions(
     first = positions(large)
     gradient = torch.stack([gx.index_select(0, keep), gy.index_select(0, keep)])
     return Regions(cell.index_select(0, keep), region, gradient.mT, cell[first] // (height * width))
+
+
+def _labels(one: Tensor, other: Tensor, agree: Tensor, count: int) -> Tensor:
+    """As `connected_components` of the pairs of `_neighbours` that agree, of runs along rows instead of cells."""
+    joined = positions(agree)
+    one, other = one.index_select(0, joined), other.index_select(0, joined)
+    beside = other - one == 1  # the next cell of the list is the next of the row wherever it is a neighbour
+    first = torch.ones(count, dtype=torch.bool, device=one.device).index_fill_(0, other[beside], False)
+    run, start = first.cumsum(0) - 1, positions(first)
+    apart = positions(~beside)
+    one, other = (run.index_select(0, v.index_select(0, apart)) for v in (one, other))
+    new = torch.ones_like(one, dtype=torch.bool)
+    new[1:] = (one[1:] != one[:-1]) | (other[1:] != other[:-1])
+    new = positions(new)
+    label = connected_components(one.index_select(0, new), other.index_select(0, new), start.numel())
+    return start.index_select(0, label.index_select(0, run))
 
 
 def _sorted(region: Tensor) -> tuple[Tensor, Tensor]:

@@ -81,29 +81,35 @@ class Wanted:
         polarity: +1 dark inside, -1 light inside, 0 either.
         semi_minor: px, the least.
         place: where in each frame; None for anywhere.
+        concentric: outer circles of rings only.
     """
 
     polarity: float = 0.0
     semi_minor: float = 0.0
     place: Place | None = None
+    concentric: bool = False
 
     @classmethod
     def of(cls, polarities: Float[Tensor, " T"], semi_minor: float) -> "Wanted":
-        """Ellipses of any of these polarities, of at least such a semi-minor axis, px."""
+        """Rings of any of these polarities, of at least such a semi-minor axis, px."""
         each = polarities.unique()
-        return cls(float(each) if each.numel() == 1 else 0.0, semi_minor)
+        return cls(float(each) if each.numel() == 1 else 0.0, semi_minor, concentric=True)
 
     def reduced(self, factor: int) -> "Wanted":
         """The same in a frame reduced by a factor, anywhere in it."""
-        return Wanted(self.polarity, self.semi_minor / factor)
+        return replace(self, semi_minor=self.semi_minor / factor, place=None)
 
     def admits(self, found: Candidates) -> Bool[Tensor, " M"]:
-        """Which candidates are asked for."""
-        good = found.ellipse[:, 3] >= self.semi_minor
+        """Which candidates are asked for, by their ellipses alone."""
+        return self.admits_ellipses(found.frame, found.ellipse, found.polarity)
+
+    def admits_ellipses(self, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> Bool[Tensor, " M"]:
+        """Which ellipses (M, 5) of frames (M,) and polarities (M,) are asked for."""
+        good = ellipses[:, 3] >= self.semi_minor
         if self.polarity:
-            good &= found.polarity == self.polarity
+            good &= polarity == self.polarity
         if self.place is not None:
-            away = found.ellipse[:, :2] - self.place.center[found.frame]
+            away = ellipses[:, :2] - self.place.center[frame]
             good &= torch.linalg.vector_norm(away, dim=-1) < self.place.shift
         return good
 

@@ -38,6 +38,16 @@ def segment_sum(values: Shaped[Tensor, "E ..."], index: Int[Tensor, " E"], count
     return out.index_add(0, index, values)
 
 
+def run_sums(values: Float64[Tensor, "N E"], size: Int[Tensor, " count"]) -> Float64[Tensor, "N count"]:
+    """Sums of runs of so many values that follow each other, none of them empty; NumPy adds them as they lie."""
+    if values.device.type == "cpu":
+        if size.numel() == 0:
+            return values[:, :0]
+        return torch.from_numpy(np.add.reduceat(values.numpy(), (size.cumsum(0) - size).numpy(), axis=1))
+    group = torch.repeat_interleave(size, output_size=values.shape[1])
+    return values.new_zeros(len(values), size.numel()).index_add_(1, group, values)
+
+
 def segment_mean(
     values: Shaped[Tensor, "E ..."], index: Int[Tensor, " E"], count: int, weights: Shaped[Tensor, " E"] | None = None
 ) -> Shaped[Tensor, "count ..."]:

@@ -95,6 +95,9 @@ class Codes(NamedTuple):
 
         error, tolerance = each(rings.ratio) - expected, each(tolerance_of(rings))
         radius = each(rings.outer.params[:, 2:4].prod(-1).sqrt())
+        if not bool(rings.clipped.any()):
+            unknown = torch.full_like(error, torch.nan)
+            return cls(error.abs() / tolerance, unknown, unknown)
         clipping = error * each(rings.polarity) * radius / (1 + expected)
         per_px = (1 + expected) / radius / tolerance
         most = _MOST_CLIPPING * each(blurs.axes(rings.blur)[1].sqrt().clamp_min(1.0))

@@ -85,7 +85,7 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int, inst
     if instances is not None:
         number = torch.arange(len(kept), device=device) - torch.searchsorted(row[kept], row[kept])
         kept = kept[number < instances]
-    kept = kept[~_contested(rivals, kept, rings.clipped.repeat(len(table)))]
+    kept = kept[~_contested(rivals, kept, rings.clipped)]
     group, at = row[kept], torch.arange(len(kept), device=device)
     without = (~marked(group, rows)).nonzero()[:, 0]
     if without.numel():
@@ -109,7 +109,9 @@ def _contested(rivals: Rivals, kept: Tensor, clipped: Tensor) -> Tensor:
     Codes read up to a displacement let a small target turn, by a code and a corner. What it costs is that the rings'
     size, moved with their edges, no longer suits their distances.
     """
-    claims = rivals.claims.where(clipped[rivals.claims.ring])
+    if not bool(clipped.any()):
+        return torch.zeros_like(kept, dtype=torch.bool)
+    claims = rivals.claims.where(clipped[rivals.claims.ring % len(clipped)])
     number = torch.full_like(rivals.row, -1).index_copy_(0, kept, torch.arange(len(kept), device=kept.device))
     own = claims.where(number[claims.pose] >= 0)
     ring, order = claims.ring.sort()

@@ -77,7 +77,9 @@ def decide_on_grey(solutions: Solutions, evidence: Evidence, sight: Sight) -> So
     chi2, explained = grey_chi2(sight, one, two)
     swap = chi2 < 0
     better = two.where(swap, one)
-    sure = one.good & two.good & (better.kept > LEAST_KEPT) & (_meet(one, two) | (chi2.abs() > AMBIGUOUS_CHI2))
+    # a pose whose fit loses every pixel is no reason for doubt in the one that keeps them
+    alike = one.good & two.good & _meet(one, two)
+    sure = better.good & (better.kept > LEAST_KEPT) & (alike | (chi2.abs() > AMBIGUOUS_CHI2))
     sure &= ~shape | torch.where(swap, explained[:, 1], explained[:, 0])
     decided = open_ones.swapped(swap).marked(sure, Status.OK, Reason.NONE)
     # the covariance is that of the pose which it stands beside

@@ -13,10 +13,10 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.detect.reduce import area_reduce
 from torchpose.geometry import blur as blurs
+from torchpose.geometry.robust import LEAST_KEPT as LEAST_KEPT
 from torchpose.geometry.rows import Rows, shared
 from torchpose.target import Target
 
-LEAST_KEPT = 0.5  # of the pixels around the edges that must follow the model for a refinement to count
 QUANTISATION = 1 / 12  # variance of rounding, in grey levels^2, below which no noise estimate falls
 _START_BLUR = 0.8  # px, of rows whose rings tell of none
 _MOST_REDUCTION = 4

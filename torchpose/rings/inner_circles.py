@@ -12,13 +12,13 @@ from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
 from torchpose.geometry.grey import full_scale
 from torchpose.geometry.least_squares import solve_scaled
+from torchpose.geometry.robust import RATIO_RANGE
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import values_at
 
 ANGLES = 64
 _RADII = 72
 _INNERMOST, _OUTERMOST = 0.08, 1.12  # of the outer ellipse, the range of the radial profile
-_RATIO_RANGE = (0.12, 0.93)  # of inner to outer radius
 _LEAST_PEAK = 0.25  # of the outer edge's slope in the mean radial profile
 _LEAST_EDGE = 0.5  # of the median rise at the outer edge over all directions, for a direction that counts
 _EIGHTHS = 8  # parts of the perimeter in which the blur is looked at
@@ -76,13 +76,13 @@ def find_inner(frames: Tensor, candidates: Candidates, camera: Camera | None = N
     grey = values_at(frames, cell)
     at, polarity = rho[1:-1], candidates.polarity[own]
     # what covers the outer circle on one side hides the inner one there too: only directions that show the outer count
-    far = int((at <= _RATIO_RANGE[1]).sum())
+    far = int((at <= RATIO_RANGE[1]).sum())
     edge = ((grey[:, far + 2 :] - grey[:, far:-2]) * polarity[:, None, None].float()).amax(1)
     seen = edge > _LEAST_EDGE * edge.nanmedian(-1, keepdim=True).values
     profile = _mean_profile(grey, seen, frames.is_floating_point())
     rise = (profile[:, 2:] - profile[:, :-2]) * polarity[:, None]
-    outermost = rise.masked_fill(at < _RATIO_RANGE[1], -torch.inf).amax(-1)
-    fall = (-rise).masked_fill((at < _RATIO_RANGE[0]) | (at > _RATIO_RANGE[1]), -torch.inf)
+    outermost = rise.masked_fill(at < RATIO_RANGE[1], -torch.inf).amax(-1)
+    fall = (-rise).masked_fill((at < RATIO_RANGE[0]) | (at > RATIO_RANGE[1]), -torch.inf)
     peak, best = fall.nan_to_num(nan=-torch.inf).max(-1)
     # of both planes the one with the steeper edge
     count = len(candidates)
@@ -106,6 +106,8 @@ def _clipped(grey: Tensor, seen: Tensor, frame: Tensor) -> Tensor:
     of_frame = brightest.new_full((frames,), -torch.inf).scatter_reduce_(0, frame, brightest, "amax")
     limit = full_scale(of_frame)[frame]
     some = (brightest >= limit).nonzero()[:, 0]
+    if some.numel() == 0:
+        return torch.zeros_like(brightest, dtype=torch.bool)
     at_limit = (grey[some] >= limit[some, None, None]) & seen[some, None]
     most = at_limit.sum(-1).amax(1) > _MOST_CLIPPED * seen[some].sum(-1)
     return torch.zeros_like(brightest, dtype=torch.bool).index_copy_(0, some, most)

@@ -1,6 +1,7 @@
 """Stage: concentric pairs. From candidate ellipses to rings with both circles measured."""
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -29,6 +30,7 @@ _LARGE = 20.0  # px, of the outer semi-minor axis, from which on a fit of all pi
 _BLURRED = 1.3  # px: a wider blur is out of the reach of an edge's mask; the frame is looked at in half its size
 _MOST_REDUCTION = 4
 _LEAST_REDUCED = 5.0  # px, outer semi-minor axis in a reduced frame: of a smaller one too few pixels are left
+_ROUGH = 0.5  # px, of a candidate's centre and axes
 _EDGE_APART = 0.8  # ... and so do two edges closer than 5 px
 _STEP_RANGE = (0.4, 2.5)  # inner to outer grey step
 
@@ -72,15 +74,61 @@ def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera, *, cor
         camera: its distortion is taken off the sub-pixel points before the final fit.
         correct: free the edges from what blur and curvature do to them; False leaves them as the moments read them.
     """
-    if len(candidates) == 0:
-        return _no_rings(candidates)
+    return measure_circles(frames, find_circles(frames, candidates, camera), camera, correct=correct)
+
+
+@dataclass(frozen=True, eq=False)
+class Circles(Rows):
+    """Candidates with a circle inside, neither of them measured yet.
+
+    Attributes:
+        outer: the candidates.
+        inside: what is inside of each.
+    """
+
+    outer: Candidates
+    inside: InnerCircles
+
+    def __len__(self) -> int:
+        return len(self.outer)
+
+
+def find_circles(frames: Tensor, candidates: Candidates, camera: Camera) -> Circles:
+    """Those of the candidates that have a circle inside; arguments as for `measure_rings`."""
+    if len(candidates) == 0:  # frames without any cost nothing here
+        none, found = candidates.ellipse, candidates.frame > 0
+        seen = found.new_empty(0, ANGLES)
+        return Circles(candidates, InnerCircles(candidates.polarity, found, none, seen, none[:, :3], found))
     inside = find_inner(frames, candidates, camera)
-    found = inside.found
-    return _measured(frames, candidates[found], inside[found], camera, correct)[0]
+    return Circles(candidates, inside)[inside.found]
+
+
+def rough_rings(circles: Circles, camera: Camera) -> Rings:
+    """The circles as rings of the accuracy that they have now: good to name them, at a hundredth of the cost."""
+    outer, inner = circles.outer.ellipse, circles.inside.ellipse
+    if len(circles) == 0:
+        return _no_rings(circles.outer)
+    covariance = _ROUGH**2 * torch.eye(5, dtype=outer.dtype, device=outer.device).expand(len(outer), 5, 5)
+    one = torch.ones_like(circles.outer.polarity)
+
+    def fit(ellipses: Tensor) -> EllipseFit:
+        return EllipseFit(mapped(ellipses, lambda points: ideal_pixels(camera, points)), covariance, _ROUGH * one, one)
+
+    blur, clipped = circles.inside.blur, circles.inside.clipped
+    return Rings(circles.outer.frame, circles.outer.polarity, outer, inner, fit(outer), fit(inner), blur, clipped)
+
+
+def measure_circles(
+    frames: Tensor, circles: Circles, camera: Camera, *, correct: bool = True, precise: bool = True
+) -> Rings:
+    """`measure_rings` of circles that were found before; ``precise`` as for `fit_small_rings`."""
+    if len(circles) == 0:
+        return _no_rings(circles.outer)
+    return _measured(frames, circles, camera, _How(correct, precise))[0]
 
 
 def _no_rings(candidates: Candidates) -> Rings:
-    """Of no candidates: frames without any cost nothing here."""
+    """Of no candidates."""
     frame, polarity, none = candidates.frame, candidates.polarity, candidates.ellipse
     fit = EllipseFit(none, none.new_empty(0, 5, 5), polarity, polarity)
     return Rings(frame, polarity, none, none, fit, fit, none[:, :3], frame > 0)
@@ -91,16 +139,22 @@ def measure_predicted(
 ) -> tuple[Rings, Tensor]:
     """The same where the inner ellipses (M, 5) are known, about; also which candidate each ring is of, (K,) int64."""
     inside = replace(find_inner(frames, candidates, camera), ellipse=inner)
-    return _measured(frames, candidates, inside, camera, correct)
+    return _measured(frames, Circles(candidates, inside), camera, _How(correct))
 
 
-def _measured(
-    frames: Tensor, candidates: Candidates, inside: InnerCircles, camera: Camera, correct: bool
-) -> tuple[Rings, Tensor]:
-    """Rings of candidates, each in frames reduced as far as its blur asks for, and whose they are.
+class _How(NamedTuple):
+    """correct: as for `measure_rings`. precise: as for `fit_small_rings`."""
+
+    correct: bool
+    precise: bool = True
+
+
+def _measured(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tuple[Rings, Tensor]:
+    """Rings of circles, each in frames reduced as far as its blur asks for, and whose they are.
 
     A mask or a band of a fixed size sees little of an edge that is wider; in a frame of half the size it is not.
     """
+    candidates, inside = circles.outer, circles.inside
     wide, room = blurs.axes(inside.blur)[1].sqrt(), candidates.ellipse[:, 3]
     factor = torch.ones_like(candidates.frame)
     for power in range(1, _MOST_REDUCTION.bit_length()):
@@ -119,7 +173,7 @@ def _measured(
         )
         small = frames if len(frame) == len(frames) else frames[frame]
         small = small if value == 1 else area_reduce(small, value, exact=True)
-        found, of = _measure(small, some, part, camera.reduced(value), correct)
+        found, of = _measure(small, Circles(some, part), camera.reduced(value), how)
         rings.append(_enlarged(replace(found, frame=frame[found.frame]), value))
         which.append(index[of])
     if not rings:
@@ -158,12 +212,26 @@ def _enlarged(rings: Rings, factor: int) -> Rings:
     )
 
 
-def _measure(
-    frames: Tensor, candidates: Candidates, inside: InnerCircles, camera: Camera, correct: bool
-) -> tuple[Rings, Tensor]:
-    """Rings of candidates in the frames as they are, and whose they are."""
-    outer, inner, clear = candidates.ellipse, inside.ellipse, clear_directions(inside.seen)
+def _measure(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tuple[Rings, Tensor]:
+    """Rings of circles in the frames as they are, and whose they are."""
+    outer, inner = circles.outer.ellipse, circles.inside.ellipse
     ratio = (inner[:, 2:4].prod(-1) / outer[:, 2:4].prod(-1)).sqrt()
+    inside = replace(circles.inside, ratio=ratio, seen=clear_directions(circles.inside.seen))
+    circles = replace(circles, inside=inside)
+    narrow = torch.minimum((1 - ratio) * _EDGE_APART, ratio) * outer[:, 3] < _SMALL
+    small = narrow & (outer[:, 3] < _LARGE)
+    parts = []
+    for index, measured in (((~small).nonzero()[:, 0], _by_edges), (small.nonzero()[:, 0], _as_a_whole)):
+        if index.numel():
+            rings, of = measured(frames, circles[index], camera, how)
+            parts.append((rings, index[of]))
+    return Rings.cat([rings for rings, _ in parts]), torch.cat([which for _, which in parts])
+
+
+def _by_edges(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tuple[Rings, Tensor]:
+    """Rings of circles whose edges are measured one by one, and whose they are."""
+    candidates, inside = circles.outer, circles.inside
+    outer, inner, clear, ratio = candidates.ellipse, inside.ellipse, inside.seen, inside.ratio
     count = len(candidates)
     # no search band may reach the other circle, nor the centre
     gap = torch.minimum(0.5 * (1 - ratio), 0.6 * ratio) * outer[:, 3]
@@ -178,7 +246,7 @@ def _measure(
     distance = edges.offset - ellipse.distance(edges.points, edges.ring, raw) * outward[edges.ring]
     blur = zernike.edge_blur(edges.offset[keep], distance[keep], edges.normal[keep], edges.ring[keep] % count, count)
     points = edges.points
-    if correct:
+    if how.correct:
         points = points + _correction(edges, raw, blur, outward)[:, None] * edges.normal
     raw, keep = ellipse.fit_robust(points, edges.ring, 2 * count, start=raw, scales=(0.5,))
     ring, points = edges.ring[keep], points[keep]
@@ -205,19 +273,12 @@ def _measure(
         & (offset < 0.25 * raw[:count, 3])  # concentric but for perspective
         & (raw[count:, 2] < raw[:count, 2])
     )
-    narrow = torch.minimum((1 - ratio) * _EDGE_APART, ratio) * outer[:, 3] < _SMALL
-    small = narrow & (outer[:, 3] < _LARGE)
-    index = (good & ~small).nonzero()[:, 0]
+    index = good.nonzero()[:, 0]
     second = index + count
     pixel = blurs.isotropic(blur.new_tensor(12**-0.5))  # that of the mask
     blur = blurs.limited(blur - pixel, LEAST**2, MOST**2)[index]
     frame, polarity = candidates.frame[index], candidates.polarity[index]
-    large = Rings(frame, polarity, raw[index], raw[second], fit[index], fit[second], blur, inside.clipped[index])
-    if not bool(small.any()):
-        return large, index
-    rest = small.nonzero()[:, 0]
-    measured, which = _measure_small(frames, candidates[rest], replace(inside, ratio=ratio, seen=clear)[rest], camera)
-    return Rings.cat([large, measured]), torch.cat([index, rest[which]])
+    return Rings(frame, polarity, raw[index], raw[second], fit[index], fit[second], blur, inside.clipped[index]), index
 
 
 def _direction(edges: RingEdges, ellipses: Tensor) -> Tensor:
@@ -231,12 +292,11 @@ def _direction(edges: RingEdges, ellipses: Tensor) -> Tensor:
     return (turn * (ANGLES / (2 * torch.pi))).round().long() % ANGLES
 
 
-def _measure_small(
-    frames: Tensor, candidates: Candidates, inside: InnerCircles, camera: Camera
-) -> tuple[Rings, Tensor]:
+def _as_a_whole(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tuple[Rings, Tensor]:
     """The same for rings whose circles are too close to each other, or too small, to be measured one by one."""
     focal = camera.matrix.diagonal()[:2].mean()
-    found = fit_small_rings(frames, candidates, inside, focal)
+    candidates = circles.outer
+    found = fit_small_rings(frames, candidates, circles.inside, focal, precise=how.precise)
     least_outer, least_inner = _LEAST_SEMI_MINOR
     large = (found.outer.params[:, 3] > least_outer) & (found.inner.params[:, 3] > least_inner)
     index = (found.good & large).nonzero()[:, 0]
@@ -253,7 +313,7 @@ def _measure_small(
         replace(outer, params=mapped(outer.params, to_ideal)),
         replace(inner, params=mapped(inner.params, to_ideal)),
         found.blur[index],
-        inside.clipped[index],
+        circles.inside.clipped[index],
     )
     return rings, index
 

@@ -38,19 +38,19 @@ from torchpose.geometry.least_squares import (
     minimise,
     solve_scaled,
 )
+from torchpose.geometry.robust import CUT, LEAST_KEPT, RATIO_RANGE, of_chance
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import values_at
 from torchpose.rings.inner_circles import InnerCircles
 from torchpose.rings.small_ring_model import MOST_NODES, RING, depth, exact, first_order, outer_ellipses
 
 _MARGIN = 3.0  # px around the outer ellipse
-_SOFT, _CUT = 2.5, 4.0  # standard deviations: scale of the soft weights, and from where on a pixel is dropped
-_SECTORS, _SECTOR_CUT = 16, 4.0  # and standard deviations of the mean square of a sector
+_SOFT = 2.5  # standard deviations, scale of the soft weights
+_SECTORS = 16
 _MISFIT = (
     0.05  # of the contrast, RMS in a sector, that a blur of another shape leaves: the most of a box for a Gaussian
 )
 _ACROSS = 4.0  # px across an edge, two blurs on either side, that share its misfit: all of them tell as much as one
-_LEAST_KEPT = 0.5  # of the pixels
 _MOST_MOVE = (*[0.7] * 5, 0.1, *[0.7] * 2)  # of an iteration: px, and the ratio
 _START_SIGMA = 0.8  # px, at least
 _OVAL = 0.3  # of a blur's mean variance: what is expected of its lean, which a ring as small as its blur hardly tells
@@ -60,7 +60,6 @@ _LEAST_EXPLAINED = 0.75  # of the variance of grey around the ring
 _PROMISING = 0.5  # of it, from the first fit, for a second one
 _PART = 400_000  # pixels times nodes at a time
 _UNEVEN = 2.0  # most pixels of a window over the least, of those that are padded to one size
-_RATIO_RANGE = (0.12, 0.93)  # beyond it, a plain disc or its rim
 _RATIO_SIGMA = 0.1  # of the ratio: an inner circle that is not sure is none
 _LEVELS = 4  # paper, its slope 2, contrast
 _LEAST = (*[-math.inf] * 5, 0.05, *[-math.inf] * 2)  # of the ring's parameters, and the most
@@ -113,7 +112,12 @@ _PRECISE = _Scheme(exact, 1e-5, (_Stage(6), _Stage(4, hard=True)))
 
 
 def fit_small_rings(
-    frames: Shaped[Tensor, "B H W"], candidates: Candidates, inside: InnerCircles, focal: Float[Tensor, ""]
+    frames: Shaped[Tensor, "B H W"],
+    candidates: Candidates,
+    inside: InnerCircles,
+    focal: Float[Tensor, ""],
+    *,
+    precise: bool = True,
 ) -> SmallRings:
     """Fits the model above by damped Gauss-Newton from rough rings.
 
@@ -122,6 +126,7 @@ def fit_small_rings(
         candidates: the outer circles, about.
         inside: what is inside of them, about; directions in which the outer edge does not show do not count.
         focal: px.
+        precise: fit rings of a wide blur by the exact integral; else a code may be off by a fifth of its tolerance.
     """
     frame, outer, polarity, ratio, seen = (
         candidates.frame,
@@ -140,6 +145,8 @@ def fit_small_rings(
     for part in _parts(_pixels(outer, margin), 1):
         some = _fitted(_windows(frames, frame[part], outer[part], margin[part]), begun[part], _ROUGH)
         fit = fit.replaced(part, some)
+    if not precise:
+        return _judged(fit, outer, polarity)
     which = _blurred(fit, outer, polarity)
     reach = (_BLURRED_MARGIN * blurs.axes(fit.blur)[1].sqrt()).clamp_min(_MARGIN)
     begun = replace(begun, theta=fit.theta, spread=Spread(fit.blur))
@@ -306,9 +313,8 @@ class _Pixels:
         sums[0].scatter_add_(0, self.sector.flatten(), (self.clear * residual.square()).flatten())
         sums[1].scatter_add_(0, self.sector.flatten(), self.clear.flatten())
         square, number = (sums[0] / sums[1]).view(-1, _SECTORS), sums[1].view(-1, _SECTORS)  # NaN where it is not seen
-        chance = 1 + _SECTOR_CUT * (2 / number).sqrt()
         allowed = (_MISFIT * self.levels[:, 3:]).square()
-        limit = square.nanmedian(-1, keepdim=True).values * chance + allowed
+        limit = square.nanmedian(-1, keepdim=True).values * of_chance(number) + allowed
         return (square <= limit).flatten()[self.sector].to(residual)
 
 
@@ -320,11 +326,11 @@ def _judged(fit: _Fit, outer: Tensor, polarity: Tensor) -> SmallRings:
     good = (
         shape_ok
         & fit.sound
-        & (fit.kept > _LEAST_KEPT)
+        & (fit.kept > LEAST_KEPT)
         & (fit.explained > _LEAST_EXPLAINED)
         & (fit.contrast * polarity < 0)
-        & (ratio > _RATIO_RANGE[0])
-        & (ratio < _RATIO_RANGE[1])
+        & (ratio > RATIO_RANGE[0])
+        & (ratio < RATIO_RANGE[1])
         & (covariance[:, 5, 5].sqrt() < _RATIO_SIGMA * ratio)
         & (torch.linalg.vector_norm(params[:, :2] - outer[:, :2], dim=-1) < 0.3 * outer[:, 3] + 1)
     )
@@ -384,7 +390,7 @@ def _windows(frames: Tensor, frame: Tensor, outer: Tensor, margin: Tensor) -> _W
 def _weights(deviation: Tensor, keep: bool) -> Tensor:
     """Weights of residuals in standard deviations: Geman-McClure's, or with ``keep`` 1 within the cut, else 0."""
     if keep:
-        return (deviation.abs() < _CUT).to(deviation)
+        return (deviation.abs() < CUT).to(deviation)
     return geman_mcclure(deviation / _SOFT).nan_to_num(nan=0.0)
 
 

@@ -28,6 +28,7 @@ from torchpose.geometry.least_squares import (
     minimise,
     solve_scaled,
 )
+from torchpose.geometry.robust import CUT
 from torchpose.geometry.segments import segment_mean, segment_sum
 from torchpose.refine.edges.step_filter import StepOffsets, step_offsets, window_correlation
 from torchpose.refine.sight import Refined, Sight, at_full_size
@@ -47,7 +48,6 @@ _ROOM = 1.2  # of half the ring's width: a filter that sees the other circle tak
 _WIDEST = 1.3  # px, of a blur's major axis: a wider one is out of the mask's reach
 _MOST_BLUR = 3.0  # px, about what a window of the filter holds
 _MOST_CHANGE = 0.6  # px, of the blur in a step, times the blur itself: of its variance
-_CUT = 4.0  # robust standard deviations beyond which an edge point is left out
 _CUT_FLOOR = 0.02  # px, added to the cut: what pixels alias to
 
 
@@ -153,7 +153,7 @@ class _Fit:
         of, sound = self.seen.of, self.seen.sound
         soft = sound * geman_mcclure(error / (_SOFT * self.spread)[of])
         self.spread = _SOFT_BIAS * segment_mean(error.square(), of, len(self.sight), soft).sqrt()
-        self.keep = sound * (error.abs() < (_CUT * self.spread + _CUT_FLOOR)[of])
+        self.keep = sound * (error.abs() < (CUT * self.spread + _CUT_FLOOR)[of])
         return soft
 
     def _normal(self, pose: Pose, error: Tensor, by_pose: Tensor, weight: Tensor) -> Normal:

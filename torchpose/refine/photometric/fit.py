@@ -20,6 +20,7 @@ from torch import Tensor
 from torchpose.geometry import blur as blurs
 from torchpose.geometry.blurred_edge import LEAST, MOST, Kind, Spread
 from torchpose.geometry.least_squares import Block, Minimum, Normal, Pose, PosePrior, Unknowns, Vector, minimise
+from torchpose.geometry.robust import of_chance
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import segment_mean, segment_sum
 from torchpose.refine.photometric.band import band_width
@@ -57,7 +58,6 @@ class _Stage(NamedTuple):
 
 _KINDS: tuple[Kind, ...] = ("gauss", "line", "disc")
 _LONG = 1.7  # variance along the major axis over the minor one: a motion of 2 px, from which on it may be a line
-_SIGNIFICANT = 4.0  # standard deviations of a mean square
 _MATTERS = 0.004  # of the contrast, RMS at the edges: that of a disc of 2 px, which costs a tenth in the covariance
 _FEWER = 0.02  # of the pixels that a shape of the blur may keep less than a Gaussian, and still explain them better
 _QUICK = (_Stage(3, coarse=True), _Stage(1))
@@ -210,7 +210,7 @@ class _Fit:
         at_edges, everywhere = sums[0] / sums[1], sums[3] / sums[4]
         pixels = sums[1].square() / sums[2]
         matters = at_edges - everywhere > (_MATTERS * contrast).square()
-        return matters & (at_edges > everywhere * (1 + _SIGNIFICANT * (2 / pixels).sqrt()))
+        return matters & (at_edges > everywhere * of_chance(pixels))
 
     def _trusted(self, spread: Tensor, misfit: Tensor) -> Tensor:
         """Weights (K, 96) of the sectors."""

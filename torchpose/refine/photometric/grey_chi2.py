@@ -5,10 +5,10 @@ from torch import Tensor
 
 from torchpose.geometry.blurred_edge import Spread
 from torchpose.geometry.least_squares import solve_scaled
+from torchpose.geometry.robust import CUT
 from torchpose.geometry.segments import segment_sum
 from torchpose.refine.photometric.band import band_width
 from torchpose.refine.photometric.grey_levels import (
-    CUT,
     TILE,
     columns_of,
     first_levels,

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from torchpose.geometry.blurred_edge import Spread
 from torchpose.geometry.least_squares import geman_mcclure, solve_scaled
+from torchpose.geometry.robust import CUT
 from torchpose.refine.photometric.light import LEVELS
 from torchpose.refine.photometric.ring_model import PixelBlocks, RingModel, ring_model
 
 TILE = 256  # pixels summed in float32 at a time; sums of tiles are float64, so padding changes no digit that counts
-CUT = 4.0  # robust standard deviations beyond which a pixel is left out
 _CLEAR_OF_LIMITS = 3.0  # standard deviations between what a pixel should show and where its noise is clipped
 _MISFIT = 0.02  # of the contrast: what a point-spread function that is not Gaussian leaves at the edges of quiet frames
 _MOST_SPREAD = 1.5  # of a marker's residuals, in those of the best marker of its frame

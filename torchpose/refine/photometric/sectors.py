@@ -18,16 +18,15 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchpose.geometry.robust import CUT, of_chance
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import segment_sum
 from torchpose.refine.photometric.ring_model import PixelBlocks, RingModel
 
 SECTORS = 48  # of a circle
 _KEPT = 0.9  # of a sector's pixels that must follow the model for it to count
-_CUT = 4.0  # standard deviations of the mean square of a sector's residuals
 _LEAST_CLEAR = 0.55  # of the sectors of a marker, below which none of them counts
 _CELL = 4  # sectors over which a misfit is taken for one
-_SIGNIFICANT = 4.0  # standard deviations beyond which a chi-squared or a displacement is no noise
 _UNCLEAR = 3  # sectors of an outer circle: more are no chance
 _RESTLESS = 24.3  # chi-squared of seven unknowns, exceeded once in a thousand
 _DISPLACED = 0.005  # px, displacement that a camera or print slightly off may cause: no reason for doubt
@@ -95,7 +94,7 @@ def clear_sectors(sectors: Sectors, spread: Tensor, misfit: Tensor) -> Tensor:
     Args:
         spread: (K,) standard deviation of noise. misfit: (K,) what the model itself may be off by; grey levels.
     """
-    limit = spread[:, None].square() * (1 + _CUT * (2 / sectors.used.clamp_min(1)).sqrt()) + misfit[:, None].square()
+    limit = spread[:, None].square() * of_chance(sectors.used.clamp_min(1)) + misfit[:, None].square()
     clear = (sectors.used > _KEPT * sectors.total) & (sectors.square < sectors.used * limit)
     # where half of a ring is gone, the rest of the marker is not to be trusted either
     seen = (sectors.total > 0).sum(-1, keepdim=True)
@@ -120,7 +119,7 @@ def trust(sectors: Sectors, clear: Tensor, variance: Tensor) -> Tensor:
         variance: (K,) of noise.
     """
     noise = variance[:, None].to(sectors.pull.dtype)
-    good = clear & (sectors.pull.square() < _SIGNIFICANT**2 * noise * sectors.hold.clamp_min(_TINY))
+    good = clear & (sectors.pull.square() < CUT**2 * noise * sectors.hold.clamp_min(_TINY))
     chi2, hold = _cells(sectors.scaled(good.to(sectors.pull.dtype)), noise)
     excess = (chi2 - (hold > 0).to(chi2.dtype)).sum(-1).clamp_min(0)
     spread = (excess / hold.sum(-1).clamp_min(_TINY))[:, None] * hold  # tau^2 over the variance of each cell
@@ -156,5 +155,5 @@ def doubtful(sectors: Sectors, clear: Tensor, variance: Tensor, row: Tensor, ste
     )
     total = segment_sum(chi2.double().sum(-1), row, rows) - step_chi2
     freedom = segment_sum((hold > 0).double().sum(-1), row, rows).clamp_min(1)
-    pulled = total > freedom + _SIGNIFICANT * (2 * freedom).sqrt()
+    pulled = total > freedom * of_chance(freedom)
     return pulled | (step_chi2 > _RESTLESS * (more - 1)) | (segment_sum(unclear.double(), row, rows) > 0)

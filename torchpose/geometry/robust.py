@@ -1,0 +1,16 @@
+"""What is taken for noise: the limits that all stages share."""
+
+from typing import TypeVar
+
+from torch import Tensor
+
+Value = TypeVar("Value", float, Tensor)
+
+CUT = 4.0  # standard deviations, beyond which a value is no noise: of a ring's thousand pixels noise loses 0.06
+LEAST_KEPT = 0.5  # of the pixels of a ring that must follow its model: with less, what is left may be something else
+RATIO_RANGE = (0.12, 0.93)  # of inner to outer radius: beyond, a plain disc or its rim
+
+
+def of_chance(number: Value) -> Value:
+    """Most that the mean square of so many values exceeds its expectation by chance, as a factor."""
+    return 1 + CUT * (2 / number) ** 0.5
