@@ -131,6 +131,5 @@ def propose(rings: Rings, table: MarkerTable, matrix: Tensor) -> Assignments:
     conic = matrix.T @ conics.to_matrix(conics.conic_from_ellipse(ellipse)) @ matrix
     place, axis = conics.circle_poses(conic, radius)
     number = target * len(rings) + ring
-    return Assignments(
-        row, target, marker, ring, number, *(c[ring, target, marker] for c in codes), ellipse, radius, place, axis
-    )
+    off, clipping, per_px = (code[ring, target, marker] for code in codes)
+    return Assignments(row, target, marker, ring, number, off, clipping, per_px, ellipse, radius, place, axis)
