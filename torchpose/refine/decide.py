@@ -77,10 +77,10 @@ def decide_on_grey(solutions: Solutions, evidence: Evidence, sight: Sight) -> So
     chi2, explained = grey_chi2(sight, one, two)
     swap = chi2 < 0
     better = two.where(swap, one)
-    # a pose whose fit loses every pixel is no reason for doubt in the one that keeps them
-    alike = one.good & two.good & _meet(one, two)
-    sure = better.good & (better.kept > LEAST_KEPT) & (alike | (chi2.abs() > AMBIGUOUS_CHI2))
-    sure &= ~shape | torch.where(swap, explained[:, 1], explained[:, 0])
+    # whatever becomes of the other's fit, this one must show every ring
+    shows = torch.where(swap, explained[:, 1], explained[:, 0])
+    told = shape | (one.good & two.good & _meet(one, two)) | (chi2.abs() > AMBIGUOUS_CHI2)
+    sure = better.good & (better.kept > LEAST_KEPT) & shows & told
     decided = open_ones.swapped(swap).marked(sure, Status.OK, Reason.NONE)
     # the covariance is that of the pose which it stands beside
     own = pose_covariance(replace(evidence[row], mask=open_ones.mask), decided.R, decided.t)[0]
