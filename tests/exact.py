@@ -61,4 +61,4 @@ def rings_of(ellipses: Tensor, frame: Tensor, sigma: float = 0.005, polarity: fl
 
     outer, inner = fit(ellipses[:, 0]), fit(ellipses[:, 1])
     side, blur = torch.full((count,), polarity, dtype=F64), isotropic(torch.full((count,), 0.8, dtype=F64))
-    return Rings(frame, side, outer.params, inner.params, outer, inner, blur)
+    return Rings(frame, side, outer.params, inner.params, outer, inner, blur, frame < 0)

@@ -312,6 +312,7 @@ def _sight(scene: Scene, found: Found, evidence: Evidence) -> Sight:
     """The solvable rows in their frames."""
     ring = found.rings[found.identified.ring[found.solvable].clamp_min(0).flatten()]
     raw = torch.stack([ring.outer_raw, ring.inner_raw], 1).view(*evidence.mask.shape, 2, 5)
+    blur = torch.where(ring.clipped[:, None], torch.nan, ring.blur)  # what is left of a clipped edge tells of none
     return Sight(
         scene.frame[found.solvable],
         evidence.mask,
@@ -322,7 +323,7 @@ def _sight(scene: Scene, found: Found, evidence: Evidence) -> Sight:
         evidence.radii,
         scene.frames,
         scene.camera,
-        ring.blur.view(*evidence.mask.shape, 3),
+        blur.view(*evidence.mask.shape, 3),
     )
 
 

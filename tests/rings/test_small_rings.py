@@ -22,7 +22,7 @@ def begun(frame: Tensor, outer: Tensor, ratio: Tensor) -> tuple[Candidates, Inne
     candidates = Candidates(frame, outer, one, -one, one, torch.zeros_like(frame))
     inner = torch.cat([outer[:, :2], outer[:, 2:4] * ratio[:, None], outer[:, 4:]], -1)
     seen = torch.ones(len(frame), 64, dtype=torch.bool)
-    return candidates, InnerCircles(ratio, one > 0, inner, seen, isotropic(0.8 * one))
+    return candidates, InnerCircles(ratio, one > 0, inner, seen, isotropic(0.8 * one), one < 0)
 
 
 @pytest.mark.parametrize("tilt", [0.1, 40.0])

@@ -14,12 +14,16 @@ from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.geometry.rows import Rows, shared
-from torchpose.geometry.segments import marked
+from torchpose.geometry.segments import marked, pairs_in_group
 from torchpose.identify.assignments import Assignments, propose, ratio_tolerance
 from torchpose.identify.copies import MIN_MARKERS, Claims, Rivals, rank, share_out
 from torchpose.identify.hypotheses import Hypotheses, hypotheses
 from torchpose.identify.scene import MarkerTable
 from torchpose.rings import Rings
+
+# of the tolerances, mean over the markers: a false code of rings of 13 px misses by 0.2 more (derived), a right one by
+# less than 0.1 (the frames of `corruption_statistics.py --only over-exposure`)
+_AS_WELL = 0.1
 
 __all__ = ["Identified", "identify", "ratio_tolerance"]
 
@@ -81,6 +85,7 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int, inst
     if instances is not None:
         number = torch.arange(len(kept), device=device) - torch.searchsorted(row[kept], row[kept])
         kept = kept[number < instances]
+    kept = kept[~_contested(rivals, kept, rings.clipped)]
     group, at = row[kept], torch.arange(len(kept), device=device)
     without = (~marked(group, rows)).nonzero()[:, 0]
     if without.numel():
@@ -92,10 +97,30 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int, inst
     chosen = (to >= 0).nonzero()[:, 0]
     result.ring[to[chosen], claims.marker[chosen]] = claims.ring[chosen] % len(rings)
     if without.numel():
-        # no pair, no pose: the code is all there is
-        alone = marked(without, rows)[one.row].nonzero()[:, 0]
+        # no pair, no pose: the code is all there is, where it is not clipped
+        alone = (marked(without, rows)[one.row] & one.clipping.isnan()).nonzero()[:, 0]
         result.ring[torch.searchsorted(group, one.row[alone]), one.marker[alone]] = one.ring[alone]
     return result
+
+
+def _contested(rivals: Rivals, kept: Tensor, clipped: Tensor) -> Tensor:
+    """Poses ``kept`` (P,) bool that another one explains as well by other codes of the same rings (K,) ``clipped``.
+
+    Codes read up to a displacement let a small target turn, by a code and a corner. What it costs is that the rings'
+    size, moved with their edges, no longer suits their distances.
+    """
+    if not bool(clipped.any()):
+        return torch.zeros_like(kept, dtype=torch.bool)
+    claims = rivals.claims.where(clipped[rivals.claims.ring % len(clipped)])
+    number = torch.full_like(rivals.row, -1).index_copy_(0, kept, torch.arange(len(kept), device=kept.device))
+    own = claims.where(number[claims.pose] >= 0)
+    ring, order = claims.ring.sort()
+    i, j = pairs_in_group(own.ring, ring)
+    j = order[j]
+    one, two = own.pose[i], claims.pose[j]
+    worse = (rivals.score[one] - rivals.score[two]) * (2 * rivals.size[2]) / rivals.explained[one]
+    other = (claims.marker[j] != own.marker[i]) & (rivals.explained[two] >= rivals.explained[one]) & (worse < _AS_WELL)
+    return marked(number[one[other]], len(kept))
 
 
 def _tried(
@@ -125,7 +150,9 @@ def _weighed(tried: Hypotheses, one: Assignments, size: tuple[int, int, int]) ->
     member, pose, markers = tried.member, tried.pose, size[2]
     every = Claims(pose, one.number[member], one.marker[member])
     # the code has its say, too: markers of neighbouring codes must not change places
-    cost = torch.where(tried.miss < 1, 0.5 * (tried.miss + one.mismatch[member]), torch.inf)
+    # and clipping moves the edges of all rings as far as those of the one that the pose comes from
+    off = one[member].mismatch_under(one.clipping[tried.origin[pose]])
+    cost = torch.where((tried.miss < 1) & (off < 1), 0.5 * (tried.miss + off), torch.inf)
     slot = pose * markers + every.marker
     per_marker = torch.full((len(tried.R) * markers,), torch.inf, dtype=cost.dtype, device=cost.device)
     per_marker.scatter_reduce_(0, slot, cost, "amin")

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.detect import Candidates, Verdict
 from torchpose.geometry import conics
-from torchpose.identify.assignments import tolerance_of
+from torchpose.identify.assignments import Codes
 from torchpose.identify.markers import Identified
 from torchpose.identify.scene import MarkerTable, Scene
 from torchpose.rings import Rings, mapped, measure_predicted
@@ -54,9 +54,10 @@ def look_again(
     row, marker, ideal = row[kept[which]], marker[kept[which]], ideal[kept[which], 0]
     measured = found.outer.params
     miss = torch.linalg.vector_norm(measured[:, :2] - ideal[:, :2], dim=-1)
-    off = (found.ratio - markers.radii[row, marker, 1] / markers.radii[row, marker, 0]).abs()
+    expected = markers.radii[..., 1] / markers.radii[..., 0]
+    off = Codes.of(found, expected[row, marker]).under(_clipping(rings, identified.ring, expected)[row])
     px, of_size = _PLACE_TOLERANCE
-    good = (miss < px + of_size * measured[:, 2]) & (off < tolerance_of(found))
+    good = (miss < px + of_size * measured[:, 2]) & (off < 1)
     # of several poses of a row, the one that was nearest
     slot = row * identified.ring.shape[1] + marker
     nearest = torch.full((identified.ring.numel(),), torch.inf, dtype=miss.dtype, device=miss.device)
@@ -67,6 +68,19 @@ def look_again(
     assigned = identified.ring.index_put((place[:, 0], place[:, 1]), ring)
     more = replace(identified, ring=assigned, proposal=torch.cat([identified.proposal, place]))
     return Rings.cat([rings, found[index]]), more
+
+
+def _clipping(rings: Rings, ring: Tensor, expected: Tensor) -> Tensor:
+    """By how far clipping has moved the edges of each row's rings (N, M), -1 where not seen: (N,) px, NaN if unknown.
+
+    Args:
+        rings: of all frames.
+        ring: index into them.
+        expected: ratios (N, M) of the markers.
+    """
+    some = rings[ring.flatten().clamp_min(0)]
+    each = Codes.of(some, expected.flatten()).clipping.view_as(expected)
+    return torch.where(ring >= 0, each, torch.nan).nanmedian(1).values
 
 
 def _predicted(

@@ -34,7 +34,7 @@ class Sight(Rows):
         centers: of the markers, target frame, mm.
         normals: the same.
         radii: outer and inner, mm.
-        blur: of every marker, px^2, see `geometry.blur`; None where nothing is known of it.
+        blur: of every marker, px^2, see `geometry.blur`; NaN or None where nothing is known of it.
         frames: grey values, any real dtype.
         camera: with distortion.
         reduction: of the frames, by block means: their rounding counts for less.
@@ -68,12 +68,12 @@ class Sight(Rows):
 
     @property
     def common_blur(self) -> Float[Tensor, "N 3"]:
-        """The median of the blurs of the markers of every row that are seen."""
+        """The median of the known blurs of the markers of every row that are seen."""
         start = torch.tensor(_START_BLUR, dtype=torch.float64, device=self.frame.device)
         if self.blur is None:
             return blurs.isotropic(start.expand(len(self)))
-        known = torch.where(self.mask[..., None], self.blur, torch.nan)
-        return torch.where(self.mask.any(1, keepdim=True), known.nanmedian(1).values, blurs.isotropic(start))
+        median = torch.where(self.mask[..., None], self.blur, torch.nan).nanmedian(1).values
+        return torch.where(median.isnan(), blurs.isotropic(start), median)
 
     def reduced(self, factor: int) -> Sight:
         """The same rows in frames of which blocks of ``factor`` px make one; only those frames that they need."""

@@ -10,6 +10,7 @@ from torchpose.camera import Camera
 from torchpose.detect import Candidates
 from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
+from torchpose.geometry.grey import full_scale
 from torchpose.geometry.least_squares import solve_scaled
 from torchpose.geometry.robust import RATIO_RANGE
 from torchpose.geometry.rows import Rows
@@ -22,6 +23,7 @@ _LEAST_PEAK = 0.25  # of the outer edge's slope in the mean radial profile
 _LEAST_EDGE = 0.5  # of the median rise at the outer edge over all directions, for a direction that counts
 _EIGHTHS = 8  # parts of the perimeter in which the blur is looked at
 _MOST_BLUR = 12.0  # px
+_MOST_CLIPPED = 0.5  # of the directions, at one radius: from there on the median is no measurement (a convention)
 _PARTED = 0.02  # of the semi-minor axis: from which shift of the centres on perspective smears the profile
 
 
@@ -36,6 +38,7 @@ class InnerCircles(Rows):
         seen: the directions, evenly spaced in eccentric anomaly from +u on the circle that the candidate is the image
             of, in which its own edge shows.
         blur: of the outer edge, px^2, about; see `geometry.blur`.
+        clipped: whether most of the paper, or of a light ring, is at the grey value at which the frame is clipped.
     """
 
     ratio: Float[Tensor, " M"]
@@ -43,6 +46,7 @@ class InnerCircles(Rows):
     ellipse: Float[Tensor, "M 5"]
     seen: Bool[Tensor, "M A"]
     blur: Float[Tensor, "M 3"]
+    clipped: Bool[Tensor, " M"]
 
 
 def find_inner(frames: Tensor, candidates: Candidates, camera: Camera | None = None) -> InnerCircles:
@@ -91,7 +95,22 @@ def find_inner(frames: Tensor, candidates: Candidates, camera: Camera | None = N
     inner = torch.cat([center, candidates.ellipse[:, 2:4] * ratio[:, None], candidates.ellipse[:, 4:]], -1)
     found = (outermost[first] > 0) & (steepest > _LEAST_PEAK * outermost[first])
     blur = _edge_blur(grey[first], seen[first], candidates.ellipse, ratio, at)
-    return InnerCircles(ratio, found, inner, seen[first], blur)
+    clipped = _clipped(grey, seen, candidates.frame[own])[first]
+    return InnerCircles(ratio, found, inner, seen[first], blur, clipped)
+
+
+def _clipped(grey: Tensor, seen: Tensor, frame: Tensor) -> Tensor:
+    """Profiles (P,) bool of grey (P, R, A) that at some radius are clipped in most of the directions (P, A) seen."""
+    brightest = grey.nan_to_num(nan=-torch.inf).flatten(1).amax(1)
+    frames = int(frame.max()) + 1 if len(frame) else 0
+    of_frame = brightest.new_full((frames,), -torch.inf).scatter_reduce_(0, frame, brightest, "amax")
+    limit = full_scale(of_frame)[frame]
+    some = (brightest >= limit).nonzero()[:, 0]
+    if some.numel() == 0:
+        return torch.zeros_like(brightest, dtype=torch.bool)
+    at_limit = (grey[some] >= limit[some, None, None]) & seen[some, None]
+    most = at_limit.sum(-1).amax(1) > _MOST_CLIPPED * seen[some].sum(-1)
+    return torch.zeros_like(brightest, dtype=torch.bool).index_copy_(0, some, most)
 
 
 def _edge_blur(grey: Tensor, seen: Tensor, outer: Tensor, ratio: Tensor, at: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose import ellipse
@@ -47,6 +47,7 @@ class Rings(Rows):
         outer: fits in ideal pixels, that is of the same camera without lens distortion.
         inner: the same.
         blur: of the ring's edges, px^2, see `geometry.blur`.
+        clipped: whether the lighter side of the edges is clipped, which moves them all towards the darker side.
     """
 
     frame: Int[Tensor, " K"]
@@ -56,6 +57,7 @@ class Rings(Rows):
     outer: EllipseFit
     inner: EllipseFit
     blur: Float[Tensor, "K 3"]
+    clipped: Bool[Tensor, " K"]
 
     @property
     def ratio(self) -> Tensor:
@@ -96,7 +98,7 @@ def find_circles(frames: Tensor, candidates: Candidates, camera: Camera) -> Circ
     if len(candidates) == 0:  # frames without any cost nothing here
         none, found = candidates.ellipse, candidates.frame > 0
         seen = found.new_empty(0, ANGLES)
-        return Circles(candidates, InnerCircles(candidates.polarity, found, none, seen, none[:, :3]))
+        return Circles(candidates, InnerCircles(candidates.polarity, found, none, seen, none[:, :3], found))
     inside = find_inner(frames, candidates, camera)
     return Circles(candidates, inside)[inside.found]
 
@@ -112,8 +114,8 @@ def rough_rings(circles: Circles, camera: Camera) -> Rings:
     def fit(ellipses: Tensor) -> EllipseFit:
         return EllipseFit(mapped(ellipses, lambda points: ideal_pixels(camera, points)), covariance, _ROUGH * one, one)
 
-    blur = circles.inside.blur
-    return Rings(circles.outer.frame, circles.outer.polarity, outer, inner, fit(outer), fit(inner), blur)
+    blur, clipped = circles.inside.blur, circles.inside.clipped
+    return Rings(circles.outer.frame, circles.outer.polarity, outer, inner, fit(outer), fit(inner), blur, clipped)
 
 
 def measure_circles(
@@ -129,7 +131,7 @@ def _no_rings(candidates: Candidates) -> Rings:
     """Of no candidates."""
     frame, polarity, none = candidates.frame, candidates.polarity, candidates.ellipse
     fit = EllipseFit(none, none.new_empty(0, 5, 5), polarity, polarity)
-    return Rings(frame, polarity, none, none, fit, fit, none[:, :3])
+    return Rings(frame, polarity, none, none, fit, fit, none[:, :3], frame > 0)
 
 
 def measure_predicted(
@@ -276,7 +278,7 @@ def _by_edges(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
     pixel = blurs.isotropic(blur.new_tensor(12**-0.5))  # that of the mask
     blur = blurs.limited(blur - pixel, LEAST**2, MOST**2)[index]
     frame, polarity = candidates.frame[index], candidates.polarity[index]
-    return Rings(frame, polarity, raw[index], raw[second], fit[index], fit[second], blur), index
+    return Rings(frame, polarity, raw[index], raw[second], fit[index], fit[second], blur, inside.clipped[index]), index
 
 
 def _direction(edges: RingEdges, ellipses: Tensor) -> Tensor:
@@ -311,6 +313,7 @@ def _as_a_whole(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> 
         replace(outer, params=mapped(outer.params, to_ideal)),
         replace(inner, params=mapped(inner.params, to_ideal)),
         found.blur[index],
+        circles.inside.clipped[index],
     )
     return rings, index
 

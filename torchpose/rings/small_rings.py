@@ -50,6 +50,7 @@ _SECTORS = 16
 _MISFIT = (
     0.05  # of the contrast, RMS in a sector, that a blur of another shape leaves: the most of a box for a Gaussian
 )
+_ACROSS = 4.0  # px across an edge, two blurs on either side, that share its misfit: all of them tell as much as one
 _MOST_MOVE = (*[0.7] * 5, 0.1, *[0.7] * 2)  # of an iteration: px, and the ratio
 _START_SIGMA = 0.8  # px, at least
 _OVAL = 0.3  # of a blur's mean variance: what is expected of its lean, which a ring as small as its blur hardly tells
@@ -138,7 +139,7 @@ def fit_small_rings(
     start = [outer[:, :2], shape[:, 0, :1], shape[:, 0, 1:], shape[:, 1, 1:], ratio[:, None]]
     theta = torch.cat([*start, torch.zeros_like(outer[:, :2])], -1)
     parted = (outer[:, 2].square() * (1 - ratio.square()) / focal).clamp_min(_LEAST_PARTED)
-    begun = _Start(theta, Spread(blurs.limited(inside.blur, _START_SIGMA**2, MOST**2)), seen, parted)
+    begun = _Start(theta, Spread(blurs.limited(inside.blur, _START_SIGMA**2, MOST**2)), seen, parted, inside.clipped)
     fit = _no_fit(begun)
     margin = torch.full_like(ratio, _MARGIN)
     for part in _parts(_pixels(outer, margin), 1):
@@ -158,13 +159,14 @@ def fit_small_rings(
 
 @dataclass(frozen=True, eq=False)
 class _Start(Rows):
-    """Where K fits begin: parameters, blur; directions in which the ring is seen, and how far its centres may be
-    apart, px."""
+    """Where K fits begin: parameters, blur; directions in which the ring is seen, how far its centres may be apart, px,
+    and whether it is clipped."""
 
     theta: Float[Tensor, "K 8"]
     spread: Spread
     seen: Bool[Tensor, "K A"]
     parted: Float[Tensor, " K"]
+    clipped: Bool[Tensor, " K"]
 
     @property
     def known(self) -> Float[Tensor, "K 11 11"]:
@@ -245,10 +247,15 @@ def _fitted(window: _Window, begun: _Start, scheme: _Scheme) -> _Fit:
     weight, grey = pixels.weight, window.grey
     number = weight.sum(-1)  # the last weights are 0 or 1
     variance = (weight * pixels.residual.square()).sum(-1) / (number - RING - BLUR - _LEVELS).clamp_min(1)
+    # clipped pixels have no noise; at the edges is what a profile cut off, no Gaussian's, leaves of the model
+    steep = weight * pixels.steepness
+    at_edges = (steep * pixels.residual.square()).sum(-1) / steep.sum(-1)
+    misfit = torch.where(begun.clipped, (at_edges - variance).clamp_min(0), 0.0)
+    uncertain = variance + _ACROSS * misfit
     mean = (weight * grey).sum(-1, keepdim=True) / number[:, None]
     total = (weight * (grey - mean).square()).sum(-1) / number
     covariance, determined = found.covariance()
-    covariance = covariance * (variance / pixels.spread.square())[:, None, None]
+    covariance = covariance * (uncertain / pixels.spread.square())[:, None, None]
     sound = window.whole & determined & covariance.isfinite().all(-1).all(-1)
     theta, spread = unknowns.values("ring") + middle, cast(Spread, unknowns.own["blur"])
     kept, explained = number / window.valid.sum(-1), 1 - variance / total
@@ -269,11 +276,13 @@ class _Pixels:
         ring = torch.arange(len(theta), device=theta.device)[:, None]
         self.sector = ring * _SECTORS + direction * _SECTORS // directions
         self.spread = torch.ones_like(theta[:, 0])
+        self.steepness = torch.zeros_like(window.x)  # squared slope of the coverage
         self.residual, self.levels = window.grey, theta.new_zeros(len(theta), _LEVELS)
 
     def __call__(self, unknowns: Unknowns) -> Normal:
         theta, window, stage, n = unknowns.values("ring"), self.window, self.stage, RING + BLUR
         value, derivative = self.scheme.coverage(theta, cast(Spread, unknowns.own["blur"]), window.x, window.y)
+        self.steepness = derivative[:, :2].square().sum(1)  # by the centre
         basis = torch.cat([self.plane, value.to(self.plane)[:, None]], 1)
         # grey levels first, so that the derivatives have their contrast
         self.levels = _levels(basis, window.grey, self.weight)

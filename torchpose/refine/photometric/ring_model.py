@@ -18,13 +18,13 @@ from torch import Tensor
 
 from torchpose.geometry import blur as blurs
 from torchpose.geometry.blurred_edge import Spread
+from torchpose.geometry.grey import full_scale
 from torchpose.geometry.rotations import plane_axes
 from torchpose.geometry.rows import Rows, shared
 from torchpose.geometry.segments import values_at
 from torchpose.refine.photometric.band import band_pixels
 from torchpose.refine.sight import Sight
 
-_FULL_SCALES = (255.0, 1023.0, 4095.0, 16383.0, 65520.0, 65535.0)  # of 8 to 16 bits; 12 bits in the upper ones of 16
 _CURVED = 0.2  # blur's variance over the squared radius of curvature: nearer to its centre edges are on all sides
 _BENT = 0.4  # of a distance from an edge: the most that its second-order term may be
 _FAR = 3.5  # standard deviations of the blur from an edge, from where on neither matters
@@ -155,9 +155,8 @@ def _clipping(grey: Tensor, row: Tensor, rows: int) -> Tensor:
     ends = torch.tensor([torch.inf, -torch.inf], device=grey.device).repeat(rows, 1)
     darkest = ends[:, 0].scatter_reduce(0, row, grey, "amin")
     brightest = ends[:, 1].scatter_reduce(0, row, grey, "amax")
-    full = torch.isin(brightest, torch.tensor(_FULL_SCALES, dtype=grey.dtype, device=grey.device))
     low = torch.where(darkest <= 0, 0.0, -torch.inf)
-    return torch.stack([low, torch.where(full, brightest, torch.inf)], -1)
+    return torch.stack([low, full_scale(brightest)], -1)
 
 
 class _Foot(NamedTuple):
