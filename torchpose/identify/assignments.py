@@ -74,9 +74,16 @@ def ratio_tolerance(semi_minor: Ratio, blur: Ratio | float = 1.0) -> Ratio:
     return _RATIO_TOLERANCE + _RATIO_TOLERANCE_PX * blur / semi_minor
 
 
-def tolerance_of(rings: Rings) -> Tensor:
-    """`ratio_tolerance` (K,) of measured rings."""
-    return ratio_tolerance(rings.outer.params[:, 3], blurs.axes(rings.blur)[1].sqrt().clamp_min(1.0))
+def _tolerance_of(rings: Rings, half_gap: Tensor) -> Tensor:
+    """`ratio_tolerance` (K, ...) of measured rings.
+
+    A wide blur widens it no farther than to half of the least difference between codes (K or 1, ...): with more, the
+    rings of a symmetric target fit it turned by a quarter.
+    """
+    each = (-1, *[1] * (half_gap.ndim - 1))
+    semi_minor = rings.outer.params[:, 3].view(each)
+    blurred = ratio_tolerance(semi_minor, blurs.axes(rings.blur)[1].sqrt().clamp_min(1.0).view(each))
+    return ratio_tolerance(semi_minor).maximum(blurred.minimum(half_gap))
 
 
 class Codes(NamedTuple):
@@ -87,13 +94,13 @@ class Codes(NamedTuple):
     per_px: Tensor
 
     @classmethod
-    def of(cls, rings: Rings, expected: Tensor) -> Self:
-        """Against the ratios (K or 1, ...) of markers."""
+    def of(cls, rings: Rings, expected: Tensor, half_gap: Tensor) -> Self:
+        """Against the ratios (K or 1, ...) of markers, of targets with codes that far apart."""
 
         def each(values: Tensor) -> Tensor:
             return values.view(-1, *[1] * (expected.ndim - 1))
 
-        error, tolerance = each(rings.ratio) - expected, each(tolerance_of(rings))
+        error, tolerance = each(rings.ratio) - expected, _tolerance_of(rings, half_gap)
         radius = each(rings.outer.params[:, 2:4].prod(-1).sqrt())
         if not bool(rings.clipped.any()):
             unknown = torch.full_like(error, torch.nan)
@@ -115,7 +122,7 @@ class Codes(NamedTuple):
 def propose(rings: Rings, table: MarkerTable, matrix: Tensor) -> Assignments:
     """Every marker whose code a ring has."""
     outer = rings.outer.params
-    codes = Codes.of(rings, (table.radii[..., 1] / table.radii[..., 0])[None])
+    codes = Codes.of(rings, (table.radii[..., 1] / table.radii[..., 0])[None], table.half_gap[None, :, None])
     fits = (codes.mismatch < 1) & table.valid & (rings.polarity[:, None, None] == table.polarity[:, None])
     ring, target, marker = fits.nonzero().unbind(-1)
     row = rings.frame[ring] * len(table) + target

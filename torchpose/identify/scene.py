@@ -12,6 +12,8 @@ from torchpose.camera import Camera
 from torchpose.geometry.rows import Rows
 from torchpose.target import Target
 
+_SAME_CODE = 1e-3  # of the ratio of radii: what differs by less is one code
+
 
 @dataclass(frozen=True, eq=False)
 class MarkerTable(Rows):
@@ -49,6 +51,14 @@ class MarkerTable(Rows):
             torch.tensor([1.0 if t.background == "light" else -1.0 for t in targets], dtype=torch.float64),
             torch.tensor([t.coplanar for t in targets]),
         )
+
+    @property
+    def half_gap(self) -> Float[Tensor, " T"]:
+        """Half of the least difference between two codes of each target, as ratios of radii; inf where there is one."""
+        ratio = self.radii[..., 1] / self.radii[..., 0]
+        apart = (ratio[:, :, None] - ratio[:, None]).abs()
+        both = self.valid[:, :, None] & self.valid[:, None] & (apart > _SAME_CODE)
+        return 0.5 * torch.where(both, apart, torch.inf).flatten(1).amin(1)
 
 
 class Scene(NamedTuple):

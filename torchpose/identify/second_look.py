@@ -55,7 +55,9 @@ def look_again(
     measured = found.outer.params
     miss = torch.linalg.vector_norm(measured[:, :2] - ideal[:, :2], dim=-1)
     expected = markers.radii[..., 1] / markers.radii[..., 0]
-    off = Codes.of(found, expected[row, marker]).under(_clipping(rings, identified.ring, expected)[row])
+    half_gap = scene.table.half_gap[scene.target]
+    clipping = _clipping(rings, identified.ring, expected, half_gap)[row]
+    off = Codes.of(found, expected[row, marker], half_gap[row]).under(clipping)
     px, of_size = _PLACE_TOLERANCE
     good = (miss < px + of_size * measured[:, 2]) & (off < 1)
     # of several poses of a row, the one that was nearest
@@ -70,16 +72,17 @@ def look_again(
     return Rings.cat([rings, found[index]]), more
 
 
-def _clipping(rings: Rings, ring: Tensor, expected: Tensor) -> Tensor:
+def _clipping(rings: Rings, ring: Tensor, expected: Tensor, half_gap: Tensor) -> Tensor:
     """By how far clipping has moved the edges of each row's rings (N, M), -1 where not seen: (N,) px, NaN if unknown.
 
     Args:
         rings: of all frames.
         ring: index into them.
-        expected: ratios (N, M) of the markers.
+        expected: ratios (N, M) of the markers. half_gap: (N,), as for `Codes.of`.
     """
     some = rings[ring.flatten().clamp_min(0)]
-    each = Codes.of(some, expected.flatten()).clipping.view_as(expected)
+    apart = half_gap[:, None].expand_as(expected).flatten()
+    each = Codes.of(some, expected.flatten(), apart).clipping.view_as(expected)
     return torch.where(ring >= 0, each, torch.nan).nanmedian(1).values
 
 
