@@ -27,7 +27,6 @@ _LEAST_COVER = (0.4, 0.33)  # of the perimeter with edge points, outer and inner
 _SMALL = 4.0  # px: circles of a smaller semi-minor axis fill the mask of an edge
 _LEAST_SEMI_MINOR = (4.0, 1.2)  # px, outer and inner circle: smaller ones are letters and specks as well as rings
 _LARGE = 20.0  # px, of the outer semi-minor axis, from which on a fit of all pixels costs too much
-_LARGE_BLURRED = 50.0  # px, of the semi-major axis, of one whose edges are too wide for their mask
 _BLURRED = 1.3  # px: a wider blur is out of the reach of an edge's mask; the frame is looked at in half its size
 _MOST_REDUCTION = 4
 _LEAST_REDUCED = 5.0  # px, outer semi-minor axis in a reduced frame: of a smaller one too few pixels are left
@@ -225,7 +224,7 @@ def _measure(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tup
     if index.numel():
         rings, of = _by_edges(frames, circles[index], camera, how)
         # a narrow ring may hide its blur from its profile, not from its edges
-        wide = (blurs.axes(rings.blur)[1] > _BLURRED**2) & (outer[index[of], 2] < _LARGE_BLURRED)
+        wide = (blurs.axes(rings.blur)[1] > _BLURRED**2) & (outer[index[of], 3] < _LARGE)
         parts.append((rings[~wide], index[of[~wide]]))
         small = small.index_fill(0, index[of[wide]], True)
     index = small.nonzero()[:, 0]
