@@ -28,6 +28,7 @@ _SMALL = 4.0  # px: circles of a smaller semi-minor axis fill the mask of an edg
 _LEAST_SEMI_MINOR = (4.0, 1.2)  # px, outer and inner circle: smaller ones are letters and specks as well as rings
 _LARGE = 20.0  # px, of the outer semi-minor axis, from which on a fit of all pixels costs too much
 _BLURRED = 1.3  # px: a wider blur is out of the reach of an edge's mask; the frame is looked at in half its size
+_SOFT_ALL_AROUND = 1.0  # px, along the minor axis: what is soft along lines alone may be fields of an interlaced frame
 _MOST_REDUCTION = 4
 _LEAST_REDUCED = 5.0  # px, outer semi-minor axis in a reduced frame: of a smaller one too few pixels are left
 _ROUGH = 0.5  # px, of a candidate's centre and axes
@@ -224,7 +225,8 @@ def _measure(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tup
     if index.numel():
         rings, of = _by_edges(frames, circles[index], camera, how)
         # a narrow ring may hide its blur from its profile, not from its edges
-        wide = (blurs.axes(rings.blur)[1] > _BLURRED**2) & (outer[index[of], 3] < _LARGE)
+        least, most = blurs.axes(rings.blur)
+        wide = (least > _SOFT_ALL_AROUND**2) & (most > _BLURRED**2) & (outer[index[of], 3] < _LARGE)
         parts.append((rings[~wide], index[of[~wide]]))
         small = small.index_fill(0, index[of[wide]], True)
     index = small.nonzero()[:, 0]
