@@ -73,12 +73,12 @@ def find_candidates(
     grad = gradient(reduced)
     sharp = find_ellipses(grad, wanted.reduced(factor))
     found = [find_finer(frames, factor, grad, sharp, wanted)] if factor > 1 else []
-    found.append(replace(sharp, ellipse=rescaled(sharp.ellipse, factor)))
+    found.append(replace(sharp, ellipse=conics.rescaled(sharp.ellipse, factor)))
     if coarse is None:
         known = accepted(sharp)
-        known = replace(known, ellipse=rescaled(known.ellipse, 0.5))
+        known = replace(known, ellipse=conics.rescaled(known.ellipse, 0.5))
         blurred = find_ellipses(gradient(area_reduce(reduced, 2, exact=True)), wanted.reduced(2 * factor), known)
-        coarse = replace(blurred, ellipse=rescaled(blurred.ellipse, 2 * factor))
+        coarse = replace(blurred, ellipse=conics.rescaled(blurred.ellipse, 2 * factor))
     every = Candidates.cat([*found, coarse])
     every = every[(every.verdict != Verdict.ACCEPTED) | wanted.admits(every)]
     return merge_duplicates(every if explain else accepted(every), explain=explain)
@@ -92,7 +92,7 @@ def find_coarse(frames: Shaped[Tensor, "B H W"], *, wanted: Wanted = ANYTHING) -
     factor = reduction_factor(*frames.shape[-2:])
     reduced = area_reduce(area_reduce(frames, factor), 2, exact=True)
     found = accepted(find_ellipses(gradient(reduced), wanted.reduced(2 * factor)))
-    found = replace(found, ellipse=rescaled(found.ellipse, 2 * factor))
+    found = replace(found, ellipse=conics.rescaled(found.ellipse, 2 * factor))
     return found[wanted.admits(found)]
 
 
@@ -113,7 +113,7 @@ def find_finer(
     height, width = frames.shape[-2:]
     if place.numel() == 0 or min(height, width) < SIDE * fine:
         return found[place[:0]]
-    frame, middle = found.frame[place], rescaled(found.ellipse[place], factor)[:, :2]
+    frame, middle = found.frame[place], conics.rescaled(found.ellipse[place], factor)[:, :2]
     cut, corner = cut_outs(frames, frame, middle, fine)
     grad = gradient(cut)
     # where edges fill most of a cut-out, the noise of the whole frame tells more than the median of their gradients
@@ -122,18 +122,12 @@ def find_finer(
         reach = SHIFT + LARGER * factor / fine * found.ellipse[place, 2]
         wanted = replace(wanted.reduced(fine), place=Place((middle - corner - 0.5 * (fine - 1)) / fine, SHIFT, reach))
     finer = accepted(find_ellipses(grad, wanted))
-    ellipses = rescaled(finer.ellipse, fine)
+    ellipses = conics.rescaled(finer.ellipse, fine)
     ellipses = torch.cat([ellipses[:, :2] + corner[finer.frame], ellipses[:, 2:]], -1)
     # the ellipses that might have been tried are those of the frame, not those of the cut-out
     more = 2.5 * math.log10(height * width / (SIDE * fine) ** 2)
     finer = replace(finer, ellipse=ellipses, frame=frame[finer.frame], log10_nfa=finer.log10_nfa + more)
     return finer[finer.log10_nfa < 0]
-
-
-def rescaled(ellipses: Float[Tensor, "M 5"], factor: int | float) -> Float[Tensor, "M 5"]:
-    """Ellipses of a frame reduced by ``factor`` in the pixels of the frame itself."""
-    center = factor * ellipses[:, :2] + 0.5 * (factor - 1)
-    return torch.cat([center, factor * ellipses[:, 2:4], ellipses[:, 4:]], -1)
 
 
 def find_ellipses(grad: Gradient, wanted: Wanted = ANYTHING, known: Candidates | None = None) -> Candidates:

@@ -5,10 +5,11 @@ from typing import TypeVar
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Real, Shaped
+from jaxtyping import Float, Int, Real, Shaped
 from torch import Tensor
 
 REDUCED_PIXELS = 1_300_000  # upper bound of the reduced frame's size when the factor is chosen automatically
+_MOST_REDUCTION = 4  # of frames that are looked at from farther away: of wider blurs rings are not read
 _PART_PIXELS = 1_000_000  # of the frames that are reduced at a time
 _OPENCV_MOST = 9  # OpenCV forms larger blocks' means in float32, which is too short to round the sums of 16 bits right
 _OPENCV_LANES = 16  # columns that its widest vectors take at a time
@@ -41,6 +42,23 @@ def area_reduce(frames: Shaped[Tensor, "B H W"], factor: int, *, exact: bool = F
     reduced = _in_parts if frames.device.type == "cpu" else _at_once
     means = reduced(frames[:, : h * factor, : w * factor], factor, exact)
     return means.to(torch.uint8 if whole else torch.float32)
+
+
+def reduction_for(width: Float[Tensor, " N"], widest: float) -> Int[Tensor, " N"]:
+    """The power of two, at most 4, by which frames are reduced so that what is ``width`` px wide is not wider."""
+    factor = torch.ones_like(width, dtype=torch.int64)
+    for power in range(1, _MOST_REDUCTION.bit_length()):
+        factor = torch.where(width > widest * 2 ** (power - 1), 2**power, factor)
+    return factor
+
+
+def only_reduced(
+    frames: Shaped[Tensor, "B H W"], frame: Int[Tensor, " N"], factor: int
+) -> tuple[Real[Tensor, "F h w"], Int[Tensor, " N"], Int[Tensor, " F"]]:
+    """The frames that N items are of, reduced; the number of each item's among them; and which of all they are."""
+    which, own = frame.unique(return_inverse=True)
+    some = frames if len(which) == len(frames) else frames[which]
+    return some if factor == 1 else area_reduce(some, factor, exact=True), own, which
 
 
 def _steps(factor: int) -> list[int]:

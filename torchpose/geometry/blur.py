@@ -23,6 +23,11 @@ def across(blur: Blur, nu: Tensor, nv: Tensor) -> Tensor:
     return s11 * nu * nu + 2 * s12 * nu * nv + s22 * nv * nv
 
 
+def columns(nu: Tensor, nv: Tensor) -> Tensor:
+    """Derivatives (..., 3) of `across` by the blur."""
+    return torch.stack([nu * nu, 2 * nu * nv, nv * nv], -1)
+
+
 def axes(blur: Blur) -> tuple[Tensor, Tensor]:
     """Variances along the minor and the major axis."""
     s11, s12, s22 = blur.unbind(-1)
@@ -49,14 +54,14 @@ def size(blur: Blur) -> Tensor:
 
 def reduced(blur: Blur, factor: int) -> Blur:
     """The same in pixels of frames reduced by block means, whose pixel is wider."""
-    return blur / factor**2 + _pixel(blur, 1 - 1 / factor**2)
+    return blur / factor**2 + pixel(blur, 1 - 1 / factor**2)
 
 
 def enlarged(blur: Blur, factor: int) -> Blur:
     """The inverse of `reduced`."""
-    return (blur - _pixel(blur, 1 - 1 / factor**2)) * factor**2
+    return (blur - pixel(blur, 1 - 1 / factor**2)) * factor**2
 
 
-def _pixel(like: Tensor, share: float) -> Tensor:
-    """Covariance of a share of the square pixel, 1/12 along either axis."""
+def pixel(like: Tensor, share: float = 1.0) -> Float[Tensor, "3"]:
+    """Covariance of the square pixel, or of a share of it: 1/12 along either axis."""
     return like.new_tensor([share / 12, 0.0, share / 12])

@@ -64,6 +64,12 @@ def conic_from_ellipse(ellipse: Ellipse) -> Conic:
     return torch.stack([p, r, q, d, e, f], -1)
 
 
+def rescaled(ellipses: Float[Tensor, "*batch 5"], factor: float) -> Float[Tensor, "*batch 5"]:
+    """Ellipses of frames reduced by ``factor`` in the pixels of the frames themselves; the inverse by 1 / factor."""
+    center = factor * ellipses[..., :2] + 0.5 * (factor - 1)
+    return torch.cat([center, factor * ellipses[..., 2:4], ellipses[..., 4:]], -1)
+
+
 def shape_matrix(ellipse: Ellipse) -> Float[Tensor, "*N 2 2"]:
     """Symmetric S = R diag(a, b) R^T: the ellipse is centre + S (cos s, sin s). Smooth also at a circle."""
     _, _, a, b, theta = ellipse.unbind(-1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -11,15 +11,16 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchpose.camera import Camera
-from torchpose.detect.reduce import area_reduce
+from torchpose.detect.reduce import only_reduced
 from torchpose.geometry import blur as blurs
+from torchpose.geometry import conics
+from torchpose.geometry.least_squares import Pose, PosePrior
 from torchpose.geometry.robust import LEAST_KEPT as LEAST_KEPT
 from torchpose.geometry.rows import Rows, shared
 from torchpose.target import Target
 
 QUANTISATION = 1 / 12  # variance of rounding, in grey levels^2, below which no noise estimate falls
 _START_BLUR = 0.8  # px, of rows whose rings tell of none
-_MOST_REDUCTION = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,39 +80,38 @@ class Sight(Rows):
         """The same rows in frames of which blocks of ``factor`` px make one; only those frames that they need."""
         if factor == 1:
             return self
-        which, frame = self.frame.unique(return_inverse=True)
-        rings = torch.cat([(self.rings[..., :2] - 0.5 * (factor - 1)) / factor, self.rings[..., 2:4] / factor], -1)
+        frames, frame, _ = only_reduced(self.frames, self.frame, factor)
         return replace(
             self,
             frame=frame,
-            rings=torch.cat([rings, self.rings[..., 4:]], -1),
-            frames=area_reduce(self.frames[which], factor, exact=True),
+            rings=conics.rescaled(self.rings, 1 / factor),
+            frames=frames,
             camera=self.camera.reduced(factor),
             blur=None if self.blur is None else blurs.reduced(self.blur, factor),
             reduction=self.reduction * factor,
         )
 
-    def by_blur(self, widest: float, *, minor: bool = False) -> Iterator[tuple[Tensor, Sight]]:
-        """The rows in parts, each in frames so far reduced that its blur is not wider: indices (K,) and the part.
 
-        Args:
-            widest: px, standard deviation along the major axis, or the ``minor`` one.
-        """
-        if len(self) == 0:
-            yield self.frame, self
-            return
-        axis = blurs.axes(self.common_blur)[0 if minor else 1].clamp_min(0).sqrt()
-        factor = torch.ones_like(self.frame)
-        for power in range(1, _MOST_REDUCTION.bit_length()):
-            factor = torch.where(axis > widest * 2 ** (power - 1), 2**power, factor)
-        for value in factor.unique().tolist():
-            index = (factor == value).nonzero()[:, 0]
-            yield index, self[index].reduced(value)
+def refined_by_blur(
+    refine: Callable[[Sight, Pose, PosePrior | None], Refined],
+    sight: Sight,
+    start: Pose,
+    prior: Tensor | None,
+    factor: Int[Tensor, " N"],
+) -> Refined:
+    """N rows refined in parts, each in frames reduced by its ``factor``; blurs in px of the frames themselves.
 
-
-def at_full_size(refined: Refined, factor: int) -> Refined:
-    """What was refined in reduced frames: its blur in px of the frames themselves."""
-    return refined if factor == 1 else replace(refined, spread=blurs.enlarged(refined.spread, factor))
+    Args:
+        prior: (N, 6, 6), information about the pose where it starts.
+    """
+    known = None if prior is None else PosePrior(prior, start)
+    order, parts = [], []
+    for value in factor.unique().tolist() or [1]:
+        index = (factor == value).nonzero()[:, 0]
+        some = refine(sight[index].reduced(value), start[index], None if known is None else known[index])
+        parts.append(some if value == 1 else replace(some, spread=blurs.enlarged(some.spread, value)))
+        order.append(index)
+    return Refined.cat(parts)[torch.argsort(torch.cat(order))]
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ from torchpose.camera import Camera
 from torchpose.detect import Candidates
 from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
+from torchpose.geometry.blurred_edge import MOST
 from torchpose.geometry.grey import full_scale
 from torchpose.geometry.least_squares import solve_scaled
 from torchpose.geometry.robust import RATIO_RANGE
@@ -22,7 +23,6 @@ _INNERMOST, _OUTERMOST = 0.08, 1.12  # of the outer ellipse, the range of the ra
 _LEAST_PEAK = 0.25  # of the outer edge's slope in the mean radial profile
 _LEAST_EDGE = 0.5  # of the median rise at the outer edge over all directions, for a direction that counts
 _EIGHTHS = 8  # parts of the perimeter in which the blur is looked at
-_MOST_BLUR = 12.0  # px
 _MOST_CLIPPED = 0.5  # of the directions, at one radius: from there on the median is no measurement (a convention)
 _PARTED = 0.02  # of the semi-minor axis: from which shift of the centres on perspective smears the profile
 
@@ -128,12 +128,7 @@ def _edge_blur(grey: Tensor, seen: Tensor, outer: Tensor, ratio: Tensor, at: Ten
     profile = (mean / weight.sum(-1)[:, None]).double()  # NaN where it is not seen
     outside = (at > 0.5 * (1 + ratio)[:, None])[..., None]
     rise = (profile[:, 2:] - profile[:, :-2]).abs()
-    inner = torch.where(outside, profile[:, 1:-1], torch.nan).nan_to_num(nan=torch.inf)
-    step = (
-        (profile[:, -1] - inner.amin(1))
-        .abs()
-        .maximum((profile[:, -1] - torch.where(inner == torch.inf, -torch.inf, inner).amax(1)).abs())
-    )
+    step = torch.where(outside, (profile[:, -1:] - profile[:, 1:-1]).abs(), -torch.inf).amax(1)
     steepest = torch.where(outside, rise, -torch.inf).amax(1)
     angle = (torch.arange(_EIGHTHS, dtype=torch.float64, device=grey.device) + 0.5) * (2 * torch.pi / _EIGHTHS)
     normal = torch.linalg.inv(conics.shape_matrix(outer)) @ torch.stack([angle.cos(), angle.sin()])  # (M, 2, 8)
@@ -141,10 +136,9 @@ def _edge_blur(grey: Tensor, seen: Tensor, outer: Tensor, ratio: Tensor, at: Ten
     spacing = float(at[2] - at[0]) / length  # px, between the two samples, across the edge
     variance = (step / steepest * spacing).square() / (2 * torch.pi) - (spacing.square() + 1) / 12
     known = variance.isfinite()
-    nu, nv = (normal / length[:, None]).unbind(1)
-    rows = torch.stack([nu * nu, 2 * nu * nv, nv * nv], 1) * known[:, None]
+    rows = blurs.columns(*(normal / length[:, None]).unbind(1)).mT * known[:, None]
     found = solve_scaled(rows @ rows.mT, (rows @ torch.where(known, variance, 0.0)[..., None]).squeeze(-1))
-    return blurs.limited(found.nan_to_num(nan=0.0), 0.0, _MOST_BLUR**2)
+    return blurs.limited(found.nan_to_num(nan=0.0), 0.0, MOST**2)
 
 
 def _mean_profile(grey: Tensor, seen: Tensor, gaps: bool) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchpose import ellipse
 from torchpose.camera import Camera
 from torchpose.detect import Candidates
-from torchpose.detect.reduce import area_reduce
+from torchpose.detect.reduce import only_reduced, reduction_for
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
@@ -29,7 +29,6 @@ _LEAST_SEMI_MINOR = (4.0, 1.2)  # px, outer and inner circle: smaller ones are l
 _LARGE = 20.0  # px, of the outer semi-minor axis, from which on a fit of all pixels costs too much
 _BLURRED = 1.3  # px: a wider blur is out of the reach of an edge's mask; the frame is looked at in half its size
 _SOFT_ALL_AROUND = 1.0  # px, along the minor axis: what is soft along lines alone may be fields of an interlaced frame
-_MOST_REDUCTION = 4
 _LEAST_REDUCED = 5.0  # px, outer semi-minor axis in a reduced frame: of a smaller one too few pixels are left
 _ROUGH = 0.5  # px, of a candidate's centre and axes
 _EDGE_APART = 0.8  # ... and so do two edges closer than 5 px
@@ -156,24 +155,15 @@ def _measured(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
     A mask or a band of a fixed size sees little of an edge that is wider; in a frame of half the size it is not.
     """
     candidates, inside = circles.outer, circles.inside
-    wide, room = blurs.axes(inside.blur)[1].sqrt(), candidates.ellipse[:, 3]
-    factor = torch.ones_like(candidates.frame)
-    for power in range(1, _MOST_REDUCTION.bit_length()):
-        factor = torch.where(
-            (wide > _BLURRED * 2 ** (power - 1)) & (room > _LEAST_REDUCED * 2**power), 2**power, factor
-        )
+    by_blur = reduction_for(blurs.axes(inside.blur)[1].sqrt(), _BLURRED)
+    factor = by_blur.minimum(reduction_for(candidates.ellipse[:, 3], 2 * _LEAST_REDUCED))
     rings, which = [], []
     for value in factor.unique().tolist():
         index = (factor == value).nonzero()[:, 0]
-        frame, own = candidates.frame[index].unique(return_inverse=True)
-        some = replace(candidates[index], frame=own, ellipse=_reduced(candidates.ellipse[index], value))
-        part = replace(
-            inside[index],
-            ellipse=_reduced(inside.ellipse[index], value),
-            blur=blurs.reduced(inside.blur[index], value),
-        )
-        small = frames if len(frame) == len(frames) else frames[frame]
-        small = small if value == 1 else area_reduce(small, value, exact=True)
+        small, own, frame = only_reduced(frames, candidates.frame[index], value)
+        outer, inner = (conics.rescaled(e[index], 1 / value) for e in (candidates.ellipse, inside.ellipse))
+        some = replace(candidates[index], frame=own, ellipse=outer)
+        part = replace(inside[index], ellipse=inner, blur=blurs.reduced(inside.blur[index], value))
         found, of = _measure(small, Circles(some, part), camera.reduced(value), how)
         rings.append(_enlarged(replace(found, frame=frame[found.frame]), value))
         which.append(index[of])
@@ -183,30 +173,19 @@ def _measured(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
     return Rings.cat(rings)[order], torch.cat(which)[order]
 
 
-def _reduced(ellipses: Tensor, factor: int) -> Tensor:
-    """Ellipses (K, 5) in pixels of frames of which blocks of ``factor`` px make one."""
-    return torch.cat([(ellipses[:, :2] - 0.5 * (factor - 1)) / factor, ellipses[:, 2:4] / factor, ellipses[:, 4:]], -1)
-
-
 def _enlarged(rings: Rings, factor: int) -> Rings:
-    """Rings measured in such frames, in pixels of the frames themselves."""
+    """Rings measured in frames reduced by ``factor``, in pixels of the frames themselves."""
     if factor == 1:
         return rings
-    move = torch.tensor([0.5 * (factor - 1)] * 2 + [0.0] * 3, dtype=torch.float64, device=rings.frame.device)
-    grow = torch.tensor([factor] * 4 + [1], dtype=torch.float64, device=rings.frame.device)
 
     def fit(small: EllipseFit) -> EllipseFit:
-        return replace(
-            small,
-            params=small.params * grow + move,
-            covariance=small.covariance * factor**2,
-            sigma=small.sigma * factor,
-        )
+        params = conics.rescaled(small.params, factor)
+        return replace(small, params=params, covariance=small.covariance * factor**2, sigma=small.sigma * factor)
 
     return replace(
         rings,
-        outer_raw=rings.outer_raw * grow + move,
-        inner_raw=rings.inner_raw * grow + move,
+        outer_raw=conics.rescaled(rings.outer_raw, factor),
+        inner_raw=conics.rescaled(rings.inner_raw, factor),
         outer=fit(rings.outer),
         inner=fit(rings.inner),
         blur=blurs.enlarged(rings.blur, factor),
@@ -283,8 +262,7 @@ def _by_edges(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
     )
     index = good.nonzero()[:, 0]
     second = index + count
-    pixel = blurs.isotropic(blur.new_tensor(12**-0.5))  # that of the mask
-    blur = blurs.limited(blur - pixel, LEAST**2, MOST**2)[index]
+    blur = blurs.limited(blur - blurs.pixel(blur), LEAST**2, MOST**2)[index]  # less that of the mask
     frame, polarity = candidates.frame[index], candidates.polarity[index]
     return Rings(frame, polarity, raw[index], raw[second], fit[index], fit[second], blur, inside.clipped[index]), index
 

@@ -47,9 +47,7 @@ from torchpose.rings.small_ring_model import MOST_NODES, RING, depth, exact, fir
 _MARGIN = 3.0  # px around the outer ellipse
 _SOFT = 2.5  # standard deviations, scale of the soft weights
 _SECTORS = 16
-_MISFIT = (
-    0.05  # of the contrast, RMS in a sector, that a blur of another shape leaves: the most of a box for a Gaussian
-)
+_MISFIT = 0.05  # of the contrast, RMS in a sector: the most that a box for a Gaussian leaves
 _ACROSS = 4.0  # px across an edge, two blurs on either side, that share its misfit: all of them tell as much as one
 _MOST_MOVE = (*[0.7] * 5, 0.1, *[0.7] * 2)  # of an iteration: px, and the ratio
 _START_SIGMA = 0.8  # px, at least

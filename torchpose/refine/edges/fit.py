@@ -18,7 +18,9 @@ import torch
 from torch import Tensor
 
 from torchpose.camera import Camera
+from torchpose.detect.reduce import reduction_for
 from torchpose.geometry import blur as blurs
+from torchpose.geometry.blurred_edge import LEAST
 from torchpose.geometry.least_squares import (
     Normal,
     Pose,
@@ -31,7 +33,7 @@ from torchpose.geometry.least_squares import (
 from torchpose.geometry.robust import CUT
 from torchpose.geometry.segments import segment_mean, segment_sum
 from torchpose.refine.edges.step_filter import StepOffsets, step_offsets, window_correlation
-from torchpose.refine.sight import Refined, Sight, at_full_size
+from torchpose.refine.sight import Refined, Sight, refined_by_blur
 from torchpose.rings import zernike
 from torchpose.rings.edges import RingEdges, ring_edges
 
@@ -43,7 +45,6 @@ _SOFT_BIAS = 1.17  # of a normal distribution, standard deviation over its RMS u
 _STEPS = 6  # on Zernike edges
 _SOFT_STEPS = 2  # of these, the first, that weigh all points instead of leaving some out
 _FILTER_STEPS = 2  # on matched filters
-_LEAST_BLUR = 0.3  # px, point-spread function and pixel: a pixel alone
 _ROOM = 1.2  # of half the ring's width: a filter that sees the other circle takes it for its own
 _WIDEST = 1.3  # px, of a blur's major axis: a wider one is out of the mask's reach
 _MOST_BLUR = 3.0  # px, about what a window of the filter holds
@@ -53,14 +54,8 @@ _CUT_FLOOR = 0.02  # px, added to the cut: what pixels alias to
 
 def refine_edges(sight: Sight, rotation: Tensor, translation: Tensor, *, prior: Tensor | None = None) -> Refined:
     """Refines N poses on the edge points of their rings; arguments as in `refine_photometric`."""
-    start = Pose(rotation, translation)
-    known = None if prior is None else PosePrior(prior, start)
-    order, refined = [], []
-    for index, part in sight.by_blur(_WIDEST):
-        some = _refined_in(part, start[index], None if known is None else known[index])
-        order.append(index)
-        refined.append(at_full_size(some, part.reduction))
-    return Refined.cat(refined)[torch.argsort(torch.cat(order))]
+    factor = reduction_for(blurs.axes(sight.common_blur)[1].clamp_min(0).sqrt(), _WIDEST)
+    return refined_by_blur(_refined_in, sight, Pose(rotation, translation), prior, factor)
 
 
 def _refined_in(sight: Sight, start: Pose, known: PosePrior | None) -> Refined:
@@ -125,15 +120,14 @@ class _Fit:
 
     def _widen(self, widening: Tensor, weight: Tensor) -> None:
         """The blur of each row after widenings (E,) px^2 of these weights across its edges."""
-        nu, nv = self.across.unbind(-1)
-        rows = torch.stack([nu * nu, 2 * nu * nv, nv * nv], -1)
+        rows = blurs.columns(*self.across.unbind(-1))
         columns = torch.cat([rows, widening[:, None]], -1) * weight[:, None]
         sums = segment_sum((rows[:, :, None] * columns[:, None]).flatten(1), self.seen.of, len(self.sight))
         matrix, right = sums.unflatten(1, (3, 4)).split([3, 1], -1)
         change = solve_scaled(matrix, right).squeeze(-1)
         limit = _MOST_CHANGE * blurs.axes(self.blur)[1].sqrt()
         change = change * (limit / torch.linalg.vector_norm(change, dim=-1).clamp_min(1e-12)).clamp_max(1.0)[:, None]
-        self.blur = blurs.limited(self.blur + change, _LEAST_BLUR**2, _MOST_BLUR**2)
+        self.blur = blurs.limited(self.blur + change, LEAST**2, _MOST_BLUR**2)
 
     def _zernike(self, pose: Pose) -> tuple[Tensor, Tensor]:
         """How far Zernike edges lie outside the circles (E,), px, and derivatives (E, 6) of the distance."""
@@ -144,7 +138,7 @@ class _Fit:
         pushed = zernike.curvature_shift(found[of], edges.normal) * bend * sign
         read = zernike.deblur(edges.offset, zernike.slope_across(found[of], edges.normal)) - pushed
         # that is of two pixels: the image's and the kernel's
-        self.blur = blurs.limited(found - blurs.isotropic(found.new_tensor(12**-0.5)), _LEAST_BLUR**2, _MOST_BLUR**2)
+        self.blur = blurs.limited(found - blurs.pixel(found), LEAST**2, _MOST_BLUR**2)
         self.correlation = _CHAIN * zernike.edge_correlation()
         return (sign * (read - true)).nan_to_num(nan=0.0), by_pose
 

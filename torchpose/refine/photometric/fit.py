@@ -17,6 +17,7 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor
 
+from torchpose.detect.reduce import reduction_for
 from torchpose.geometry import blur as blurs
 from torchpose.geometry.blurred_edge import LEAST, MOST, Kind, Spread
 from torchpose.geometry.least_squares import Block, Minimum, Normal, Pose, PosePrior, Unknowns, Vector, minimise
@@ -36,7 +37,7 @@ from torchpose.refine.photometric.grey_levels import (
 from torchpose.refine.photometric.light import LEVELS, POSE, normal_equations
 from torchpose.refine.photometric.ring_model import gather_pixels, ring_model
 from torchpose.refine.photometric.sectors import Sectors, away_from_unclear, clear_sectors, doubtful, sum_sectors, trust
-from torchpose.refine.sight import Refined, Sight, at_full_size
+from torchpose.refine.sight import Refined, Sight, refined_by_blur
 
 _COARSE = 6  # the first steps take one pixel of so many; both are whole numbers of tiles
 _WIDEST = 2.4  # px, of a blur's minor axis, in frames as they are: a pixel twice as wide adds 4 % of its variance
@@ -74,14 +75,8 @@ def refine_photometric(sight: Sight, rotation: Tensor, translation: Tensor, *, p
         prior: (N, 6, 6), information about the pose besides the frames, that is the inverse covariance of the start:
             from the robot, or to hold what is known.
     """
-    start = Pose(rotation, translation)
-    known = None if prior is None else PosePrior(prior, start)
-    order, refined = [], []
-    for index, part in sight.by_blur(_WIDEST, minor=True):
-        some = _refined_in(part, start[index], None if known is None else known[index])
-        order.append(index)
-        refined.append(at_full_size(some, part.reduction))
-    return Refined.cat(refined)[torch.argsort(torch.cat(order))]
+    factor = reduction_for(blurs.axes(sight.common_blur)[0].clamp_min(0).sqrt(), _WIDEST)
+    return refined_by_blur(_refined_in, sight, Pose(rotation, translation), prior, factor)
 
 
 @dataclass(frozen=True, eq=False)
