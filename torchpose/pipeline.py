@@ -40,7 +40,7 @@ from torchpose.pose import (
 )
 from torchpose.refine import METHODS, Recipe, Sight
 from torchpose.results import Poses, Reason, Status
-from torchpose.rings import Circles, Rings, find_circles, measure_circles, measure_rings, rough_rings
+from torchpose.rings import Circles, Rings, find_circles, measure_circles, rough_rings
 from torchpose.target import Target
 
 _LEAST_CANDIDATE = (
@@ -194,7 +194,8 @@ class PoseEstimator(nn.Module):
         """What is found in all frames: at the coarse scale alone where that shows every target whole."""
         frames, wanted = scene.frames, Wanted.of(scene.table.polarity, _LEAST_CANDIDATE)
         if self.instances > 1:  # a copy may be too small for the coarse scale
-            return self._read(scene, self._rings(scene, find_candidates(frames, wanted=wanted)))
+            candidates = find_candidates(frames, wanted=wanted)
+            return self._read(scene, self._rings(scene, self._circles(scene, candidates)))
         coarse = find_coarse(frames, wanted=wanted)
         rings, copies = self._likely(scene, coarse)
         first = self._read(scene, rings, copies)
@@ -205,33 +206,30 @@ class PoseEstimator(nn.Module):
         known = coarse[~settled[coarse.frame]]
         known = replace(known, frame=number[known.frame])
         finer = find_candidates(frames[rest], wanted=wanted, coarse=known)
-        more = self._rings(scene, replace(finer, frame=rest[finer.frame]))
+        more = self._rings(scene, self._circles(scene, replace(finer, frame=rest[finer.frame])))
         return self._read(scene, Rings.cat([rings[settled[rings.frame]], more]), copies)
 
-    def _rings(self, scene: Scene, candidates: Candidates) -> Rings:
+    def _circles(self, scene: Scene, candidates: Candidates) -> Circles:
         candidates = candidates[torch.isin(candidates.polarity, scene.table.polarity)]
-        return measure_rings(scene.frames, candidates, scene.camera, correct=self._recipe.correct)
+        return find_circles(scene.frames, candidates, scene.camera)
+
+    def _rings(self, scene: Scene, circles: Circles, *, precise: bool = True) -> Rings:
+        return measure_circles(scene.frames, circles, scene.camera, correct=self._recipe.correct, precise=precise)
 
     def _likely(self, scene: Scene, candidates: Candidates) -> tuple[Rings, Tensor]:
         """The rings that the best copy of every target has by its circles' rough places and codes, measured.
 
         Also how many copies (B T,) were seen.
         """
-        candidates = candidates[torch.isin(candidates.polarity, scene.table.polarity)]
-        circles = find_circles(scene.frames, candidates, scene.camera)
+        circles, precise = self._circles(scene, candidates), not self._recipe.on_rims
         # the code of a much blurred ring is not to be read off its profile
         blurred = blurs.axes(circles.inside.blur)[1] > _LEGIBLE**2
-
-        def measured(some: Circles) -> Rings:
-            how = {"correct": self._recipe.correct, "precise": not self._recipe.on_rims}
-            return measure_circles(scene.frames, some, scene.camera, **how)
-
-        sharp, known = circles[~blurred], measured(circles[blurred])
+        sharp, known = circles[~blurred], self._rings(scene, circles[blurred], precise=precise)
         rough = Rings.cat([rough_rings(sharp, scene.camera), known])
         likely = identify(rough, scene.table, scene.camera, len(scene.frames), instances=1)
         named = marked(likely.ring[likely.ring >= 0], len(rough))
-        rings = Rings.cat([measured(sharp[named[: len(sharp)]]), known[named[len(sharp) :]]])
-        return rings, likely.copies
+        others = self._rings(scene, sharp[named[: len(sharp)]], precise=precise)
+        return Rings.cat([others, known[named[len(sharp) :]]]), likely.copies
 
     def _read(self, scene: Scene, rings: Rings, copies: Tensor | None = None) -> tuple[Scene, Found]:
         """Rows of the rings of all frames, identified and solved; at least so many ``copies`` (B T,) were seen."""

@@ -23,6 +23,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.geometry import blur as blurs
+from torchpose.geometry.quadrature import disc_chords, gauss_legendre
 from torchpose.geometry.rows import Rows, shared
 
 Kind = Literal["gauss", "line", "disc"]
@@ -30,6 +31,7 @@ BLUR = 3  # numbers of a blur
 LEAST, MOST = 0.3, 12.0  # px, standard deviations: a pixel alone has 0.289; beyond the widest band nothing is left
 _NODES_A_SIGMA = 1.1  # Gauss-Legendre nodes a half length in narrow Gaussians: an edge to 1e-3
 _MOST_NODES = 40
+_ON_CPU = torch.zeros(0, dtype=torch.float64)  # nodes are numbers
 _CORE = 0.6  # px, of what is not the line or the disc, to begin with: a pixel, and a sharp lens
 _SQUARE = 1 / (24 * 120)  # fourth cumulant of a pixel along its side, over -24
 _LEAST_SHARE = 0.25  # of a variance that terms of second order may leave: beyond, the expansion has failed
@@ -180,13 +182,13 @@ class _Line:
         self.core, self.mu, self.mv = values.split(1, -1)
         self.nu, self.nv = nu, nv
         self.normal, self.along = nu * self.mu + nv * self.mv, nu * self.mv - nv * self.mu
-        self.node, self.weight = _rule(0.5 * torch.hypot(self.mu, self.mv), self.core)
+        self.node, self.weight = gauss_legendre(_nodes(0.5 * torch.hypot(self.mu, self.mv), self.core), _ON_CPU)
 
     def __call__(self, distance: Tensor, bend: Tensor) -> Edge:
         square = self.along.square()
         nodes = [
             (float(w), float(x), float(x) * self.normal, float(x) ** 2 * square)
-            for w, x in zip(0.5 * self.weight, 0.5 * self.node, strict=True)
+            for w, x in zip(self.weight, self.node - 0.5, strict=True)
         ]
         mean = _averaged(distance, bend, self.core, nodes)
         lean = bend * self.along * mean.by_square
@@ -199,10 +201,7 @@ class _Disc:
 
     def __init__(self, values: Tensor) -> None:
         self.core, self.radius, _ = values.split(1, -1)
-        count = len(_rule(self.radius, self.core)[0])
-        angle = torch.arange(1, count + 1, dtype=torch.float64) * (math.pi / (count + 1))
-        # Gauss-Chebyshev of the second kind, whose weight is the length of the chord
-        self.node, self.weight = angle.cos(), angle.sin().square() * (2 / (count + 1))
+        self.node, self.weight = disc_chords(_nodes(self.radius, self.core), _ON_CPU)
 
     def __call__(self, distance: Tensor, bend: Tensor) -> Edge:
         radius = self.radius
@@ -215,14 +214,10 @@ class _Disc:
         return Edge(mean.step, mean.slope, (mean.by_core, by_radius, torch.zeros_like(by_radius)))
 
 
-def _rule(half: Tensor, core: Tensor) -> tuple[Tensor, Tensor]:
-    """Gauss-Legendre nodes on [-1, 1] for the longest of half lengths (K, 1) beside cores (K, 1)."""
+def _nodes(half: Tensor, core: Tensor) -> int:
+    """Nodes for the longest of half lengths (K, 1) beside cores (K, 1)."""
     ratio = float((half / core.sqrt()).max()) if half.numel() else 0.0
-    count = min(_MOST_NODES, 2 + math.ceil(_NODES_A_SIGMA * ratio))
-    k = torch.arange(1, count, dtype=torch.float64)
-    off = k / (4 * k * k - 1).sqrt()
-    node, vector = torch.linalg.eigh(off.diag(1) + off.diag(-1))  # Golub and Welsch 1969
-    return node, 2 * vector[0].square()
+    return min(_MOST_NODES, 2 + math.ceil(_NODES_A_SIGMA * ratio))
 
 
 def square_cumulant(product: Tensor, variance: Tensor) -> Tensor:

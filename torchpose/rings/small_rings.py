@@ -6,8 +6,8 @@ measurement. The whole ring as one model has no such limit:
     I = paper + slope . x + contrast (E(1) - E(q)),
 
 E(s) the blurred indicator of the ellipse scaled by s, q the ratio of the radii. To first order in the distance it is
-that of a curved edge (`geometry.blurred_edge`). Where the blur is more than a third of the inner circle, that is off by
-up to a quarter of the contrast, and the ring is fitted once more with the exact integral (`geometry.blurred_ellipse`).
+that of a curved edge (`geometry.blurred_edge`). Where the blur is more than a third of the inner circle, that misreads
+codes, and the ring is fitted once more with the exact integral (`geometry.blurred_ellipse`).
 The circles share their shape; perspective parts their centres by about a^2 (1 - q^2) / f at most (a the semi-major
 axis, f the focal length, px), the standard deviation of a prior at zero. What covers a part of the ring, or touches it,
 is left out by robust weights.

@@ -20,8 +20,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.errors import ConfigError, FrameError
+from torchpose.geometry.quadrature import gauss_legendre
 from torchpose.geometry.rows import Rows
-from torchpose.sim.boundary import REACH, Boundary, Samples, gauss_legendre, nodes_across, on_chords
+from torchpose.sim.boundary import REACH, Boundary, Samples, nodes_across, on_chords
 
 # an edge averaged by the trapezoidal rule over a Gaussian line: to 5e-6 of its contrast for lines of up to 30 sigma
 _LINE_REACH, _LINE_NODES = 4.4, 6.6

@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.camera import Camera
+from torchpose.geometry.quadrature import disc_chords, gauss_legendre
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import ragged_arange
 from torchpose.sim.shapes import Shapes
@@ -238,10 +239,9 @@ def on_chords(
     """
     ratio = float((radius.detach() / sigma.detach()).max()) if len(radius) else 0.0
     nodes = nodes_across(ratio)
-    angle = torch.arange(1, nodes + 1, dtype=radius.dtype, device=radius.device) * (math.pi / (nodes + 1))
-    weight = angle.sin().square() * (2 / (nodes + 1))
-    half = (angle.sin()[:, None] * radius).clamp(min=_MIN_CHORD)
-    return angle.cos()[:, None] * radius, half, weight[:, None].expand_as(half)
+    place, weight = disc_chords(nodes, radius)
+    half = ((1 - place.square()).sqrt()[:, None] * radius).clamp(min=_MIN_CHORD)
+    return place[:, None] * radius, half, weight[:, None].expand_as(half)
 
 
 def accumulate(total: Tensor, index: Tensor, values: Tensor) -> Tensor:
@@ -253,14 +253,6 @@ def accumulate(total: Tensor, index: Tensor, values: Tensor) -> Tensor:
 def nodes_across(ratio: float) -> int:
     """Nodes of a Gauss rule that average an edge over an interval of half the length ``ratio`` sigma to 1e-5."""
     return 2 + math.ceil(1.9 * ratio)
-
-
-def gauss_legendre(order: int, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Nodes and weights (order,) on [0, 1] (Golub and Welsch 1969)."""
-    k = torch.arange(1, order, dtype=like.dtype, device=like.device)
-    off = k / (4 * k * k - 1).sqrt()
-    node, vector = torch.linalg.eigh(off.diag(1) + off.diag(-1))
-    return (node + 1) / 2, vector[0].square()
 
 
 def _posed(camera: Camera, R: Tensor, t: Tensor, shapes: Shapes, of: Tensor, points: tuple[Tensor, Tensor]) -> _Curves:

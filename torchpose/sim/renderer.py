@@ -21,6 +21,7 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.errors import ConfigError, FrameError
 from torchpose.geometry import rotations
+from torchpose.geometry.quadrature import gauss_legendre
 from torchpose.geometry.segments import ragged_arange
 from torchpose.sim import boundary
 from torchpose.sim.blur import Blur, Level, Pair, blur_of, blurred, start
@@ -201,7 +202,7 @@ def _moving(
         before, middle, after = _project_each(camera, edges, *posed(motion.new_tensor([-0.5, 0.0, 0.5])))[0]
         path = torch.maximum((before - middle).norm(dim=-1), (after - middle).norm(dim=-1)) / sigma[edges.frame]
         nodes = boundary.nodes_across(float(path.max()) if path.numel() else 0.0)
-    node, weight = boundary.gauss_legendre(nodes, t)
+    node, weight = gauss_legendre(nodes, t)
     pixel, dv = _project_each(camera, edges, *posed(node - 0.5))
     return pixel, weight[:, None] * dv
 
