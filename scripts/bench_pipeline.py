@@ -40,7 +40,15 @@ from torchpose.sim import add_noise, render
 SIZES = {"2 MP": (1824, 1216, 1111.11), "20 MP": (5472, 3648, 3333.33)}
 FRAMES = 8
 REFINEMENT = "refine_photometric"
-STAGES = ("find_candidates", "measure_rings", "identify", "solve_poses", REFINEMENT)
+STAGES = (
+    "find_coarse",
+    "find_candidates",
+    "find_circles",
+    "measure_circles",
+    "identify",
+    "solve_poses",
+    REFINEMENT,
+)
 
 
 def camera_of(width: int, height: int, focal: float) -> tp.Camera:
