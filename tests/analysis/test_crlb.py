@@ -9,10 +9,12 @@ from torch import Tensor
 
 from tests.exact import pinhole, random_poses
 from torchpose.analysis import pose_crlb
+from torchpose.analysis.crlb import _fisher
 from torchpose.camera import Camera
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.sim import render
+from torchpose.sim.blur import blur_of
 from torchpose.target import Target
 
 F64 = torch.float64
@@ -171,3 +173,18 @@ def test_a_keyword_that_is_none_is_refused() -> None:
     r, t = random_poses(1, 10, (150, 160))
     with pytest.raises(TypeError, match="noise"):
         pose_crlb(camera, target, r, t, noise=2.0)
+
+
+@pytest.mark.parametrize(("distance", "most"), [((140, 200), 7e-5), ((460, 465), 4e-4)])
+def test_three_unknowns_of_the_blur_cost_little_more_than_one(distance: tuple[float, float], most: float) -> None:
+    """One is the sum of both variances' columns; rings of 30 to 40 px radius, and of 12, round blur of 0.7 px."""
+    r, t = random_poses(24, 45, distance, seed=7)
+    round_ = blur_of(0.7, None, 0.0, t)
+    three = _fisher(pinhole(), Target.load("quad40"), r, t, round_, torch.full_like(t[:, 0], 190.0))
+    same = torch.zeros(9, 7, dtype=F64)
+    same[:6, :6], same[6, 6], same[8, 6] = torch.eye(6, dtype=F64), 1.0, 1.0
+    deviations = [
+        torch.linalg.inv(f)[:, :6, :6].diagonal(dim1=1, dim2=2).sqrt() for f in (three, same.T @ three @ same)
+    ]
+    rise = (deviations[0] / deviations[1]).amax() - 1
+    assert 0 < rise < most

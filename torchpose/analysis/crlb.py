@@ -52,7 +52,7 @@ def pose_crlb(camera: Camera, target: Target, R: Tensor, t: Tensor, **conditions
     Unknown besides the pose: the three numbers of the blur's covariance per frame, a dark and a light level per marker.
     Of smear and disc only the shape is known: whatever changes the covariance, theirs or the Gaussian's, changes the
     picture alike. Three numbers instead of one raise the deviations of quad40 under round blur of 0.7 px by at most
-    0.006 % at 140 to 200 mm and 0.04 % where its rings have radii of 12 px (docs/decisions/0010-imaging-effects.md).
+    0.007 % at 140 to 200 mm and 0.04 % where its rings have radii of 12 px (tests/analysis/test_crlb.py).
 
     Args:
         R: (B, 3, 3), target to camera.

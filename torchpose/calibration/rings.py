@@ -9,6 +9,7 @@ from torchpose.calibration.views import Views
 from torchpose.camera import Camera
 from torchpose.detect import find_candidates
 from torchpose.geometry.projection import image_by_point
+from torchpose.geometry.robust import LEAST_KEPT
 from torchpose.identify import MarkerTable, identify
 from torchpose.pipeline import PoseEstimator
 from torchpose.pose import common_center, raw_centers
@@ -18,7 +19,6 @@ from torchpose.rings import measure_rings
 from torchpose.target import Target
 
 _HELD = 1e12  # information about the rotation of a marker: as good as known
-_LEAST_KEPT = 0.5  # of a marker's pixels that must follow the model
 
 
 def find_rings(names: Sequence[str], frames: Tensor, cameras: Sequence[Camera], target: Target) -> list[Views]:
@@ -84,5 +84,5 @@ def measure_centers(names: Sequence[str], frames: Tensor, camera: Camera, target
     jacobian = camera.J_distort(xy) @ image_by_point(xy, refined.t[:, 2])
     covariance = jacobian @ refined.covariance[:, :3, :3] @ jacobian.mT
     pixels = camera.distort(xy)
-    good = refined.good & (refined.kept > _LEAST_KEPT) & pixels.isfinite().all(-1)
+    good = refined.good & (refined.kept > LEAST_KEPT) & pixels.isfinite().all(-1)
     return Views(found.frame, found.marker, points, pixels, covariance, tuple(names))[good]
