@@ -82,6 +82,7 @@ class Poses(Rows):
             by the target's origin.
         copies: of the target that the frame shows, each by a pose or by four markers in their places; the same in all
             rows of a frame and target. More than there are rows: the others were left out, or no pose explains them.
+            Where one copy is looked for, those at the coarse scale are counted, and there may be more.
         R, t: target to camera: X_cam = R X_target + t, mm.
         covariance: translation (mm) first, then rotation (rad, left-multiplied: R = exp(w) R_est, that is about the
             camera axes).
