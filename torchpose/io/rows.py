@@ -16,6 +16,7 @@ Schema = dict[str, type]
 
 _POSE = ("tx", "ty", "tz", "rx", "ry", "rz")
 _STD = ("sx", "sy", "sz", "srx", "sry", "srz")
+_NOISE = ("nx", "ny", "nz", "nrx", "nry", "nrz")
 
 POSE_SCHEMA: Schema = {
     "frame": str,
@@ -23,16 +24,23 @@ POSE_SCHEMA: Schema = {
     "status": str,
     **dict.fromkeys((*_POSE, *_STD, "rms_px"), float),
     "markers": int,
+    **dict.fromkeys(_NOISE, float),
     "reason": str,
     "instance": int,
     "copies": int,
     "covariance": list,
+    "noise_covariance": list,
+    "systematic": list,
     "quaternion": list,
     "solutions": list,
 }
-"""Columns of a row: t in mm, rotation vector r in rad, standard deviations s* of t and of the rotation about the camera
-axes; instance counts the copies of a target in its frame from the left, copies says how many it shows, if any;
-covariance 6x6 (t, then rotation), quaternion w, x, y, z, and the one or two solutions, the row's own first."""
+"""Columns of a row.
+
+t in mm, rotation vector r in rad, standard deviations s* of t and of the rotation about the camera axes, of everything,
+and n* of the noise of the frame alone; instance counts the copies of a target in its frame from the left, copies says
+how many it shows, if any; covariance and noise_covariance 6x6 (t, then rotation), systematic as `Poses.systematic`,
+quaternion w, x, y, z, and the one or two solutions, the row's own first.
+"""
 
 BASE_SCHEMA: Schema = {
     **dict.fromkeys(tuple(f"base_{c}" for c in (*_POSE, *_STD)), float),
@@ -51,8 +59,8 @@ DETECTION_SCHEMA: Schema = {
 }
 """One row a marker: compensated centre with standard deviation, semi-axes and direction of both ellipses (px, rad)."""
 
-SINCE_INSTANCES: Row = {"instance": 0, "copies": None}
-"""Cells of rows that were written before a frame could have several copies of a target."""
+NEWER: Row = {"instance": 0, "copies": None} | dict.fromkeys((*_NOISE, "noise_covariance", "systematic"))
+"""Cells of rows that were written before a frame could have several copies of a target, or two covariances."""
 
 
 def pose_rows(poses: Poses, frames: Sequence[str], targets: Sequence[str]) -> list[Row]:
@@ -75,6 +83,7 @@ def pose_rows(poses: Poses, frames: Sequence[str], targets: Sequence[str]) -> li
         reason=[Reason(reason).name.lower() if reason else None for reason in poses.reason.tolist()],
         instance=poses.instance.tolist(),
         copies=[count or None for count in poses.copies.tolist()],
+        **_noise_cells(poses),
         quaternion=[pose and pose["quaternion"] for pose in own],
         solutions=[a and [a, *([b] if b else [])] for a, b in zip(own, other, strict=True)],
     )
@@ -124,6 +133,14 @@ def _pose_cells(poses: Poses, prefix: str) -> list[Row]:
     whole = poses.covariance.isfinite().flatten(1).all(1).tolist()
     covariance = [c if ok else None for c, ok in zip(poses.covariance.tolist(), whole, strict=True)]
     return table(**columns, **{f"{prefix}covariance": covariance})
+
+
+def _noise_cells(poses: Poses) -> dict[str, list[Any]]:
+    """Columns of the parts of the covariance."""
+    there = poses.noise.isfinite().flatten(1).all(1).tolist()
+    lists = {"noise_covariance": poses.noise.tolist(), "systematic": poses.systematic.tolist()}
+    parts = {name: [v if ok else None for v, ok in zip(values, there, strict=True)] for name, values in lists.items()}
+    return dict(zip(_NOISE, _columns(poses.noise_std), strict=True)) | parts
 
 
 def _columns(numbers: Tensor) -> list[list[float | None]]:

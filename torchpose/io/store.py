@@ -22,7 +22,7 @@ from filelock import lock_descriptor
 from pydantic import BaseModel, Field, ValidationError
 
 from torchpose.errors import ConfigError
-from torchpose.io.rows import DETECTION_SCHEMA, SINCE_INSTANCES, Row, Schema
+from torchpose.io.rows import DETECTION_SCHEMA, NEWER, Row, Schema
 from torchpose.io.writers import atomic_path, check_table_path, read_rows, write_rows
 
 _UNSAID = {"--instances": 1}  # in what older runs were made from
@@ -208,8 +208,9 @@ class ResultStore:
                 offset, length = self._places[frame]
                 journal.seek(offset)
                 record = json.loads(journal.read(length))
-                for part in ("rows", "detections"):
-                    record[part] = [SINCE_INSTANCES | row for row in record[part]]
+                for part, schema in (("rows", self._schema), ("detections", DETECTION_SCHEMA)):
+                    newer = {column: cell for column, cell in NEWER.items() if column in schema}
+                    record[part] = [newer | row for row in record[part]]
                 yield record
 
     def _finished(self) -> Iterator[Row]:

@@ -61,7 +61,7 @@ def outcome(scene: Scene, found: Found) -> Poses:
         reason=torch.where(few, int(Reason.NONE), reason),
         markers=torch.where(few, proposed, mask.sum(-1)),
         detections=_detections(scene, found, mask),
-        of_camera=found.evidence.by_target.shape[-1] - scene.table.by_print.shape[-1],
+        of_camera=found.evidence.of_camera,
         **{name: spread(getattr(solutions, name)) for name in names},
     )
     return every if rows == scene.groups else _numbered(scene, every, awarded)
