@@ -42,6 +42,15 @@ class Reason(IntEnum):
     TWO_SOLUTIONS = 6  # with Status.AMBIGUOUS
 
 
+class Misfit(IntEnum):
+    """What the residuals of a row show beyond noise and the stated uncertainties; its covariance is widened by that."""
+
+    NONE = 0
+    PRINT = 1  # markers sit beside their places, or edges do
+    CAMERA = 2  # focal length, principal point or distortion are off, as far as one frame can tell
+    SCATTER = 3  # neither: something else in the frame
+
+
 @dataclass(frozen=True, eq=False)
 class Detections(Rows):
     """The K markers found in a batch, flat. Pixels are those of the raw (distorted) frame, OpenCV convention.
@@ -110,6 +119,9 @@ class Poses(Rows):
         noise: the part of it that is the frame's own: how far the pose would scatter if the frame were taken again.
         systematic: how the pose errs with each of L numbers of unit variance that are the same in all frames: the
             uncertain parameters of the camera, the first ``of_camera``, and what is uncertain of the target.
+        place: where the fit found the M markers beside their places, target frame, mm, and their edges outwards, mm,
+            as far as the file or the residuals leave it open; NaN for markers that were not used.
+        misfit: `Misfit`.
         rms: reprojection RMS of the compensated marker centres, px.
         status, reason: `Status` and `Reason`.
         markers: number of markers used.
@@ -129,6 +141,8 @@ class Poses(Rows):
     covariance: Float[Tensor, "N 6 6"]
     noise: Float[Tensor, "N 6 6"]
     systematic: Float[Tensor, "N 6 L"]
+    place: Float[Tensor, "N M 4"]
+    misfit: Int[Tensor, " N"]
     rms: Float[Tensor, " N"]
     status: Int[Tensor, " N"]
     reason: Int[Tensor, " N"]

@@ -25,6 +25,7 @@ if TYPE_CHECKING:  # imported where they are used: torch takes more than a secon
     from torchpose.camera import Camera
     from torchpose.handeye import HandEye
     from torchpose.io import reader
+    from torchpose.io.misfits import Misfits
     from torchpose.io.rows import Row
     from torchpose.io.sources import Source
     from torchpose.pipeline import PoseEstimator
@@ -176,6 +177,7 @@ def _run(
     progress.summary(store.counts, out)
     if not quiet:
         _tell_crowded(store.crowded, store.most, work)
+        _tell_misfits(store.misfits, work)
     return ended(store.unreadable)
 
 
@@ -191,6 +193,23 @@ def _tell_crowded(frames: set[str], most: dict[str, int], work: _Work) -> None:
         f"up to {seen}; {fix}",
         err=True,
     )
+
+
+def _tell_misfits(misfits: dict[str, Misfits], work: _Work) -> None:
+    """Tells, on stderr, what the files leave out that the standard deviations then cannot count."""
+    silent = [t.name for t in work.rows_of if t.covariance is None and t.name in misfits and misfits[t.name].frames]
+    files = [f"target {', '.join(silent)} (center_sigma, edge_gain_sigma)"] if silent else []
+    if work.camera.covariance is None and any(m.frames for m in misfits.values()):
+        files.append("camera (intrinsics_covariance)")
+    if files:
+        typer.echo(
+            f"torchpose: no uncertainty is stated of {' and '.join(files)}: s* counts the noise of the frames, and what "
+            "residuals show beyond it, alone",
+            err=True,
+        )
+    for target in work.rows_of:
+        for line in misfits[target.name].lines(target.name, target.ids.tolist()) if target.name in misfits else ():
+            typer.echo(f"torchpose: {line}", err=True)
 
 
 def _records(batch: reader.Batch, estimator: PoseEstimator, work: _Work, painter: pictures.Overlay | None) -> list[Row]:

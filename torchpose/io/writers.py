@@ -145,7 +145,7 @@ def _write_parquet(path: Path, rows: Iterable[Row], schema: Schema) -> None:
 
     number = pa.float64()
     parts = {"translation": pa.list_(number, 3), "rotation": pa.list_(number, 3), "quaternion": pa.list_(number, 4)}
-    matrices = ("covariance", "noise_covariance", "systematic", "base_covariance")
+    matrices = ("covariance", "noise_covariance", "systematic", "place", "base_covariance")
     nested = dict.fromkeys(matrices, pa.list_(pa.list_(number))) | {
         "quaternion": pa.list_(number),
         "solutions": pa.list_(pa.struct(parts | {"rms_px": number, "chi2": number})),

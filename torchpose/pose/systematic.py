@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.camera import Camera
@@ -85,7 +85,8 @@ class OnPrint(Rows):
         noise: the part of it that is the frame's own.
         systematic: how the pose errs with each of the L numbers, one deviation of them; the same in all frames.
         place: where the markers sit beside their places, target frame, mm, and the edge gain, all as estimated.
-        explained: whether the residuals agree with print, camera and what a print may have besides.
+        misfit: `Misfit`, what the residuals show beyond noise and stated uncertainties; it is in the covariance.
+        explained: whether the residuals agree with all that.
         known: whether the pose is determined.
     """
 
@@ -94,6 +95,7 @@ class OnPrint(Rows):
     noise: Float[Tensor, "N 6 6"]
     systematic: Float[Tensor, "N 6 L"]
     place: Float[Tensor, "N M 4"]
+    misfit: Int[Tensor, " N"]
     explained: Bool[Tensor, " N"]
     known: Bool[Tensor, " N"]
 
@@ -134,7 +136,8 @@ def on_print(
     place = (place @ joint.numbers[:, None, :, None])[..., 0]
     sure = joint.known & (torch.linalg.cholesky_ex(joint.covariance)[1] == 0)
     parts = (joint.by_camera[..., : by_camera.shape[-1]], joint.by_print[..., : by_target.shape[-1]])
-    return OnPrint(joint.step, joint.covariance, joint.noise, torch.cat(parts, -1), place, excess.explained, sure)
+    common = torch.cat(parts, -1)
+    return OnPrint(joint.step, joint.covariance, joint.noise, common, place, excess.misfit, excess.explained, sure)
 
 
 class _Joint(NamedTuple):
@@ -191,7 +194,7 @@ def _excess(normals: MarkerNormals, known: Tensor, count: int, setting: Setting)
     camera = further.new_zeros(*further.shape[:3], CAMERA)
     every = torch.cat([further, camera], -1)
     excess = excess_of(*_remaining(normals, known, _among(every, n), count))
-    wide = (~excess.explained | (excess.factor > 1) | (excess.deviation > 0).any(-1)).nonzero()[:, 0]
+    wide = (excess.misfit > 0).nonzero()[:, 0]
     if wide.numel() == 0:
         return excess, every
     # only where the print alone would have to explain it, the camera is asked, too
