@@ -30,7 +30,10 @@ from torchpose.io.store import ResultStore
 from torchpose.io.writers import read_rows, read_table, write_rows
 from torchpose.results import Detections, Poses, Reason, Status
 
-CONTRACT = "frame,target,status,tx,ty,tz,rx,ry,rz,sx,sy,sz,srx,sry,srz,rms_px,markers,nx,ny,nz,nrx,nry,nrz,reason,instance,copies,misfit"
+CONTRACT = (
+    "frame,target,status,tx,ty,tz,rx,ry,rz,sx,sy,sz,srx,sry,srz,rms_px,markers,nx,ny,nz,nrx,nry,nrz,"
+    "reason,instance,copies,misfit"
+)
 DETECTION_CONTRACT = "frame,target,marker,u,v,su,sv,outer_a,outer_b,outer_theta,inner_a,inner_b,inner_theta,instance"
 NAN = float("nan")
 

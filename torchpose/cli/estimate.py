@@ -203,8 +203,8 @@ def _tell_misfits(misfits: dict[str, Misfits], work: _Work) -> None:
         files.append("camera (intrinsics_covariance)")
     if files:
         typer.echo(
-            f"torchpose: no uncertainty is stated of {' and '.join(files)}: s* counts the noise of the frames, and what "
-            "residuals show beyond it, alone",
+            f"torchpose: no uncertainty is stated of {' and '.join(files)}: s* counts the noise of the frames alone, "
+            "and what residuals show beyond it",
             err=True,
         )
     for target in work.rows_of:

@@ -53,9 +53,9 @@ class Misfits:
                 for marker, at in zip(ids, mean, strict=False)
             )
             lines.append(
-                f"{name}: markers sit {1e3 * size:.2g} um beside their places, the same in all {self.frames} frames: the "
-                f"target or the camera file is off; torchpose calibrate --measure-target measures both. By marker, um: "
-                f"{places}"
+                f"{name}: markers sit {1e3 * size:.2g} um beside their places, the same in all {self.frames} frames: "
+                "the target or the camera file is off; torchpose calibrate --measure-target measures both. By marker, "
+                f"um: {places}"
             )
         return lines
 

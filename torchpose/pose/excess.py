@@ -86,7 +86,9 @@ def excess_of(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) 
 
 
 def _modes(information: Tensor, right: Tensor) -> _Modes:
-    values, vectors = torch.linalg.eigh(information)
+    finite = (information.isfinite().all(-1) & right.isfinite()).all(-1, keepdim=True)
+    right = torch.where(finite, right, 0.0)
+    values, vectors = torch.linalg.eigh(torch.where(finite[..., None], information, 0.0))
     there = values > _LEAST_MODE * values[:, -1:].clamp_min(torch.finfo(values.dtype).tiny)
     root = torch.where(there, values, 0.0).sqrt()
     residual = torch.where(there, (vectors.mT @ right[..., None])[..., 0] / root.clamp_min(1e-300), 0.0)

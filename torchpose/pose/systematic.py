@@ -174,7 +174,9 @@ class _Joint(NamedTuple):
         both = torch.cat([right[..., None], by_lens], -1)
         step = alone @ both[:, :k]
         told = matrix[:, k:, k:] - matrix[:, k:, :k] @ shift
-        values, vectors = torch.linalg.eigh(0.5 * (told + told.mT))
+        finite = told.isfinite().all(-1).all(-1)
+        told = torch.where(finite[:, None, None], 0.5 * (told + told.mT), 0.0)
+        values, vectors = torch.linalg.eigh(told)
         values = values.clamp_min(0.0)[:, None] if estimate else torch.zeros_like(values)[:, None]
         held = shift[:, :POSE] @ vectors / (1 + values)
         numbers = both[:, k:] - matrix[:, k:, :k] @ step
@@ -184,7 +186,7 @@ class _Joint(NamedTuple):
         lens = step[..., 1:]
         covariance = noise + held @ held.mT + lens @ lens.mT
         step = step[..., 0] * float(estimate)
-        return cls(step, numbers[..., 0], covariance, noise, held @ vectors.mT, lens, known)
+        return cls(step, numbers[..., 0], covariance, noise, held @ vectors.mT, lens, known & finite)
 
 
 def _excess(normals: MarkerNormals, known: Tensor, count: int, setting: Setting) -> tuple[Excess, Tensor]:
