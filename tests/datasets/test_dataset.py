@@ -13,7 +13,10 @@ from torchpose.camera import Camera
 from torchpose.datasets.dataset import analytic, bounds, plan_truth, write_bop, write_dataset
 from torchpose.datasets.plan import Plan, load_plan
 from torchpose.errors import ConfigError
+from torchpose.io.truth import read_truth
+from torchpose.io.writers import read_table
 from torchpose.sim import render
+from torchpose.target import Target
 
 F64 = torch.float64
 
@@ -70,6 +73,86 @@ def test_blur_with_a_direction_is_drawn_and_recorded(plan: Plan) -> None:
     torch.testing.assert_close(analytic(other)(every), drawn, rtol=0, atol=1e-3)
     # the bound knows that blur: 4 px of smear leave less of edges in their direction
     assert (bounds(other, every) > bounds(plan, every)).all()
+
+
+def with_keys(plan: Plan, name: str, **keys: object) -> Plan:
+    """The plan with other sections, from a file of its own."""
+    text = yaml.safe_load(plan.path.read_text()) | keys
+    path = plan.path.with_name(name)
+    path.write_text(yaml.safe_dump(text))
+    return load_plan(path)
+
+
+def test_one_print_is_that_of_all_frames(plan: Plan, tmp_path: Path) -> None:
+    wanted = {
+        "seed": 4,
+        "center_sigma": [0.1, 0.1, 0.2],
+        "gain": [0.1, 0.2],
+        "scale": 0.01,
+        "warp": 0.1,
+        "warp_deg": 30,
+    }
+    other = with_keys(plan, "print.yaml", print=wanted)
+    assert torch.equal(other.R, plan.R)
+    assert torch.equal(other.motion, plan.motion)
+    # a plan of another seed and other frames shows the same print
+    again = with_keys(plan, "again.yaml", print=wanted, seed=9)
+    assert other.prints is not None
+    assert again.prints is not None
+    assert not torch.equal(again.R, other.R)
+    assert torch.equal(again.prints.centers, other.prints.centers)
+    out = tmp_path / "set"
+    write_dataset(other, out)
+    made, meant = Target.load(out / "print.yaml"), Target.load(out / "target.yaml")
+    gain = read_truth(out / "truth.csv").extra["edge_gain"]
+    assert (gain == gain[0]).all()
+    assert 0.1 <= gain[0] <= 0.2
+    torch.testing.assert_close(made.radii[:, 0], 1.01 * meant.radii[:, 0] + gain[0])
+    torch.testing.assert_close(made.radii[:, 1], 1.01 * meant.radii[:, 1] - gain[0])
+    assert 0.05 < float((made.centers - 1.01 * meant.centers).square().mean().sqrt()) < 0.4
+    rows = read_table(out / "prints.csv")
+    assert [(row["frame"], int(str(row["id"]))) for row in rows[3:5]] == [("0000.png", 3), ("0001.png", 0)]
+    for number, row in enumerate(rows):
+        assert [float(str(row[name])) for name in "xyz"] == made.centers[number % 4].tolist()
+        assert float(str(row["inner_radius"])) == float(made.radii[number % 4, 1])
+    # the frames show it: bent rings and all
+    frames = analytic(other)(torch.arange(4))
+    look = plan_truth(other).extra
+    shown = render(
+        other.camera, made, other.R, other.t, psf_sigma=look["psf_sigma"], dark=look["dark"], light=look["light"],
+        plate=(70, 70), motion=other.motion,
+    )  # fmt: skip
+    assert float((frames - shown).abs().mean()) < 0.05 * float((frames - analytic(plan)(torch.arange(4))).abs().mean())
+
+
+def test_every_frame_may_have_a_print(plan: Plan, tmp_path: Path) -> None:
+    other = with_keys(plan, "prints.yaml", print={"each": "frame", "center_sigma": 0.05, "gain": [-0.1, 0.1]})
+    assert other.prints is not None
+    assert len(other.prints.gain.unique()) == 4
+    write_dataset(other, tmp_path / "set")
+    assert not (tmp_path / "set" / "print.yaml").exists()
+    rows = read_table(tmp_path / "set" / "prints.csv")
+    assert [float(str(row["x"])) for row in rows] == other.prints.centers[..., 0].flatten().tolist()
+    part = other[torch.tensor([2])]
+    torch.testing.assert_close(analytic(part)(torch.tensor([0])), analytic(other)(torch.tensor([2])), rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "words"),
+    [
+        ({"center_sigma": -0.1}, r"print\.center_sigma"),
+        ({"center_sigma": [0.1, 0.1]}, r"print\.center_sigma: has 2 entries; give a number or"),
+        ({"warp": [-0.1, 0.1]}, r"print\.warp: is -0.1; give half of the plate's height"),
+        ({"warp_shape": "bowl"}, r"print\.warp_shape"),
+        ({"gain": 3.0, "each": "set"}, r"print\.markers\[0\]\.inner_radius"),
+        ({"gain": -3.0}, r"print\.gain: leaves nothing of a ring"),
+        ({"bow": 1}, r"print\.bow"),
+    ],
+)
+def test_a_wrong_print_is_one_clear_line(plan: Plan, wanted: dict[str, object], words: str) -> None:
+    with pytest.raises(ConfigError, match=words) as caught:
+        with_keys(plan, "wrong.yaml", print=wanted)
+    assert "\n" not in str(caught.value)
 
 
 def test_bop_is_that_of_the_folder(plan: Plan, tmp_path: Path) -> None:

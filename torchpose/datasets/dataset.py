@@ -5,6 +5,7 @@ A data set is a folder:
     frames/0000.png ...      8 or 16 bit grey, lossless
     camera.yaml target.yaml  the models of the frames
     truth.csv                one row a frame, see `torchpose.io.truth`
+    prints.csv print.yaml    where the plan has a print: one row a frame and marker; a target file, of one print for all
     plan.json                what the frames were made from
     bop/                     the same in the layout of the BOP challenge, where asked for
 """
@@ -33,7 +34,7 @@ from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.io.images import UnreadableImageError, decode
 from torchpose.io.truth import Truth, read_truth, write_truth
-from torchpose.io.writers import atomic_path
+from torchpose.io.writers import atomic_path, write_rows
 from torchpose.sim import faults_of, with_faults
 from torchpose.sim.clutter import random_clutter, random_covers
 from torchpose.sim.renderer import Defocus, render
@@ -53,9 +54,10 @@ def plan_truth(plan: Plan) -> Truth:
 
     Columns besides the pose: tilt_deg, psf_sigma, psf_ratio, psf_deg, smear_px, smear_deg, disc_px, see
     `torchpose.datasets.plan.Conditions`; noise_sigma (read noise), dark, light, motion_mm, motion_deg;
-    markers_in_view, markers that lie in the frame as a whole; in_depth_range, 0 where the plan's range is left.
+    markers_in_view, markers that lie in the frame as a whole; in_depth_range, 0 where the plan's range is left;
+    edge_gain, the dot gain of the print.
     """
-    taken = plan.conditions
+    taken, prints = plan.conditions, plan.prints
     return Truth(
         frame=plan.names,
         target=[plan.target.name] * len(plan),
@@ -71,6 +73,7 @@ def plan_truth(plan: Plan) -> Truth:
             "motion_deg": plan.motion[:, 3:].norm(dim=1).rad2deg(),
             "markers_in_view": plan.seen.double(),
             "in_depth_range": plan.in_depth_range.double(),
+            "edge_gain": torch.zeros(len(plan), dtype=torch.float64) if prints is None else prints.gain,
         },
     )
 
@@ -113,7 +116,7 @@ def analytic(plan: Plan) -> Renderer:
         part, numbers = plan[which], which.tolist()
         return render(
             plan.camera,
-            plan.target,
+            plan.target if part.prints is None else part.prints,
             part.R,
             part.t,
             **part.conditions.blur,
@@ -192,7 +195,24 @@ def write_dataset(
         std = torch.cat([bounds(plan, which) for which in torch.split(torch.arange(len(plan)), 64)])
         truth.extra.update(zip(BOUND, std.unbind(1), strict=True))
     write_truth(out / "truth.csv", truth)
+    _write_prints(plan, out)
     return len(pending)
+
+
+def _write_prints(plan: Plan, out: Path) -> None:
+    """What was printed, where that differs from the target."""
+    if (prints := plan.prints) is None:
+        return
+    names = ("x", "y", "z", "nx", "ny", "nz", "outer_radius", "inner_radius")
+    values = torch.cat([prints.centers, prints.normals, prints.radii], -1).tolist()
+    rows: list[dict[str, object]] = [
+        {"frame": frame, "id": marker, **dict(zip(names, row, strict=True))}
+        for frame, markers in zip(plan.names, values, strict=True)
+        for marker, row in zip(plan.target.ids.tolist(), markers, strict=True)
+    ]
+    write_rows(out / "prints.csv", rows, {"frame": str, "id": int} | dict.fromkeys(names, float))
+    if plan.file.print is not None and plan.file.print.each == "set":
+        replace(prints.as_target(), part_rotation=None, part_translation=None).save(out / "print.yaml")
 
 
 def write_bop(out: Path) -> None:

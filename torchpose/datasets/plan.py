@@ -32,7 +32,8 @@ from torchpose.geometry.rotations import plane_axes
 from torchpose.geometry.rows import Rows, shared
 from torchpose.io.sources import find_sources
 from torchpose.io.truth import read_truth
-from torchpose.sim import faults_of
+from torchpose.sim import PrintErrors, Prints, faults_of, printed
+from torchpose.sim.prints import Warp
 from torchpose.target import Target
 
 _HALTON_BASES = (2, 3, 5, 7, 11, 13)
@@ -71,6 +72,8 @@ Blur = Annotated[Range, _from(lambda s: s > 0, "the blur must be above 0 px, suc
 Move = Annotated[Range, _from(lambda s: s >= 0, "give the length of the move during the exposure, 0 or more")]
 Ratio = Annotated[Range, _from(lambda s: s >= 1, "give the larger standard deviation over the smaller, 1 or more")]
 Extent = Annotated[Range, _from(lambda s: s >= 0, "give px, 0 or more")]
+Height = Annotated[Range, _from(lambda s: s >= 0, "give half of the plate's height in mm, 0 or more")]
+Scale = Annotated[Range, _from(lambda s: s > -1, "give the relative error of lengths, such as 0.001")]
 Noise = Annotated[Range, _from(lambda s: s >= 0, "give the standard deviation in grey levels, 0 or more")]
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 
@@ -185,6 +188,30 @@ class Imaging(_Section):
         return self
 
 
+def _three(value: Any) -> Any:
+    return [value] * 3 if isinstance(value, int | float) and not isinstance(value, bool) else value
+
+
+class Print(_Section):
+    """How the print differs from the target file, see `torchpose.sim.PrintErrors`."""
+
+    each: Literal["set", "frame"] = "set"
+    seed: int | None = None
+    center_sigma: Annotated[list[Annotated[FiniteFloat, Field(ge=0)]], BeforeValidator(_three)] = [0.0, 0.0, 0.0]
+    gain: Range = [0.0, 0.0]
+    scale: Scale = [0.0, 0.0]
+    warp: Height = [0.0, 0.0]
+    warp_shape: Warp = "twist"
+    warp_deg: Range = [0.0, 180.0]
+
+    @field_validator("center_sigma")
+    @classmethod
+    def _axes(cls, value: list[float]) -> list[float]:
+        if len(value) != 3:
+            raise ValueError(f"has {len(value)} entries; give a number or [x, y, z] in mm")
+        return value
+
+
 class Sensor(_Section):
     """Noise after EMVA 1288 and the stored depth."""
 
@@ -201,6 +228,7 @@ class PlanFile(_Section):
     target: str
     seed: int = 0
     poses: Poses
+    print: Print | None = None
     imaging: Imaging = Imaging()
     sensor: Sensor = Sensor()
     faults: dict[str, dict[str, Any]] = {}
@@ -254,6 +282,7 @@ class Plan(Rows):
         conditions: blur, levels and noise.
         motion: mm and rad during the exposure.
         seen: markers that lie in the frame as a whole.
+        prints: what was printed, where the plan says that it differs from the target.
         file: what the plan file ``path`` says, with the ``camera`` and the ``target`` that it names.
         backgrounds: pictures, in natural order; frame i takes the one of the number i modulo their count.
     """
@@ -263,6 +292,7 @@ class Plan(Rows):
     conditions: Conditions
     motion: Float[Tensor, "N 6"]
     seen: Int[Tensor, " N"]
+    prints: Prints | None
     file: PlanFile = shared()
     path: Path = shared()
     camera: Camera = shared()
@@ -316,10 +346,38 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
     directed = (image.psf_ratio, image.psf_deg, image.smear_px, image.smear_deg, image.disc_px)
     conditions = Conditions(*levels, *map(draw, directed))
     seen = markers_in_view(camera, target, R, t)
-    plan = Plan(R, t, conditions, motion, seen, file, path, camera, target, _backgrounds(path, image.background))
+    with within(f"{path}: print."):
+        prints = _prints(file, target, len(t))
+    backgrounds = _backgrounds(path, image.background)
+    plan = Plan(R, t, conditions, motion, seen, prints, file, path, camera, target, backgrounds)
     if file.out_of_view == "error":
         _check_view(plan)
     return plan
+
+
+def _prints(file: PlanFile, target: Target, frames: int) -> Prints | None:
+    """What is printed in each frame; its chance is its own, so that plans of one print may differ in the rest."""
+    if (wanted := file.print) is None:
+        return None
+    generator = torch.Generator().manual_seed((file.seed if wanted.seed is None else wanted.seed) % 2**63)
+    count = 1 if wanted.each == "set" else frames
+
+    def draw(value: list[float]) -> Tensor:
+        return _spread(value, torch.rand(count, dtype=torch.float64, generator=generator))
+
+    errors = PrintErrors(
+        wanted.center_sigma,
+        draw(wanted.gain),
+        draw(wanted.scale),
+        draw(wanted.warp),
+        wanted.warp_shape,
+        draw(wanted.warp_deg).deg2rad(),
+    )
+    prints = printed(target, errors, count, generator)
+    if wanted.each == "frame":
+        return prints
+    prints.as_target()  # is written beside the frames as a target file
+    return prints.repeated(frames)
 
 
 def markers_in_view(

@@ -26,6 +26,7 @@ from torchpose.geometry.segments import ragged_arange
 from torchpose.sim import boundary
 from torchpose.sim.blur import Blur, Level, Pair, blur_of, blurred, start
 from torchpose.sim.boundary import Boundary, Boxes
+from torchpose.sim.prints import Prints
 from torchpose.sim.sensor import Lighting
 from torchpose.sim.shapes import Shapes, rectangle, rings
 from torchpose.target import Target
@@ -98,7 +99,9 @@ class Imaging:
     covers: Shapes | None = None
 
 
-def render(camera: Camera, target: Target | Shapes, R: Tensor, t: Tensor, **imaging: Any) -> Float[Tensor, "B H W"]:
+def render(
+    camera: Camera, target: Target | Prints | Shapes, R: Tensor, t: Tensor, **imaging: Any
+) -> Float[Tensor, "B H W"]:
     """Noise-free float32 frames of a target, grey values 0..255, differentiable in pose, blur and grey levels.
 
     A shape, the plate too, is drawn from either side, and not at all where it reaches behind the camera or beyond the
@@ -106,7 +109,7 @@ def render(camera: Camera, target: Target | Shapes, R: Tensor, t: Tensor, **imag
 
     Args:
         camera: the camera; its width and height are those of the frames.
-        target: the target, or shapes with levels of their own.
+        target: the target, a print of it for every frame, or shapes with levels of their own.
         R: (B, 3, 3), target to camera.
         t: (B, 3), target to camera, mm.
         imaging: fields of `Imaging`: ``psf_sigma``, ``dark``, ``light``, ``plate``, ``surround`` and so on.
@@ -114,7 +117,7 @@ def render(camera: Camera, target: Target | Shapes, R: Tensor, t: Tensor, **imag
     Raises:
         ConfigError: ``psf_sigma`` is not above 0 or no covariance, ``disc`` is below 0 or stands beside ``defocus``, or
             there are background pictures and no plate.
-        FrameError: shapes of R and t, of blur, ``motion`` or background pictures disagree.
+        FrameError: shapes of R and t, of prints, blur, ``motion`` or background pictures disagree.
     """
     R, t = check_poses(R, t)
     scene = Imaging(**imaging)
@@ -123,8 +126,10 @@ def render(camera: Camera, target: Target | Shapes, R: Tensor, t: Tensor, **imag
         raise ConfigError("disc: a lens has one defocus; give disc or defocus")
     if motion is not None and motion.shape != (len(t), 6):
         raise FrameError(f"motion: shape {tuple(motion.shape)} is not (B, 6) of {len(t)} poses")
+    if isinstance(target, Prints) and len(target) != len(t):
+        raise FrameError(f"target: {len(target)} prints are not one for each of {len(t)} poses")
     ink, paper = per_frame(scene.dark, t), per_frame(scene.light, t)
-    if isinstance(target, Target) and target.background == "dark":
+    if not isinstance(target, Shapes) and _background_of(target) == "dark":
         ink, paper = paper, ink
     ground = _ground(camera, t, paper, scene)
     if len(t) == 0:
@@ -141,7 +146,12 @@ def render(camera: Camera, target: Target | Shapes, R: Tensor, t: Tensor, **imag
     return torch.cat(out) if len(out) > 1 else out[0]
 
 
-def _layers(target: Target | Shapes, scene: Imaging, ink: Tensor, paper: Tensor, first: int) -> list[Shapes]:
+def _background_of(target: Target | Prints) -> str:
+    """Tone around the rings, ``light`` or ``dark``."""
+    return (target.target if isinstance(target, Prints) else target).background
+
+
+def _layers(target: Target | Prints | Shapes, scene: Imaging, ink: Tensor, paper: Tensor, first: int) -> list[Shapes]:
     """What is drawn one over the other in the frames from the number ``first`` on, with levels ink and paper (B,)."""
 
     def alike(shapes: Shapes, level: Tensor) -> Shapes:
@@ -152,7 +162,10 @@ def _layers(target: Target | Shapes, scene: Imaging, ink: Tensor, paper: Tensor,
         return [] if shapes is None else [shapes.to(ink).of_frames(first, len(ink))]
 
     plate = [] if scene.plate is None else [alike(rectangle((0.0, 0.0), scene.plate[0], scene.plate[1]), paper)]
-    marks = [alike(rings(target), ink)] if isinstance(target, Target) else own(target)
+    if isinstance(target, Prints):
+        marks = [target.to(ink)[first : first + len(ink)].rings(ink)]
+    else:
+        marks = [alike(rings(target), ink)] if isinstance(target, Target) else own(target)
     return [*plate, *own(scene.clutter), *marks, *own(scene.covers)]
 
 
