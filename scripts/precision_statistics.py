@@ -5,10 +5,13 @@
 
 Simulated 2-megapixel frames of the built-in target quad40, 8 bit. One row a case and method: frames with a pose, RMS
 error over RMS bound across and along the optical axis and of the rotation, the claimed deviation across over the same
-bound, the RMS errors, mean NEES (ideal 6), the share inside the 99 % ellipsoid. Point-spread functions outside the
+bound, the RMS errors and claimed deviations, mean NEES (ideal 6), the share inside the 99 % ellipsoid. Point-spread functions outside the
 model are mixtures of shifted frames: a shift of the principal point is a shift of the picture. The bound of a covered
 ring takes the covered part of that marker's information off; that of a foreign point-spread function is the bound of a
 Gaussian of the same variance.
+
+The cases of a print have a print of its own in every frame and an estimator whose files know nothing of it, those of a
+camera an estimator whose camera file is off. Their bound is that of the nominal target and camera.
 """
 
 from __future__ import annotations
@@ -30,7 +33,7 @@ from torchpose.analysis import pose_crlb, pose_errors
 from torchpose.geometry import rotations
 from torchpose.io.writers import write_rows
 from torchpose.pipeline import Method
-from torchpose.sim import add_noise, render
+from torchpose.sim import PrintErrors, Prints, add_noise, printed, render
 
 F64 = torch.float64
 FOCAL, WIDTH, HEIGHT = 1111.11, 1824, 1216
@@ -55,6 +58,8 @@ class Case:
     missing: bool = False
     encoded: bool = False
     srgb: bool = False
+    errors: PrintErrors | None = None
+    k1_error: float = 0.0
 
 
 def tilted(tilt_deg: float, near: float = 140.0, far: float = 190.0) -> Callable[..., tuple[Tensor, Tensor]]:
@@ -107,6 +112,13 @@ CASES = {
     "missing": Case(tilted(45), missing=True),
     "srgb": Case(tilted(60), encoded=True, srgb=True),
     "srgb-as-linear": Case(tilted(60), encoded=True),
+    # what differs from the files of target and camera
+    "as-filed": Case(tilted(40)),
+    "print-10": Case(tilted(40), errors=PrintErrors(center_sigma=0.010)),
+    "print-50": Case(tilted(40), errors=PrintErrors(center_sigma=0.050)),
+    "warp-50": Case(tilted(40), errors=PrintErrors(warp=0.050)),
+    "gain-30": Case(tilted(40), errors=PrintErrors(gain=0.030)),
+    "k1-off": Case(tilted(40), k1_error=0.002),
 }
 
 
@@ -127,7 +139,10 @@ def spread(psf: str) -> Tensor:
     return 1.2 * square[square.norm(dim=-1) <= 1.01]  # a disc of radius 1.2 px
 
 
-def picture(case: Case, camera: tp.Camera, target: tp.Target, r: Tensor, t: Tensor) -> Tensor:
+Drawn = tp.Target | Prints
+
+
+def picture(case: Case, camera: tp.Camera, target: Drawn, r: Tensor, t: Tensor) -> Tensor:
     """Frames (B, H, W), free of noise."""
     if case.psf == "blackman-harris":
         return filtered(case, camera, target, r, t)
@@ -141,7 +156,7 @@ def picture(case: Case, camera: tp.Camera, target: tp.Target, r: Tensor, t: Tens
     return out
 
 
-def filtered(case: Case, camera: tp.Camera, target: tp.Target, r: Tensor, t: Tensor, finer: int = 3) -> Tensor:
+def filtered(case: Case, camera: tp.Camera, target: Drawn, r: Tensor, t: Tensor, finer: int = 3) -> Tensor:
     """Frames through a Blackman-Harris pixel filter 1.5 px wide in place of the pixel's square (Harris 1978)."""
     matrix = camera.matrix.clone()
     matrix[:2] *= finer
@@ -194,17 +209,27 @@ def without_first(target: tp.Target) -> tp.Target:
     )
 
 
+def printed_anew(case: Case, frames: int, g: torch.Generator) -> Prints | None:
+    """A print for every frame; plates are bent in any direction."""
+    if case.errors is None:
+        return None
+    direction = math.pi * torch.rand(frames, dtype=F64, generator=g)
+    return printed(TARGET, replace(case.errors, direction=direction), frames, g)
+
+
 def run(name: str, case: Case, methods: list[Method], frames: int, seed: int) -> list[dict[str, Any]]:
     g = torch.Generator().manual_seed(seed)
     camera = camera_of(case.k1)
     r, t = case.poses(frames, g)
-    drawn = without_first(TARGET) if case.missing else TARGET
-    estimators = {m: tp.PoseEstimator(camera, TARGET, method=m, srgb=case.srgb) for m in methods}
+    prints = printed_anew(case, frames, g)
+    filed = camera_of(case.k1 + case.k1_error)
+    estimators = {m: tp.PoseEstimator(filed, TARGET, method=m, srgb=case.srgb) for m in methods}
     parts: dict[str, list[tuple[Tensor, ...]]] = {m: [] for m in methods}
     bounds = []
     for a in range(0, frames, BATCH):
         s = slice(a, a + BATCH)
-        clean = picture(case, camera, drawn, r[s], t[s])
+        drawn = without_first(TARGET) if case.missing else TARGET
+        clean = picture(case, camera, drawn if prints is None else prints[s], r[s], t[s])
         if case.cover:
             clean = covered(case, camera, clean, r[s], t[s], g)
         if case.encoded:
@@ -238,6 +263,8 @@ def run(name: str, case: Case, methods: list[Method], frames: int, seed: int) ->
             "claimed_ratio": math.sqrt(claimed[ok][:, :2].mean(0).sum() / b2[:2].sum()),
             "lateral_um": 1e3 * math.sqrt(e2[:2].sum()),
             "depth_um": 1e3 * math.sqrt(e2[2]),
+            "claimed_lateral_um": 1e3 * math.sqrt(claimed[ok][:, :2].mean(0).sum()),
+            "claimed_depth_um": 1e3 * math.sqrt(claimed[ok][:, 2].mean()),
             "rotation_mdeg": math.degrees(1e3 * math.sqrt(e2[3:].sum())),
             "nees": float(nees[ok].mean()),
             "nees_median": float(nees[ok].median()),

@@ -29,6 +29,7 @@ from torchpose.sim.boundary import Boundary, Boxes
 from torchpose.sim.prints import Prints
 from torchpose.sim.sensor import Lighting
 from torchpose.sim.shapes import Shapes, rectangle, rings
+from torchpose.sim.texture import Texture
 from torchpose.target import Target
 
 _CHUNK_PIXELS = 1 << 24  # pixels rendered at a time
@@ -83,6 +84,7 @@ class Imaging:
         lighting: uneven light, None for even light.
         clutter: shapes on and beside the plate, below the rings.
         covers: shapes over everything.
+        texture: of the plate, the clutter and the rings on it; None for an even reflectance.
     """
 
     psf_sigma: Level = 0.7
@@ -97,6 +99,7 @@ class Imaging:
     lighting: Lighting | None = None
     clutter: Shapes | None = None
     covers: Shapes | None = None
+    texture: Texture | None = None
 
 
 def render(
@@ -140,6 +143,9 @@ def render(
         frames = ground[part].float().expand(len(t[part]), camera.height, camera.width).contiguous()
         twist = None if motion is None else motion[part].to(t)
         for shapes in _layers(target, scene, ink[part], paper[part], part.start):
+            if isinstance(shapes, Texture):
+                frames = frames * shapes.gain(camera, R[part], t[part], part.start, _size(scene.plate))
+                continue
             boxes, coverage = cover(camera, shapes, R[part], t[part], blur[part], scene.defocus, twist)
             frames = _paint(frames, shapes, boxes, coverage.float())
         out.append(frames if scene.lighting is None else frames * scene.lighting.gain(camera, R[part], t[part]))
@@ -151,7 +157,13 @@ def _background_of(target: Target | Prints) -> str:
     return (target.target if isinstance(target, Prints) else target).background
 
 
-def _layers(target: Target | Prints | Shapes, scene: Imaging, ink: Tensor, paper: Tensor, first: int) -> list[Shapes]:
+def _size(plate: Sequence[float] | None) -> tuple[float, float] | None:
+    return None if plate is None else (plate[0], plate[1])
+
+
+def _layers(
+    target: Target | Prints | Shapes, scene: Imaging, ink: Tensor, paper: Tensor, first: int
+) -> list[Shapes | Texture]:
     """What is drawn one over the other in the frames from the number ``first`` on, with levels ink and paper (B,)."""
 
     def alike(shapes: Shapes, level: Tensor) -> Shapes:
@@ -166,7 +178,8 @@ def _layers(target: Target | Prints | Shapes, scene: Imaging, ink: Tensor, paper
         marks = [target.to(ink)[first : first + len(ink)].rings(ink)]
     else:
         marks = [alike(rings(target), ink)] if isinstance(target, Target) else own(target)
-    return [*plate, *own(scene.clutter), *marks, *own(scene.covers)]
+    texture = [] if scene.texture is None else [scene.texture]
+    return [*plate, *own(scene.clutter), *marks, *texture, *own(scene.covers)]
 
 
 def cover(
