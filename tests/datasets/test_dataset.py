@@ -10,7 +10,7 @@ import torch
 import yaml
 
 from torchpose.camera import Camera
-from torchpose.datasets.dataset import analytic, bounds, plan_truth, write_bop, write_dataset
+from torchpose.datasets.dataset import analytic, bounds, plan_truth, simulated_frames, write_bop, write_dataset
 from torchpose.datasets.plan import Plan, load_plan
 from torchpose.errors import ConfigError
 from torchpose.io.truth import read_truth
@@ -153,6 +153,84 @@ def test_a_wrong_print_is_one_clear_line(plan: Plan, wanted: dict[str, object], 
     with pytest.raises(ConfigError, match=words) as caught:
         with_keys(plan, "wrong.yaml", print=wanted)
     assert "\n" not in str(caught.value)
+
+
+FAULTS: dict[str, dict[str, object]] = {
+    "coma": {"imaging": {"coma_px": 2.0}},
+    "haze": {"imaging": {"haze_px": 0.3, "haze_length": 20}},
+    "ghost": {"imaging": {"ghost": [10, 20]}},
+    "speckle": {"imaging": {"speckle": 0.05}},
+    "flicker": {"imaging": {"flicker": [0.03, 0.05], "flicker_px": 30}},
+    "texture": {"print": {"texture": {"share": 0.05, "length": 1.0}}},
+    "prnu": {"sensor": {"prnu": 0.02}},
+    "columns": {"sensor": {"column_noise": 3}},
+    "jitter": {"sensor": {"line_jitter": 0.3}},
+    "srgb": {"sensor": {"gamma": "srgb"}},
+    "bayer": {"processing": {"bayer": True}},
+    "denoise": {"processing": {"denoise": 10}},
+    "sharpen": {"processing": {"sharpen": 1.0}},
+    "jpeg": {"processing": {"jpeg": 60}},
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_is_in_the_frames_in_any_batch(plan: Plan, name: str) -> None:
+    other = with_keys(plan, f"{name}.yaml", **FAULTS[name])
+    clean = with_keys(plan, "clean.yaml", **{section: {} for section in FAULTS[name]})
+    whole = simulated_frames(other, analytic(other), torch.arange(4))
+    assert whole.dtype == torch.uint8
+    without = simulated_frames(clean, analytic(clean), torch.arange(4))
+    assert (whole.float() - without.float()).abs().flatten(1).amax(1).min() > 4
+    some = torch.tensor([3, 1])
+    # to rounding: a grey value in ten thousand lies on its edge
+    again = simulated_frames(other, analytic(other), some).float() - whole[some].float()
+    assert again.abs().max() <= (1 if name != "jpeg" else 12)
+    assert float((again != 0).double().mean()) < 1e-3
+
+
+def test_a_sensor_keeps_its_pattern(plan: Plan) -> None:
+    look = {"imaging": {"dark": 100, "light": 100, "plate": None}, "bounds": False}
+    flat = [
+        with_keys(plan, f"{n}.yaml", seed=n, sensor={"prnu": 0.05, "noise": 0, "seed": sensor}, **look)
+        for n, sensor in ((1, 8), (2, 8), (3, 9))
+    ]
+    frames = [simulated_frames(each, analytic(each), torch.arange(1))[0] for each in flat]
+    assert torch.equal(frames[0], frames[1])
+    assert not torch.equal(frames[0], frames[2])
+
+
+def test_faults_are_in_the_truth(plan: Plan) -> None:
+    other = with_keys(plan, "f.yaml", imaging={"haze_px": [0.1, 0.2], "coma_px": 1.5, "coma_deg": 40})
+    extra = plan_truth(other).extra
+    assert ((extra["haze_px"] >= 0.1) & (extra["haze_px"] <= 0.2)).all()
+    assert len(extra["haze_px"].unique()) == 4
+    assert (extra["coma_px"] == 1.5).all()
+    assert (extra["coma_deg"] == 40).all()
+    assert (extra["ghost"] == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("section", "wanted", "words"),
+    [
+        ("imaging", {"haze_px": -0.1}, r"imaging\.haze_px: is -0.1; give px, 0 or more"),
+        ("imaging", {"speckle": [0.1, 1.5]}, r"imaging\.speckle: is 1.5; the contrast"),
+        ("imaging", {"haze_length": 0.5}, r"imaging\.haze_length"),
+        ("print", {"texture": {"share": 0.02}}, r"print\.texture\.length"),
+        ("sensor", {"prnu": -1}, r"sensor\.prnu"),
+        ("sensor", {"gamma": "sRGB"}, r"sensor\.gamma"),
+        ("processing", {"jpeg": 0}, r"processing\.jpeg"),
+        ("processing", {"jpg": 80}, r"processing\.jpg"),
+    ],
+)
+def test_a_wrong_fault_is_one_clear_line(plan: Plan, section: str, wanted: dict[str, object], words: str) -> None:
+    with pytest.raises(ConfigError, match=words) as caught:
+        with_keys(plan, "wrong.yaml", **{section: wanted})
+    assert "\n" not in str(caught.value)
+
+
+def test_jpeg_of_twelve_bits_is_refused(plan: Plan) -> None:
+    with pytest.raises(ConfigError, match=r"processing\.jpeg: holds 8 bits and sensor\.bits is 12"):
+        with_keys(plan, "wrong.yaml", processing={"jpeg": 80}, sensor={"bits": 12})
 
 
 def test_bop_is_that_of_the_folder(plan: Plan, tmp_path: Path) -> None:

@@ -50,13 +50,13 @@ def test_texture_is_fixed_to_the_print() -> None:
     square = camera(256, 240)
     square.matrix[1, 1] = 400.0
     t = torch.tensor([[0.0, 0.0, 200.0], [4.0, -2.0, 200.0]], dtype=F64)
-    paper = Texture(0.05, 3.0, key)
+    paper = Texture(key, 0.05, 3.0)
     light = shapes.polygon([])[torch.zeros(1, dtype=torch.bool)]  # nothing printed
     frame, moved = render(square, light, R, t, light=100.0, texture=paper) / 100 - 1
     torch.testing.assert_close(moved[0:200, 8:250], frame[4:204, 0:242], rtol=0, atol=2e-3)
     # under perspective and distortion the frame sees the same reflectance in the same place of the plate
     tilted, at = pose(40, 20, (2.0, 1.0, 210.0))
-    seen = render(cam, light, tilted, at, light=100.0, texture=Texture(0.05, 3.0, key[:1]))[0] / 100 - 1
+    seen = render(cam, light, tilted, at, light=100.0, texture=Texture(key[:1], 0.05, 3.0))[0] / 100 - 1
     v, u = torch.meshgrid(torch.arange(60, 180, 7), torch.arange(60, 200, 7), indexing="ij")
     ray = cam.undistort_points(torch.stack([u, v], -1).double().view(-1, 2))
     ray = torch.cat([ray, torch.ones(len(ray), 1, dtype=F64)], 1)
@@ -76,7 +76,7 @@ def test_texture_is_fixed_to_the_print() -> None:
 def test_texture_has_share_and_length(length: float) -> None:
     cam = camera(400, 400)
     cam.matrix[1, 1] = 400.0
-    paper = Texture(0.02, length, keys_of(6, 1, "paper"))
+    paper = Texture(keys_of(6, 1, "paper"), 0.02, length)
     R, t = torch.eye(3, dtype=F64).expand(6, 3, 3), torch.tensor([[0.0, 0, 80.0]], dtype=F64).expand(6, 3)
     light = shapes.polygon([])[torch.zeros(1, dtype=torch.bool)]
     field = render(cam, light, R, t, light=200.0, texture=paper) / 200 - 1  # 5 px a mm
@@ -93,7 +93,7 @@ def test_texture_is_on_the_plate_and_below_the_covers() -> None:
     options = {"plate": (30.0, 30.0), "covers": cover}
     plain, papery = (
         render(cam, target(), R, t, texture=texture, **options)[0]
-        for texture in (None, Texture(0.05, 1.0, keys_of(1, 0, "paper")))
+        for texture in (None, Texture(keys_of(1, 0, "paper"), 0.05, 1.0))
     )
     gain = papery / plain
     assert 0.03 < float(gain[plain > 215].std()) < 0.07  # paper
@@ -105,4 +105,4 @@ def test_texture_is_on_the_plate_and_below_the_covers() -> None:
 
 def test_a_texture_without_length_is_refused() -> None:
     with pytest.raises(ConfigError, match="texture: needs"):
-        Texture(0.02, 0.0, keys_of(1, 0, "paper"))
+        Texture(keys_of(1, 0, "paper"), 0.02, 0.0)

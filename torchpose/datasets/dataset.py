@@ -18,7 +18,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -35,7 +35,7 @@ from torchpose.geometry import rotations
 from torchpose.io.images import UnreadableImageError, decode
 from torchpose.io.truth import Truth, read_truth, write_truth
 from torchpose.io.writers import atomic_path, write_rows
-from torchpose.sim import faults_of, with_faults
+from torchpose.sim import Processing, SensorPattern, disturbed, faults_of, processed, read_out, with_faults
 from torchpose.sim.clutter import random_clutter, random_covers
 from torchpose.sim.renderer import Defocus, render
 from torchpose.sim.sensor import Lighting, add_noise
@@ -45,6 +45,7 @@ Renderer = Callable[[Int[Tensor, " B"]], Float[Tensor, "B H W"]]
 """Noise-free frames, float32, of the frames numbered."""
 
 BLUR = ("psf_sigma", "psf_ratio", "psf_deg", "smear_px", "smear_deg", "disc_px")
+DISTURBANCES = ("coma_px", "coma_deg", "haze_px", "ghost", "speckle", "flicker")
 BOUND = ("sx", "sy", "sz", "srx", "sry", "srz")
 _BATCH_PIXELS = 7_000_000  # larger buffers go back to the system and are cleared anew each time
 
@@ -55,7 +56,7 @@ def plan_truth(plan: Plan) -> Truth:
     Columns besides the pose: tilt_deg, psf_sigma, psf_ratio, psf_deg, smear_px, smear_deg, disc_px, see
     `torchpose.datasets.plan.Conditions`; noise_sigma (read noise), dark, light, motion_mm, motion_deg;
     markers_in_view, markers that lie in the frame as a whole; in_depth_range, 0 where the plan's range is left;
-    edge_gain, the dot gain of the print.
+    those of `torchpose.sim.Disturbances`; edge_gain, the dot gain of the print.
     """
     taken, prints = plan.conditions, plan.prints
     return Truth(
@@ -73,6 +74,7 @@ def plan_truth(plan: Plan) -> Truth:
             "motion_deg": plan.motion[:, 3:].norm(dim=1).rad2deg(),
             "markers_in_view": plan.seen.double(),
             "in_depth_range": plan.in_depth_range.double(),
+            **{name: getattr(plan.disturbances, name) for name in DISTURBANCES},
             "edge_gain": torch.zeros(len(plan), dtype=torch.float64) if prints is None else prints.gain,
         },
     )
@@ -128,6 +130,7 @@ def analytic(plan: Plan) -> Renderer:
             motion=part.motion if bool(part.motion.any()) else None,
             lighting=lighting,
             clutter=random_clutter(plan.target, image.clutter, seed, numbers) if image.clutter else None,
+            texture=part.texture,
             covers=random_covers(plan.target, image.covered, seed, numbers) if image.covered else None,
         )
 
@@ -136,10 +139,18 @@ def analytic(plan: Plan) -> Renderer:
 
 def simulated_frames(plan: Plan, renderer: Renderer, which: Int[Tensor, " B"]) -> Shaped[Tensor, "B H W"]:
     """The frames numbered ``which``, uint8 or uint16, as the plan's sensor delivers them."""
-    sensor, frames = plan.file.sensor.model_dump(exclude={"noise"}), renderer(which)
+    sensor, seed = plan.file.sensor, plan.file.seed
+    frames = disturbed(renderer(which), plan.disturbances[which], which)
     if plan.file.faults:
-        frames = with_faults(frames, faults_of(plan.file.faults), plan.file.seed, index=which)
-    return add_noise(frames, plan.conditions.noise[which], plan.file.seed, index=which, **sensor)
+        frames = with_faults(frames, faults_of(plan.file.faults), seed, index=which)
+    own = seed if sensor.seed is None else sensor.seed
+    frames = read_out(frames, SensorPattern(sensor.prnu, sensor.column_noise, sensor.line_jitter, own), seed, which)
+    noise, steps = plan.conditions.noise[which], Processing(**plan.file.processing.model_dump())
+    if not steps.wanted:
+        look: dict[str, Any] = {"full_well": sensor.full_well, "bits": sensor.bits, "gamma": sensor.gamma}
+        return add_noise(frames, noise, seed, index=which, **look)
+    raw = add_noise(frames, noise, seed, index=which, bits=16, full_well=sensor.full_well)
+    return processed(raw.float() * (255.0 / 65535), steps, sensor.bits, sensor.gamma)
 
 
 def write_dataset(

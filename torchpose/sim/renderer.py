@@ -144,7 +144,7 @@ def render(
         twist = None if motion is None else motion[part].to(t)
         for shapes in _layers(target, scene, ink[part], paper[part], part.start):
             if isinstance(shapes, Texture):
-                frames = frames * shapes.gain(camera, R[part], t[part], part.start, _size(scene.plate))
+                frames = frames * shapes.gain(camera, R[part], t[part], _size(scene.plate))
                 continue
             boxes, coverage = cover(camera, shapes, R[part], t[part], blur[part], scene.defocus, twist)
             frames = _paint(frames, shapes, boxes, coverage.float())
@@ -178,7 +178,7 @@ def _layers(
         marks = [target.to(ink)[first : first + len(ink)].rings(ink)]
     else:
         marks = [alike(rings(target), ink)] if isinstance(target, Target) else own(target)
-    texture = [] if scene.texture is None else [scene.texture]
+    texture = [] if scene.texture is None else [scene.texture[first : first + len(ink)]]
     return [*plate, *own(scene.clutter), *marks, *texture, *own(scene.covers)]
 
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.errors import ConfigError
+from torchpose.geometry.rows import Rows, shared
 from torchpose.sim.fields import smooth_field
 from torchpose.sim.sensor import coarse_rays, enlarged
 
@@ -17,21 +18,21 @@ _NODES = 4  # of them in the correlation length: bicubic interpolation keeps the
 
 
 @dataclass(frozen=True, eq=False)
-class Texture:
+class Texture(Rows):
     """A gain of the plate and of what is printed on it, with a Gaussian distribution.
 
     It is applied to the blurred picture, so ``share`` and ``length`` are those that the frame shows, and a texture
     finer than a pixel is white in it. It repeats itself after 128 lengths.
 
     Attributes:
+        key: of every frame's texture; prints of the same key have the same one.
         share: standard deviation of the reflectance, of its mean.
         length: mm, the distance at which the autocorrelation exp(-(d / length)^2) has fallen to 1/e.
-        key: (B,) int64, one texture for each; prints of the same key have the same one.
     """
 
-    share: float
-    length: float
     key: Int[Tensor, " B"]
+    share: float = shared()
+    length: float = shared()
 
     def __post_init__(self) -> None:
         if not (self.share >= 0 and self.length > 0):
@@ -42,11 +43,10 @@ class Texture:
         camera: Camera,
         R: Float[Tensor, "B 3 3"],
         t: Float[Tensor, "B 3"],
-        first: int,
         plate: tuple[float, float] | None,
     ) -> Float[Tensor, "B H W"]:
-        """Gain of every pixel of the frames from the number ``first`` on, 1 where the plate of a size in mm is not."""
-        keys, which = self.key[first : first + len(t)].unique(return_inverse=True)
+        """Gain of every pixel, 1 where the plate of a size in mm is not."""
+        keys, which = self.key.unique(return_inverse=True)
         x = enlarged(_on_plane(camera, R, t).flatten(0, 1), camera).view(len(t), 2, camera.height, camera.width)
         place = torch.remainder(x * (_NODES / self.length), _TILE).movedim(1, -1)
         # circular to the left and right; nodes lie at the corners that align
