@@ -23,7 +23,7 @@ class MarkerTable(Rows):
         ids: of the markers.
         centers: target frame, mm.
         normals: the same.
-        radii: outer and inner, mm.
+        radii: outer and inner, mm, as printed (`Target.printed_radii`).
         valid: False where padded.
         polarity: +1 dark rings, -1 light ones.
         coplanar: whether all markers lie in one plane.
@@ -46,7 +46,7 @@ class MarkerTable(Rows):
             padded([t.ids for t in targets], -1),
             padded([t.centers for t in targets], 0.0),
             padded([t.normals for t in targets], 0.0),
-            padded([t.radii for t in targets], 1.0),
+            padded([t.printed_radii for t in targets], 1.0),
             padded([torch.ones(len(t), dtype=torch.bool) for t in targets], False),
             torch.tensor([1.0 if t.background == "light" else -1.0 for t in targets], dtype=torch.float64),
             torch.tensor([t.coplanar for t in targets]),

@@ -57,7 +57,9 @@ class Sight(Rows):
     def of(cls, frames: Tensor, camera: Camera, target: Target, frame: Tensor, rings: Tensor) -> Self:
         """Rows of one target, all markers seen: frame (N,) of each, fitted ellipses (N, M, 2, 5) in raw pixels."""
         rows = (len(frame), len(target))
-        centers, normals, radii = (x.expand(rows[0], *x.shape) for x in (target.centers, target.normals, target.radii))
+        centers, normals, radii = (
+            x.expand(rows[0], *x.shape) for x in (target.centers, target.normals, target.printed_radii)
+        )
         polarity = rings.new_full(rows, 1.0 if target.background == "light" else -1.0)
         mask = torch.ones(rows, dtype=torch.bool, device=rings.device)
         return cls(frame, mask, rings, polarity, centers, normals, radii, frames, camera)
