@@ -50,9 +50,9 @@ def test_sharpening_is_an_unsharp_mask() -> None:
     (1.0, {10.0: 10.0}),
 ])  # fmt: skip
 def test_tone_has_known_values(gamma: float, pairs: dict[float, float]) -> None:
-    found = toned(torch.tensor([list(pairs)]), gamma)  # type: ignore[arg-type]
+    found = toned(torch.tensor([list(pairs)]), gamma)
     torch.testing.assert_close(found, torch.tensor([list(pairs.values())]), rtol=0, atol=2e-3)
-    noisy = add_noise(torch.tensor([[list(pairs)]]), 0.0, gamma=gamma, bits=16)  # type: ignore[arg-type]
+    noisy = add_noise(torch.tensor([[list(pairs)]]), 0.0, gamma=gamma, bits=16)
     torch.testing.assert_close(noisy.float()[0] / 257, found, rtol=0, atol=3e-3)
 
 

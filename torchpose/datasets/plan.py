@@ -395,8 +395,8 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
     directed = (image.psf_ratio, image.psf_deg, image.smear_px, image.smear_deg, image.disc_px)
     conditions = Conditions(*levels, *map(draw, directed))
     rows = (image.coma_px, image.coma_deg, image.haze_px, image.ghost, image.speckle, image.flicker)
-    scales = (image.haze_length, image.speckle_px, image.flicker_px)
-    disturbances = Disturbances(*map(draw, rows), *scales, file.seed)
+    each: list[Any] = [*map(draw, rows), image.haze_length, image.speckle_px, image.flicker_px, file.seed]
+    disturbances = Disturbances(*each)
     seen = markers_in_view(camera, target, R, t)
     with within(f"{path}: print."):
         printed_ = _prints(file, target, len(t))

@@ -7,7 +7,7 @@ blur of 0.7 px it is half a percent, of one with 1 px 2e-4. Chance comes from ke
 
 import math
 from dataclasses import dataclass, fields
-from typing import Self
+from typing import Any, Self
 
 import torch
 from jaxtyping import Float, Int
@@ -56,8 +56,8 @@ class Disturbances(Rows):
     def of(cls, count: int, *, seed: int = 0, **given: float) -> Self:
         """The same for ``count`` frames, with the fields that are given."""
         rows = {f.name: given.get(f.name, 0.0) for f in fields(cls) if not f.metadata.get("shared")}
-        common = {name: value for name, value in given.items() if name not in rows}
-        return cls(**{n: torch.full((count,), v, dtype=torch.float64) for n, v in rows.items()}, **common, seed=seed)
+        each: dict[str, Any] = {n: torch.full((count,), v, dtype=torch.float64) for n, v in rows.items()}
+        return cls(**{**given, **each}, seed=seed)
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ class PrintErrors:
     Attributes:
         center_sigma: standard deviation in mm of the places of markers along x, y and z, each on its own; a number
             stands for all three.
-        gain: dot gain in mm: every dark edge lies so much further outwards.
+        gain: dot gain in mm, beyond that of the target file: every dark edge lies so much further outwards.
         scale: relative error of all lengths.
         warp: half of the height in mm from the lowest to the highest point of the plate that is bent, on the smallest
             disc about the mean of the markers' centres that holds all rings.
@@ -59,7 +59,7 @@ class Prints(Rows):
         normals: of their planes.
         radii: outer and inner.
         curvature: second derivatives of the plate's height along z by x and y, per mm, everywhere the same.
-        gain: dot gain.
+        gain: dot gain, that of the target file included.
         target: what was to be printed.
     """
 
@@ -71,13 +71,20 @@ class Prints(Rows):
     target: Target = shared()
 
     def as_target(self, number: int = 0) -> Target:
-        """One of the prints as a target of its own: its rings in the planes that touch the plate in their centres.
+        """One of the prints as a target that knows it: its rings in the planes that touch the plate in their centres.
 
         Raises:
-            ConfigError: its rings overlap or cannot be told apart any more.
+            ConfigError: its rings overlap.
         """
+        target, gain = self.target, float(self.gain[number])
+        outwards = self.radii.new_tensor([gain, -gain]) * (1 if target.background == "light" else -1)
         return replace(
-            self.target, centers=self.centers[number], normals=self.normals[number], radii=self.radii[number]
+            target,
+            centers=self.centers[number],
+            normals=self.normals[number],
+            radii=self.radii[number] - outwards,
+            edge_gain=gain,
+            covariance=None,
         )
 
     def repeated(self, count: int) -> Self:
@@ -122,7 +129,7 @@ def printed(target: Target, errors: PrintErrors, count: int = 1, generator: torc
     if not bool((sigma >= 0).all()):
         raise ConfigError("center_sigma: is negative; give 0 mm or more")
     error = sigma * torch.randn(count, *like.shape, dtype=like.dtype, device=like.device, generator=generator)
-    gain, scale = each(errors.gain), 1 + each(errors.scale)
+    gain, scale = target.edge_gain + each(errors.gain), 1 + each(errors.scale)
     centers, normals, curvature = _warped(target, each(errors.warp), errors.shape, each(errors.direction))
     centers = scale[:, None, None] * centers + error
     # ink and toner spread: dark rings grow, light ones shrink
