@@ -143,6 +143,8 @@ FAULTS = {
     "print-50": Case(tilted(40), errors=PrintErrors(center_sigma=0.050)),
     "warp-50": Case(tilted(40), errors=PrintErrors(warp=0.050)),
     "gain-30": Case(tilted(40), errors=PrintErrors(gain=0.030)),
+    "raster-600": Case(tilted(40), errors=PrintErrors(dpi=600.0)),
+    "raster-150": Case(tilted(40), errors=PrintErrors(dpi=150.0)),
     "k1-off": Case(tilted(40), k1_error=0.002),
     "texture": Case(tilted(40), texture=(0.02, 4.0)),
     "coma": Case(tilted(40), disturbances={"coma_px": 2.0, "coma_deg": 30.0}),
@@ -269,7 +271,7 @@ def printed_anew(case: Case, frames: int, g: torch.Generator) -> Prints | None:
 
 
 def stated(errors: PrintErrors) -> tp.Target:
-    """The target with what its file may say of such prints."""
+    """The target with what its file may say of such prints; it has no word for a raster."""
     sigma = torch.as_tensor(errors.center_sigma, dtype=F64).expand(3).clone()
     reach = TARGET.centers[:, :2].norm(dim=1)
     # a saddle of any direction: its height over the markers, RMS

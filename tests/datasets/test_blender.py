@@ -58,6 +58,9 @@ def test_filter_width_has_the_variance() -> None:
         ("imaging.plate", "plate: [70, 70], ", ""),
         ("imaging.clutter", "plate:", "clutter: 3, plate:"),
         ("imaging.motion_mm", "plate:", "motion_mm: 0.1, plate:"),
+        ("print.each", "sensor:", "print: {each: frame}\nsensor:"),
+        ("print.center_sigma", "sensor:", "print: {center_sigma: 0.02}\nsensor:"),
+        ("print.dpi", "sensor:", "print: {dpi: 600}\nsensor:"),
     ],
 )
 def test_what_is_not_modelled_is_an_error(plan: Plan, field: str, old: str, new: str) -> None:
@@ -67,6 +70,30 @@ def test_what_is_not_modelled_is_an_error(plan: Plan, field: str, old: str, new:
     path.write_text(path.read_text().replace(old, new))
     with pytest.raises(ConfigError, match=field):
         blender(load_plan(path))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("shape", ["dome", "cylinder", "twist"])
+def test_agrees_on_a_print(plan: Plan, shape: str) -> None:
+    pytest.importorskip("bpy")
+    from torchpose.datasets.blender import blender
+
+    made = f"{{center_sigma: [0.05, 0.05, 0], gain: 0.06, warp: 0.8, warp_shape: {shape}, warp_deg: 25}}"
+    plan.path.write_text(plan.path.read_text().replace("sensor:", f"print: {made}\nsensor:"))
+    printed = load_plan(plan.path)
+    which = torch.arange(2)
+    seen, expected, nominal = (f(which) for f in (blender(printed), analytic(printed), analytic(plan)))
+    # both know the print: what is left is sampling noise and the shape of the pixel filter
+    both, other = (ink_centroids(printed, f) for f in (seen, expected))
+    moved = ink_centroids(plan, nominal) - other
+    print(f"{shape}: {(both - other).norm(dim=-1).max():.4f} of {moved.norm(dim=-1).mean():.3f} px")
+    assert (both - other).norm(dim=-1).max() < 0.005
+    assert moved.norm(dim=-1).mean() > 0.2
+    ink = [(220 - f).clamp_min(0) * (f != 128) for f in (seen, expected, nominal)]
+    area = [float(f.sum()) for f in ink]
+    assert area[0] == pytest.approx(area[1], rel=5e-4)
+    assert area[1] > 1.02 * area[2]
 
 
 @pytest.mark.slow

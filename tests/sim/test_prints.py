@@ -18,6 +18,7 @@ from torchpose.sim.prints import Warp
 from torchpose.target import Target
 
 F64 = torch.float64
+STRAIGHT = torch.eye(3, dtype=F64)[None], torch.tensor([[0.0, 0.0, 200.0]], dtype=F64)
 QUAD = Target.load("quad40")
 
 
@@ -71,6 +72,7 @@ def test_plate_has_its_height(kind: Warp) -> None:
     assert x.abs().max() == y.abs().max() == 0
     x, y = QUAD.centers[:, 0], QUAD.centers[:, 1]
     torch.testing.assert_close(z, height(kind, warp, angle, x, y))
+    torch.testing.assert_close(prints.height(QUAD.centers[:, :2])[0], z)
     step = 1e-3
     slope = [
         (height(kind, warp, angle, x + a, y + b) - height(kind, warp, angle, x - a, y - b)) / (2 * step)
@@ -115,6 +117,48 @@ def test_rings_are_bent_as_the_plate_is(kind: Warp) -> None:
     assert rms[1] > 0.01
 
 
+@pytest.mark.parametrize("dpi", [50, 300])
+def test_raster_has_the_cells_of_the_ring(dpi: float) -> None:
+    prints = printed(target(), PrintErrors(dpi=dpi), 2, torch.Generator().manual_seed(1))
+    frames = render(camera(), prints, *(x.expand(2, *x.shape[1:]) for x in STRAIGHT), dark=0.0, light=1.0).double()
+    for frame, phase in zip(frames, prints.phase.numpy(), strict=True):
+        cell = 25.4 / dpi
+        x, y = np.meshgrid(*(p + cell * (np.arange(-400, 400) + 0.5) for p in phase))
+        black = (np.hypot(x, y) < 5.0) & (np.hypot(x, y) >= 1.5)
+        area = float((1 - frame).sum()) * 200**2 / (400 * 405)
+        assert area == pytest.approx(black.sum() * cell**2, rel=2e-5)
+    assert (frames[0] - frames[1]).abs().max() > 0.005
+
+
+def test_raster_is_the_rows_of_its_cells() -> None:
+    prints = printed(target(), PrintErrors(dpi=60), 1, torch.Generator().manual_seed(2))
+    cell, phase = 25.4 / 60, prints.phase[0].numpy()
+    rows = []
+    for j in range(-20, 20):
+        y = phase[1] + cell * (j + 0.5)
+        x = phase[0] + cell * (np.arange(-40, 40) + 0.5)
+        black = (np.hypot(x, y) < 5.0) & (np.hypot(x, y) >= 1.5)
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], black.astype(int), [0]])))
+        for a, b in edges.reshape(-1, 2):
+            left, right = x[a] - cell / 2, x[b - 1] + cell / 2
+            rows.append(shapes.rectangle(((left + right) / 2, y), right - left, cell))
+    cam, (R, t) = camera(distortion=BROWN), pose(50, 30, (3.0, -4.0, 190.0))
+    found = render(cam, prints, R, t)
+    expected = render(cam, shapes.cat(rows), R, t, light=220.0)
+    torch.testing.assert_close(found, expected, rtol=0, atol=2e-3)
+    assert (found - render(cam, target(), R, t)).abs().max() > 3
+
+
+def test_raster_lies_on_the_bent_plate() -> None:
+    cam, (R, t) = camera(640, 640), pose(40, 30, (0.0, 0.0, 300.0))
+    errors = {"warp": 0.5, "shape": "dome", "center_sigma": 0.1}
+    smooth, fine = drawn(1, **errors), drawn(1, **errors, dpi=1200)
+    found, expected = render(cam, fine, R, t), render(cam, smooth, R, t)
+    flat = render(cam, drawn(1, center_sigma=0.1), R, t)
+    difference = [float((f - expected).square().mean().sqrt()) for f in (found, flat)]
+    assert difference[0] < 0.1 * difference[1]
+
+
 def test_each_frame_has_its_own_print() -> None:
     cam = camera(640, 640)
     R, t = pose(30, 10, (3.0, -2.0, 300.0))
@@ -134,6 +178,7 @@ def test_each_frame_has_its_own_print() -> None:
     ("wrong", "words"),
     [
         ({"center_sigma": -0.1}, "center_sigma: is negative"),
+        ({"dpi": 0.0}, "dpi: is 0; give cells an inch"),
         ({"gain": -2.0}, "gain: leaves nothing of a ring"),
     ],
 )

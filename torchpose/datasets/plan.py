@@ -231,6 +231,7 @@ class Print(_Section):
     warp_shape: Warp = "twist"
     warp_deg: Range = [0.0, 180.0]
     texture: Paper | None = None
+    dpi: Positive | None = None
 
     @field_validator("center_sigma")
     @classmethod
@@ -437,6 +438,7 @@ def _prints(file: PlanFile, target: Target, frames: int) -> tuple[Prints | None,
         draw(wanted.warp),
         wanted.warp_shape,
         draw(wanted.warp_deg).deg2rad(),
+        wanted.dpi,
     )
     prints, texture = printed(target, errors, count, generator), None
     if (paper := wanted.texture) is not None:

@@ -15,9 +15,11 @@ from torch import Tensor
 from torchpose.errors import ConfigError
 from torchpose.geometry.rotations import plane_axes
 from torchpose.geometry.rows import Rows, shared
+from torchpose.sim.raster import raster_sides
 from torchpose.sim.shapes import Circles, Shapes, Sides
 from torchpose.target import Target
 
+_INCH = 25.4  # mm
 Warp = Literal["dome", "cylinder", "twist"]
 # height on the unit disc, offset + (x, y) diag (x, y): mean 0 over the disc, 2 from its lowest to its highest point
 _WARPS: dict[str, tuple[float, tuple[float, float]]] = {
@@ -40,6 +42,8 @@ class PrintErrors:
             disc about the mean of the markers' centres that holds all rings.
         shape: of the plate: ``dome``, ``cylinder`` (bent along x) or ``twist`` (a saddle, up along x, down along y).
         direction: by which its x lies off that of the target, rad from x towards y.
+        dpi: cells an inch of a raster printer, aligned with the target's x and y, which makes a cell black where its
+            centre is to be; None for smooth edges.
     """
 
     center_sigma: float | Sequence[float] = 0.0
@@ -48,6 +52,7 @@ class PrintErrors:
     warp: float | Tensor = 0.0
     shape: Warp = "twist"
     direction: float | Tensor = 0.0
+    dpi: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,16 +64,22 @@ class Prints(Rows):
         normals: of their planes.
         radii: outer and inner.
         curvature: second derivatives of the plate's height along z by x and y, per mm, everywhere the same.
+        rise: height of the plate at the mean of the target's markers.
         gain: dot gain, that of the target file included.
+        phase: a corner of the raster.
         target: what was to be printed.
+        cell: side of the raster's cells; 0 for smooth edges.
     """
 
     centers: Float[Tensor, "B M 3"]
     normals: Float[Tensor, "B M 3"]
     radii: Float[Tensor, "B M 2"]
     curvature: Float[Tensor, "B 2 2"]
+    rise: Float[Tensor, " B"]
     gain: Float[Tensor, " B"]
+    phase: Float[Tensor, "B 2"]
     target: Target = shared()
+    cell: float = shared(0.0)
 
     def as_target(self, number: int = 0) -> Target:
         """One of the prints as a target that knows it: its rings in the planes that touch the plate in their centres.
@@ -86,6 +97,11 @@ class Prints(Rows):
             edge_gain=gain,
             covariance=None,
         )
+
+    def height(self, place: Float[Tensor, "N 2"]) -> Float[Tensor, "B N"]:
+        """How far the plates lie along z beyond the flat target at (x, y), mm."""
+        away = place - self.target.centers[:, :2].mean(0)
+        return self.rise[:, None] + 0.5 * ((away @ self.curvature) * away).sum(-1)
 
     def repeated(self, count: int) -> Self:
         """A print that was made once, for ``count`` frames."""
@@ -107,7 +123,21 @@ class Prints(Rows):
         )
         frame, marker = each // markers, each % markers
         sides = Sides(each[:0], radii.new_zeros(0, 2, 3))
+        if self.cell > 0:
+            circles, sides = circles[each[:0]], self._rastered()
         return Shapes(frame, marker, level[frame], center, circles, sides)
+
+    def _rastered(self) -> Sides:
+        """Outlines of the rings of all prints, on their bent plates."""
+        print_ = torch.arange(len(self), device=self.gain.device).repeat_interleave(2 * self.centers.shape[1])
+        center, normal = (x.flatten(0, 1).repeat_interleave(2, 0) for x in (self.centers, self.normals))
+        circle, ends = raster_sides(center[:, :2], self.radii.flatten(), self.cell, self.phase[print_])
+        away, slope = ends - center[circle, None, :2], -normal[:, :2] / normal[:, 2:]
+        bend = 0.5 * ((away @ self.curvature[print_[circle]]) * away).sum(-1)
+        height = center[circle, None, 2] + (away * slope[circle, None]).sum(-1) + bend
+        ends = torch.cat([ends, height[..., None]], -1)
+        hole = circle % 2 == 1
+        return Sides(circle // 2, torch.where(hole[:, None, None], ends.flip(1), ends))
 
 
 def printed(target: Target, errors: PrintErrors, count: int = 1, generator: torch.Generator | None = None) -> Prints:
@@ -118,7 +148,7 @@ def printed(target: Target, errors: PrintErrors, count: int = 1, generator: torc
 
     Raises:
         ConfigError: a deviation is negative, the dot gain leaves nothing of a ring, or a target that is not flat in a
-            plane z = const is warped.
+            plane z = const is warped or rastered.
     """
     like = target.centers
 
@@ -130,7 +160,7 @@ def printed(target: Target, errors: PrintErrors, count: int = 1, generator: torc
         raise ConfigError("center_sigma: is negative; give 0 mm or more")
     error = sigma * torch.randn(count, *like.shape, dtype=like.dtype, device=like.device, generator=generator)
     gain, scale = target.edge_gain + each(errors.gain), 1 + each(errors.scale)
-    centers, normals, curvature = _warped(target, each(errors.warp), errors.shape, each(errors.direction))
+    centers, normals, curvature, rise = _warped(target, each(errors.warp), errors.shape, each(errors.direction))
     centers = scale[:, None, None] * centers + error
     # ink and toner spread: dark rings grow, light ones shrink
     outwards = gain if target.background == "light" else -gain
@@ -138,18 +168,28 @@ def printed(target: Target, errors: PrintErrors, count: int = 1, generator: torc
     radii = torch.stack([radii[..., 0], radii[..., 1].clamp_min(0.0)], -1)  # a hole may be filled
     if not bool((radii[..., 0] > radii[..., 1]).all()):
         raise ConfigError("gain: leaves nothing of a ring; give less")
-    return Prints(centers, normals, radii, curvature, gain, target)
+    phase, cell = like.new_zeros(count, 2), 0.0
+    if errors.dpi is not None:
+        if not errors.dpi > 0:
+            raise ConfigError(f"dpi: is {errors.dpi:g}; give cells an inch, such as 600")
+        _check_upright("dpi", target)
+        cell = _INCH / errors.dpi
+        phase = cell * torch.rand(count, 2, dtype=like.dtype, device=like.device, generator=generator)
+    return Prints(centers, normals, radii, curvature, rise, gain, phase, target, cell)
 
 
-def _warped(target: Target, warp: Tensor, shape: Warp, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Centres (B, M, 3), normals (B, M, 3) and curvature (B, 2, 2) of the target on plates of such heights (B,)."""
+def _check_upright(field: str, target: Target) -> None:
+    if not (target.coplanar and bool(target.normals[:, :2].abs().max() < 1e-6)):
+        raise ConfigError(f"{field}: is for targets in a plane z = const; leave it out")
+
+
+def _warped(target: Target, warp: Tensor, shape: Warp, direction: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The fields ``centers``, ``normals``, ``curvature`` and ``rise`` of prints on plates of such heights (B,)."""
     count, markers = len(warp), len(target)
     flat = target.centers.new_zeros(count, 2, 2)
     if not bool(warp.any()):
-        return target.centers.expand(count, -1, -1), target.normals.expand(count, -1, -1), flat
-    upright = target.normals[:, :2].abs().max() < 1e-6
-    if not (target.coplanar and bool(upright)):
-        raise ConfigError("warp: is for targets in a plane z = const; leave it out")
+        return target.centers.expand(count, -1, -1), target.normals.expand(count, -1, -1), flat, warp
+    _check_upright("warp", target)
     place = target.centers[:, :2] - target.centers[:, :2].mean(0)
     radius = (place.norm(dim=1) + target.radii[:, 0]).max()
     offset, diagonal = _WARPS[shape]
@@ -161,7 +201,7 @@ def _warped(target: Target, warp: Tensor, shape: Warp, direction: Tensor) -> tup
     lifted = torch.cat([place.new_zeros(count, markers, 2), height[..., None]], -1)
     sign = target.normals[:, 2].sign().expand(count, -1)
     normals = torch.nn.functional.normalize(torch.cat([-slope, torch.ones_like(height)[..., None]], -1), dim=-1)
-    return target.centers + lifted, sign[..., None] * normals, curvature
+    return target.centers + lifted, sign[..., None] * normals, curvature, offset * warp
 
 
 def _bend(axes: Tensor, normal: Tensor, curvature: Tensor) -> Tensor:
