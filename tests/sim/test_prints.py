@@ -73,6 +73,9 @@ def test_plate_has_its_height(kind: Warp) -> None:
     x, y = QUAD.centers[:, 0], QUAD.centers[:, 1]
     torch.testing.assert_close(z, height(kind, warp, angle, x, y))
     torch.testing.assert_close(prints.height(QUAD.centers[:, :2])[0], z)
+    # markers that are off their places lie on the plate there
+    off = drawn(3, warp=warp, shape=kind, direction=angle, center_sigma=[0.5, 0.5, 0.0], scale=0.01).centers
+    torch.testing.assert_close(off[..., 2], height(kind, warp, angle, off[..., 0], off[..., 1]))
     step = 1e-3
     slope = [
         (height(kind, warp, angle, x + a, y + b) - height(kind, warp, angle, x - a, y - b)) / (2 * step)

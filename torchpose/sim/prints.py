@@ -160,8 +160,8 @@ def printed(target: Target, errors: PrintErrors, count: int = 1, generator: torc
         raise ConfigError("center_sigma: is negative; give 0 mm or more")
     error = sigma * torch.randn(count, *like.shape, dtype=like.dtype, device=like.device, generator=generator)
     gain, scale = target.edge_gain + each(errors.gain), 1 + each(errors.scale)
-    centers, normals, curvature, rise = _warped(target, each(errors.warp), errors.shape, each(errors.direction))
-    centers = scale[:, None, None] * centers + error
+    curvature, rise = _plate(target, each(errors.warp), errors.shape, each(errors.direction))
+    centers, normals = _laid(target, scale[:, None, None] * target.centers + error, curvature, rise)
     # ink and toner spread: dark rings grow, light ones shrink
     outwards = gain if target.background == "light" else -gain
     radii = scale[:, None, None] * target.radii + outwards[:, None, None] * like.new_tensor([1.0, -1.0])
@@ -183,25 +183,30 @@ def _check_upright(field: str, target: Target) -> None:
         raise ConfigError(f"{field}: is for targets in a plane z = const; leave it out")
 
 
-def _warped(target: Target, warp: Tensor, shape: Warp, direction: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The fields ``centers``, ``normals``, ``curvature`` and ``rise`` of prints on plates of such heights (B,)."""
-    count, markers = len(warp), len(target)
-    flat = target.centers.new_zeros(count, 2, 2)
+def _plate(target: Target, warp: Tensor, shape: Warp, direction: Tensor) -> tuple[Tensor, Tensor]:
+    """Curvature (B, 2, 2) of plates of such heights (B,), and their height (B,) at the mean of the markers."""
     if not bool(warp.any()):
-        return target.centers.expand(count, -1, -1), target.normals.expand(count, -1, -1), flat, warp
+        return warp.new_zeros(len(warp), 2, 2), warp
     _check_upright("warp", target)
-    place = target.centers[:, :2] - target.centers[:, :2].mean(0)
-    radius = (place.norm(dim=1) + target.radii[:, 0]).max()
+    radius = ((target.centers - target.centers.mean(0)).norm(dim=1) + target.radii[:, 0]).max()
     offset, diagonal = _WARPS[shape]
     axis = torch.stack([direction.cos(), direction.sin()], -1)
     turn = torch.stack([axis, torch.stack([-axis[:, 1], axis[:, 0]], -1)], -1)  # columns: the quadric's x and y
-    curvature = (turn @ torch.diag(warp.new_tensor(diagonal)) @ turn.mT) * (2 * warp / radius.square())[:, None, None]
-    slope = place @ curvature  # (B, M, 2)
-    height = 0.5 * (slope * place).sum(-1) + offset * warp[:, None]
-    lifted = torch.cat([place.new_zeros(count, markers, 2), height[..., None]], -1)
-    sign = target.normals[:, 2].sign().expand(count, -1)
+    unit = turn @ torch.diag(warp.new_tensor(diagonal)) @ turn.mT
+    return unit * (2 * warp / radius.square())[:, None, None], offset * warp
+
+
+def _laid(target: Target, centers: Tensor, curvature: Tensor, rise: Tensor) -> tuple[Tensor, Tensor]:
+    """Centres (B, M, 3) lifted onto bent plates, and normals (B, M, 3) of these there."""
+    count = len(centers)
+    if not bool(curvature.any()):
+        return centers, target.normals.expand(count, -1, -1)
+    place = centers[..., :2] - target.centers[:, :2].mean(0)
+    slope = place @ curvature
+    height = rise[:, None] + 0.5 * (slope * place).sum(-1)
+    lifted = torch.cat([centers[..., :2], (centers[..., 2] + height)[..., None]], -1)
     normals = torch.nn.functional.normalize(torch.cat([-slope, torch.ones_like(height)[..., None]], -1), dim=-1)
-    return target.centers + lifted, sign[..., None] * normals, curvature, offset * warp
+    return lifted, target.normals[:, 2:].sign() * normals
 
 
 def _bend(axes: Tensor, normal: Tensor, curvature: Tensor) -> Tensor:
