@@ -149,6 +149,7 @@ FAULTS = {
     "texture": Case(tilted(40), texture=(0.02, 4.0)),
     "coma": Case(tilted(40), disturbances={"coma_px": 2.0, "coma_deg": 30.0}),
     "haze": Case(tilted(40), disturbances={"haze_px": 0.1}),
+    "haze-fine": Case(tilted(40), disturbances={"haze_px": 0.1, "haze_length": 10.0}),
     "ghost": Case(tilted(40), disturbances={"ghost": 15.0}),
     "speckle": Case(tilted(40), disturbances={"speckle": 0.05}),
     "flicker": Case(tilted(40), disturbances={"flicker": 0.05}),
