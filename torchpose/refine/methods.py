@@ -139,6 +139,8 @@ def _of_joint(rows: Solutions, seen: Evidence, pose: Pose, joint: OnPrint) -> So
         covariance=joint.covariance,
         noise=joint.noise,
         systematic=joint.systematic,
+        place=torch.where(seen.mask[..., None], joint.place, torch.nan),
+        misfit=joint.misfit,
         rms=center_rms(seen, pose.R, pose.t),
     )
     return better.marked(joint.known & ~joint.explained & better.ok, Status.REJECTED, Reason.RESIDUAL)
