@@ -6,7 +6,7 @@ and the poses under which most markers have a ring of the right place, size and 
 the target each. All pairs of all frames are tried in one flat batch.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,11 +14,11 @@ from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.geometry.rows import Rows, shared
-from torchpose.geometry.segments import marked, pairs_in_group
-from torchpose.identify.assignments import Assignments, propose, ratio_tolerance
+from torchpose.geometry.segments import marked, pairs_in_group, segment_sum
+from torchpose.identify.assignments import Assignments, Codes, Marks, propose, ratio_tolerance
 from torchpose.identify.copies import MIN_MARKERS, Claims, Rivals, rank, share_out
 from torchpose.identify.hypotheses import Hypotheses, hypotheses
-from torchpose.identify.scene import MarkerTable
+from torchpose.identify.scene import MOST_GAIN, MarkerTable
 from torchpose.rings import Rings
 
 # of the tolerances, mean over the markers: a false code of rings of 13 px misses by 0.2 more (derived), a right one by
@@ -40,6 +40,7 @@ class Identified(Rows):
         R: the rough pose that the rings were assigned under; NaN without one.
         t: the same, mm.
         copies: how many copies the rings of the row's frame show, each by three markers or more.
+        gain: mm, the edge gain of the plate as the codes tell it and the target's file allows; 0 where nothing tells.
         proposal: group, marker and ring of every ring with the code of a marker, whether or not it fits.
     """
 
@@ -48,6 +49,7 @@ class Identified(Rows):
     R: Float[Tensor, "N 3 3"]
     t: Float[Tensor, "N 3"]
     copies: Int[Tensor, " N"]
+    gain: Float[Tensor, " N"]
     proposal: Int[Tensor, "A 3"] = shared()
 
     def proposed(self, unclaimed: Bool[Tensor, " K"]) -> Tensor:
@@ -85,7 +87,7 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int, inst
     if instances is not None:
         number = torch.arange(len(kept), device=device) - torch.searchsorted(row[kept], row[kept])
         kept = kept[number < instances]
-    kept = kept[~_contested(rivals, kept, rings.clipped)]
+    kept = kept[~_contested(rivals, kept)]
     group, at = row[kept], torch.arange(len(kept), device=device)
     without = (~marked(group, rows)).nonzero()[:, 0]
     if without.numel():
@@ -96,22 +98,31 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int, inst
     to = torch.full_like(row, -1).index_copy_(0, kept, at)[claims.pose]
     chosen = (to >= 0).nonzero()[:, 0]
     result.ring[to[chosen], claims.marker[chosen]] = claims.ring[chosen] % len(rings)
+    result = replace(result, gain=_gain(rings, result, table))
     if without.numel():
         # no pair, no pose: the code is all there is, where it is not clipped
-        alone = (marked(without, rows)[one.row] & one.clipping.isnan()).nonzero()[:, 0]
+        alone = (marked(without, rows)[one.row] & ~one.clipped & (one.mismatch_plain() < 1)).nonzero()[:, 0]
         result.ring[torch.searchsorted(group, one.row[alone]), one.marker[alone]] = one.ring[alone]
     return result
 
 
-def _contested(rivals: Rivals, kept: Tensor, clipped: Tensor) -> Tensor:
-    """Poses ``kept`` (P,) bool that another one explains as well by other codes of the same rings (K,) ``clipped``.
+def _gain(rings: Rings, rows: Identified, table: MarkerTable) -> Tensor:
+    """The likeliest edge gain (N,) of every row's plate, mm, by the codes of its rings that are not clipped."""
+    row, marker = (rows.ring >= 0).nonzero().unbind(-1)
+    seen, target = rings[rows.ring[row, marker]], rows.group[row] % len(table)
+    codes = Codes.of(seen, Marks.of(table, target, marker))
+    weight = torch.where(seen.clipped, 0.0, (MOST_GAIN * codes.per_unit).square())
+    known, sums = (segment_sum(value, row, len(rows)) for value in (weight, weight * codes.moved))
+    return sums / (known + table.gain_scale[rows.group % len(table)].pow(-2))
+
+
+def _contested(rivals: Rivals, kept: Tensor) -> Tensor:
+    """Poses ``kept`` (P,) bool that another one explains as well by other codes of the same rings.
 
     Codes read up to a displacement let a small target turn, by a code and a corner. What it costs is that the rings'
     size, moved with their edges, no longer suits their distances.
     """
-    if not bool(clipped.any()):
-        return torch.zeros_like(kept, dtype=torch.bool)
-    claims = rivals.claims.where(clipped[rivals.claims.ring % len(clipped)])
+    claims = rivals.claims
     number = torch.full_like(rivals.row, -1).index_copy_(0, kept, torch.arange(len(kept), device=kept.device))
     own = claims.where(number[claims.pose] >= 0)
     ring, order = claims.ring.sort()
@@ -150,8 +161,8 @@ def _weighed(tried: Hypotheses, one: Assignments, size: tuple[int, int, int]) ->
     member, pose, markers = tried.member, tried.pose, size[2]
     every = Claims(pose, one.number[member], one.marker[member])
     # the code has its say, too: markers of neighbouring codes must not change places
-    # and clipping moves the edges of all rings as far as those of the one that the pose comes from
-    off = one[member].mismatch_under(one.clipping[tried.origin[pose]])
+    # and gain or clipping move the edges of all rings as far as those of the one that the pose comes from
+    off = one[member].mismatch_beside(one[tried.origin[pose]])
     cost = torch.where((tried.miss < 1) & (off < 1), 0.5 * (tried.miss + off), torch.inf)
     slot = pose * markers + every.marker
     per_marker = torch.full((len(tried.R) * markers,), torch.inf, dtype=cost.dtype, device=cost.device)
@@ -174,6 +185,7 @@ def _empty(group: Tensor, markers: int, copies: Tensor, proposal: Tensor) -> Ide
         nowhere.repeat(count, 3, 3),
         nowhere.repeat(count, 3),
         copies,
+        torch.zeros(count, dtype=torch.float64, device=group.device),
         proposal,
     )
 

@@ -13,6 +13,9 @@ from torchpose.geometry.rows import Rows
 from torchpose.target import Target
 
 _SAME_CODE = 1e-3  # of the ratio of radii: what differs by less is one code
+MOST_GAIN = 3.0  # deviations of the edge gain that a file states, up to which codes are read (a convention)
+# mm, of prints of which nothing is said: laser printers and copiers (docs/targets.md); no more than makes half a code
+_OFFICE_GAIN = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +30,7 @@ class MarkerTable(Rows):
         valid: False where padded.
         polarity: +1 dark rings, -1 light ones.
         coplanar: whether all markers lie in one plane.
+        gain_sigma: of the edge gain, mm; 0 where the file states none.
     """
 
     ids: Int[Tensor, "T M"]
@@ -36,6 +40,7 @@ class MarkerTable(Rows):
     valid: Bool[Tensor, "T M"]
     polarity: Float[Tensor, " T"]
     coplanar: Bool[Tensor, " T"]
+    gain_sigma: Float[Tensor, " T"]
 
     @classmethod
     def of(cls, targets: Sequence[Target]) -> Self:
@@ -50,6 +55,9 @@ class MarkerTable(Rows):
             padded([torch.ones(len(t), dtype=torch.bool) for t in targets], False),
             torch.tensor([1.0 if t.background == "light" else -1.0 for t in targets], dtype=torch.float64),
             torch.tensor([t.coplanar for t in targets]),
+            torch.stack([t.radii.new_zeros(()) if t.covariance is None else t.covariance[-1, -1] for t in targets])
+            .clamp_min(0)
+            .sqrt(),
         )
 
     @property
@@ -59,6 +67,22 @@ class MarkerTable(Rows):
         apart = (ratio[:, :, None] - ratio[:, None]).abs()
         both = self.valid[:, :, None] & self.valid[:, None] & (apart > _SAME_CODE)
         return 0.5 * torch.where(both, apart, torch.inf).flatten(1).amin(1)
+
+    @property
+    def gain_scale(self) -> Float[Tensor, " T"]:
+        """Standard deviation of each target's edge gain, mm: as its file states it, or that of a plausible print.
+
+        Of a print of which nothing is said the codes alone tell what they are: by less than half of the way to the next.
+        """
+        by_half = self.half_gap[:, None] * self.radii[..., 0].square() / self.radii.sum(-1)
+        least = torch.where(self.valid, by_half, torch.inf).amin(1)
+        plausible = least.clamp_max(_OFFICE_GAIN) / MOST_GAIN
+        return torch.where(self.gain_sigma > 0, self.gain_sigma, plausible)
+
+    @property
+    def most_gain(self) -> Float[Tensor, " T"]:
+        """Largest edge gain with which codes are read, mm."""
+        return MOST_GAIN * self.gain_scale
 
 
 class Scene(NamedTuple):
@@ -83,6 +107,16 @@ class Scene(NamedTuple):
     def of_rows(self, group: Tensor) -> Self:
         """The same with other rows, of the frames and targets ``group`` (N,): frame times T plus target."""
         return self._replace(frame=group // len(self.table), target=group % len(self.table))
+
+    def printed_radii(self, gain: Tensor) -> Tensor:
+        """(N, M, 2) mm, of the markers of every row where its file states how uncertain the edge gain is, by ``gain``.
+
+        Args:
+            gain: (N,) mm, of each row.
+        """
+        outwards = self.table.polarity[self.target] * torch.where(self.table.gain_sigma[self.target] > 0, gain, 0.0)
+        radii = self.table.radii[self.target]
+        return radii + outwards[:, None, None] * radii.new_tensor([1.0, -1.0])
 
     @property
     def groups(self) -> int:
