@@ -67,16 +67,13 @@ class Assignments(Rows):
     place: Tensor
     axis: Tensor
 
-    def mismatch_beside(self, other: Self) -> Tensor:
-        """Of the codes, where the edges of these and of the others (A,) were moved alike."""
-        return self._under(torch.where(self.clipped == other.clipped, other.likely, torch.nan))
+    def codes_of(self, index: Tensor | slice = slice(None)) -> "Codes":
+        """Codes of the rings of some."""
+        return Codes(*(value[index] for value in (self.mismatch, self.moved, self.per_unit, self.likely)))
 
-    def mismatch_plain(self) -> Tensor:
-        """Of the codes, where no edge was moved."""
-        return self._under(torch.zeros_like(self.likely))
-
-    def _under(self, common: Tensor) -> Tensor:
-        return Codes(self.mismatch, self.moved, self.per_unit, self.likely).under(common)
+    def common(self, origin: Tensor, member: Tensor) -> Tensor:
+        """By how far edges of ``member`` (S,) are moved where those of ``origin`` (S,) are: NaN if one is clipped."""
+        return torch.where(self.clipped[origin] == self.clipped[member], self.likely[origin], torch.nan)
 
 
 def ratio_tolerance(semi_minor: Ratio, blur: Ratio | float = 1.0) -> Ratio:

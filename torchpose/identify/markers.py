@@ -6,7 +6,7 @@ and the poses under which most markers have a ring of the right place, size and 
 the target each. All pairs of all frames are tried in one flat batch.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,7 +15,7 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.geometry.rows import Rows, shared
 from torchpose.geometry.segments import marked, pairs_in_group, segment_sum
-from torchpose.identify.assignments import Assignments, Codes, Marks, propose, ratio_tolerance
+from torchpose.identify.assignments import Assignments, Codes, propose, ratio_tolerance
 from torchpose.identify.copies import MIN_MARKERS, Claims, Rivals, rank, share_out
 from torchpose.identify.hypotheses import Hypotheses, hypotheses
 from torchpose.identify.scene import MOST_GAIN, MarkerTable
@@ -87,7 +87,8 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int, inst
     if instances is not None:
         number = torch.arange(len(kept), device=device) - torch.searchsorted(row[kept], row[kept])
         kept = kept[number < instances]
-    kept = kept[~_contested(rivals, kept)]
+    if len(one.number.unique()) < len(one):  # rings with several codes
+        kept = kept[~_contested(rivals, kept)]
     group, at = row[kept], torch.arange(len(kept), device=device)
     without = (~marked(group, rows)).nonzero()[:, 0]
     if without.numel():
@@ -98,22 +99,26 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int, inst
     to = torch.full_like(row, -1).index_copy_(0, kept, at)[claims.pose]
     chosen = (to >= 0).nonzero()[:, 0]
     result.ring[to[chosen], claims.marker[chosen]] = claims.ring[chosen] % len(rings)
-    result = replace(result, gain=_gain(rings, result, table))
+    result.gain[at] = rivals.gain[kept]
     if without.numel():
         # no pair, no pose: the code is all there is, where it is not clipped
-        alone = (marked(without, rows)[one.row] & ~one.clipped & (one.mismatch_plain() < 1)).nonzero()[:, 0]
+        alone = (marked(without, rows)[one.row] & ~one.clipped & (one.codes_of().under(torch.zeros_like(one.likely)) < 1)).nonzero()[:, 0]
         result.ring[torch.searchsorted(group, one.row[alone]), one.marker[alone]] = one.ring[alone]
     return result
 
 
-def _gain(rings: Rings, rows: Identified, table: MarkerTable) -> Tensor:
-    """The likeliest edge gain (N,) of every row's plate, mm, by the codes of its rings that are not clipped."""
-    row, marker = (rows.ring >= 0).nonzero().unbind(-1)
-    seen, target = rings[rows.ring[row, marker]], rows.group[row] % len(table)
-    codes = Codes.of(seen, Marks.of(table, target, marker))
-    weight = torch.where(seen.clipped, 0.0, (MOST_GAIN * codes.per_unit).square())
-    known, sums = (segment_sum(value, row, len(rows)) for value in (weight, weight * codes.moved))
-    return sums / (known + table.gain_scale[rows.group % len(table)].pow(-2))
+def _gain(codes: Codes, told: Tensor, pose: Tensor, scale: Tensor) -> Tensor:
+    """The likeliest edge gain (H,) under every pose, mm, by the codes of its rings.
+
+    Args:
+        codes: (S,), of rings taken for markers.
+        told: (S,) bool, which of them count.
+        pose: (S,), of each.
+        scale: (H,) mm, standard deviation of the gain.
+    """
+    weight = torch.where(told, (MOST_GAIN * codes.per_unit).square(), 0.0)
+    known, sums = (segment_sum(value, pose, len(scale)) for value in (weight, weight * codes.moved))
+    return sums / (known + scale.pow(-2))
 
 
 def _contested(rivals: Rivals, kept: Tensor) -> Tensor:
@@ -139,7 +144,7 @@ def _tried(
 ) -> tuple[Hypotheses, Rivals]:
     """Poses of targets seen from their printed side; from behind too where these explain too few rings."""
     tried = hypotheses(one, table, matrix, 1.0)
-    rivals = _weighed(tried, one, size)
+    rivals = _weighed(tried, one, table, size)
     lacking = ~marked(rivals.row[rivals.explained >= MIN_MARKERS], size[0])[one.row]
     if not bool(lacking.any()):
         return tried, rivals
@@ -148,7 +153,7 @@ def _tried(
     if behind.numel() == 0:
         return tried, rivals
     tried = tried.and_of(hypotheses(one[behind], table, matrix, -1.0), behind)
-    return tried, _weighed(tried, one, size)
+    return tried, _weighed(tried, one, table, size)
 
 
 def _different(row: Tensor, marker: Tensor, size: tuple[int, int]) -> Tensor:
@@ -156,24 +161,26 @@ def _different(row: Tensor, marker: Tensor, size: tuple[int, int]) -> Tensor:
     return marked(row * size[1] + marker, size[0] * size[1]).view(size).sum(-1)
 
 
-def _weighed(tried: Hypotheses, one: Assignments, size: tuple[int, int, int]) -> Rivals:
+def _weighed(tried: Hypotheses, one: Assignments, table: MarkerTable, size: tuple[int, int, int]) -> Rivals:
     """The poses with the nearest ring of each of their markers; ``size`` as in `Rivals`."""
     member, pose, markers = tried.member, tried.pose, size[2]
     every = Claims(pose, one.number[member], one.marker[member])
     # the code has its say, too: markers of neighbouring codes must not change places
     # and gain or clipping move the edges of all rings as far as those of the one that the pose comes from
-    off = one[member].mismatch_beside(one[tried.origin[pose]])
+    codes = one.codes_of(member)
+    off = codes.under(one.common(tried.origin[pose], member))
     cost = torch.where((tried.miss < 1) & (off < 1), 0.5 * (tried.miss + off), torch.inf)
     slot = pose * markers + every.marker
     per_marker = torch.full((len(tried.R) * markers,), torch.inf, dtype=cost.dtype, device=cost.device)
     per_marker.scatter_reduce_(0, slot, cost, "amin")
     chosen = (cost == per_marker[slot]) & cost.isfinite()
+    gain = _gain(codes, chosen & ~one.clipped[member], pose, table.gain_scale[one.target[tried.origin]])
     per_marker = per_marker.view(-1, markers)
     found = per_marker.isfinite()
     count = found.sum(-1)
     score = count - torch.where(found, per_marker, 0.0).sum(-1) / (2 * markers)
     row = one.row[tried.origin]
-    return Rivals(row, score, count, rank(row, score, size[0]), every.where(chosen), every, size)
+    return Rivals(row, score, count, rank(row, score, size[0]), gain, every.where(chosen), every, size)
 
 
 def _empty(group: Tensor, markers: int, copies: Tensor, proposal: Tensor) -> Identified:

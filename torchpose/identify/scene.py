@@ -31,6 +31,9 @@ class MarkerTable(Rows):
         polarity: +1 dark rings, -1 light ones.
         coplanar: whether all markers lie in one plane.
         gain_sigma: of the edge gain, mm; 0 where the file states none.
+        gain_scale: the same, or that of a plausible print where the file states none.
+        half_gap: half of the least difference between two codes of each target, as ratios of radii; inf where there is
+            one.
     """
 
     ids: Int[Tensor, "T M"]
@@ -41,6 +44,8 @@ class MarkerTable(Rows):
     polarity: Float[Tensor, " T"]
     coplanar: Bool[Tensor, " T"]
     gain_sigma: Float[Tensor, " T"]
+    gain_scale: Float[Tensor, " T"]
+    half_gap: Float[Tensor, " T"]
 
     @classmethod
     def of(cls, targets: Sequence[Target]) -> Self:
@@ -55,34 +60,35 @@ class MarkerTable(Rows):
             padded([torch.ones(len(t), dtype=torch.bool) for t in targets], False),
             torch.tensor([1.0 if t.background == "light" else -1.0 for t in targets], dtype=torch.float64),
             torch.tensor([t.coplanar for t in targets]),
-            torch.stack([t.radii.new_zeros(()) if t.covariance is None else t.covariance[-1, -1] for t in targets])
-            .clamp_min(0)
-            .sqrt(),
+            torch.stack([_gain_sigma(t) for t in targets]),
+            torch.stack([_gain_scale(t) for t in targets]),
+            torch.stack([_half_gap(t.printed_radii) for t in targets]),
         )
 
-    @property
-    def half_gap(self) -> Float[Tensor, " T"]:
-        """Half of the least difference between two codes of each target, as ratios of radii; inf where there is one."""
-        ratio = self.radii[..., 1] / self.radii[..., 0]
-        apart = (ratio[:, :, None] - ratio[:, None]).abs()
-        both = self.valid[:, :, None] & self.valid[:, None] & (apart > _SAME_CODE)
-        return 0.5 * torch.where(both, apart, torch.inf).flatten(1).amin(1)
 
-    @property
-    def gain_scale(self) -> Float[Tensor, " T"]:
-        """Standard deviation of each target's edge gain, mm: as its file states it, or that of a plausible print.
+def _gain_sigma(target: Target) -> Tensor:
+    """Standard deviation of the edge gain as the target's file states it, mm; 0 where it does not."""
+    if target.covariance is None:
+        return target.radii.new_zeros(())
+    return target.covariance[-1, -1].clamp_min(0).sqrt()
 
-        Of a print of which nothing is said the codes alone tell what they are: by less than half of the way to the next.
-        """
-        by_half = self.half_gap[:, None] * self.radii[..., 0].square() / self.radii.sum(-1)
-        least = torch.where(self.valid, by_half, torch.inf).amin(1)
-        plausible = least.clamp_max(_OFFICE_GAIN) / MOST_GAIN
-        return torch.where(self.gain_sigma > 0, self.gain_sigma, plausible)
 
-    @property
-    def most_gain(self) -> Float[Tensor, " T"]:
-        """Largest edge gain with which codes are read, mm."""
-        return MOST_GAIN * self.gain_scale
+def _gain_scale(target: Target) -> Tensor:
+    """Standard deviation of the edge gain, mm: the one that is stated, or that of a plausible print.
+
+    A print of which nothing is said is read with a gain of less than half of the way from a code to the next.
+    """
+    radii = target.printed_radii
+    by_half = (_half_gap(radii) * radii[:, 0].square() / radii.sum(-1)).amin()
+    stated = _gain_sigma(target)
+    return torch.where(stated > 0, stated, by_half.clamp_max(_OFFICE_GAIN) / MOST_GAIN)
+
+
+def _half_gap(radii: Tensor) -> Tensor:
+    """Half of the least difference between two ratios of radii (M, 2); inf where there is one."""
+    ratio = radii[:, 1] / radii[:, 0]
+    apart = (ratio[:, None] - ratio).abs()
+    return 0.5 * torch.where(apart > _SAME_CODE, apart, torch.inf).amin()
 
 
 class Scene(NamedTuple):
