@@ -102,7 +102,8 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int, inst
     result.gain[at] = rivals.gain[kept]
     if without.numel():
         # no pair, no pose: the code is all there is, where it is not clipped
-        alone = (marked(without, rows)[one.row] & ~one.clipped & (one.codes_of().under(torch.zeros_like(one.likely)) < 1)).nonzero()[:, 0]
+        plain = ~one.clipped & (one.codes_of().under(torch.zeros_like(one.likely)) < 1)
+        alone = (marked(without, rows)[one.row] & plain).nonzero()[:, 0]
         result.ring[torch.searchsorted(group, one.row[alone]), one.marker[alone]] = one.ring[alone]
     return result
 

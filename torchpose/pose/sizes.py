@@ -22,7 +22,8 @@ def code_shift(evidence: Evidence, predicted: Tensor) -> Tensor:
     excess = evidence.shape[..., 2:4] / predicted[..., 2:4] - 1
     outer, inner = evidence.radii.unbind(-1)
     difference = (evidence.radii[..., None] * excess).sum(-2) / outer[..., None]
-    one, two = (torch.where(evidence.mask[..., None], difference, 0.0).sum(1) / evidence.mask.sum(-1)[:, None]).unbind(-1)
+    seen = evidence.mask[..., None]
+    one, two = (torch.where(seen, difference, 0.0).sum(1) / seen.sum(1)).unbind(-1)
     # blur that bends the shapes draws one axis alone
     both = torch.where(one * two > 0, one.sign() * torch.minimum(one.abs(), two.abs()), 0.0)
     return both / _code_gap(inner / outer)
