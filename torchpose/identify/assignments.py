@@ -135,8 +135,8 @@ class Codes(NamedTuple):
         per_mm = (1 + ratio) / marks.outer / tolerance
         beyond = (gain.abs() - most_gain).clamp_min(0)
         # the error of reading and the gain share the difference by their variances; the tolerance is the largest error
-        reading = 1 / (MOST_GAIN * per_mm)
-        likely = gain * marks.gain_scale.square() / (marks.gain_scale.square() + reading.square())
+        share = (most_gain * per_mm).square()
+        likely = gain * share / (1 + share)
         if not bool(rings.clipped.any()):
             return cls(beyond * per_mm, gain, per_mm, likely)
         radius, clipped = each(rings.outer.params[:, 2:4].prod(-1).sqrt()), each(rings.clipped)
@@ -179,5 +179,5 @@ def propose(rings: Rings, table: MarkerTable, matrix: Tensor) -> Assignments:
     conic = matrix.T @ conics.to_matrix(conics.conic_from_ellipse(ellipse)) @ matrix
     place, axis = conics.circle_poses(conic, radius)
     number = target * len(rings) + ring
-    mismatch, *shared = codes
-    return Assignments(row, target, marker, ring, number, mismatch, clipped, *shared, ellipse, radius, place, axis)
+    of_code = (codes.mismatch, clipped, codes.moved, codes.per_unit, codes.likely)
+    return Assignments(row, target, marker, ring, number, *of_code, ellipse, radius, place, axis)

@@ -81,7 +81,10 @@ def _gain_scale(target: Target) -> Tensor:
     radii = target.printed_radii
     by_half = (_half_gap(radii) * radii[:, 0].square() / radii.sum(-1)).amin()
     stated = _gain_sigma(target)
-    return torch.where(stated > 0, stated, by_half.clamp_max(_OFFICE_GAIN) / MOST_GAIN)
+    room = (
+        torch.minimum(radii[:, 1], 0.5 * (radii[:, 0] - radii[:, 1])).amin() / MOST_GAIN
+    )  # a hole and a ring are left
+    return torch.where(stated > 0, stated.minimum(0.9 * room), by_half.clamp_max(_OFFICE_GAIN) / MOST_GAIN)
 
 
 def _half_gap(radii: Tensor) -> Tensor:
@@ -120,8 +123,10 @@ class Scene(NamedTuple):
         Args:
             gain: (N,) mm, of each row.
         """
-        outwards = self.table.polarity[self.target] * torch.where(self.table.gain_sigma[self.target] > 0, gain, 0.0)
-        radii = self.table.radii[self.target]
+        radii, stated = self.table.radii[self.target], self.table.gain_sigma > 0
+        if not bool(stated.any()):
+            return radii
+        outwards = self.table.polarity[self.target] * torch.where(stated[self.target], gain, 0.0)
         return radii + outwards[:, None, None] * radii.new_tensor([1.0, -1.0])
 
     @property

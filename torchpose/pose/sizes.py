@@ -9,11 +9,13 @@ from torch import Tensor
 
 from torchpose.pose.evidence import Evidence
 
+# px, of a radius, and times the blur: measured ones of clutter_statistics.py --seed 54 err by less
+_SIZE_ERROR = 0.1
 _SAME_CODE = 1e-3  # of the ratio of radii: what differs by less is one code
 
 
 def code_shift(evidence: Evidence, predicted: Tensor) -> Tensor:
-    """By how many codes (N,) the sums of the rings' radii exceed those of their markers at least, mean over those seen.
+    """By how many codes (N,) at least the sums of the rings' radii differ from those of their markers, in the mean.
 
     Args:
         evidence: N rows.
@@ -22,11 +24,12 @@ def code_shift(evidence: Evidence, predicted: Tensor) -> Tensor:
     excess = evidence.shape[..., 2:4] / predicted[..., 2:4] - 1
     outer, inner = evidence.radii.unbind(-1)
     difference = (evidence.radii[..., None] * excess).sum(-2) / outer[..., None]
-    seen = evidence.mask[..., None]
-    one, two = (torch.where(seen, difference, 0.0).sum(1) / seen.sum(1)).unbind(-1)
+    error = 2 * _SIZE_ERROR * evidence.blur.sqrt().clamp_min(1.0) / evidence.shape[..., 0, 3]
+    seen, each = evidence.mask[..., None], torch.cat([difference, error[..., None]], -1)
+    one, two, error = (torch.where(seen, each, 0.0).sum(1) / seen.sum(1)).unbind(-1)
     # blur that bends the shapes draws one axis alone
-    both = torch.where(one * two > 0, one.sign() * torch.minimum(one.abs(), two.abs()), 0.0)
-    return both / _code_gap(inner / outer)
+    both = torch.where(one * two > 0, torch.minimum(one.abs(), two.abs()), 0.0)
+    return (both - error).clamp_min(0) / _code_gap(inner / outer)
 
 
 def _code_gap(ratio: Tensor) -> Tensor:

@@ -83,7 +83,7 @@ def _solve(evidence: Evidence, rough: tuple[Tensor, Tensor], iterations: int, co
     for condition, why in (
         (chi2_alt - chi2[:, 0] < AMBIGUOUS_CHI2, Reason.TWO_SOLUTIONS),
         (of_shapes[:, 0] > 4 * _SHAPE_LIMIT * seen, Reason.RING_SHAPE),
-        (contradicts | (shift.abs() > _CODE_SHIFT), Reason.RESIDUAL),
+        (contradicts | (shift > _CODE_SHIFT), Reason.RESIDUAL),
         (~solvable, Reason.NOT_CONVERGED),
         (result.code == pnp.PnPCode.BEHIND_CAMERA, Reason.BEHIND_CAMERA),
         ((result.code == pnp.PnPCode.DEGENERATE) | (solvable & ~determined), Reason.DEGENERATE),
