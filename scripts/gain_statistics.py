@@ -85,7 +85,8 @@ def run(name: str, gain: float, distance: str, frames: int, hidden: int, keys: l
     target, lens = tp.Target.load(name), camera()
     files = {"none": target, "stated": stating(target, max(GAINS[name]) / 2)}
     r, t = views(frames, DISTANCES[distance], SIDE[name], seed=17)
-    shown, parts = printed(target, gain, hidden), {key: [] for key in keys}
+    shown = printed(target, gain, hidden)
+    parts: dict[str, list[Tensor]] = {key: [] for key in keys}
     for first in range(0, frames, BATCH):
         s = slice(first, first + BATCH)
         clean = render(lens, shown, r[s], t[s], psf_sigma=0.7, dark=30.0, light=220.0)

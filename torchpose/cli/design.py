@@ -6,7 +6,7 @@ import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -82,8 +82,7 @@ def design(
         assert scene is not None
         assert need is not None
         assert sides is not None
-        choice = {"name": name, "background": background, "markers": markers, "print_gain": print_gain / 1e3}
-        chosen, precision, written = _new_target(scene, sides, need, out, choice)
+        chosen, precision, written = _new_target(scene, sides, need, out, (name, background, markers, print_gain / 1e3))
     else:
         chosen, written = existing, []
         if scene is not None:
@@ -155,12 +154,13 @@ def _new_target(
     plate: tuple[float, float],
     need: Need,
     out: Path,
-    choice: dict[str, Any],
+    choice: tuple[str | None, str, int | None, float],
 ) -> tuple[Target, Precision, list[Path]]:
     """The designed target, its precision and its file; its rings are told."""
     from torchpose.design import design_target
 
-    made = design_target(scene.camera, scene.volume, plate, need, scene.imaging, **choice)
+    named = dict(zip(("name", "background", "markers", "print_gain"), choice, strict=True))
+    made = design_target(scene.camera, scene.volume, plate, need, scene.imaging, **named)
     ratios = ", ".join(f"{ratio:.2f}" for ratio in sorted(made.target.codes.sqrt().tolist()))
     typer.echo(
         f"{len(made.target)} rings of {2 * made.radius:g} mm, semi-minor axis at least {made.semi_minor:.0f} px; "
