@@ -53,8 +53,8 @@ def solved(rings: Rings, target: Target) -> tuple[Identified, torch.Tensor]:
     """The markers of every frame, and the status of its pose."""
     table, result = MarkerTable.of([target]), found(rings, target)
     scene = Scene.of(torch.zeros(COUNT, 1, 1), CAMERA, table).of_rows(result.group)
-    markers = replace(table[scene.target], radii=scene.printed_radii(result.gain))
-    evidence = gather_evidence(rings, result.ring, markers, CAMERA.matrix)
+    markers = replace(table[scene.target], radii=scene.printed_radii(scene.stated_gain(result.gain)))
+    evidence = gather_evidence(rings, result.ring, markers, CAMERA)
     able = evidence.mask.sum(1) >= 3
     status = torch.full((COUNT,), int(Status.TOO_FEW_MARKERS))
     status[able] = solve_poses(evidence[able], (result.R[able], result.t[able])).status
@@ -122,7 +122,7 @@ def test_sizes_tell_codes_apart_whatever_the_gain_is(gain: float) -> None:
         taken = replace(target, radii=target.radii + torch.tensor([0.0, 0.5 * step], dtype=F64))
         table = MarkerTable.of([taken])
         every = table[torch.zeros(COUNT, dtype=torch.int64)]
-        evidence = gather_evidence(rings, torch.arange(4 * COUNT).view(COUNT, 4), every, CAMERA.matrix)
+        evidence = gather_evidence(rings, torch.arange(4 * COUNT).view(COUNT, 4), every, CAMERA)
         shift = code_shift(evidence, predicted_circles(evidence, r[:, None], t[:, None])[:, 0])
         # less what sizes may err by, 0.1 px of 30 in each of two radii, 0.07 codes here
         assert (shift - 0.93 * abs(step)).abs().max() < 0.05

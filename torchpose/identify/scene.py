@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.camera import Camera
+from torchpose.geometry.least_squares import covariance_factor
 from torchpose.geometry.rows import Rows
 from torchpose.target import Target
 
@@ -34,6 +35,8 @@ class MarkerTable(Rows):
         gain_scale: the same, or that of a plausible print where the file states none.
         half_gap: half of the least difference between two codes of each target, as ratios of radii; inf where there is
             one.
+        by_print: how place (mm) and edge gain (mm) of the markers vary with each of Q numbers of unit variance, as
+            `Target.covariance` says.
     """
 
     ids: Int[Tensor, "T M"]
@@ -46,6 +49,7 @@ class MarkerTable(Rows):
     gain_sigma: Float[Tensor, " T"]
     gain_scale: Float[Tensor, " T"]
     half_gap: Float[Tensor, " T"]
+    by_print: Float[Tensor, "T M 4 Q"]
 
     @classmethod
     def of(cls, targets: Sequence[Target]) -> Self:
@@ -63,6 +67,7 @@ class MarkerTable(Rows):
             torch.stack([_gain_sigma(t) for t in targets]),
             torch.stack([_gain_scale(t) for t in targets]),
             torch.stack([_half_gap(t.printed_radii) for t in targets]),
+            _by_print(targets),
         )
 
 
@@ -81,10 +86,9 @@ def _gain_scale(target: Target) -> Tensor:
     radii = target.printed_radii
     by_half = (_half_gap(radii) * radii[:, 0].square() / radii.sum(-1)).amin()
     stated = _gain_sigma(target)
-    room = (
-        torch.minimum(radii[:, 1], 0.5 * (radii[:, 0] - radii[:, 1])).amin() / MOST_GAIN
-    )  # a hole and a ring are left
-    return torch.where(stated > 0, stated.minimum(0.9 * room), by_half.clamp_max(_OFFICE_GAIN) / MOST_GAIN)
+    room = torch.minimum(radii[:, 1], 0.5 * (radii[:, 0] - radii[:, 1])).amin()  # or neither hole nor ring is left
+    most = torch.where(stated > 0, (MOST_GAIN * stated).minimum(0.9 * room), by_half.clamp_max(_OFFICE_GAIN))
+    return most / MOST_GAIN
 
 
 def _half_gap(radii: Tensor) -> Tensor:
@@ -92,6 +96,18 @@ def _half_gap(radii: Tensor) -> Tensor:
     ratio = radii[:, 1] / radii[:, 0]
     apart = (ratio[:, None] - ratio).abs()
     return 0.5 * torch.where(apart > _SAME_CODE, apart, torch.inf).amin()
+
+
+def _by_print(targets: Sequence[Target]) -> Tensor:
+    """`MarkerTable.by_print`; Q is the most directions that a covariance has, 0 where all targets are perfect."""
+    factors = [covariance_factor(t.centers.new_zeros(1, 1) if t.covariance is None else t.covariance) for t in targets]
+    table = torch.zeros(len(targets), max(map(len, targets)), 4, max(f.shape[1] for f in factors), dtype=torch.float64)
+    for of_target, target, factor in zip(table, targets, factors, strict=True):
+        if target.covariance is not None:
+            places = factor[:-1].unflatten(0, (-1, 3))
+            of_target[: len(target), :3, : factor.shape[1]] = places
+            of_target[: len(target), 3, : factor.shape[1]] = factor[-1]
+    return table
 
 
 class Scene(NamedTuple):
@@ -117,17 +133,14 @@ class Scene(NamedTuple):
         """The same with other rows, of the frames and targets ``group`` (N,): frame times T plus target."""
         return self._replace(frame=group // len(self.table), target=group % len(self.table))
 
-    def printed_radii(self, gain: Tensor) -> Tensor:
-        """(N, M, 2) mm, of the markers of every row where its file states how uncertain the edge gain is, by ``gain``.
+    def stated_gain(self, gain: Tensor) -> Tensor:
+        """The gains (N,) of rows whose targets' files state how uncertain the edge gain is, 0 of the others."""
+        return torch.where(self.table.gain_sigma[self.target] > 0, gain, 0.0)
 
-        Args:
-            gain: (N,) mm, of each row.
-        """
-        radii, stated = self.table.radii[self.target], self.table.gain_sigma > 0
-        if not bool(stated.any()):
-            return radii
-        outwards = self.table.polarity[self.target] * torch.where(stated[self.target], gain, 0.0)
-        return radii + outwards[:, None, None] * radii.new_tensor([1.0, -1.0])
+    def printed_radii(self, gain: Tensor) -> Tensor:
+        """(N, M, 2) mm, of the markers of every row printed with an edge gain (N,) beyond that of the file."""
+        radii = self.table.radii[self.target]
+        return radii + (self.table.polarity[self.target] * gain)[:, None, None] * radii.new_tensor([1.0, -1.0])
 
     @property
     def groups(self) -> int:

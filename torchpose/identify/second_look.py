@@ -41,7 +41,7 @@ def look_again(
     row, option, marker = (wanted[:, None] & R.isfinite().all(-1).all(-1)[..., None]).nonzero().unbind(-1)
     if row.numel() == 0:
         return rings, identified
-    printed = replace(markers, radii=scene.printed_radii(identified.gain))
+    printed = replace(markers, radii=scene.printed_radii(scene.stated_gain(identified.gain)))
     ideal, raw, depth = _predicted(printed, camera, R[row, option], t[row, option], (row, marker))
     outer, limit = raw[:, 0], torch.tensor([camera.width - 1, camera.height - 1], device=R.device)
     # a circle that reaches behind the camera, or a plane seen edge-on, has no ellipse
