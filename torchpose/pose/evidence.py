@@ -43,6 +43,7 @@ class Evidence(Rows):
         by_target: `MarkerTable.by_print`.
         matrix: of the camera.
         of_camera: how many independent numbers are uncertain of it.
+        gain: mm, edge gain of each plate that ``radii`` hold beyond those of the target's file; None for none.
     """
 
     points: Float[Tensor, "N M 3"]
@@ -60,6 +61,7 @@ class Evidence(Rows):
     by_target: Float[Tensor, "N M 4 L"]
     matrix: Float[Tensor, "3 3"] = shared()
     of_camera: int = shared(0)
+    gain: Float[Tensor, " N"] | None = None
 
     @property
     def numbers(self) -> int:
@@ -121,16 +123,30 @@ def gather_evidence(
     )
 
 
-def shape_chi2(evidence: Evidence, R: Tensor, t: Tensor) -> Tensor:
-    """Chi-squared (N, S) of the rings' shapes: elongation and its direction, which blur and threshold hardly touch."""
+def predicted_circles(evidence: Evidence, R: Tensor, t: Tensor) -> Tensor:
+    """Ellipses (N, S, M, 2, 5), ideal px, of every marker's circles under S poses R (N, S, 3, 3), t (N, S, 3)."""
     x = (R[:, :, None] @ evidence.points[:, None, ..., None]).squeeze(-1) + t[:, :, None]  # (N, S, M, 3)
-    predicted = conics.circle_ellipse(
+    return conics.circle_ellipse(
         evidence.matrix,
         R[:, :, None, None],
         x[..., None, :],
         evidence.normals[:, None, :, None],
         evidence.radii[:, None],
-    )  # (N, S, M, 2, 5)
+    )
+
+
+def shape_chi2(evidence: Evidence, R: Tensor, t: Tensor) -> Tensor:
+    """`misfit_of_shapes` (N, S) under S poses."""
+    return misfit_of_shapes(evidence, predicted_circles(evidence, R, t))
+
+
+def misfit_of_shapes(evidence: Evidence, predicted: Tensor) -> Tensor:
+    """Chi-squared (N, S) of the rings' shapes: elongation and its direction, which blur and threshold hardly touch.
+
+    Args:
+        evidence: N rows.
+        predicted: as `predicted_circles`.
+    """
     difference = conics.shape_matrix(evidence.shape)[:, None] - conics.shape_matrix(predicted)
     theta = evidence.shape[..., 4]
     cos, sin = theta.cos(), theta.sin()
