@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchpose.detect.arcs import edge_band, fit_scatter, perimeter_samples, scatter_sums
 from torchpose.detect.regions import Gradient
+from torchpose.detect.validation import WHOLE
 from torchpose.geometry import conics
 from torchpose.geometry.rows import Rows, shared
 from torchpose.geometry.segments import positions, segment_sum
@@ -22,7 +23,6 @@ _SECTORS = 16
 _RUN = 9  # sectors of a run: what leaves 65 % of a perimeter in view leaves a run in view, wherever it begins
 _REACH = 3  # cells to either side in which the ridge of an edge is looked for
 _MOST_SAMPLES = 96  # of an ellipse, a multiple of the sectors
-_WELL = 0.9  # support from which on an ellipse is left as it is
 _ROUNDS = 2
 _TRIALS = 4  # fits of runs that are compared at the frame itself
 SETTLE = 4  # fits to what agrees
@@ -53,7 +53,7 @@ def free_of_stumps(
     part = torch.arange(len(ellipses), device=ellipses.device)
     for _ in range(_ROUNDS if len(part) else 0):
         ridge = find_ridge(grad, frame[part], ellipses[part], polarity[part])
-        weak = positions(ridge.support < _WELL)
+        weak = positions(ridge.support < WHOLE)
         part, ridge = part[weak], _ridge_of(ridge, weak)
         if part.numel() == 0:
             break
