@@ -42,7 +42,9 @@ class Constant(NamedTuple):
 
 def modules(root: Path) -> list[Path]:
     """Modules of the stages."""
-    return sorted(path for room in ROOMS for path in ([root / room] if room[-3:] == ".py" else (root / room).rglob("*.py")))
+    return sorted(
+        path for room in ROOMS for path in ([root / room] if room[-3:] == ".py" else (root / room).rglob("*.py"))
+    )
 
 
 def constants(root: Path) -> list[Constant]:
@@ -149,7 +151,9 @@ def _comments(text: str) -> dict[int, tuple[str, bool]]:
     """Comments by line, and whether each has its line for itself."""
     tokens = tokenize.generate_tokens(io.StringIO(text).readline)
     return {
-        t.start[0]: (t.string.lstrip("# "), not t.line[: t.start[1]].strip()) for t in tokens if t.type == tokenize.COMMENT
+        t.start[0]: (t.string.lstrip("# "), not t.line[: t.start[1]].strip())
+        for t in tokens
+        if t.type == tokenize.COMMENT
     }
 
 

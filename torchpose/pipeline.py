@@ -322,6 +322,7 @@ def _sight(scene: Scene, found: Found, evidence: Evidence) -> Sight:
         scene.frames,
         scene.camera,
         blur.view(*evidence.mask.shape, 3),
+        seen=ring.seen.view(*evidence.mask.shape, -1),
     )
 
 

@@ -17,8 +17,6 @@ from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import positions, ragged_arange, segment_mean, segment_sum
 
 _TANGENT_PX = 2.0  # px of position error that weigh as much as a radian of direction error
-_LEAST_TURN = 0.25  # rad from end to end of an arc; less may be straight
-_RADII = 4.0  # most ratio of the radii of curvature of two arcs of one ellipse
 _BAND = 2  # px to either side in which an ellipse is followed
 
 
@@ -88,26 +86,19 @@ def chain_pairs(arcs: Arcs, polarity: float = 0.0) -> Int[Tensor, "Q 2"]:
     The middles are no farther apart than the two circles of curvature allow. Arcs are sorted by frame. With a
     ``polarity`` only those count that belong to ellipses of this one.
     """
-    curved = arcs.turn > _LEAST_TURN
-    rank = segments.rank_in_group(arcs.frame, by=torch.where(curved, -arcs.size, 0))
-    index = positions(curved & (rank < MOST_A_FRAME) & (arcs.curvature * polarity >= 0))
+    rank = segments.rank_in_group(arcs.frame, by=-arcs.size)
+    index = positions((rank < MOST_A_FRAME) & (arcs.curvature * polarity >= 0))
     i, j = segments.pairs_in_group(arcs.frame[index], arcs.frame[index])
     ahead = positions(i < j)
     i, j = index[i[ahead]], index[j[ahead]]
     ki, kj = arcs.curvature[i], arcs.curvature[j]
-    ratio = (ki / kj).abs()
     reach = 1 / torch.minimum(ki.abs(), kj.abs())
     step = arcs.middle[j] - arcs.middle[i]
     distance = torch.linalg.vector_norm(step, dim=-1)
     inward_i, inward_j = -ki.sign()[:, None] * arcs.normal[i], -kj.sign()[:, None] * arcs.normal[j]
     # a chord leaves a convex curve inwards at both ends
     fits = (
-        (ki * kj > 0)
-        & (ratio < _RADII)
-        & (ratio > 1 / _RADII)
-        & (distance < 3 * reach)
-        & ((step * inward_i).sum(-1) > -1.0)
-        & ((step * inward_j).sum(-1) < 1.0)
+        (ki * kj > 0) & (distance < 3 * reach) & ((step * inward_i).sum(-1) > -1.0) & ((step * inward_j).sum(-1) < 1.0)
     )
     return torch.stack([i[fits], j[fits]], -1)
 

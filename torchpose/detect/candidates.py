@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchpose import ellipse
 from torchpose.detect.arcs import chain_pairs, describe_arcs, fit_pairs, follow
-from torchpose.detect.finer import LARGER, MIN_ASPECT, MIN_SEMI_MINOR, SHIFT, SIDE, cut_outs, promising_places
+from torchpose.detect.finer import MIN_ASPECT, MIN_SEMI_MINOR, SHIFT, SIDE, cut_outs, promising_places
 from torchpose.detect.partial import SETTLE, free_of_stumps
 from torchpose.detect.prospects import crests, hints, rings, sorted_out
 from torchpose.detect.reduce import area_reduce, reduction_factor
@@ -47,9 +47,8 @@ _MIN_CRESTS = 7  # of cells that are left where edges are thinned
 _MIN_CELLS = 0.35  # of a region on its ellipse, a pixel of perimeter; an edge is two to three cells wide
 _PART_ROUNDS = 2  # of following the ellipse of a region that is only a part of it
 _RING_SETTLE = 2  # fits of a ring to what agrees: its edges are measured later
-_FOLLOW = ((0.4, 1), (0.5, 2))  # least cover to be followed further, and rounds of it
+_FOLLOW = 0.5, 3  # least cover of a pair of arcs to be followed, and rounds of it (measured: docs/tried.md)
 _TAPER = 2 * ON_EDGE  # where the weight of a cell in the second fit has fallen to 0
-_LENGTH = 1.5  # of a place: semi-major axis over the least semi-minor axis that is wanted
 
 
 def find_candidates(
@@ -110,7 +109,7 @@ def find_finer(
     fine = factor // 2
     whole = (found.verdict == Verdict.ACCEPTED) & (found.cover > WHOLE)
     # an arc of what is wanted turns as it does, though its own ellipse may be flatter
-    asked = (found.polarity * wanted.polarity >= 0) & (found.ellipse[:, 2] >= _LENGTH * wanted.semi_minor / factor)
+    asked = (found.polarity * wanted.polarity >= 0) & (found.ellipse[:, 2] >= wanted.semi_minor / factor)
     place = promising_places(found.frame, found.ellipse, whole, asked)
     if wanted.concentric:
         place = place[hints(sharp, found[place])]
@@ -123,7 +122,7 @@ def find_finer(
     # where edges fill most of a cut-out, the noise of the whole frame tells more than the median of their gradients
     grad = replace(grad, threshold=torch.minimum(grad.threshold, factor / fine * sharp.threshold[frame]))
     if wanted is not ANYTHING:  # what lies elsewhere in a cut-out is a place of its own
-        reach = SHIFT + LARGER * factor / fine * found.ellipse[place, 2]
+        reach = SHIFT + factor / fine * found.ellipse[place, 2]
         wanted = replace(wanted.reduced(fine), place=Place((middle - corner - 0.5 * (fine - 1)) / fine, SHIFT, reach))
     finer = accepted(find_ellipses(grad, wanted))
     ellipses = conics.rescaled(finer.ellipse, fine)
@@ -246,11 +245,9 @@ def fit_arcs(grad: Gradient, arcs: Regions, wanted: Wanted = ANYTHING) -> Candid
     good = positions(rms < ON_EDGE)
     frame, polarity = about.frame[pair[good, 0]], about.curvature[pair[good, 0]].sign()
     mine = wanted.admits_ellipses(frame, params[good], polarity)
-    found = score(grad, frame[mine], params[good][mine], polarity[mine])
-    found = found[asked_for(grad, found, wanted, found.cover > _FOLLOW[0][0])]
-    for least_cover, rounds in _FOLLOW if len(found) else ():
-        found = merge_duplicates(found[found.cover > least_cover], 2 * SAME)
-        found, _ = _followed(grad, found, rounds)
+    found, (least_cover, rounds) = score(grad, frame[mine], params[good][mine], polarity[mine]), _FOLLOW
+    found = found[asked_for(grad, found, wanted, found.cover > least_cover)]
+    found, _ = _followed(grad, merge_duplicates(found, 2 * SAME), rounds)
     return accepted(found)
 
 

@@ -8,12 +8,11 @@ from torchpose.detect.reduce import area_reduce
 from torchpose.detect.regions import MOST_A_FRAME, ON_EDGE
 from torchpose.geometry.segments import marked, near_pairs, positions, rank_in_group
 
-SIDE = 64  # px of a cut-out
-SHIFT = 16.0  # px of a cut-out: how far from its middle the ellipse that it is made for may have its centre
-LARGER = 1.2  # than the place itself, what it is a part of, beside its shift
+SIDE = 64  # px of a cut-out (convention: docs/decisions/0051)
+SHIFT = SIDE / 4  # px: how far from its middle the ellipse that it is made for may have its centre (convention)
 MIN_SEMI_MINOR = 2.0  # px of any scale: the least that the gradient's two pixels leave a hole in (convention)
 MIN_ASPECT = 0.12  # of an ellipse: a tilt of 83 degrees (convention)
-_LARGEST = 10.0  # reduced px of semi-major axis: whatever is larger needs no finer look
+_LARGEST = (SIDE / 2 - SHIFT) / 2  # reduced px of semi-major axis: what a cut-out holds wherever in it (derived)
 _SAME_PLACE = 2 * ON_EDGE  # reduced px
 
 

@@ -18,10 +18,7 @@ _CREST = 0.5  # of squared gradients: with 0.64 more rings are lost, with 0.36 l
 # Of true rings of `scripts/clutter_statistics.py`, seeds 41, 42 and 33: regions of outer circles have a mean direction
 # of length 0.64 at most and a roundness of at least 0.27; an ellipse of an axes' ratio of 0.12 has 0.27 as well.
 _STRAIGHT = 0.8  # length of the mean direction of a region that turns too little: an arc of 130 degrees has 0.8
-_ROUND = 0.2
-_LINE = 0.985  # an arc of 34 degrees
-_OTHER = -0.5  # roundness of a region of the other polarity
-_WHOLE = 0.3  # length of the mean direction of a region that goes all the way round
+_ROUND = 0.2  # roundness; and length of the mean direction of what goes all the way round (measured, as above)
 _STEP = 0.2  # of the inner edge, to the outer one: true rings have it in 0.83 of the directions at least
 _SHARE = 0.6  # of the directions in which the outer edge is seen
 _DIRECTIONS = 16
@@ -68,8 +65,8 @@ def sorted_out(
     that are not, but may have arcs of the polarity in them."""
     mean, turning = roundness(regions, xy)
     own = turning.abs() if polarity == 0 else polarity * turning
-    fit = ((mean < _STRAIGHT) & (own > _ROUND)) | ((mean < _WHOLE) & (turning.abs() > _ROUND))
-    return fit, ~fit & (mean < _LINE) & (own > _OTHER)
+    fit = ((mean < _STRAIGHT) & (own > _ROUND)) | ((mean < _ROUND) & (turning.abs() > _ROUND))
+    return fit, ~fit & (own > -_ROUND)
 
 
 def rings(grad: Gradient, found: Candidates) -> Bool[Tensor, " M"]:

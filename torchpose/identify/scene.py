@@ -10,9 +10,7 @@ from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.geometry.rows import Rows
-from torchpose.target import Target
-
-_SAME_CODE = 1e-3  # of the ratio of radii: what differs by less is one code
+from torchpose.target import MIN_RATIO_GAP, Target
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +55,7 @@ class MarkerTable(Rows):
         """Half of the least difference between two codes of each target, as ratios of radii; inf where there is one."""
         ratio = self.radii[..., 1] / self.radii[..., 0]
         apart = (ratio[:, :, None] - ratio[:, None]).abs()
-        both = self.valid[:, :, None] & self.valid[:, None] & (apart > _SAME_CODE)
+        both = self.valid[:, :, None] & self.valid[:, None] & (apart > 0.5 * MIN_RATIO_GAP)
         return 0.5 * torch.where(both, apart, torch.inf).flatten(1).amin(1)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchpose.pose import Evidence, Solutions, center_rms, common_center, compensate
+from torchpose.pose import CENTER_RMS, Evidence, Solutions, center_rms, common_center, compensate
 from torchpose.refine.centers import refine_centers
 from torchpose.refine.decide import decide, decide_on_grey
 from torchpose.refine.edges.fit import refine_edges
@@ -14,7 +14,6 @@ from torchpose.refine.photometric.fit import refine_photometric
 from torchpose.refine.sight import LEAST_KEPT, Refined, Sight
 
 _LEAST_KEPT_NEAR = 0.2  # of the pixels, where the pose stays near: of wires over half of every ring 0.27 (`wires 3`)
-_NEAR = 0.3  # px, RMS of the centres about a pose that they do not contradict (`pose.solve`)
 
 Step = Callable[[Solutions, Evidence, Sight], Solutions]
 """From solutions of N rows, what was measured of them, and the rows in their frames, to better solutions."""
@@ -46,7 +45,7 @@ def on_frames(refine: Callable[[Sight, Tensor, Tensor], Refined]) -> Step:
         refined = refine(replace(sight[index], mask=rows.mask), rows.R, rows.t)
         rms = center_rms(replace(evidence[index], mask=rows.mask), refined.R, refined.t)
         better = replace(rows, R=refined.R, t=refined.t, covariance=refined.covariance, rms=rms)
-        near = rms < torch.maximum(rows.rms, torch.full_like(rows.rms, _NEAR))
+        near = rms < torch.maximum(rows.rms, torch.full_like(rows.rms, CENTER_RMS))
         good = refined.good & ((refined.kept > LEAST_KEPT) | (near & (refined.kept > _LEAST_KEPT_NEAR)))
         return solutions.replaced(index[good], better[good])
 

@@ -46,7 +46,6 @@ _STEPS = 6  # on Zernike edges
 _SOFT_STEPS = 2  # of these, the first, that weigh all points instead of leaving some out
 _FILTER_STEPS = 2  # on matched filters
 _ROOM = 1.2  # of half the ring's width: a filter that sees the other circle takes it for its own
-_WIDEST = 1.3  # px, of a blur's major axis: a wider one is out of the mask's reach
 _MOST_BLUR = 3.0  # px, about what a window of the filter holds
 _MOST_CHANGE = 0.6  # px, of the blur in a step, times the blur itself: of its variance
 _CUT_FLOOR = 0.02  # px, added to the cut: what pixels alias to
@@ -54,7 +53,7 @@ _CUT_FLOOR = 0.02  # px, added to the cut: what pixels alias to
 
 def refine_edges(sight: Sight, rotation: Tensor, translation: Tensor, *, prior: Tensor | None = None) -> Refined:
     """Refines N poses on the edge points of their rings; arguments as in `refine_photometric`."""
-    factor = reduction_for(blurs.axes(sight.common_blur)[1].clamp_min(0).sqrt(), _WIDEST)
+    factor = reduction_for(blurs.axes(sight.common_blur)[1].clamp_min(0).sqrt(), zernike.WIDEST)
     return refined_by_blur(_refined_in, sight, Pose(rotation, translation), prior, factor)
 
 

@@ -181,7 +181,9 @@ class _Fit:
         columns, slope = columns_of(part, model, levels)
         residual = columns[:, :, -1].flatten(1)
         self.usable, self.weight = inliers(residual, part, model, levels)
-        if not stage.coarse:
+        if stage.coarse:  # the first steps begin with what was seen so far, the others see for themselves
+            self.weight = self.weight * part.seen
+        else:
             self.misshapen = self._stands_out(residual, slope, levels)
             self.sectors = sum_sectors(residual, slope, self.usable, self.weight, part, model)
             factor = self._trusted(noise_spread(residual, part), model_misfit(levels))

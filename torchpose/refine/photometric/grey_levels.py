@@ -16,7 +16,6 @@ from torchpose.refine.photometric.light import LEVELS
 from torchpose.refine.photometric.ring_model import PixelBlocks, RingModel, ring_model
 
 TILE = 256  # pixels summed in float32 at a time; sums of tiles are float64, so padding changes no digit that counts
-_CLEAR_OF_LIMITS = 3.0  # standard deviations between what a pixel should show and where its noise is clipped
 _MISFIT = 0.02  # of the contrast: what a point-spread function that is not Gaussian leaves at the edges of quiet frames
 _MOST_SPREAD = 1.5  # of a marker's residuals, in those of the best marker of its frame
 _NEAR_PURE = 0.05  # of paper in a pixel, beside the most and the least of its marker
@@ -36,7 +35,7 @@ def first_levels(blocks: PixelBlocks, R: Tensor, t: Tensor, spread: Spread) -> T
     for _ in range(_FIRST_STEPS):
         predicted = (levels.float()[:, None, None] @ columns[:, :, :LEVELS]).flatten(1)
         residual = blocks.grey - predicted
-        weight = blocks.valid * geman_mcclure(residual / (2 * noise_spread(residual, blocks)[:, None]))
+        weight = blocks.valid * blocks.seen * geman_mcclure(residual / (2 * noise_spread(residual, blocks)[:, None]))
         sums = sum_products(columns, weight)
         levels = solve_scaled(sums[:, :LEVELS, :LEVELS], sums[:, :LEVELS, LEVELS:]).squeeze(-1)
     return levels
@@ -102,7 +101,7 @@ def inliers(residual: Tensor, blocks: PixelBlocks, model: RingModel, levels: Ten
     """Pixels (K, P) whose noise is not clipped, by what they should show, and of these the ones that do show it."""
     spread = noise_spread(residual, blocks)[:, None]
     predicted = blocks.grey - residual
-    margin = _CLEAR_OF_LIMITS * spread
+    margin = CUT * spread
     low, high = blocks.limits[:, :1], blocks.limits[:, 1:]
     usable = blocks.valid * ((predicted > low + margin) & (predicted < high - margin))
     if model.sound is not None:

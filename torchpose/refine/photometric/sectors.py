@@ -11,26 +11,23 @@ and these displacements are independent and of zero mean where the model holds (
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose.geometry.robust import CUT, of_chance
+from torchpose.geometry.robust import CUT, LEAST_KEPT, of_chance
 from torchpose.geometry.rows import Rows
+from torchpose.geometry.sectors import SECTORS
 from torchpose.geometry.segments import segment_sum
 from torchpose.refine.photometric.ring_model import PixelBlocks, RingModel
 
-SECTORS = 48  # of a circle
 _KEPT = 0.9  # of a sector's pixels that must follow the model for it to count
-_LEAST_CLEAR = 0.55  # of the sectors of a marker, below which none of them counts
 _CELL = 4  # sectors over which a misfit is taken for one
 _UNCLEAR = 3  # sectors of an outer circle: more are no chance
-_RESTLESS = 24.3  # chi-squared of seven unknowns, exceeded once in a thousand
+_UNKNOWNS = 7  # of a frame: its pose, and the size of its blur
 _DISPLACED = 0.005  # px, displacement that a camera or print slightly off may cause: no reason for doubt
-_TINY = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,10 +65,9 @@ def sum_sectors(
     """Sums of residuals (K, P) with derivatives by the edge ``slope``, and weights, of which ``usable`` is the most."""
     middle = 0.5 * (1 + blocks.radii[:, 1] / blocks.radii[:, 0])
     outer = torch.hypot(model.x, model.y) > middle[:, None].float()
-    turn = (torch.atan2(model.y, model.x) / (2 * math.pi) + 0.5) * SECTORS
     count = len(blocks.row)
     block = torch.arange(count, device=blocks.row.device)[:, None]
-    cell = (2 * block + outer) * SECTORS + turn.long().clamp(0, SECTORS - 1)
+    cell = (2 * block + outer) * SECTORS + blocks.sector
     flat = cell.flatten()
     weighted = weight * residual
     slope = slope.masked_fill(weight == 0, 0.0)  # padded pixels have none
@@ -98,7 +94,7 @@ def clear_sectors(sectors: Sectors, spread: Tensor, misfit: Tensor) -> Tensor:
     clear = (sectors.used > _KEPT * sectors.total) & (sectors.square < sectors.used * limit)
     # where half of a ring is gone, the rest of the marker is not to be trusted either
     seen = (sectors.total > 0).sum(-1, keepdim=True)
-    return clear & (clear.sum(-1, keepdim=True) > _LEAST_CLEAR * seen)
+    return clear & (clear.sum(-1, keepdim=True) > LEAST_KEPT * seen)
 
 
 def away_from_unclear(sectors: Sectors, clear: Tensor) -> Tensor:
@@ -119,10 +115,10 @@ def trust(sectors: Sectors, clear: Tensor, variance: Tensor) -> Tensor:
         variance: (K,) of noise.
     """
     noise = variance[:, None].to(sectors.pull.dtype)
-    good = clear & (sectors.pull.square() < CUT**2 * noise * sectors.hold.clamp_min(_TINY))
+    good = clear & (sectors.pull.square() < CUT**2 * noise * sectors.hold.clamp_min(1e-12))
     chi2, hold = _cells(sectors.scaled(good.to(sectors.pull.dtype)), noise)
     excess = (chi2 - (hold > 0).to(chi2.dtype)).sum(-1).clamp_min(0)
-    spread = (excess / hold.sum(-1).clamp_min(_TINY))[:, None] * hold  # tau^2 over the variance of each cell
+    spread = (excess / hold.sum(-1).clamp_min(1e-12))[:, None] * hold  # tau^2 over the variance of each cell
     return good / (1 + spread.repeat_interleave(_CELL, 1))
 
 
@@ -130,7 +126,7 @@ def _cells(sectors: Sectors, noise: Tensor, allowed: float = 0.0) -> tuple[Tenso
     """Chi-squared of the displacement of every cell, given ``allowed`` px besides noise, and its hold: (K, 24)."""
     pull, hold = (v.unflatten(1, (-1, _CELL)).sum(-1) for v in (sectors.pull, sectors.hold))
     variance = noise * hold + (allowed * hold).square()
-    return torch.where(hold > 0, pull.square() / variance.clamp_min(_TINY), 0.0), hold
+    return torch.where(hold > 0, pull.square() / variance.clamp_min(1e-12), 0.0), hold
 
 
 def misfit(sectors: Sectors, clear: Tensor, variance: Tensor, row: Tensor, rows: int) -> Tensor:
@@ -156,4 +152,8 @@ def doubtful(sectors: Sectors, clear: Tensor, variance: Tensor, row: Tensor, ste
     total = segment_sum(chi2.double().sum(-1), row, rows) - step_chi2
     freedom = segment_sum((hold > 0).double().sum(-1), row, rows).clamp_min(1)
     pulled = total > freedom * of_chance(freedom)
-    return pulled | (step_chi2 > _RESTLESS * (more - 1)) | (segment_sum(unclear.double(), row, rows) > 0)
+    return (
+        pulled
+        | (step_chi2 > _UNKNOWNS * of_chance(float(_UNKNOWNS)) * (more - 1))
+        | (segment_sum(unclear.double(), row, rows) > 0)
+    )
