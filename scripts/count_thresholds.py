@@ -4,7 +4,7 @@
 
 A constant is a name in capitals that a module binds to numbers. It is a threshold where it decides: where it, or a name
 that a line of the same function makes of it, stands in a comparison, or where it is handed to a function that compares
-(`DECIDING`). Beside it the script counts bare numbers in comparisons, other than -1 to 4 and 0.5 (signs, counts,
+(`COMPARING`). Beside it the script counts bare numbers in comparisons, other than -1 to 4 and 0.5 (signs, counts,
 halves): naming thresholds less would be no progress.
 
 The origin of a threshold stands in the comment on its line or right above it: it is *derived*, a *convention*, or
@@ -21,9 +21,23 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOMS = ("detect", "rings", "identify", "pose", "refine", "geometry", "pipeline.py", "ellipse.py")
-ORIGIN = re.compile(r"derived|convention|measured|contract|`[\w/.]+(\.py|\.md)?\b[^`]*`|docs/|00\d\d", re.I)
+ORIGIN = re.compile(r"\((a )?(derived|convention|measured|contract)|^contract", re.I)
 PLAIN = {-1, 0, 1, 2, 3, 4, 0.5}
-DECIDING = {"near_pairs", "reduction_for", "merge_duplicates"}
+COMPARING = {"near_pairs", "reduction_for", "merge_duplicates", "ratio_tolerance"}
+PASSING = {
+    "maximum",
+    "minimum",
+    "max",
+    "min",
+    "clamp",
+    "clamp_min",
+    "clamp_max",
+    "where",
+    "sqrt",
+    "square",
+    "double",
+    "abs",
+}
 
 
 class Constant(NamedTuple):
@@ -42,9 +56,7 @@ class Constant(NamedTuple):
 
 def modules(root: Path) -> list[Path]:
     """Modules of the stages."""
-    return sorted(
-        path for room in ROOMS for path in ([root / room] if room[-3:] == ".py" else (root / room).rglob("*.py"))
-    )
+    return sorted(path for path in root.rglob("*.py") if path.relative_to(root).parts[0] in ROOMS)
 
 
 def constants(root: Path) -> list[Constant]:
@@ -101,35 +113,43 @@ def _is_number(node: ast.expr) -> bool:
     if isinstance(node, ast.BinOp):
         return _is_number(node.left) and _is_number(node.right)
     if isinstance(node, ast.Call):
-        return all(_is_number(n) for n in node.args) and bool(node.args)
+        return ast.unparse(node.func) in ("math.sqrt", "math.log", "round") and all(_is_number(n) for n in node.args)
     if isinstance(node, (ast.Attribute, ast.Subscript)):
         return ast.unparse(node).split(".")[-1].isupper() or ast.unparse(node) in ("math.pi", "math.inf", "torch.pi")
     return isinstance(node, ast.Name) and node.id.isupper()
 
 
 def _used(node: ast.AST) -> set[str]:
-    return {n.id for n in ast.walk(node) if isinstance(n, ast.Name)} | {
-        n.attr for n in ast.walk(node) if isinstance(n, ast.Attribute)
-    }
+    """Names that the value of an expression is made of; what goes into other functions is a number of theirs."""
+    if isinstance(node, ast.Name):
+        return {node.id}
+    if isinstance(node, ast.Attribute):
+        return {node.attr} | _used(node.value)
+    parts = [part for part in ast.iter_child_nodes(node) if not isinstance(part, ast.Slice)]
+    if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] not in PASSING | COMPARING:
+        parts = [node.func]
+    return {name for part in parts for name in _used(part)}
 
 
 def _deciding(tree: ast.Module) -> Iterator[str]:
     """Names that comparisons of a module use, themselves or by a name made of them in the same function."""
-    scopes = [n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef)]
-    for scope in scopes:
+    assigned = [n for n in tree.body if isinstance(n, ast.Assign) and isinstance(n.value, ast.Constant)]
+    broken = {
+        ast.unparse(n.targets[0])
+        for n in assigned
+        if isinstance(n.value, ast.Constant) and type(n.value.value) is float
+    }
+    for scope in (n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef)):
         made: dict[str, set[str]] = {}
         for node in ast.walk(scope):
-            if isinstance(node, (ast.Assign, ast.For, ast.comprehension)):
-                target = node.targets[0] if isinstance(node, ast.Assign) else node.target
-                source = _used(node.value if isinstance(node, ast.Assign) else node.iter)
-                for name in (n.id for n in ast.walk(target) if isinstance(n, ast.Name)):
-                    made.setdefault(name, set()).update(source)
-        for default in (*scope.args.defaults, *scope.args.kw_defaults):
-            if isinstance(default, ast.Name):
-                yield default.id
+            if isinstance(node, ast.Assign):
+                for name in (n.id for n in ast.walk(node.targets[0]) if isinstance(n, ast.Name)):
+                    made.setdefault(name, set()).update(_used(node.value))
+        given = (d.id for d in (*scope.args.defaults, *scope.args.kw_defaults) if isinstance(d, ast.Name))
+        yield from (name for name in given if name in broken)  # whole numbers are sizes there
         for node in ast.walk(scope):
-            called = isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in DECIDING
-            if isinstance(node, ast.Compare) or called:
+            compares = isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in COMPARING
+            if isinstance(node, ast.Compare) or compares:
                 names = _used(node)
                 yield from names
                 yield from (source for name in names for source in made.get(name, ()))
@@ -138,13 +158,13 @@ def _deciding(tree: ast.Module) -> Iterator[str]:
 def _imported(tree: ast.Module, decided: set[str], root: Path) -> Iterator[tuple[Path, str]]:
     """Modules and names of imported constants that decide here."""
     for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("torchpose."):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("torchpose"):
             path = root.joinpath(*node.module.split(".")[1:])
             for alias in node.names:
-                if (alias.asname or alias.name) in decided:
+                name = alias.asname or alias.name
+                if name in decided:  # itself, or as a module whose constants stand behind a dot
                     yield path.with_suffix(".py"), alias.name
-                if alias.name in decided or any(alias.name == name for name in decided):
-                    yield (path / alias.name).with_suffix(".py"), alias.name
+                    yield from (((path / alias.name).with_suffix(".py"), other) for other in decided)
 
 
 def _comments(text: str) -> dict[int, tuple[str, bool]]:

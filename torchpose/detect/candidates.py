@@ -15,6 +15,7 @@ from torchpose.detect.prospects import crests, hints, rings, sorted_out
 from torchpose.detect.reduce import area_reduce, reduction_factor
 from torchpose.detect.regions import (
     AGREE_COS,
+    BESIDE,
     MIN_CELLS,
     ON_EDGE,
     PHASE,
@@ -44,11 +45,12 @@ from torchpose.geometry import conics
 from torchpose.geometry.segments import marked, members, positions, segment_mean
 
 _MIN_CRESTS = 7  # of cells that are left where edges are thinned
-_MIN_CELLS = 0.35  # of a region on its ellipse, a pixel of perimeter; an edge is two to three cells wide
+# of a region on its ellipse, a pixel of perimeter: an edge is two to three cells wide, of which one is enough with gaps
+# (convention; without it the same 656 of 658 rings, docs/tried.md)
+_MIN_CELLS = 0.35
+_ARC_ROUNDS = 3  # of following the ellipse of a pair of arcs
 _PART_ROUNDS = 2  # of following the ellipse of a region that is only a part of it
 _RING_SETTLE = 2  # fits of a ring to what agrees: its edges are measured later
-_FOLLOW = 0.5, 3  # least cover of a pair of arcs to be followed, and rounds of it (measured: docs/tried.md)
-_TAPER = 2 * ON_EDGE  # where the weight of a cell in the second fit has fallen to 0
 
 
 def find_candidates(
@@ -174,8 +176,8 @@ def fit_regions(grad: Gradient, regions: Regions, wanted: Wanted = ANYTHING) -> 
     params = ellipse.fit(xy, regions.region, count, magnitude)
     # once more with what is near the ellipse; weights that fall to 0 smoothly leave it where it is when the threshold,
     # and with it the rim of the region, changes a little
-    r = ellipse.distance(xy, regions.region, params).nan_to_num(nan=_TAPER)
-    params = ellipse.fit(xy, regions.region, count, magnitude * (1 - (r / _TAPER).square()).clamp_min(0).square())
+    r = ellipse.distance(xy, regions.region, params).nan_to_num(nan=BESIDE)
+    params = ellipse.fit(xy, regions.region, count, magnitude * (1 - (r / BESIDE).square()).clamp_min(0).square())
     polarity = region_polarity(regions, params[:, :2], xy).sign()
     follows, along = _on_ellipses(regions, xy, params, polarity, magnitude)
     length, edge = (torch.bincount(regions.region[positions(on)], minlength=count) for on in (follows, along))
@@ -222,7 +224,7 @@ def _on_ellipses(
     rise = (nx * gx + ny * gy) * outwards
     off = off.abs()
     follows = off < ON_EDGE
-    return follows, follows | ((off < _TAPER) & (rise > AGREE_COS * magnitude))
+    return follows, follows | ((off < BESIDE) & (rise > AGREE_COS * magnitude))
 
 
 def fit_arcs(grad: Gradient, arcs: Regions, wanted: Wanted = ANYTHING) -> Candidates:
@@ -245,9 +247,9 @@ def fit_arcs(grad: Gradient, arcs: Regions, wanted: Wanted = ANYTHING) -> Candid
     good = positions(rms < ON_EDGE)
     frame, polarity = about.frame[pair[good, 0]], about.curvature[pair[good, 0]].sign()
     mine = wanted.admits_ellipses(frame, params[good], polarity)
-    found, (least_cover, rounds) = score(grad, frame[mine], params[good][mine], polarity[mine]), _FOLLOW
-    found = found[asked_for(grad, found, wanted, found.cover > least_cover)]
-    found, _ = _followed(grad, merge_duplicates(found, 2 * SAME), rounds)
+    found = score(grad, frame[mine], params[good][mine], polarity[mine])
+    found = found[asked_for(grad, found, wanted, found.cover > 0.5)]
+    found, _ = _followed(grad, merge_duplicates(found, 2 * SAME), _ARC_ROUNDS)
     return accepted(found)
 
 

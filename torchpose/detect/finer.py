@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.detect.reduce import area_reduce
-from torchpose.detect.regions import MOST_A_FRAME, ON_EDGE
+from torchpose.detect.regions import BESIDE, MOST_A_FRAME
 from torchpose.geometry.segments import marked, near_pairs, positions, rank_in_group
 
 SIDE = 64  # px of a cut-out (convention: docs/decisions/0051)
@@ -13,7 +13,6 @@ SHIFT = SIDE / 4  # px: how far from its middle the ellipse that it is made for 
 MIN_SEMI_MINOR = 2.0  # px of any scale: the least that the gradient's two pixels leave a hole in (convention)
 MIN_ASPECT = 0.12  # of an ellipse: a tilt of 83 degrees (convention)
 _LARGEST = (SIDE / 2 - SHIFT) / 2  # reduced px of semi-major axis: what a cut-out holds wherever in it (derived)
-_SAME_PLACE = 2 * ON_EDGE  # reduced px
 
 
 def promising_places(
@@ -33,10 +32,10 @@ def promising_places(
     j, i = near_pairs(center[known], center[place], 0.5 * b[known], (frame[known], frame[place]))
     apart = torch.linalg.vector_norm(ellipses[place[i], :2] - ellipses[known[j], :2], dim=-1)
     place = place[~marked(i[apart < 0.5 * b[known[j]]], len(place))]
-    near = torch.full_like(b[place], _SAME_PLACE)
+    near = torch.full_like(b[place], BESIDE)
     i, j = near_pairs(center[place], center[place], near, (frame[place], frame[place]))
     apart = torch.linalg.vector_norm(center[place[i]] - center[place[j]], dim=-1)
-    place = place[~marked(i[(j < i) & (apart < _SAME_PLACE)], len(place))]
+    place = place[~marked(i[(j < i) & (apart < BESIDE)], len(place))]
     return place[rank_in_group(frame[place]) < MOST_A_FRAME]
 
 

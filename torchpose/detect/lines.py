@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchpose.detect.regions import (
+    BESIDE,
     MIN_CELLS,
     ON_EDGE,
     PHASE,
@@ -21,8 +22,6 @@ from torchpose.detect.validation import edges_at, log10_nfa
 from torchpose.geometry import segments
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import marked, positions, segment_mean, segment_sum
-
-_JOIN = 4.0  # cells between the end of one side of a polygon and the start of the next
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +136,7 @@ def _chains(frame: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
     count = frame.numel()
     i, j = segments.pairs_in_group(frame, frame)
     gap = torch.linalg.vector_norm(ends[j, 0] - ends[i, 1], dim=-1)
-    meets = positions((gap < _JOIN) & (i != j))
+    meets = positions((gap < BESIDE) & (i != j))
     i, j, gap = i[meets], j[meets], gap[meets]
     far = torch.full((count,), torch.inf, dtype=gap.dtype, device=gap.device)
     after, before = far.scatter_reduce(0, i, gap, "amin"), far.scatter_reduce(0, j, gap, "amin")

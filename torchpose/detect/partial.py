@@ -17,18 +17,16 @@ from torchpose.detect.regions import Gradient
 from torchpose.detect.validation import WHOLE
 from torchpose.geometry import conics
 from torchpose.geometry.rows import Rows, shared
-from torchpose.geometry.sectors import SECTORS
+from torchpose.geometry.sectors import MOST, SECTORS
 from torchpose.geometry.segments import positions, segment_sum
 
 _RUNS = 16  # of an ellipse, each a little longer than half of it: few enough to try them all (convention)
-_RUN = (
-    SECTORS * 9 // 16
-)  # sectors of a run: what leaves 65 % in view leaves a run in view, wherever it begins (derived)
+_RUN = round(MOST * SECTORS)  # sectors of a run: 65 % in view leave a run in view, wherever it begins (derived)
 _REACH = 3  # cells to either side in which the ridge of an edge is looked for
 _MOST_SAMPLES = 96  # of an ellipse, a multiple of the sectors
 _ROUNDS = 2
 _TRIALS = 4  # fits of runs that are compared at the frame itself
-SETTLE = 4  # fits to what agrees
+SETTLE = 4  # fits to what agrees (measured: docs/tried.md, rounds of freeing rings of stumps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +98,7 @@ def _agreement(ridge: Ridge, fits: Float[Tensor, "M F 5"]) -> Float[Tensor, "M F
 
 
 def _settled(grad: Gradient, frame: Tensor, fits: Tensor, polarity: Tensor, settle: int) -> Float[Tensor, "M 5"]:
-    """Fitted again to all of the perimeter that agrees, so often that they stay: the borders of the runs leave no trace."""
+    """Fitted again to all of the perimeter that agrees, so often that the borders of the runs leave no trace."""
     for _ in range(settle):
         near = find_ridge(grad, frame, fits, polarity)
         on = (near.found & (near.offset.abs() < 1)).double()

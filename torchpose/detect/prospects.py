@@ -14,13 +14,15 @@ from torchpose.detect.validation import Candidates
 from torchpose.geometry import conics
 from torchpose.geometry.segments import positions, run_sums, values_at
 
-_CREST = 0.5  # of squared gradients: with 0.64 more rings are lost, with 0.36 less is saved (docs/tried.md)
+_CREST = 0.5  # of squared gradients: with 0.64 more rings are lost, with 0.36 less is saved (measured: docs/tried.md)
 # Of true rings of `scripts/clutter_statistics.py`, seeds 41, 42 and 33: regions of outer circles have a mean direction
-# of length 0.64 at most and a roundness of at least 0.27; an ellipse of an axes' ratio of 0.12 has 0.27 as well.
+# of length 0.64 at most and a roundness of at least 0.27; an ellipse of an axes' ratio of 0.12 has 0.27 as well
+# (measured).
 _STRAIGHT = 0.8  # length of the mean direction of a region that turns too little: an arc of 130 degrees has 0.8
 _ROUND = 0.2  # roundness; and length of the mean direction of what goes all the way round (measured, as above)
-_STEP = 0.2  # of the inner edge, to the outer one: true rings have it in 0.83 of the directions at least
-_SHARE = 0.6  # of the directions in which the outer edge is seen
+# of the inner edge, to the outer one: true rings have it in 0.83 of the directions at least (measured: decisions/0057)
+_STEP = 0.2
+_SHARE = 0.6  # of the directions in which the outer edge is seen (measured: decisions/0057)
 _DIRECTIONS = 16
 _RADII = (1.05, 1.0, 0.95, 0.9, 0.85, 0.8, 0.7, 0.6, 0.45, 0.3, 0.15, 0.0)  # close where the other circle may be close
 _OUTSIDE = (1.0, 2.0)  # px beyond the ellipse

@@ -15,8 +15,8 @@ from torchpose.detect.validation import Candidates, Verdict
 from torchpose.geometry import conics
 from torchpose.geometry.segments import marked, pairs_in_group, positions, segment_sum
 
-_MOSTLY = 0.7  # of the samples of a line, or of the perimeter of an ellipse
-_BULGE = 0.1  # of the semi-minor axis: the sides of a hexagon leave its best circle by 8 %
+_MOSTLY = 0.7  # of the samples of a line, or of the perimeter of an ellipse: between half and all (convention)
+_BULGE = 0.1  # of the semi-minor axis: the sides of a hexagon leave its best circle by 8 % (derived)
 _SAMPLES = 9  # of a line
 
 

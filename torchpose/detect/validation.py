@@ -17,13 +17,16 @@ from torchpose.detect.arcs import cells_at, perimeter_samples
 from torchpose.detect.regions import AGREE_COS, ON_EDGE, Gradient
 from torchpose.geometry import conics
 from torchpose.geometry.rows import Rows
+from torchpose.geometry.sectors import MOST
 from torchpose.geometry.segments import marked, members, near_pairs, positions, segment_sum
 
-WHOLE = 0.9  # cover from which on an ellipse is seen whole
-SAME = 0.08  # of the semi-minor axis, plus a pixel: ellipses nearer than that are one
-LEAST_COVER = 0.58  # a circle in a square is covered by 0.5
+WHOLE = 0.9  # cover from which on an ellipse is seen whole: a tenth may be lost to noise (convention)
+# of the semi-minor axis, plus a pixel: ellipses nearer than that are one (convention; with 0.1 the same rings are
+# found)
+SAME = 0.08
 _ROUNDS = 4
-_COVER_ERROR = 0.125  # 22.5 degrees in units of pi: a sample with a smaller error belongs to the arc
+# 22.5 degrees in units of pi: a sample with a smaller error is on the arc, in noise one of eight (convention)
+_COVER_ERROR = 0.125
 
 
 class Verdict(IntEnum):
@@ -161,7 +164,7 @@ def score(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> 
     samples = sample_edges(grad, frame, ellipses, polarity)
     nfa, cover = false_alarms(grad, samples.error, samples.of, ellipses.shape[0])
     verdict = torch.where(nfa < 0, int(Verdict.ACCEPTED), int(Verdict.FALSE_ALARM))
-    verdict = torch.where((nfa < 0) & (cover < LEAST_COVER), int(Verdict.FRAGMENT), verdict)
+    verdict = torch.where((nfa < 0) & (cover < MOST), int(Verdict.FRAGMENT), verdict)
     return Candidates(frame, ellipses, polarity, nfa, cover, verdict)
 
 
@@ -242,7 +245,7 @@ def explain_once(grad: Gradient, found: Candidates, known: Candidates | None = N
     for _ in range(_ROUNDS):
         free = ~marked(sample[kept[other]], len(samples))
         nfa, cover = false_alarms(grad, samples.error[free], samples.of[free], part.numel())
-        kept[part] = (nfa < 0) & (cover >= LEAST_COVER)
+        kept[part] = (nfa < 0) & (cover >= MOST)
     return replace(found, verdict=torch.where(kept[: len(found)], found.verdict, int(Verdict.EXPLAINED)))
 
 

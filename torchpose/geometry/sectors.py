@@ -1,8 +1,8 @@
 """The sectors of a ring: which way from its centre it is seen, one row for each ring.
 
-Whatever covers a ring hides a part of its perimeter. The row is measured where the ring is found, goes along with it, and
-every stage that looks closer begins with the row of the one before. Sectors divide the eccentric anomaly of the ring's
-outer ellipse, from +u on the circle that its shape matrix makes the ellipse of.
+Whatever covers a ring hides a part of its perimeter. The row is measured where the ring is found, goes along with it,
+and every stage that looks closer begins with the row of the one before. Sectors divide the eccentric anomaly of the
+ring's outer ellipse, from +u on the circle that its shape matrix makes the ellipse of.
 """
 
 import math
@@ -12,9 +12,12 @@ from torch import Tensor
 
 from torchpose.geometry import conics
 
-# of a circle: the end of a cover, which is lost with it, is 2 % of the perimeter then; a ring of 8 px has a pixel of edge
-# in each (convention; figures for other numbers in docs/tried.md)
+# of a circle: what goes with the end of a cover is 2 % of the perimeter, and a ring of 8 px has a pixel of edge in each
+# (convention; figures in docs/tried.md)
 SECTORS = 48
+MOST = (
+    27 / 48
+)  # of a perimeter: more than a circle in a square shows, or a ring that is half hidden (derived: both show half)
 
 
 def middles(device: torch.device) -> Tensor:

@@ -17,12 +17,18 @@ from torchpose.identify.nearby import Nearby
 from torchpose.identify.scene import MarkerTable
 
 # px, of the ring's semi-major axis, of the distance to the ring the pose comes from
+# px, of the ring's semi-major axis, of the distance to the ring the pose comes from (convention;
+# `scripts/clutter_statistics.py`)
 PLACE_TOLERANCE = (2.0, 0.3, 0.05)
+# ratio of a ring's semi-major axis to the predicted one: what a rough pose leaves open (convention)
 SIZE_TOLERANCE = 1.25
-_PARTNERS = 4  # of a ring, plane and marker, the nearest to their places: one is right, the others are neighbours'
+# of a ring, plane and marker, the nearest: one is right, the others are neighbours' (convention: decisions/0058)
+_PARTNERS = 4
 _STEEPEST = 0.1  # of a plane's depth: how near to the camera a circle in it is taken to reach at most
 _NEAREST = 1e-3  # mm: what lies behind the camera gets a box that holds nothing of the right place
-SAME_PLACE = 2.0  # times the tolerance of a place: two poses that put a marker so near to one ring are of one copy
+# times the tolerance of a place: two poses that put a marker so near to one ring are of one copy (derived: each may be
+# off by one)
+SAME_PLACE = 2.0
 
 
 class Hypotheses(NamedTuple):

@@ -19,7 +19,7 @@ from torchpose.refine.photometric.grey_chi2 import grey_chi2
 from torchpose.refine.sight import LEAST_KEPT, Refined, Sight
 from torchpose.results import Reason, Status
 
-_CLOSE = 200.0  # difference of chi-squared that small blurred rings were seen to be wrong by 37 of
+_CLOSE = 200.0  # difference of chi-squared: small blurred rings were seen to be wrong by 37 (convention)
 
 
 def decide(solutions: Solutions, evidence: Evidence, sight: Sight | None = None) -> Solutions:

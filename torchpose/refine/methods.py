@@ -13,7 +13,9 @@ from torchpose.refine.edges.fit import refine_edges
 from torchpose.refine.photometric.fit import refine_photometric
 from torchpose.refine.sight import LEAST_KEPT, Refined, Sight
 
-_LEAST_KEPT_NEAR = 0.2  # of the pixels, where the pose stays near: of wires over half of every ring 0.27 (`wires 3`)
+# of the pixels, where the pose stays near: of wires over half of every ring 0.27 (measured: `wires 3` of
+# `scripts/corruption_statistics.py`)
+_LEAST_KEPT_NEAR = 0.2
 
 Step = Callable[[Solutions, Evidence, Sight], Solutions]
 """From solutions of N rows, what was measured of them, and the rows in their frames, to better solutions."""

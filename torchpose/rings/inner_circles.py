@@ -20,9 +20,11 @@ from torchpose.geometry.segments import values_at
 
 _RADII = 72
 _INNERMOST, _OUTERMOST = 0.08, 1.12  # of the outer ellipse, the range of the radial profile
-_LEAST_PEAK = 0.25  # of the outer edge's slope in the mean radial profile
+# of the outer edge's slope in the mean radial profile: a blur of the inner circle's size leaves as much (convention)
+_LEAST_PEAK = 0.25
 _EIGHTHS = 8  # parts of the perimeter in which the blur is looked at
-_PARTED = 0.02  # of the semi-minor axis: from which shift of the centres on perspective smears the profile
+# of the semi-minor axis: from which shift of the centres on perspective smears the profile (convention: a sample of it)
+_PARTED = 0.02
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,14 +24,18 @@ from torchpose.rings.inner_circles import InnerCircles, find_inner
 from torchpose.rings.lens import ideal_pixels, mapped
 from torchpose.rings.small_rings import fit_small_rings
 
-_LEAST_COVER = (0.4, 0.33)  # of the perimeter with edge points, outer and inner circle
-_SMALL = 4.0  # px: circles of a smaller semi-minor axis fill the mask of an edge
-_LEAST_SEMI_MINOR = (4.0, 1.2)  # px, outer and inner circle: smaller ones are letters and specks as well as rings
-_LARGE = 20.0  # px, of the outer semi-minor axis, from which on a fit of all pixels costs too much
-_SOFT_ALL_AROUND = 1.0  # px, along the minor axis: what is soft along lines alone may be fields of an interlaced frame
-_LEAST_REDUCED = 5.0  # px, outer semi-minor axis in a reduced frame: of a smaller one too few pixels are left
+# of the perimeter with edge points, outer and inner circle: a third covered and noise beside (convention)
+_LEAST_COVER = (0.4, 0.33)
+# px: circles of a smaller semi-minor axis fill the mask of an edge (derived: half of 7 px, and half of one)
+_SMALL = 4.0
+# px, outer and inner circle: smaller ones are letters and specks as well as rings (measured: decisions/0051)
+_LEAST_SEMI_MINOR = (4.0, 1.2)
+_LARGE = 20.0  # px, of the outer semi-minor axis, from which on a fit of all pixels costs too much (convention)
+# px, along the minor axis: what is soft along lines alone may be fields of an interlaced frame (measured:
+# `scripts/corruption_statistics.py --only interlacing`)
+_SOFT_ALL_AROUND = 1.0
+_LEAST_REDUCED = 5.0  # px, outer semi-minor axis in a reduced frame: a pixel more than the least ring has (convention)
 _ROUGH = 0.5  # px, of a candidate's centre and axes
-_EDGE_APART = 0.8  # ... and so do two edges closer than 5 px
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +205,8 @@ def _measure(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tup
     ratio = (inner[:, 2:4].prod(-1) / outer[:, 2:4].prod(-1)).sqrt()
     inside = replace(circles.inside, ratio=ratio, seen=clear_of_ends(circles.inside.seen))
     circles = replace(circles, inside=inside)
-    narrow = torch.minimum((1 - ratio) * _EDGE_APART, ratio) * outer[:, 3] < _SMALL
+    # ... and so do two edges with less than a pixel beside it
+    narrow = torch.minimum((1 - ratio) * outer[:, 3] - 1, ratio * outer[:, 3]) < _SMALL
     small = narrow & (outer[:, 3] < _LARGE)
     parts, index = [], (~small).nonzero()[:, 0]
     if index.numel():

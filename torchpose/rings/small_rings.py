@@ -52,13 +52,15 @@ _ACROSS = 4.0  # px across an edge, two blurs on either side, that share its mis
 _MOST_MOVE = (*[0.7] * 5, 0.1, *[0.7] * 2)  # of an iteration: px, and the ratio
 _START_SIGMA = 0.8  # px, at least
 _OVAL = 0.3  # of a blur's mean variance: what is expected of its lean, which a ring as small as its blur hardly tells
-_BLURRED = 0.33  # blur over inner semi-minor axis above which edges are no edges any more
+# blur over inner semi-minor axis above which edges are no edges any more (measured: decisions/0053 and docs/tried.md)
+_BLURRED = 0.33
 _BLURRED_MARGIN = 2.5  # blurs around the outer ellipse
-_LEAST_EXPLAINED = 0.75  # of the variance of grey around the ring
-_PROMISING = 0.5  # of it, from the first fit, for a second one
+# of the variance of grey around the ring: noise of half of the contrast's deviation remains (convention)
+_LEAST_EXPLAINED = 0.75
+_PROMISING = 0.5  # of it, from the first fit, for a second one (convention)
 _PART = 400_000  # pixels times nodes at a time
 _UNEVEN = 2.0  # most pixels of a window over the least, of those that are padded to one size
-_RATIO_SIGMA = 0.1  # of the ratio: an inner circle that is not sure is none
+_RATIO_SIGMA = 0.1  # of the ratio: an inner circle that is not sure is none (convention)
 _LEVELS = 4  # paper, its slope 2, contrast
 _LEAST = (*[-math.inf] * 5, 0.05, *[-math.inf] * 2)  # of the ring's parameters, and the most
 _MOST = (*[math.inf] * 5, 0.97, *[math.inf] * 2)

@@ -41,14 +41,14 @@ _REACH = 2.0  # px searched to either side of the fitted ellipses
 _CHAIN = 2 * math.sqrt(2) / math.pi  # edge pixels per px of a circle: mean of max(|cos|, |sin|)
 _START_SPREAD = 0.3  # px
 _SOFT = 3.0  # Geman-McClure scale in standard deviations
-_SOFT_BIAS = 1.17  # of a normal distribution, standard deviation over its RMS under these weights
+_SOFT_BIAS = 1.17  # of a normal distribution, standard deviation over its RMS under these weights (derived)
 _STEPS = 6  # on Zernike edges
 _SOFT_STEPS = 2  # of these, the first, that weigh all points instead of leaving some out
 _FILTER_STEPS = 2  # on matched filters
 _ROOM = 1.2  # of half the ring's width: a filter that sees the other circle takes it for its own
 _MOST_BLUR = 3.0  # px, about what a window of the filter holds
 _MOST_CHANGE = 0.6  # px, of the blur in a step, times the blur itself: of its variance
-_CUT_FLOOR = 0.02  # px, added to the cut: what pixels alias to
+_CUT_FLOOR = 0.02  # px, added to the cut: what pixels alias to (convention)
 
 
 def refine_edges(sight: Sight, rotation: Tensor, translation: Tensor, *, prior: Tensor | None = None) -> Refined:

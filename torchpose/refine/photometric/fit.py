@@ -40,7 +40,8 @@ from torchpose.refine.photometric.sectors import Sectors, away_from_unclear, cle
 from torchpose.refine.sight import Refined, Sight, refined_by_blur
 
 _COARSE = 6  # the first steps take one pixel of so many; both are whole numbers of tiles
-_WIDEST = 2.4  # px, of a blur's minor axis, in frames as they are: a pixel twice as wide adds 4 % of its variance
+# px, of a blur's minor axis, in frames as they are: a pixel twice as wide adds 4 % of its variance (derived)
+_WIDEST = 2.4
 _MOST_COARSE = 512  # of a marker whose edges are sharp: the last step, on all pixels, mends what they leave
 
 
@@ -58,9 +59,13 @@ class _Stage(NamedTuple):
 
 
 _KINDS: tuple[Kind, ...] = ("gauss", "line", "disc")
-_LONG = 1.7  # variance along the major axis over the minor one: a motion of 2 px, from which on it may be a line
-_MATTERS = 0.004  # of the contrast, RMS at the edges: that of a disc of 2 px, which costs a tenth in the covariance
-_FEWER = 0.02  # of the pixels that a shape of the blur may keep less than a Gaussian, and still explain them better
+# variance along the major axis over the minor one: a motion of 2 px, from which on it may be a line (derived)
+_LONG = 1.7
+# of the contrast, RMS at the edges: that of a disc of 2 px, which costs a tenth in the covariance (measured:
+# `scripts/corruption_statistics.py --only defocus`)
+_MATTERS = 0.004
+# of the pixels that a shape of the blur may keep less than a Gaussian, and still explain them better (convention)
+_FEWER = 0.02
 _QUICK = (_Stage(3, coarse=True), _Stage(1))
 _THOROUGH = (_Stage(3, coarse=True, wary=True), _Stage(2, wary=True), _Stage(2, wary=True, tempered=True))
 
@@ -89,7 +94,7 @@ class _Result(Rows):
 
 
 def _refined_in(sight: Sight, start: Pose, known: PosePrior | None) -> Refined:
-    """Rows refined in the frames as they are: again with a band or a shape of the blur that suits it better."""
+    """Rows refined in the frames as they are: again with another shape of the blur, and where in doubt."""
     spread = Spread(blurs.limited(sight.common_blur, LEAST**2, MOST**2))
     band = band_width(spread)
     result = _refined(_Fit(sight, band, known, _MOST_COARSE), start, spread, _QUICK)
@@ -103,9 +108,7 @@ def _refined_in(sight: Sight, start: Pose, known: PosePrior | None) -> Refined:
         return index[other.refined.good], other[other.refined.good]
 
     # a wide blur needs a wider band, or it takes the levels on both sides of the edge for its own
-    wide = band_width(Spread(result.refined.spread)) > band + 1
-    if bool(wide.any()):
-        result = result.replaced(*again(wide, "gauss", _QUICK))
+    result = replace(result, doubt=result.doubt | (band_width(Spread(result.refined.spread)) > band + 1))
     kind = torch.zeros_like(sight.frame)
     least, most = blurs.axes(result.refined.spread)
     long = most > _LONG * least

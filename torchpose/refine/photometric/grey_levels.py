@@ -16,9 +16,10 @@ from torchpose.refine.photometric.light import LEVELS
 from torchpose.refine.photometric.ring_model import PixelBlocks, RingModel, ring_model
 
 TILE = 256  # pixels summed in float32 at a time; sums of tiles are float64, so padding changes no digit that counts
+_CLEAR_OF_LIMITS = 3.0  # deviations from where noise is clipped: its mean is off by 0.0004 of one there (derived)
 _MISFIT = 0.02  # of the contrast: what a point-spread function that is not Gaussian leaves at the edges of quiet frames
 _MOST_SPREAD = 1.5  # of a marker's residuals, in those of the best marker of its frame
-_NEAR_PURE = 0.05  # of paper in a pixel, beside the most and the least of its marker
+_NEAR_PURE = 0.05  # of paper in a pixel, beside the most and the least of its marker (convention)
 _FIRST_STEPS = 3  # reweighted fits of the levels before the pose is moved
 
 
@@ -101,7 +102,7 @@ def inliers(residual: Tensor, blocks: PixelBlocks, model: RingModel, levels: Ten
     """Pixels (K, P) whose noise is not clipped, by what they should show, and of these the ones that do show it."""
     spread = noise_spread(residual, blocks)[:, None]
     predicted = blocks.grey - residual
-    margin = CUT * spread
+    margin = _CLEAR_OF_LIMITS * spread
     low, high = blocks.limits[:, :1], blocks.limits[:, 1:]
     usable = blocks.valid * ((predicted > low + margin) & (predicted < high - margin))
     if model.sound is not None:

@@ -17,18 +17,15 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchpose.geometry import blur as blurs
-from torchpose.geometry.blurred_edge import Spread
+from torchpose.geometry.blurred_edge import HOLDS, Spread
 from torchpose.geometry.grey import full_scale
 from torchpose.geometry.robust import CUT, LEAST_KEPT
 from torchpose.geometry.rotations import plane_axes
 from torchpose.geometry.rows import Rows, shared
-from torchpose.geometry.sectors import sector_about
+from torchpose.geometry.sectors import SECTORS, sector_about
 from torchpose.geometry.segments import values_at
 from torchpose.refine.photometric.band import band_pixels
 from torchpose.refine.sight import Sight
-
-_CURVED = 0.2  # blur's variance over the squared radius of curvature: nearer to its centre edges are on all sides
-_BENT = 0.4  # of a distance from an edge: the most that its second-order term may be
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,11 +136,6 @@ def gather_pixels(sight: Sight, band: Tensor, grain: int) -> PixelBlocks:
     j00, j01, j10, j11 = camera.slopes((x0 + x).float(), (y0 + y).float())
     det = j00 * j11 - j01 * j10
     sector = sector_about(u, v, both[:, 0], block).index_select(0, index.flatten()).view_as(index)
-    shown = torch.ones_like(sector, dtype=torch.float32)
-    if sight.seen is not None:
-        known = sight.seen[row, marker]
-        known |= known.float().mean(-1, keepdim=True) < LEAST_KEPT
-        shown = known.float().gather(1, sector)
     return PixelBlocks(
         row,
         origin,
@@ -153,7 +145,7 @@ def gather_pixels(sight: Sight, band: Tensor, grain: int) -> PixelBlocks:
         padded(torch.where(sound, grey, 0.0)),
         padded(sound) * inside,
         sector,
-        shown,
+        _seen(sight, row, marker).gather(1, sector),
         size,
         sight.centers[row, marker],
         sight.normals[row, marker],
@@ -161,6 +153,14 @@ def gather_pixels(sight: Sight, band: Tensor, grain: int) -> PixelBlocks:
         limits,
         sight.quantisation,
     )
+
+
+def _seen(sight: Sight, row: Tensor, marker: Tensor) -> Tensor:
+    """Sectors (K, 48) of markers, 1 or 0, see `PixelBlocks.seen`."""
+    if sight.seen is None:
+        return torch.ones(len(row), SECTORS, device=row.device)
+    seen = sight.seen[row, marker].float()
+    return torch.where(seen.mean(-1, keepdim=True) < LEAST_KEPT, 1.0, seen)
 
 
 def _clipping(grey: Tensor, row: Tensor, rows: int) -> Tensor:
@@ -272,7 +272,7 @@ def ring_model(blocks: PixelBlocks, R: Tensor, t: Tensor, spread: Spread, *, che
     if check:
         blur = spread.covariance[blocks.row].float()
         most = blurs.axes(blur)[1][:, None]
-        near = (rim.bend.square() * most < _CURVED) & ((rim.second * straight).abs() < _BENT)
+        near = (rim.bend.square() * most < HOLDS**2) & ((rim.second * straight).abs() < HOLDS)
         sound = near | (d_inner.square() > CUT**2 * blurs.across(blur[:, None], *rim.normal))
     edge = spread.at(blocks.row, *rim.normal)
     outer, inner = edge(d_outer, rim.bend), edge(d_inner, rim.bend)

@@ -17,16 +17,16 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose.geometry.robust import CUT, LEAST_KEPT, of_chance
+from torchpose.geometry.robust import CUT, of_chance
 from torchpose.geometry.rows import Rows
-from torchpose.geometry.sectors import SECTORS
+from torchpose.geometry.sectors import MOST, SECTORS
 from torchpose.geometry.segments import segment_sum
+from torchpose.refine.photometric.light import POSE
 from torchpose.refine.photometric.ring_model import PixelBlocks, RingModel
 
-_KEPT = 0.9  # of a sector's pixels that must follow the model for it to count
+_KEPT = 0.9  # of a sector's pixels that must follow the model for it to count (convention; decisions/0064)
 _CELL = 4  # sectors over which a misfit is taken for one
-_UNCLEAR = 3  # sectors of an outer circle: more are no chance
-_UNKNOWNS = 7  # of a frame: its pose, and the size of its blur
+_UNCLEAR = 3  # sectors of an outer circle: more are no chance (measured: decisions/0064)
 _DISPLACED = 0.005  # px, displacement that a camera or print slightly off may cause: no reason for doubt
 
 
@@ -94,7 +94,7 @@ def clear_sectors(sectors: Sectors, spread: Tensor, misfit: Tensor) -> Tensor:
     clear = (sectors.used > _KEPT * sectors.total) & (sectors.square < sectors.used * limit)
     # where half of a ring is gone, the rest of the marker is not to be trusted either
     seen = (sectors.total > 0).sum(-1, keepdim=True)
-    return clear & (clear.sum(-1, keepdim=True) > LEAST_KEPT * seen)
+    return clear & (clear.sum(-1, keepdim=True) > MOST * seen)
 
 
 def away_from_unclear(sectors: Sectors, clear: Tensor) -> Tensor:
@@ -154,6 +154,6 @@ def doubtful(sectors: Sectors, clear: Tensor, variance: Tensor, row: Tensor, ste
     pulled = total > freedom * of_chance(freedom)
     return (
         pulled
-        | (step_chi2 > _UNKNOWNS * of_chance(float(_UNKNOWNS)) * (more - 1))
+        | (step_chi2 > POSE * of_chance(float(POSE)) * (more - 1))
         | (segment_sum(unclear.double(), row, rows) > 0)
     )
