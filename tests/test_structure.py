@@ -100,7 +100,8 @@ def test_tensor_rows_share_their_base() -> None:
 def thresholds() -> ModuleType:
     """`scripts/count_thresholds.py`."""
     spec = spec_from_file_location("count_thresholds", ROOT.parent / "scripts" / "count_thresholds.py")
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

@@ -17,6 +17,7 @@ from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import positions, ragged_arange, segment_mean, segment_sum
 
 _TANGENT_PX = 2.0  # px of position error that weigh as much as a radian of direction error
+_LEAST_TURN = 0.25  # rad from end to end of an arc; less may be straight (measured: docs/tried.md, cost)
 _BAND = 2  # px to either side in which an ellipse is followed
 
 
@@ -86,8 +87,9 @@ def chain_pairs(arcs: Arcs, polarity: float = 0.0) -> Int[Tensor, "Q 2"]:
     The middles are no farther apart than the two circles of curvature allow. Arcs are sorted by frame. With a
     ``polarity`` only those count that belong to ellipses of this one.
     """
-    rank = segments.rank_in_group(arcs.frame, by=-arcs.size)
-    index = positions((rank < MOST_A_FRAME) & (arcs.curvature * polarity >= 0))
+    curved = arcs.turn > _LEAST_TURN
+    rank = segments.rank_in_group(arcs.frame, by=torch.where(curved, -arcs.size, 0))
+    index = positions(curved & (rank < MOST_A_FRAME) & (arcs.curvature * polarity >= 0))
     i, j = segments.pairs_in_group(arcs.frame[index], arcs.frame[index])
     ahead = positions(i < j)
     i, j = index[i[ahead]], index[j[ahead]]

@@ -52,6 +52,10 @@ _ARC_ROUNDS = 3  # of following the ellipse of a pair of arcs
 _PART_ROUNDS = 2  # of following the ellipse of a region that is only a part of it
 _RING_SETTLE = 2  # fits of a ring to what agrees: its edges are measured later
 
+_LENGTH = (
+    1.5  # of a place: semi-major axis over the least semi-minor one that is wanted (measured: docs/tried.md, cost)
+)
+
 
 def find_candidates(
     frames: Shaped[Tensor, "B H W"],
@@ -111,7 +115,7 @@ def find_finer(
     fine = factor // 2
     whole = (found.verdict == Verdict.ACCEPTED) & (found.cover > WHOLE)
     # an arc of what is wanted turns as it does, though its own ellipse may be flatter
-    asked = (found.polarity * wanted.polarity >= 0) & (found.ellipse[:, 2] >= wanted.semi_minor / factor)
+    asked = (found.polarity * wanted.polarity >= 0) & (found.ellipse[:, 2] >= _LENGTH * wanted.semi_minor / factor)
     place = promising_places(found.frame, found.ellipse, whole, asked)
     if wanted.concentric:
         place = place[hints(sharp, found[place])]

@@ -20,6 +20,7 @@ _CREST = 0.5  # of squared gradients: with 0.64 more rings are lost, with 0.36 l
 # (measured).
 _STRAIGHT = 0.8  # length of the mean direction of a region that turns too little: an arc of 130 degrees has 0.8
 _ROUND = 0.2  # roundness; and length of the mean direction of what goes all the way round (measured, as above)
+_LINE = 0.985  # an arc of 34 degrees: straighter regions are no arcs (measured: docs/tried.md, cost)
 # of the inner edge, to the outer one: true rings have it in 0.83 of the directions at least (measured: decisions/0057)
 _STEP = 0.2
 _SHARE = 0.6  # of the directions in which the outer edge is seen (measured: decisions/0057)
@@ -68,7 +69,7 @@ def sorted_out(
     mean, turning = roundness(regions, xy)
     own = turning.abs() if polarity == 0 else polarity * turning
     fit = ((mean < _STRAIGHT) & (own > _ROUND)) | ((mean < _ROUND) & (turning.abs() > _ROUND))
-    return fit, ~fit & (own > -_ROUND)
+    return fit, ~fit & (mean < _LINE) & (own > -_ROUND)
 
 
 def rings(grad: Gradient, found: Candidates) -> Bool[Tensor, " M"]:

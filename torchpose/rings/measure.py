@@ -34,7 +34,6 @@ _LARGE = 20.0  # px, of the outer semi-minor axis, from which on a fit of all pi
 # px, along the minor axis: what is soft along lines alone may be fields of an interlaced frame (measured:
 # `scripts/corruption_statistics.py --only interlacing`)
 _SOFT_ALL_AROUND = 1.0
-_LEAST_REDUCED = 5.0  # px, outer semi-minor axis in a reduced frame: a pixel more than the least ring has (convention)
 _ROUGH = 0.5  # px, of a candidate's centre and axes
 
 
@@ -163,7 +162,8 @@ def _measured(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
     """
     candidates, inside = circles.outer, circles.inside
     by_blur = reduction_for(blurs.axes(inside.blur)[1].sqrt(), zernike.WIDEST)
-    factor = by_blur.minimum(reduction_for(candidates.ellipse[:, 3], 2 * _LEAST_REDUCED))
+    # a ring keeps a pixel more than the least has
+    factor = by_blur.minimum(reduction_for(candidates.ellipse[:, 3], 2 * (_LEAST_SEMI_MINOR[0] + 1)))
     rings, which = [], []
     for value in factor.unique().tolist():
         index = (factor == value).nonzero()[:, 0]

@@ -57,7 +57,6 @@ _BLURRED = 0.33
 _BLURRED_MARGIN = 2.5  # blurs around the outer ellipse
 # of the variance of grey around the ring: noise of half of the contrast's deviation remains (convention)
 _LEAST_EXPLAINED = 0.75
-_PROMISING = 0.5  # of it, from the first fit, for a second one (convention)
 _PART = 400_000  # pixels times nodes at a time
 _UNEVEN = 2.0  # most pixels of a window over the least, of those that are padded to one size
 _RATIO_SIGMA = 0.1  # of the ratio: an inner circle that is not sure is none (convention)
@@ -229,7 +228,8 @@ def _parts(pixels: Tensor, nodes: int) -> Iterator[Tensor]:
 def _blurred(fit: _Fit, outer: Tensor, polarity: Tensor) -> Tensor:
     """Indices of the fits that may be rings whose blur is wide for their size."""
     blur, inner = blurs.axes(fit.blur)[1].sqrt(), fit.theta[:, 5] * outer[:, 3]
-    promising = fit.sound & (fit.contrast * polarity < 0) & (fit.explained > _PROMISING)
+    # the first fit may leave twice as much
+    promising = fit.sound & (fit.contrast * polarity < 0) & (1 - fit.explained < 2 * (1 - _LEAST_EXPLAINED))
     return (promising & (blur > _BLURRED * inner)).nonzero()[:, 0]
 
 
