@@ -52,9 +52,7 @@ _ARC_ROUNDS = 3  # of following the ellipse of a pair of arcs
 _PART_ROUNDS = 2  # of following the ellipse of a region that is only a part of it
 _RING_SETTLE = 2  # fits of a ring to what agrees: its edges are measured later
 
-_LENGTH = (
-    1.5  # of a place: semi-major axis over the least semi-minor one that is wanted (measured: docs/tried.md, cost)
-)
+_LENGTH = 1.5  # of a place: semi-major axis over the least semi-minor one wanted (measured: docs/tried.md, cost)
 
 
 def find_candidates(

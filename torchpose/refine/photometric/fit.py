@@ -94,7 +94,7 @@ class _Result(Rows):
 
 
 def _refined_in(sight: Sight, start: Pose, known: PosePrior | None) -> Refined:
-    """Rows refined in the frames as they are: again with another shape of the blur, and where in doubt."""
+    """Rows refined in the frames as they are: again with a band or a shape of the blur that suits it better."""
     spread = Spread(blurs.limited(sight.common_blur, LEAST**2, MOST**2))
     band = band_width(spread)
     result = _refined(_Fit(sight, band, known, _MOST_COARSE), start, spread, _QUICK)
@@ -108,7 +108,9 @@ def _refined_in(sight: Sight, start: Pose, known: PosePrior | None) -> Refined:
         return index[other.refined.good], other[other.refined.good]
 
     # a wide blur needs a wider band, or it takes the levels on both sides of the edge for its own
-    result = replace(result, doubt=result.doubt | (band_width(Spread(result.refined.spread)) > band + 1))
+    wide = band_width(Spread(result.refined.spread)) > band + 1
+    if bool(wide.any()):
+        result = result.replaced(*again(wide, "gauss", _QUICK))
     kind = torch.zeros_like(sight.frame)
     least, most = blurs.axes(result.refined.spread)
     long = most > _LONG * least
