@@ -89,6 +89,8 @@ def bare_numbers(root: Path) -> int:
 
 def _names(node: ast.stmt) -> list[str]:
     """Names in capitals that a statement of a module binds to numbers."""
+    targets: list[ast.expr]
+    value: ast.expr | None
     if isinstance(node, ast.AnnAssign):
         targets, value = [node.target], node.value
     elif isinstance(node, ast.Assign):
@@ -181,7 +183,8 @@ def _comment_of(node: ast.stmt, comments: dict[int, tuple[str, bool]]) -> str:
     """The comments of a statement: on its lines, and right above it."""
     lines = range(node.lineno, (node.end_lineno or node.lineno) + 1)
     parts = [comments[line][0] for line in lines if line in comments]
-    above, line = [], node.lineno - 1
+    above: list[str] = []
+    line = node.lineno - 1
     while line in comments and comments[line][1]:
         above.insert(0, comments[line][0])
         line -= 1
