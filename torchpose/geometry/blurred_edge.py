@@ -93,7 +93,7 @@ class Spread(Rows):
         return replace(self, values=torch.stack([core, one, two], -1))
 
     def at(self, row: Tensor, nu: Tensor, nv: Tensor) -> Callable[[Tensor, Tensor], Edge]:
-        """Edges, of distances and curvatures (K, P), under the blurs of rows (K,) where the normals are nu, nv."""
+        """Edges, of distances and curvatures (..., K, P), under the blurs of rows (K,) where the normals are nu, nv."""
         values = self.values[row].float()
         if self.kind == "gauss":
             return _Gauss(values, nu, nv)
@@ -185,9 +185,10 @@ class _Averaged:
         y1, y2, y3 = one - a * self.square * lean, b * self.square * half, -b * self.square * lean
         step, slope, by_y, by_place, by_square = torch.zeros(5, *distance.shape, device=distance.device).unbind(0)
         step += 0.5
-        y, density = torch.empty_like(distance), torch.empty_like(distance)
+        moved, y, density = torch.empty_like(y3), torch.empty_like(y0), torch.empty_like(y0)
         for share, weight in self.nodes:
-            torch.add(y2, y3, alpha=share, out=y).mul_(share).add_(y1).mul_(share).add_(y0).clamp_(-_FAR / math.sqrt(2), _FAR / math.sqrt(2))
+            torch.add(y2, y3, alpha=share, out=moved).mul_(share).add_(y1).mul_(share)
+            torch.add(moved, y0, out=y).clamp_(-_FAR / math.sqrt(2), _FAR / math.sqrt(2))
             torch.mul(y, y, out=density).neg_().exp_()
             slope.add_(density, alpha=weight)
             by_place.add_(density, alpha=weight * share)
