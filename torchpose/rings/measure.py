@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchpose import ellipse
 from torchpose.camera import Camera
-from torchpose.detect import Candidates
+from torchpose.detect import Candidates, Verdict
 from torchpose.detect.reduce import only_reduced, reduction_for
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import blur as blurs
@@ -21,7 +21,7 @@ from torchpose.rings import zernike
 from torchpose.rings.edges import REACH, RingEdges, ring_edges
 from torchpose.rings.inner_circles import ANGLES, InnerCircles, clear_directions, find_inner
 from torchpose.rings.lens import ideal_pixels, mapped
-from torchpose.rings.small_rings import fit_small_rings
+from torchpose.rings.small_rings import BLURRED, fit_small_rings
 
 _LEAST_COVER = (0.4, 0.33)  # of the perimeter with edge points, outer and inner circle
 _SMALL = 4.0  # px: circles of a smaller semi-minor axis fill the mask of an edge
@@ -142,11 +142,25 @@ def measure_predicted(
     return _measured(frames, Circles(candidates, inside), camera, _How(correct))
 
 
+def measure_exactly(frames: Tensor, rings: Rings, camera: Camera) -> Rings:
+    """Rings measured before, those whose blur is wide for their size again, by the exact model of `fit_small_rings`."""
+    blurred = blurs.axes(rings.blur)[1].sqrt() > BLURRED * rings.inner_raw[:, 3]
+    some = rings[blurred]
+    if len(some) == 0:
+        return rings
+    unknown, verdict = torch.full_like(some.polarity, torch.nan), torch.full_like(some.frame, int(Verdict.ACCEPTED))
+    candidates = Candidates(some.frame, some.outer_raw, some.polarity, unknown, unknown, verdict)
+    inside = replace(find_inner(frames, candidates, camera), ellipse=some.inner_raw, blur=some.blur)
+    again, _ = _measured(frames, Circles(candidates, inside), camera, _How(correct=True, begun=True))
+    return Rings.cat([rings[~blurred], again])
+
+
 class _How(NamedTuple):
-    """correct: as for `measure_rings`. precise: as for `fit_small_rings`."""
+    """correct: as for `measure_rings`. precise, begun: as for `fit_small_rings`."""
 
     correct: bool
     precise: bool = True
+    begun: bool = False
 
 
 def _measured(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tuple[Rings, Tensor]:
@@ -198,6 +212,8 @@ def _measure(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tup
     ratio = (inner[:, 2:4].prod(-1) / outer[:, 2:4].prod(-1)).sqrt()
     inside = replace(circles.inside, ratio=ratio, seen=clear_directions(circles.inside.seen))
     circles = replace(circles, inside=inside)
+    if how.begun:
+        return _as_a_whole(frames, circles, camera, how)
     narrow = torch.minimum((1 - ratio) * _EDGE_APART, ratio) * outer[:, 3] < _SMALL
     small = narrow & (outer[:, 3] < _LARGE)
     parts, index = [], (~small).nonzero()[:, 0]
@@ -282,7 +298,7 @@ def _as_a_whole(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> 
     """The same for rings whose circles are too close to each other, or too small, to be measured one by one."""
     focal = camera.matrix.diagonal()[:2].mean()
     candidates = circles.outer
-    found = fit_small_rings(frames, candidates, circles.inside, focal, precise=how.precise)
+    found = fit_small_rings(frames, candidates, circles.inside, focal, precise=how.precise, begun=how.begun)
     least_outer, least_inner = _LEAST_SEMI_MINOR
     large = (found.outer.params[:, 3] > least_outer) & (found.inner.params[:, 3] > least_inner)
     index = (found.good & large).nonzero()[:, 0]
