@@ -18,6 +18,7 @@ from torchpose.geometry import blur as blurs
 from torchpose.geometry.grey import grey
 from torchpose.geometry.segments import marked
 from torchpose.identify import (
+    LEAST_FOUND,
     MIN_MARKERS,
     Identified,
     MarkerTable,
@@ -206,7 +207,8 @@ class PoseEstimator(nn.Module):
         known = coarse[~settled[coarse.frame]]
         known = replace(known, frame=number[known.frame])
         finer = find_candidates(frames[rest], wanted=wanted, coarse=known)
-        more = self._rings(scene, self._circles(scene, replace(finer, frame=rest[finer.frame])))
+        circles = _of_full_frames(self._circles(scene, replace(finer, frame=rest[finer.frame])), LEAST_FOUND)
+        more = self._rings(scene, circles)
         return self._read(scene, Rings.cat([rings[settled[rings.frame]], more]), copies)
 
     def _circles(self, scene: Scene, candidates: Candidates) -> Circles:
@@ -221,7 +223,9 @@ class PoseEstimator(nn.Module):
 
         Also how many copies (B T,) were seen.
         """
-        circles, precise = self._circles(scene, candidates), not self._recipe.on_rims
+        # frames with fewer circles than markers are searched at all scales anyway
+        circles = _of_full_frames(self._circles(scene, candidates), int(scene.table.valid.sum()))
+        precise = not self._recipe.on_rims
         # the code of a much blurred ring is not to be read off its profile
         blurred = blurs.axes(circles.inside.blur)[1] > _LEGIBLE**2
         sharp, known = circles[~blurred], self._rings(scene, circles[blurred], precise=precise)
@@ -279,6 +283,12 @@ class PoseEstimator(nn.Module):
         used = replace(evidence, mask=solutions.mask)
         more = intrinsics_covariance(used, solutions.R, solutions.t, scene.camera, refined=self._recipe.on_rims)
         return replace(solutions, covariance=solutions.covariance + more)
+
+
+def _of_full_frames(circles: Circles, least: int) -> Circles:
+    """Those of frames that have at least so many."""
+    frame = circles.outer.frame
+    return circles[(torch.bincount(frame) >= least)[frame]]
 
 
 def _lacking(scene: Scene, identified: Identified) -> Tensor:

@@ -4,6 +4,15 @@ from torchpose.identify.alike import indistinguishable
 from torchpose.identify.copies import MIN_MARKERS
 from torchpose.identify.markers import Identified, identify
 from torchpose.identify.scene import MarkerTable, Scene
-from torchpose.identify.second_look import look_again
+from torchpose.identify.second_look import LEAST_FOUND, look_again
 
-__all__ = ["MIN_MARKERS", "Identified", "MarkerTable", "Scene", "identify", "indistinguishable", "look_again"]
+__all__ = [
+    "LEAST_FOUND",
+    "MIN_MARKERS",
+    "Identified",
+    "MarkerTable",
+    "Scene",
+    "identify",
+    "indistinguishable",
+    "look_again",
+]

@@ -18,7 +18,7 @@ from torchpose.identify.markers import Identified
 from torchpose.identify.scene import MarkerTable, Scene
 from torchpose.rings import Rings, mapped, measure_predicted
 
-_LEAST_FOUND = 2  # markers whose rings give a pose
+LEAST_FOUND = 2  # markers whose rings give a pose
 _PLACE_TOLERANCE = (1.5, 0.15)  # px, and of the semi-major axis
 
 
@@ -37,7 +37,7 @@ def look_again(
         correct: as for `rings.measure_rings`.
     """
     markers, camera = scene.table[scene.target], scene.camera
-    wanted = markers.valid & ~seen & (seen.sum(-1) >= _LEAST_FOUND)[:, None]
+    wanted = markers.valid & ~seen & (seen.sum(-1) >= LEAST_FOUND)[:, None]
     row, option, marker = (wanted[:, None] & R.isfinite().all(-1).all(-1)[..., None]).nonzero().unbind(-1)
     if row.numel() == 0:
         return rings, identified
