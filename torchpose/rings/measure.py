@@ -111,11 +111,10 @@ def rough_rings(circles: Circles, camera: Camera) -> Rings:
     covariance = _ROUGH**2 * torch.eye(5, dtype=outer.dtype, device=outer.device).expand(len(outer), 5, 5)
     one = torch.ones_like(circles.outer.polarity)
 
-    def fit(ellipses: Tensor) -> EllipseFit:
-        return EllipseFit(mapped(ellipses, lambda points: ideal_pixels(camera, points)), covariance, _ROUGH * one, one)
-
+    ideal = mapped(torch.cat([outer, inner]), lambda points: ideal_pixels(camera, points))
+    fits = [EllipseFit(ellipses, covariance, _ROUGH * one, one) for ellipses in ideal.split(len(outer))]
     blur, clipped = circles.inside.blur, circles.inside.clipped
-    return Rings(circles.outer.frame, circles.outer.polarity, outer, inner, fit(outer), fit(inner), blur, clipped)
+    return Rings(circles.outer.frame, circles.outer.polarity, outer, inner, *fits, blur, clipped)
 
 
 def measure_circles(
@@ -304,16 +303,14 @@ def _as_a_whole(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> 
     index = (found.good & large).nonzero()[:, 0]
     outer, inner = found.outer[index], found.inner[index]
 
-    def to_ideal(points: Tensor) -> Tensor:
-        return ideal_pixels(camera, points)
-
+    both = torch.cat([outer.params, inner.params])
+    ideal = mapped(both, lambda points: ideal_pixels(camera, points)).split(len(index))
     rings = Rings(
         candidates.frame[index],
         candidates.polarity[index],
         outer.params,
         inner.params,
-        replace(outer, params=mapped(outer.params, to_ideal)),
-        replace(inner, params=mapped(inner.params, to_ideal)),
+        *(replace(fit, params=params) for fit, params in zip((outer, inner), ideal, strict=True)),
         found.blur[index],
         circles.inside.clipped[index],
     )
