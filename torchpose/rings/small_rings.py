@@ -29,6 +29,7 @@ from torchpose.ellipse import EllipseFit
 from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
 from torchpose.geometry.blurred_edge import BLUR, MOST, Spread
+from torchpose.geometry.blurred_ellipse import nodes_of_each
 from torchpose.geometry.least_squares import (
     Eliminated,
     Normal,
@@ -41,7 +42,6 @@ from torchpose.geometry.least_squares import (
 from torchpose.geometry.robust import CUT, LEAST_KEPT, RATIO_RANGE, of_chance
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import values_at
-from torchpose.geometry.blurred_ellipse import nodes_of_each
 from torchpose.rings.inner_circles import InnerCircles
 from torchpose.rings.small_ring_model import MOST_NODES, RING, depth, exact, first_order, outer_ellipses
 
