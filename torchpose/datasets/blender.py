@@ -163,7 +163,7 @@ def _ring_material(bpy: Any, plan: Plan) -> tuple[Any, dict[str, Any]]:
         return node.outputs[0]
 
     ink: Any = 0.0
-    for center, (outer, inner) in zip(plan.target.centers.tolist(), plan.target.radii.tolist(), strict=True):
+    for center, (outer, inner) in zip(plan.target.centers.tolist(), plan.target.printed_radii.tolist(), strict=True):
         distance = new("ShaderNodeVectorMath")
         distance.operation = "DISTANCE"
         link(place, distance.inputs[0])

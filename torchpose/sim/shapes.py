@@ -103,7 +103,7 @@ def cat(sets: Sequence[Shapes]) -> Shapes:
 
 def rings(target: Target) -> Shapes:
     """The rings of a target as shapes of one frame, of level 0."""
-    axes = torch.stack(plane_axes(target.normals), 1)[:, None] * target.radii[..., None, None]  # (M, 2, 2, 3)
+    axes = torch.stack(plane_axes(target.normals), 1)[:, None] * target.printed_radii[..., None, None]  # (M, 2, 2, 3)
     marker = torch.arange(len(target), device=target.radii.device)
     circles = Circles(
         marker.repeat_interleave(2),
