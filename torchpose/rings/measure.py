@@ -112,9 +112,9 @@ def rough_rings(circles: Circles, camera: Camera) -> Rings:
     one = torch.ones_like(circles.outer.polarity)
 
     ideal = mapped(torch.cat([outer, inner]), lambda points: ideal_pixels(camera, points))
-    fits = [EllipseFit(ellipses, covariance, _ROUGH * one, one) for ellipses in ideal.split(len(outer))]
+    first, second = (EllipseFit(ellipses, covariance, _ROUGH * one, one) for ellipses in ideal.split(len(outer)))
     blur, clipped = circles.inside.blur, circles.inside.clipped
-    return Rings(circles.outer.frame, circles.outer.polarity, outer, inner, *fits, blur, clipped)
+    return Rings(circles.outer.frame, circles.outer.polarity, outer, inner, first, second, blur, clipped)
 
 
 def measure_circles(
@@ -304,13 +304,14 @@ def _as_a_whole(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> 
     outer, inner = found.outer[index], found.inner[index]
 
     both = torch.cat([outer.params, inner.params])
-    ideal = mapped(both, lambda points: ideal_pixels(camera, points)).split(len(index))
+    ideal_outer, ideal_inner = mapped(both, lambda points: ideal_pixels(camera, points)).tensor_split(2)
     rings = Rings(
         candidates.frame[index],
         candidates.polarity[index],
         outer.params,
         inner.params,
-        *(replace(fit, params=params) for fit, params in zip((outer, inner), ideal, strict=True)),
+        replace(outer, params=ideal_outer),
+        replace(inner, params=ideal_inner),
         found.blur[index],
         circles.inside.clipped[index],
     )
