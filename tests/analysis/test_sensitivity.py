@@ -24,7 +24,10 @@ from torchpose.analysis.sensitivity import radius_shift
 from torchpose.camera import Camera
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import rotations
+from torchpose.pipeline import PoseEstimator
 from torchpose.pose import centers as stage
+from torchpose.results import Status
+from torchpose.sim import add_noise, render
 from torchpose.target import Target
 
 # torch's forward mode loads a module that warns of torch's own use of torch.jit.script
@@ -110,6 +113,45 @@ def test_the_calibration_of_the_camera_file_is_a_source() -> None:
     assert list(budget.sources) == ["calibration"]
     drawn = spread(simulate_points(camera, Target.load("quad40"), R, t, Uncertainty(), draws=6000))
     assert (drawn / budget.std() - 1).abs().max() < 0.03
+
+
+def stating(target: Target, places: float | tuple[float, ...], gain: float) -> Target:
+    """The target with deviations of its places and its edge gain, mm."""
+    each = torch.tensor(places, dtype=F64).expand(len(target), 3).flatten()
+    return replace(target, covariance=torch.diag(torch.cat([each, torch.tensor([gain], dtype=F64)]).square()))
+
+
+def test_what_the_target_file_states_is_a_source() -> None:
+    target = stating(Target.load("quad40_dark"), (0.01, 0.02, 0.05), 0.1)
+    R, t = volume((160.0,), (0, 40))
+    budget = propagate(distorted(), target, R, t, Uncertainty(0.02))
+    assert list(budget.sources) == ["image", "target"]
+    drawn = spread(simulate_points(distorted(), target, R, t, Uncertainty(0.02), draws=6000, seed=4))
+    assert (drawn / budget.std() - 1).abs().max() < 0.03
+    same = propagate(distorted(), Target.load("quad40_dark"), R, t, Uncertainty(0.02, print_centers=0.01))
+    alike = stating(Target.load("quad40_dark"), (0.01, 0.01, 0.0), 0.0)
+    again = propagate(distorted(), alike, R, t, Uncertainty(0.02))
+    torch.testing.assert_close(again.sources["target"], same.sources["print_centers"], rtol=1e-6, atol=1e-15)
+
+
+@pytest.mark.parametrize(("place", "gain"), [(0.001, 0.001), (0.01, 0.015), (0.05, 0.05)])
+@pytest.mark.parametrize("name", ["quad40", "hexa50"])
+def test_the_budget_of_rings_is_what_estimate_states(name: str, place: float, gain: float) -> None:
+    """Of rendered frames: all three sources, each where it counts, and the noise of the frame alone."""
+    square = torch.diag(torch.tensor([0.05, 0.05, 0.03, 0.03], dtype=F64).square())
+    camera = replace(pinhole(800.0, 600, 500), distortion=distorted().distortion, covariance=square)
+    target = stating(Target.load(name), place, gain)
+    R, t = volume((160.0,), (0, 30))
+    R, t = R[::2], t[::2]
+    found = PoseEstimator(camera, target)(add_noise(render(camera, target, R, t, psf_sigma=0.7), 2.0, bits=8))
+    assert (found.status == Status.OK).all()
+    image = edge_noise(math.sqrt(2.0**2 + 1 / 12), 190.0, 0.7)
+    budget = propagate(camera, target, R, t, Uncertainty(image), features="rings")
+    assert list(budget.sources) == ["image", "calibration", "target"]
+    stated = found.covariance.diagonal(dim1=1, dim2=2).sqrt()
+    assert (stated / budget.std() - 1).abs().max() < 0.08
+    noise = found.noise.diagonal(dim1=1, dim2=2).sqrt()
+    assert (noise / budget.std("image") - 1).abs().max() < 0.12
 
 
 def test_rings_reach_the_cramer_rao_bound() -> None:
