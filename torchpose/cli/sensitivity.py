@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,13 +14,17 @@ from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:
     from torchpose.analysis.sensitivity import Uncertainty
-    from torchpose.analysis.sweep import Sweep
+    from torchpose.analysis.sweep import Sweep, Swept
+    from torchpose.camera import Camera
+    from torchpose.target import Target
 
 _Sigmas = Annotated[
     list[float] | None,
     typer.Option(help="Standard deviation of a marker centre on each axis; may be repeated. By default 0.2 and 1."),
 ]
 _Distances = Annotated[tuple[float, float], typer.Option(metavar="NEAR FAR", help="Working distances, mm.")]
+_NOISE = "Standard deviation of the noise, grey levels of 255: adds the budget of the rings' edges, as estimate claims it."
+_LEVELS = "Grey levels of print and paper, with --noise."
 _DISTORTION = "Standard deviations of the camera's coefficients: 1e-3,1e-3,1e-5,1e-5."
 
 
@@ -37,10 +43,17 @@ def sensitivity(
     flatness_um: Annotated[float, typer.Option(help="Standard deviation of a marker along its normal.")] = 0.0,
     radius_um: Annotated[float, typer.Option(help="Standard deviation of a printed radius.")] = 0.0,
     scale_percent: Annotated[float, typer.Option(help="Standard deviation of the print's scale.")] = 0.0,
+    noise: Annotated[float | None, typer.Option(help=_NOISE)] = None,
+    blur: Annotated[float, typer.Option(help="Standard deviation of the lens's blur, px, with --noise.")] = 0.7,
+    levels: Annotated[tuple[float, float], typer.Option(metavar="DARK LIGHT", help=_LEVELS)] = (30.0, 220.0),
     draws: Annotated[int, typer.Option(min=2, max=100000, help="Random draws at every distance.")] = 300,
     seed: Annotated[int, typer.Option(min=0, help="Of the draws.")] = 0,
 ) -> int:
-    """Predict pose errors by source over the working distance, and check the prediction by Monte-Carlo."""
+    """Predict pose errors by source over the working distance, and check the prediction by Monte-Carlo.
+
+    What target file and camera file state of themselves is counted: center_sigma, edge_gain_sigma, centers_covariance,
+    and the covariance of the camera's parameters.
+    """
     sizes = {
         "--principal-point-px": principal_point_px,
         "--print-um": print_um,
@@ -53,8 +66,8 @@ def sensitivity(
     _check(sizes, sigmas, distance, tilt_deg)
     import torch
 
-    from torchpose.analysis.sensitivity import Uncertainty
-    from torchpose.analysis.sweep import sweep
+    from torchpose.analysis.sensitivity import Uncertainty, edge_noise
+    from torchpose.analysis.sweep import sweep, sweep_rings
     from torchpose.camera import Camera
     from torchpose.studies.fig04_sensitivity import cases_of, paper_camera, tabulate
     from torchpose.target import Target
@@ -75,8 +88,14 @@ def sensitivity(
         for title, case in cases_of(sigmas, size).items()
     }
     _check_view(cases)
-    files = tabulate(cases).save(out)
-    _show(cases, size)
+    rings: dict[str, Swept] = {}
+    if noise is not None:
+        edges = replace(size, image=edge_noise(_with_rounding(noise), _contrast(levels), _positive("--blur", blur)))
+        rings[f"edges of the rings, noise {noise:g}"] = sweep_rings(lens, printed, at, edges, tilt=tilt)
+    files = tabulate(cases, rings).save(out)
+    _show(cases | rings, size)
+    if lens.covariance is None or printed.covariance is None:
+        typer.echo(_unstated(lens, printed))
     for path in files:
         typer.echo(str(path))
     return 0
@@ -94,6 +113,34 @@ def _check(sizes: dict[str, float], sigmas: list[float], distance: tuple[float, 
         raise ConfigError(f"sensitivity: --distance: is {distance[0]} {distance[1]}; give NEAR above 0 and FAR beyond")
     if not abs(tilt_deg) < 85:
         raise ConfigError(f"sensitivity: --tilt-deg: is {tilt_deg}; give an angle between -85 and 85")
+
+
+def _with_rounding(noise: float) -> float:
+    """Noise with that of rounding to grey levels."""
+    return math.sqrt(_positive("--noise", noise) ** 2 + 1 / 12)
+
+
+def _contrast(levels: tuple[float, float]) -> float:
+    dark, light = levels
+    if not 0 <= dark < light <= 255:
+        raise ConfigError(f"sensitivity: --levels: is {dark:g} {light:g}; give 0 <= DARK < LIGHT <= 255")
+    return light - dark
+
+
+def _positive(option: str, value: float) -> float:
+    if not 0 < value < math.inf:
+        raise ConfigError(f"sensitivity: {option}: is {value}; give a number above 0")
+    return value
+
+
+def _unstated(camera: Camera, target: Target) -> str:
+    """What the budget takes for exact because its file says nothing."""
+    keys = []
+    if target.covariance is None:
+        keys.append(f"target {target.name} (center_sigma, edge_gain_sigma)")
+    if camera.covariance is None:
+        keys.append("camera (its covariance, which torchpose calibrate writes)")
+    return f"stated by no file, so exact but for the options: {' and '.join(keys)}"
 
 
 def _coefficients(text: str, count: int) -> tuple[float, ...]:
@@ -120,8 +167,9 @@ def _check_view(cases: dict[str, Sweep]) -> None:
             )
 
 
-def _show(cases: dict[str, Sweep], size: Uncertainty) -> None:
+def _show(cases: Mapping[str, Swept], size: Uncertainty) -> None:
     from torchpose.analysis.evaluation import AXES, SCALE, UNITS
+    from torchpose.analysis.sweep import Sweep
     from torchpose.cli.terminal import print_table
 
     columns = ("distance mm", "source", *(f"{axis} {unit}" for axis, unit in zip(AXES, UNITS, strict=True)))
@@ -129,7 +177,9 @@ def _show(cases: dict[str, Sweep], size: Uncertainty) -> None:
         rows = []
         for k in (0, len(case.distance) // 2, len(case.distance) - 1):
             lines = {name: case.budget.std(name)[k] for name in case.budget.sources}
-            lines |= {"total": case.budget.std()[k], "drawn, rms": case.rms[k], "drawn, largest": case.largest[k]}
+            lines["total"] = case.budget.std()[k]
+            if isinstance(case, Sweep):
+                lines |= {"drawn, rms": case.rms[k], "drawn, largest": case.largest[k]}
             for i, (name, std) in enumerate(lines.items()):
                 values = [value if value > 1e-9 else 0.0 for value in (SCALE * std).tolist()]  # below, rounding
                 rows.append(("" if i else f"{float(case.distance[k]):g}", name.replace("_", " "), *values))
