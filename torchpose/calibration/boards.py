@@ -16,7 +16,10 @@ from torch import Tensor
 from torchpose.calibration.views import Views
 from torchpose.errors import ConfigError
 
-_EXAMPLES = "chessboard:9x6:5mm (inner corners, square) or charuco:8x5:10mm:7mm:4X4_50 (squares, square, marker)"
+_EXAMPLES = (
+    "chessboard:9x6:5mm (inner corners, square), charuco:8x5:10mm:7mm:4X4_50 (squares, square, marker), "
+    "circles:7x6:20mm, acircles:4x11:20mm (pitch) or rings:10x7:20mm:6mm:3mm (pitch, radii)"
+)
 _LENGTH = r"(\d+\.?\d*|\.\d+)mm"
 _CHESSBOARD = re.compile(rf"chessboard:(\d+)x(\d+):{_LENGTH}")
 _CHARUCO = re.compile(rf"charuco:(\d+)x(\d+):{_LENGTH}:{_LENGTH}:(\w+)")

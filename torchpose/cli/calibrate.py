@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from torchpose.calibration import Calibration, HandEyeFit
-    from torchpose.calibration.boards import Board
+    from torchpose.calibration.session import Shown
     from torchpose.camera import Camera
     from torchpose.io.sources import Source
-    from torchpose.target import Target
 
 _BOARD = (
-    "Instead of a target: chessboard:9x6:5mm (inner corners, square) or charuco:8x5:10mm:7mm:4X4_50 (squares, square, "
-    "marker, dictionary)."
+    "Instead of a target: circles:7x6:20mm (columns, rows, pitch), acircles:4x11:20mm (OpenCV's asymmetric grid), "
+    "rings:10x7:20mm:6mm:3mm (equal rings: pitch, radii), chessboard:9x6:5mm (inner corners, square) or "
+    "charuco:8x5:10mm:7mm:4X4_50 (squares, square, marker, dictionary)."
 )
 _HAND_EYE_OUT = (
     "Hand-eye file to write; needs a manifest with robot poses. Which of camera and target is on the tool is found "
@@ -47,7 +47,7 @@ def calibrate(
     quiet: Quiet = False,
 ) -> int:
     """Calibrate a camera from views of a target, and where it sits on the robot, each with its covariance."""
-    from torchpose.calibration.boards import Board
+    from torchpose.calibration.session import parse_board
     from torchpose.camera import Camera
     from torchpose.cli.terminal import native_stderr_silenced
     from torchpose.io.sources import find_sources
@@ -60,7 +60,7 @@ def calibrate(
     if hand_eye_out is not None:
         check_robot_poses(sources)
     start = None if camera is None else Camera.load(camera)
-    shown = Target.load(target) if target is not None else Board.parse(board or "")
+    shown = Target.load(target) if target is not None else parse_board(board or "")
     frames = _Frames(sources, start, threads=threads or cores(), quiet=quiet)
     calibration = fit = None
     try:
@@ -138,7 +138,7 @@ def _first_size(sources: Sequence[Source]) -> tuple[int, int]:
     raise ConfigError(f"{sources[0].path}: INPUT: no frame could be read; give readable images")
 
 
-def _calibrate(frames: _Frames, shown: Target | Board, start: Camera | None, model: str) -> Calibration:
+def _calibrate(frames: _Frames, shown: Shown, start: Camera | None, model: str) -> Calibration:
     from torchpose.calibration.intrinsics import start_cameras
     from torchpose.calibration.session import calibrate_camera
 
@@ -147,7 +147,7 @@ def _calibrate(frames: _Frames, shown: Target | Board, start: Camera | None, mod
 
 
 def _hand_eye(
-    frames: _Frames, shown: Target | Board, calibration: Calibration | None, camera: Camera | None
+    frames: _Frames, shown: Shown, calibration: Calibration | None, camera: Camera | None
 ) -> HandEyeFit:
     from torchpose.calibration.session import calibrate_robot, locate_camera
 
