@@ -1,5 +1,6 @@
 """Views of ring targets: markers found with a rough camera, then their centres from the grey values."""
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -83,14 +84,18 @@ def measure_centers(names: Sequence[str], frames: Tensor, camera: Camera, target
     return Views(found.frame, found.marker, points, pixels, covariance, tuple(names))[good]
 
 
-def centers_alone(sight: Sight, start: Pose) -> tuple[Tensor, Tensor, Tensor]:
+def centers_alone(sight: Sight, start: Pose, size: float = math.inf) -> tuple[Tensor, Tensor, Tensor]:
     """Centres (N, 2) px of single markers, their covariances (N, 2, 2), and which of them (N,) bool are sound.
 
     Args:
         sight: rows of one marker each, its centre at the origin.
         start: of the markers; their tilt is held.
+        size: relative standard deviation of the size that each starts with.
     """
-    held = torch.diag(start.t.new_tensor([0.0, 0, 0, _HELD, _HELD, _HELD])).expand(len(start.t), 6, 6)
+    held = torch.diag(start.t.new_tensor([0.0, 0, 0, _HELD, _HELD, _HELD])).repeat(len(start.t), 1, 1)
+    # a size is a distance; the centre does not move along the ray
+    ray = start.t / (start.t.square().sum(-1, keepdim=True) * size)
+    held[:, :3, :3] += ray[:, :, None] * ray[:, None]
     refined = refine_photometric(sight, start.R, start.t, prior=held)
     xy = refined.t[:, :2] / refined.t[:, 2:]
     jacobian = sight.camera.J_distort(xy) @ image_by_point(xy, refined.t[:, 2])

@@ -21,6 +21,7 @@ from torchpose.geometry.projection import image_by_point
 from torchpose.refine import Sight
 from torchpose.rings import mapped
 
+_SIZE = 0.03  # of the marks' size: what is not flat, printed unevenly, or the pose's depth; dots of 6 px tell it no better
 _NEAR = 0.25  # of the outer semi-minor axis, and a pixel besides: how far a fit may move from where it starts
 _UNSEEN = 3.0  # times the usual standard deviation of the batch: of a mark that was not found before, the most
 _DISC = -3.0  # inner radius over the outer one, of a ring that has no hole: its inner edge is nowhere
@@ -64,7 +65,7 @@ def measure_marks(names: Sequence[str], frames: Tensor, marks: Marks, grid: Grid
         camera,
         marks.blur.median(0).values.expand(len(points), 1, 3),
     )
-    pixels, covariance, good = centers_alone(sight, Pose(R[view], start))
+    pixels, covariance, good = centers_alone(sight, Pose(R[view], start), _SIZE)
     moved = torch.linalg.vector_norm(pixels - camera.project(start), dim=-1)
     good &= moved < _NEAR * ellipse[:, 3] + 1
     sigma = covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()

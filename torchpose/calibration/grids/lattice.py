@@ -17,7 +17,7 @@ from torchpose.geometry import conics
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import near_pairs, segment_mean, segment_sum
 
-_WIDEST = 14.0  # spacing over the radius of a mark, the most that is looked for: dots a seventh of the pitch wide
+_WIDEST = 20.0  # spacing over the radius of a mark, the most that is looked for: dots a tenth of the pitch wide
 _LEAST_STEP = 1.9  # the same, the least: marks of one lattice do not touch
 _ALIKE = 1.7  # areas of neighbours, ratio: perspective and the error of small ellipses
 _NEAR = 1.28  # of the spacing: a neighbour; the diagonal has 1.41, and perspective changes steps by a tenth

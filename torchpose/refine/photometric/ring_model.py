@@ -27,6 +27,7 @@ from torchpose.refine.sight import Sight
 
 _CURVED = 0.2  # blur's variance over the squared radius of curvature: nearer to its centre edges are on all sides
 _BENT = 0.4  # of a distance from an edge: the most that its second-order term may be
+_FEW = 256  # pixels of a marker 16 px wide, of which a sixth would not tell its 15 unknowns; a tile, so that all fit
 _FAR = 3.5  # standard deviations of the blur from an edge, from where on neither matters
 
 
@@ -65,11 +66,12 @@ class PixelBlocks(Rows):
     quantisation: float = shared()
 
     def every(self, nth: int, most: int | None = None) -> PixelBlocks:
-        """The same with one pixel of ``nth``, or as many fewer as leave ``most`` of each marker."""
+        """The same with one pixel of ``nth``, or as many fewer as leave ``most`` of each marker; of small ones all."""
         count = self.grey.shape[1] // nth
         count = count if most is None else min(count, most)
         i = torch.arange(count, device=self.row.device)
-        index = i * self.size.clamp_min(nth * count)[:, None] // count
+        stretched = torch.where(self.size <= min(_FEW, count), count, self.size.clamp_min(nth * count))
+        index = i * stretched[:, None] // count
         inside = index < self.size[:, None]
         index = index.minimum((self.size[:, None] - 1).clamp_min(0))
         planes = {n: getattr(self, n).gather(1, index) for n in ("ray_x", "ray_y", "grey", "valid")}
