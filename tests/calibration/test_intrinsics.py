@@ -118,7 +118,7 @@ def test_points_that_are_mixed_up_are_no_calibration() -> None:
     _, views = _chessboards([-0.3, 0.14, 1e-3, 3e-4, 0.0])
     g = torch.Generator().manual_seed(3)
     moved = 30 * torch.randn(views.pixels.shape, dtype=F64, generator=g)
-    with pytest.raises(tp.ConfigError, match="px apart fit to|agree with each other"):
+    with pytest.raises(tp.ConfigError, match=r"px apart fit to|agree with each other"):
         calibrate_intrinsics(replace(views, pixels=views.pixels + moved), start_cameras(640, 480, "brown5"))
 
 

@@ -256,8 +256,8 @@ def _check_residuals(views: Views, bundle: Bundle, before: int) -> None:
     """
     if len(views.view) < _LEAST_AGREEING * before:
         raise ConfigError(
-            f"INPUT: only {len(views.view)} of {before} points agree with each other; check that --target or --board is "
-            "what the frames show, and that all frames are of one camera with one focus"
+            f"INPUT: only {len(views.view)} of {before} points agree with each other; check that --target or --board "
+            "is what the frames show, and that all frames are of one camera with one focus"
         )
     # as far as points apart, on average: the square root of the area that each has
     pixels = views.padded()[1]
@@ -267,8 +267,8 @@ def _check_residuals(views: Views, bundle: Bundle, before: int) -> None:
     rms = float(bundle.residual.square().sum(-1).mean().sqrt())
     if rms > _MOST_RESIDUAL * apart:
         raise ConfigError(
-            f"INPUT: points that are {apart:.0f} px apart fit to {rms:.2g} px only, which no lens or print explains; check "
-            "that --target or --board is what the frames show, and that all frames are of one camera with one focus"
+            f"INPUT: points that are {apart:.0f} px apart fit to {rms:.2g} px only, which no lens or print explains; "
+            "check that --target or --board is what the frames show, and that all frames are of one camera with one focus"
         )
 
 
@@ -292,8 +292,9 @@ def _check_lens(camera: Camera, covariance: Tensor, names: tuple[str, ...]) -> N
     sigma = float(covariance[at, at].sqrt())
     if float(factors.min()) < _LEAST_FACTOR or sigma > _OPEN_COEFFICIENT:
         raise ConfigError(
-            f"--model: the views do not tell the coefficients of rational8 apart (k1 {float(k1):.3g}, k4 {float(k4):.3g} "
-            f"+- {sigma:.2g} cancel); use brown5, or kannala_brandt for a wide lens, or add views that reach the corners"
+            f"--model: the views do not tell the coefficients of rational8 apart (k1 {float(k1):.3g}, "
+            f"k4 {float(k4):.3g} +- {sigma:.2g} cancel); use brown5, or kannala_brandt for a wide lens, "
+            "or add views that reach the corners"
         )
 
 

@@ -1,6 +1,5 @@
 """Views of ring targets: markers found with a rough camera, then their centres from the grey values."""
 
-import math
 from collections.abc import Sequence
 
 import torch
@@ -9,7 +8,6 @@ from torch import Tensor
 from torchpose.calibration.views import Views
 from torchpose.camera import Camera
 from torchpose.detect import find_candidates
-from torchpose.geometry.least_squares import Pose
 from torchpose.geometry.projection import image_by_point
 from torchpose.geometry.robust import LEAST_KEPT
 from torchpose.identify import MarkerTable, identify
@@ -68,6 +66,7 @@ def measure_centers(names: Sequence[str], frames: Tensor, camera: Camera, target
     marker = (found.marker[:, None] == target.ids).long().argmax(1)
     points, rotation = target.centers[marker], poses.R[found.frame]
     arm = (rotation @ points[..., None])[..., 0]
+    held = torch.diag(points.new_tensor([0.0, 0, 0, _HELD, _HELD, _HELD])).expand(len(marker), 6, 6)
     one = torch.ones_like(points[:, :1])
     sight = Sight(
         found.frame,
@@ -80,26 +79,10 @@ def measure_centers(names: Sequence[str], frames: Tensor, camera: Camera, target
         _grey(frames),
         camera,
     )
-    pixels, covariance, good = centers_alone(sight, Pose(rotation, arm + poses.t[found.frame]))
-    return Views(found.frame, found.marker, points, pixels, covariance, tuple(names))[good]
-
-
-def centers_alone(sight: Sight, start: Pose, size: float = math.inf) -> tuple[Tensor, Tensor, Tensor]:
-    """Centres (N, 2) px of single markers, their covariances (N, 2, 2), and which of them (N,) bool are sound.
-
-    Args:
-        sight: rows of one marker each, its centre at the origin.
-        start: of the markers; their tilt is held.
-        size: relative standard deviation of the size that each starts with.
-    """
-    held = torch.diag(start.t.new_tensor([0.0, 0, 0, _HELD, _HELD, _HELD])).repeat(len(start.t), 1, 1)
-    # a size is a distance; the centre does not move along the ray
-    ray = start.t / (start.t.square().sum(-1, keepdim=True) * size)
-    held[:, :3, :3] += ray[:, :, None] * ray[:, None]
-    refined = refine_photometric(sight, start.R, start.t, prior=held)
+    refined = refine_photometric(sight, rotation, arm + poses.t[found.frame], prior=held)
     xy = refined.t[:, :2] / refined.t[:, 2:]
-    jacobian = sight.camera.J_distort(xy) @ image_by_point(xy, refined.t[:, 2])
+    jacobian = camera.J_distort(xy) @ image_by_point(xy, refined.t[:, 2])
     covariance = jacobian @ refined.covariance[:, :3, :3] @ jacobian.mT
-    pixels = sight.camera.distort(xy)
+    pixels = camera.distort(xy)
     good = refined.good & (refined.kept > LEAST_KEPT) & pixels.isfinite().all(-1)
-    return pixels, covariance, good
+    return Views(found.frame, found.marker, points, pixels, covariance, tuple(names))[good]

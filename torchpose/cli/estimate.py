@@ -14,11 +14,13 @@ from torchpose.cli.common import (
     Overlay,
     Silent,
     Threads,
+    Tone,
     check_outputs,
     check_robot_poses,
     cores,
     ended,
     interrupted,
+    with_tone,
 )
 
 if TYPE_CHECKING:  # imported where they are used: torch takes more than a second, which --help need not wait for
@@ -59,7 +61,8 @@ def estimate(
     resume: Annotated[bool, typer.Option("--resume", help=_RESUME)] = False,
     hand_eye: Annotated[Path | None, typer.Option(help=_HAND_EYE)] = None,
     method: Annotated[str, typer.Option(metavar=_METHODS, help=_METHOD)] = "photometric",
-    srgb: Annotated[bool, typer.Option("--srgb", help="The frames are sRGB-encoded: linearise them first.")] = False,
+    tone: Tone = None,
+    srgb: Annotated[bool, typer.Option("--srgb", help="The same as --tone srgb.")] = False,
     batch: Batch = None,
     threads: Threads = None,
     quiet: Silent = False,
@@ -79,7 +82,8 @@ def estimate(
         if path is not None:
             check_table_path(path, option)
     lens, targets, sources = Camera.load(camera), [Target.load(name) for name in target], find_sources(inputs)
-    work = _Work(lens, targets, sources, _load_hand_eye(hand_eye, sources), method, srgb, instances)
+    lens = with_tone(lens, "srgb" if srgb and tone is None else tone)
+    work = _Work(lens, targets, sources, _load_hand_eye(hand_eye, sources), method, instances)
     check_outputs(inputs, sources, [p for p in (out, detections) if p is not None], overlay)
     with native_stderr_silenced():
         return _run(work, out, detections, overlay, resume=resume, batch=batch, threads=threads or cores(), quiet=quiet)
@@ -94,7 +98,6 @@ class _Work:
     sources: list[Source]
     hand_eye: HandEye | None
     method: str
-    srgb: bool
     instances: int
 
     def origin(self, detections: bool) -> dict[str, Any]:
@@ -107,7 +110,7 @@ class _Work:
             "--target": [[target.name, _digest(target)] for target in self.targets],
             "--hand-eye": None if self.hand_eye is None else _digest(self.hand_eye),
             "--method": self.method,
-            "--srgb": self.srgb,
+            "--tone": str(self.camera.tone or "linear"),
             "--instances": self.instances,
             "--detections": detections,
             "INPUT": sorted({str(source.root) for source in self.sources}),
@@ -126,9 +129,12 @@ def _run(
     quiet: bool,
 ) -> int:
     """Estimates what is not done yet and writes the tables; returns the exit code."""
+    from dataclasses import replace
+
     import cv2
     import torch
 
+    from torchpose.camera import LINEAR
     from torchpose.cli.terminal import FrameProgress
     from torchpose.io.reader import FrameReader, default_batch, in_batches
     from torchpose.io.rows import BASE_SCHEMA, POSE_SCHEMA
@@ -142,7 +148,9 @@ def _run(
     torch.set_num_threads(max(1, threads // 2))
     camera, targets, sources = work.camera, work.targets, work.sources
     method: Any = work.method  # it checks
-    estimator = PoseEstimator(camera, targets, instances=work.instances, method=method, srgb=work.srgb)
+    tone = camera.tone or LINEAR
+    # the reader hands on linear frames
+    estimator = PoseEstimator(replace(camera, tone=None), targets, instances=work.instances, method=method)
     painter = None if overlay is None else Overlay(camera, targets, overlay, threads=threads)
     schema = POSE_SCHEMA | (BASE_SCHEMA if work.hand_eye else {})
     origin = work.origin(detections is not None)
@@ -150,7 +158,7 @@ def _run(
     # a resumed run works on the same batches as one that was not interrupted, so that rows agree to the last bit
     batches = in_batches(sources, batch or default_batch(camera.width, camera.height))
     pending = [one for one in batches if any(source.name not in store for source in one)]
-    reader = FrameReader(pending, camera.width, camera.height, threads=threads)
+    reader = FrameReader(pending, camera.width, camera.height, threads=threads, tone=tone)
     try:
         with FrameProgress(len(sources), len(store), quiet=quiet) as progress, torch.inference_mode():
             for frames in reader:

@@ -57,11 +57,9 @@ class Grid:
         if not found or (found[5] is None) == (found[1] == "rings"):
             raise ConfigError(f"--board: {text}: is no grid; write {GRID_EXAMPLES}")
         columns, rows, pitch = int(found[2]), int(found[3]), float(found[4])
-        grid = cls(
-            cast(Kind, found[1]), columns, rows, pitch, (float(found[5]), float(found[6])) if found[5] else None
-        )
+        grid = cls(cast(Kind, found[1]), columns, rows, pitch, (float(found[5]), float(found[6])) if found[5] else None)
         if min(columns, rows) < _LEAST_SIDE or pitch <= 0:
-            raise ConfigError(f"--board: {text}: needs 3 x 3 marks at least and a pitch above 0 mm; take a larger board")
+            raise ConfigError(f"--board: {text}: needs 3 x 3 marks and a pitch above 0 mm; take a larger board")
         if grid.radii is not None and not 0 < grid.radii[1] < grid.radii[0] < pitch / 2:
             raise ConfigError(
                 f"--board: {text}: give the outer radius, below half the pitch, and then the smaller inner one, in mm"

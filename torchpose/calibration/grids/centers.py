@@ -10,18 +10,23 @@ from torch import Tensor
 
 from torchpose import pnp
 from torchpose.calibration.grids.board import Grid
-from torchpose.calibration.grids.marks import Marks
+from torchpose.calibration.grids.marks import Marks, find_marks
 from torchpose.calibration.intrinsics import MIN_POINTS
-from torchpose.calibration.rings import centers_alone
+from torchpose.calibration.tone import Sizes, scale_at
 from torchpose.calibration.views import Views
 from torchpose.camera import Camera
 from torchpose.geometry import conics
 from torchpose.geometry.least_squares import Pose
 from torchpose.geometry.projection import image_by_point
-from torchpose.refine import Sight
+from torchpose.refine import LEAST_KEPT, Refined, Sight, refine_photometric
 from torchpose.rings import mapped
 
-_SIZE = 0.03  # of the marks' size: what is not flat, printed unevenly, or the pose's depth; dots of 6 px tell it no better
+_HELD = 1e12  # information about the rotation of a mark: as good as known
+_SIZE = (
+    0.03  # of the marks' size: what is not flat, printed unevenly, or the pose's depth; dots of 6 px tell it no better
+)
+_OPEN = 1.0  # the same where the size itself is asked for
+_SIZED = 300  # discs whose size is measured, about
 _NEAR = 0.25  # of the outer semi-minor axis, and a pixel besides: how far a fit may move from where it starts
 _UNSEEN = 3.0  # times the usual standard deviation of the batch: of a mark that was not found before, the most
 _DISC = -3.0  # inner radius over the outer one, of a ring that has no hole: its inner edge is nowhere
@@ -42,35 +47,74 @@ def measure_marks(names: Sequence[str], frames: Tensor, marks: Marks, grid: Grid
         grid: the board.
         camera: with distortion.
     """
+    known, view, point, sight, start = mark_sight(frames, marks, grid, camera)
+    refined = fit_alone(sight, start)
+    xy = refined.t[:, :2] / refined.t[:, 2:]
+    jacobian = camera.J_distort(xy) @ image_by_point(xy, refined.t[:, 2])
+    covariance = jacobian @ refined.covariance[:, :3, :3] @ jacobian.mT
+    pixels = camera.distort(xy)
+    moved = torch.linalg.vector_norm(pixels - camera.project(start.t), dim=-1)
+    good = refined.good & (refined.kept > LEAST_KEPT) & (moved < _NEAR * sight.rings[:, 0, 0, 3] + 1)
+    sigma = covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
+    good &= known | (sigma < _UNSEEN * sigma[good & known].nanmedian())
+    points = grid.points.to(pixels)[point]
+    return Views(view, point, points, pixels, covariance, tuple(names))[good]
+
+
+def mark_sight(frames: Tensor, marks: Marks, grid: Grid, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Sight, Pose]:
+    """What `measure_marks` fits: whether a mark was found, its view and number, rows of one mark each, their starts."""
     R, t, posed = _poses(marks, grid, camera)
     marks = marks[posed[marks.view]]
-    if len(marks) == 0:
-        return marks.views(grid)
     radius = _radius(marks, grid, camera, R, t)
     known, view, point, start = _starts(marks, grid, camera, R, t)
-    one, points = torch.ones_like(start[:, :1]), grid.points.to(start)[point]
-    shape = torch.tensor([1.0, float(marks.ratio.median()) if grid.radii else _DISC]).to(start)
+    one = torch.ones_like(start[:, :1])
+    shape = torch.tensor([1.0, float(marks.ratio.nanmedian()) if grid.radii else _DISC]).to(start)
     ellipse = _predicted(camera, R[view], start, radius)
-    inner = torch.cat([ellipse[:, :2], ellipse[:, 2:4] * shape[1].clamp_min(0), ellipse[:, 4:]], -1)
-    normal = points.new_tensor([0.0, 0.0, 1.0]).expand_as(points)
+    inner = torch.cat([ellipse[:, :2], ellipse[:, 2:4] * shape[1], ellipse[:, 4:]], -1) if grid.radii else ellipse
     sight = Sight(
         view,
         one > 0,
-        torch.stack([ellipse, inner if grid.radii else ellipse], 1)[:, None],
-        one * marks.polarity.median(),
-        torch.zeros_like(points)[:, None],
-        normal[:, None],
-        (radius * shape).expand(len(points), 2)[:, None],
+        torch.stack([ellipse, inner], 1)[:, None],
+        one * marks.polarity.nanmedian(),
+        torch.zeros_like(start)[:, None],
+        start.new_tensor([0.0, 0.0, 1.0]).expand_as(start)[:, None],
+        (radius * shape).expand(len(start), 2)[:, None],
         frames,
         camera,
-        marks.blur.median(0).values.expand(len(points), 1, 3),
+        marks.blur.nanmedian(0).values.expand(len(start), 1, 3),
     )
-    pixels, covariance, good = centers_alone(sight, Pose(R[view], start), _SIZE)
-    moved = torch.linalg.vector_norm(pixels - camera.project(start), dim=-1)
-    good &= moved < _NEAR * ellipse[:, 3] + 1
-    sigma = covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
-    good &= known | (sigma < _UNSEEN * sigma[good & known].median())
-    return Views(view, point, points, pixels, covariance, tuple(names))[good]
+    return known, view, point, sight, Pose(R[view], start)
+
+
+def sizes_of_marks(frames: Tensor, names: Sequence[str], grid: Grid, camera: Camera) -> Sizes:
+    """Sizes of a grid's marks, see `torchpose.calibration.tone`: discs by the grey values, rings by their edges."""
+    marks = find_marks(names, frames, grid, camera)
+    R, t, posed = _poses(marks, grid, camera)
+    marks = marks[posed[marks.view]]
+    at = _at(grid.points.to(t)[marks.point], R, t, marks.view)
+    scale = scale_at(camera, R[marks.view], at)
+    outer = marks.ellipse[:, 2:4].prod(-1).sqrt()
+    inner = torch.where(marks.ratio > 0, marks.ratio * outer, torch.nan)
+    if grid.radii is None and len(marks):
+        known, _, _, sight, start = mark_sight(frames, marks, grid, camera)
+        some = known.nonzero()[:, 0]
+        some = some[:: len(some) // _SIZED + 1]
+        refined = fit_alone(sight[some], start[some], _OPEN)
+        scale = scale_at(camera, refined.R, start.t[some])
+        # the radius is the same for all: what is seen larger has come closer
+        outer = scale * sight.radii[some, 0, 0] * start.t[some].norm(dim=-1) / refined.t.norm(dim=-1)
+        inner = torch.full_like(outer, torch.nan)
+    radii = [(size / scale).nanmedian() for size in (outer, inner)]
+    return Sizes(scale, outer, inner, torch.stack(radii).expand(len(scale), 2))
+
+
+def fit_alone(sight: Sight, start: Pose, size: float = _SIZE) -> Refined:
+    """Rows of one mark fitted to the grey values: tilts are held, sizes to a relative standard deviation."""
+    held = torch.diag(start.t.new_tensor([0.0, 0, 0, _HELD, _HELD, _HELD])).repeat(len(start.t), 1, 1)
+    # a size is a distance; the centre does not move along the ray
+    ray = start.t / (start.t.square().sum(-1, keepdim=True) * size)
+    held[:, :3, :3] += ray[:, :, None] * ray[:, None]
+    return refine_photometric(sight, start.R, start.t, prior=held)
 
 
 def _poses(marks: Marks, grid: Grid, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:

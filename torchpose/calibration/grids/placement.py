@@ -60,7 +60,10 @@ def place_patches(
 
 
 class _Turned(NamedTuple):
-    """at: places (4, K, 2) of all marks after each quarter turn, from 0 in every frame. low: what that took off, (B, 4, 2)."""
+    """at: places (4, K, 2) of all marks after each quarter turn, from 0 in every frame.
+
+    low: what was taken off, (B, 4, 2).
+    """
 
     at: Tensor
     low: Tensor
@@ -128,7 +131,7 @@ def _imaged(image: Tensor, at: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _plane_images(found: Lattice, centers: Tensor, frames: int) -> Tensor:
-    """Homographies (B, 3, 3) from places to pixels, depth positive at the marks: least squares of the linear equations."""
+    """Homographies (B, 3, 3) from places to pixels, by least squares; the depth is positive at the marks."""
 
     def scaled(values: Tensor) -> tuple[Tensor, Tensor]:
         middle = segment_mean(values, found.frame, frames)
@@ -154,7 +157,7 @@ def _plane_images(found: Lattice, centers: Tensor, frames: int) -> Tensor:
 
 
 def _rightward(image: Tensor, middle: Tensor, grid: Grid) -> Tensor:
-    """How far the board's rows point to the right in the middle (B, 2) of the patches, after each quarter turn: (B, 4)."""
+    """How far rows point to the right in the middle (B, 2) of the patches, after each quarter turn: (B, 4)."""
     row = grid.lattice[1] - grid.lattice[0]  # from the first mark to the next
     back = (_TURNS.mT @ row).double().to(image.device)
     ends = torch.stack([middle[:, None] - 0.5 * back, middle[:, None] + 0.5 * back])
