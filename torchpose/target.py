@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, field_validator
 from torch import Tensor
 
 from torchpose.config import format_list, format_number, read_yaml, validate, within, write_text
@@ -23,6 +23,13 @@ MIN_SPREAD = 1e-2  # second / first singular value of the centred marker centres
 
 _FROZEN = ConfigDict(extra="forbid", frozen=True)
 Vector = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
+Deviation = Annotated[FiniteFloat, Field(ge=0)]
+Deviations = Annotated[
+    list[Deviation],
+    BeforeValidator(lambda value: [value] * 3 if isinstance(value, int | float) else value),
+    Field(min_length=3, max_length=3),
+]
+"""Of a printed centre along x, y, z, mm; in a file one number may stand for all three."""
 
 
 class RigidTransformFile(BaseModel):
@@ -40,6 +47,7 @@ class _MarkerFile(BaseModel):
     outer_radius: FiniteFloat
     inner_radius: FiniteFloat
     normal: Vector = [0.0, 0.0, 1.0]
+    center_sigma: Deviations | None = None
 
     @field_validator("center")
     @classmethod
@@ -49,6 +57,13 @@ class _MarkerFile(BaseModel):
         return value if len(value) == 3 else [*value, 0.0]
 
 
+class _MatrixFile(BaseModel):
+    model_config = _FROZEN
+    rows: int
+    cols: int
+    data: list[FiniteFloat]
+
+
 class _TargetFile(BaseModel):
     model_config = _FROZEN
     name: str
@@ -56,6 +71,10 @@ class _TargetFile(BaseModel):
     background: Literal["light", "dark"]
     markers: list[_MarkerFile]
     part_from_target: RigidTransformFile | None = None
+    center_sigma: Deviations | None = None
+    edge_gain: FiniteFloat = 0.0
+    edge_gain_sigma: Deviation | None = None
+    centers_covariance: _MatrixFile | None = None
 
     @field_validator("units", mode="before")
     @classmethod
@@ -79,6 +98,10 @@ class Target:
         radii: (M, 2) float64, outer and inner radius, mm.
         part_rotation, part_translation: (3,) float64 rotation vector in rad and translation in mm that map target
             coordinates to those of the part, both or neither.
+        edge_gain: mm, by which the print moved every edge of dark areas outwards, as far as it is known (dot gain):
+            `printed_radii` are those of the circles on the part.
+        covariance: (3 M + 1, 3 M + 1) float64, mm^2, of the centres on the part, x, y, z by marker, and last of the
+            edge gain; None where the file claims a perfect target.
 
     Raises:
         ConfigError: duplicate ids, rings that cannot be told apart or read, overlapping markers, fewer than 3 markers,
@@ -93,6 +116,8 @@ class Target:
     radii: Tensor
     part_rotation: Tensor | None = None
     part_translation: Tensor | None = None
+    edge_gain: float = 0.0
+    covariance: Tensor | None = None
 
     def __post_init__(self) -> None:
         _check_name(self.name)
@@ -105,6 +130,13 @@ class Target:
         if (self.part_rotation is None) != (self.part_translation is None):
             raise ConfigError("part_from_target: is half given; give both rotation and translation")
         self._check_markers()
+        if self.covariance is not None:
+            _check_covariance(self.covariance.detach(), 3 * m + 1)
+        printed = self.printed_radii
+        if not bool((printed > 0).all() & (printed[:, 1] < printed[:, 0]).all()):
+            raise ConfigError(
+                f"edge_gain: {self.edge_gain:g} mm leaves a ring without width or hole; give an edge shift in mm"
+            )
 
     def _check_markers(self) -> None:
         ids = self.ids.tolist()
@@ -168,6 +200,12 @@ class Target:
         return (self.radii[:, 1] / self.radii[:, 0]).square()
 
     @property
+    def printed_radii(self) -> Tensor:
+        """(M, 2) radii on the part, mm: a dark ring's edges lie outwards by the edge gain, a light one's inwards."""
+        outwards = self.edge_gain if self.background == "light" else -self.edge_gain
+        return self.radii + outwards * self.radii.new_tensor([1.0, -1.0])
+
+    @property
     def part_from_target(self) -> tuple[Tensor, Tensor] | None:
         """R (3, 3), t (3,) mm with X_part = R X_target + t, for `Poses.moved`; None where the file has none."""
         if self.part_rotation is None or self.part_translation is None:
@@ -224,6 +262,7 @@ class Target:
             )
         pose = data.part_from_target
         with within(f"{path}: "):
+            covariance = _covariance(data)
             return cls(
                 name=data.name,
                 background=data.background,
@@ -233,6 +272,8 @@ class Target:
                 radii=_floats([[m.outer_radius, m.inner_radius] for m in data.markers]).reshape(-1, 2),
                 part_rotation=None if pose is None else _floats(pose.rotation),
                 part_translation=None if pose is None else _floats(pose.translation),
+                edge_gain=data.edge_gain,
+                covariance=covariance,
             )
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -252,7 +293,54 @@ class Target:
         if self.part_rotation is not None and self.part_translation is not None:
             rotation, translation = map(format_list, (self.part_rotation.tolist(), self.part_translation.tolist()))
             lines.append(f"part_from_target: {{rotation: {rotation}, translation: {translation}}}")
+        if self.edge_gain:
+            lines.append(f"edge_gain: {format_number(self.edge_gain)}")
+        if self.covariance is not None:
+            places, gain = self.covariance[:-1, :-1], float(self.covariance[-1, -1])
+            lines.append(f"edge_gain_sigma: {format_number(gain**0.5)}")
+            if bool(places.any()):
+                data = format_list(places.flatten().tolist())
+                lines.append(f"centers_covariance: {{rows: {len(places)}, cols: {len(places)}, data: {data}}}")
         write_text(path, "\n".join(lines) + "\n")
+
+
+def _covariance(data: _TargetFile) -> Tensor | None:
+    """Of the centres and the edge gain, as `Target.covariance`; what a file with some of the keys leaves out is 0.
+
+    Raises:
+        ConfigError: two keys state the same, or a table has not the size of the markers.
+    """
+    sigmas = [data.center_sigma if m.center_sigma is None else m.center_sigma for m in data.markers]
+    stated, table, size = any(s is not None for s in sigmas), data.centers_covariance, 3 * len(data.markers)
+    if not stated and table is None and data.edge_gain_sigma is None:
+        return None
+    covariance = torch.zeros(size + 1, size + 1, dtype=torch.float64)
+    if table is not None:
+        if stated:
+            raise ConfigError("center_sigma: stands beside centers_covariance, which says the same; remove one of them")
+        if (table.rows, table.cols) != (size, size) or len(table.data) != size * size:
+            raise ConfigError(
+                f"centers_covariance: is {table.rows} x {table.cols} with {len(table.data)} numbers; "
+                f"{len(data.markers)} markers have {size} x {size}"
+            )
+        covariance[:-1, :-1] = _floats(table.data).view(size, size)
+    else:
+        covariance[:-1, :-1] = torch.diag(_floats([s or [0.0] * 3 for s in sigmas]).flatten().square())
+    covariance[-1, -1] = (data.edge_gain_sigma or 0.0) ** 2
+    return covariance
+
+
+def _check_covariance(covariance: Tensor, size: int) -> None:
+    field = "centers_covariance"
+    if covariance.shape != (size, size):
+        raise ConfigError(f"{field}: has shape {tuple(covariance.shape)} with the edge gain; give {size} x {size}")
+    if not bool(covariance.isfinite().all()):
+        raise ConfigError(f"{field}: holds NaN or infinity; measure the target again or state center_sigma")
+    scale = covariance.diagonal().abs().max().clamp_min(1e-30)
+    if bool(((covariance - covariance.mT).abs() > 1e-6 * scale).any()):
+        raise ConfigError(f"{field}: is not symmetric; write the whole table")
+    if bool(torch.linalg.eigvalsh(covariance)[0] < -1e-9 * scale):
+        raise ConfigError(f"{field}: has a negative variance in some direction; it is no covariance")
 
 
 def _floats(values: Any) -> Tensor:

@@ -41,7 +41,7 @@ def find_rings(names: Sequence[str], frames: Tensor, cameras: Sequence[Camera], 
         ring = identify(rings, table, camera, len(frames), 1).ring
         view, marker = (ring >= 0).nonzero().unbind(-1)
         at = ring[view, marker]
-        center, covariance = common_center(rings.outer[at], rings.inner[at], target.radii[marker])
+        center, covariance = common_center(rings.outer[at], rings.inner[at], target.printed_radii[marker])
         # ellipses are in the pixels of the first camera without its distortion
         pixels, covariance = raw_centers(cameras[0], center, covariance)
         every.append(Views(view, target.ids[marker], target.centers[marker], pixels, covariance, tuple(names)))
@@ -75,7 +75,7 @@ def measure_centers(names: Sequence[str], frames: Tensor, camera: Camera, target
         one if target.background == "light" else -one,
         torch.zeros_like(points)[:, None],
         target.normals[marker][:, None],
-        target.radii[marker][:, None],
+        target.printed_radii[marker][:, None],
         _grey(frames),
         camera,
     )

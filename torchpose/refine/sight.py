@@ -17,6 +17,7 @@ from torchpose.geometry import conics
 from torchpose.geometry.least_squares import Pose, PosePrior
 from torchpose.geometry.robust import LEAST_KEPT as LEAST_KEPT
 from torchpose.geometry.rows import Rows, shared
+from torchpose.pose import MarkerNormals
 from torchpose.target import Target
 
 QUANTISATION = 1 / 12  # variance of rounding, in grey levels^2, below which no noise estimate falls
@@ -57,7 +58,9 @@ class Sight(Rows):
     def of(cls, frames: Tensor, camera: Camera, target: Target, frame: Tensor, rings: Tensor) -> Self:
         """Rows of one target, all markers seen: frame (N,) of each, fitted ellipses (N, M, 2, 5) in raw pixels."""
         rows = (len(frame), len(target))
-        centers, normals, radii = (x.expand(rows[0], *x.shape) for x in (target.centers, target.normals, target.radii))
+        centers, normals, radii = (
+            x.expand(rows[0], *x.shape) for x in (target.centers, target.normals, target.printed_radii)
+        )
         polarity = rings.new_full(rows, 1.0 if target.background == "light" else -1.0)
         mask = torch.ones(rows, dtype=torch.bool, device=rings.device)
         return cls(frame, mask, rings, polarity, centers, normals, radii, frames, camera)
@@ -75,6 +78,11 @@ class Sight(Rows):
             return blurs.isotropic(start.expand(len(self)))
         median = torch.where(self.mask[..., None], self.blur, torch.nan).nanmedian(1).values
         return torch.where(median.isnan(), blurs.isotropic(start), median)
+
+    def displaced(self, by: Float[Tensor, "N M 4"]) -> Self:
+        """The same rows with their markers moved in the target's frame, mm, and all dark edges outwards, mm."""
+        grown = (self.polarity * by[..., 3])[..., None] * by.new_tensor([1.0, -1.0])
+        return replace(self, centers=self.centers + by[..., :3], radii=self.radii + grown)
 
     def reduced(self, factor: int) -> Sight:
         """The same rows in frames of which blocks of ``factor`` px make one; only those frames that they need."""
@@ -126,6 +134,8 @@ class Refined(Rows):
         noise: standard deviation of the residuals kept: grey levels (photometric), px (edges).
         kept: share of the pixels, or edge points, kept.
         good: where False the refinement failed and the other fields mean nothing.
+        doubt: something in the frame contradicts the model of the rings.
+        normals: what each marker tells, at the pose.
     """
 
     R: Float[Tensor, "N 3 3"]
@@ -135,6 +145,8 @@ class Refined(Rows):
     noise: Float[Tensor, " N"]
     kept: Float[Tensor, " N"]
     good: Bool[Tensor, " N"]
+    doubt: Bool[Tensor, " N"]
+    normals: MarkerNormals
 
     @property
     def blur(self) -> Float[Tensor, " N"]:

@@ -12,6 +12,7 @@ are padded blocks of pixels: one sequence of tensor operations for the whole bat
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple, cast
 
 import torch
@@ -20,7 +21,17 @@ from torch import Tensor
 from torchpose.detect.reduce import reduction_for
 from torchpose.geometry import blur as blurs
 from torchpose.geometry.blurred_edge import LEAST, MOST, Kind, Spread
-from torchpose.geometry.least_squares import Block, Minimum, Normal, Pose, PosePrior, Unknowns, Vector, minimise
+from torchpose.geometry.least_squares import (
+    Block,
+    Eliminated,
+    Minimum,
+    Normal,
+    Pose,
+    PosePrior,
+    Unknowns,
+    Vector,
+    minimise,
+)
 from torchpose.geometry.robust import of_chance
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import segment_mean, segment_sum
@@ -34,9 +45,17 @@ from torchpose.refine.photometric.grey_levels import (
     noise_spread,
     sum_products,
 )
-from torchpose.refine.photometric.light import LEVELS, POSE, normal_equations
+from torchpose.refine.photometric.light import LEVELS, POSE, normal_equations, of_markers
 from torchpose.refine.photometric.ring_model import gather_pixels, ring_model
-from torchpose.refine.photometric.sectors import Sectors, away_from_unclear, clear_sectors, doubtful, sum_sectors, trust
+from torchpose.refine.photometric.sectors import (
+    Sectors,
+    away_from_unclear,
+    clear_sectors,
+    doubtful,
+    overdispersion,
+    sum_sectors,
+    trust,
+)
 from torchpose.refine.sight import Refined, Sight, refined_by_blur
 
 _COARSE = 6  # the first steps take one pixel of so many; both are whole numbers of tiles
@@ -65,7 +84,9 @@ _QUICK = (_Stage(3, coarse=True), _Stage(1))
 _THOROUGH = (_Stage(3, coarse=True, wary=True), _Stage(2, wary=True), _Stage(2, wary=True, tempered=True))
 
 
-def refine_photometric(sight: Sight, rotation: Tensor, translation: Tensor, *, prior: Tensor | None = None) -> Refined:
+def refine_photometric(
+    sight: Sight, rotation: Tensor, translation: Tensor, *, prior: Tensor | None = None, thorough: bool = True
+) -> Refined:
     """Refines N poses on the grey values around the rings of their markers.
 
     Args:
@@ -74,21 +95,21 @@ def refine_photometric(sight: Sight, rotation: Tensor, translation: Tensor, *, p
         translation: (N, 3), the same.
         prior: (N, 6, 6), information about the pose besides the frames, that is the inverse covariance of the start:
             from the robot, or to hold what is known.
+        thorough: rows whose grey values contradict the model are refined once more, without what does not follow it.
     """
     factor = reduction_for(blurs.axes(sight.common_blur)[0].clamp_min(0).sqrt(), _WIDEST)
-    return refined_by_blur(_refined_in, sight, Pose(rotation, translation), prior, factor)
+    return refined_by_blur(partial(_refined_in, thorough=thorough), sight, Pose(rotation, translation), prior, factor)
 
 
 @dataclass(frozen=True, eq=False)
 class _Result(Rows):
-    """Refined rows, which of them are `doubtful`, and whether their residuals stand out at the edges."""
+    """Refined rows, and whether their residuals stand out at the edges."""
 
     refined: Refined
-    doubt: Tensor
     misshapen: Tensor
 
 
-def _refined_in(sight: Sight, start: Pose, known: PosePrior | None) -> Refined:
+def _refined_in(sight: Sight, start: Pose, known: PosePrior | None, thorough: bool) -> Refined:
     """Rows refined in the frames as they are: again with a band or a shape of the blur that suits it better."""
     spread = Spread(blurs.limited(sight.common_blur, LEAST**2, MOST**2))
     band = band_width(spread)
@@ -117,8 +138,8 @@ def _refined_in(sight: Sight, start: Pose, known: PosePrior | None) -> Refined:
         better &= other.refined.kept > result.refined.kept[index] - _FEWER
         result = result.replaced(index[better], other[better])
         kind = kind.index_fill(0, index[better], number)
-    for number, name in enumerate(_KINDS):
-        doubt = result.doubt & (kind == number)
+    for number, name in enumerate(_KINDS if thorough else ()):
+        doubt = result.refined.doubt & (kind == number)
         if bool(doubt.any()):
             result = result.replaced(*again(doubt, name, _THOROUGH))
     return result.refined
@@ -128,16 +149,20 @@ def _refined(fit: _Fit, start: Pose, spread: Spread, stages: tuple[_Stage, ...])
     """Rows refined in stages from poses and blurs."""
     found = _minimised(fit, start, spread, stages)
     pose, owner, rows = found.unknowns.pose, fit.blocks.row, len(spread)
+    wider = overdispersion(fit.sectors.scaled(fit.factor), fit.variance[owner], owner, rows)
     covariance, determined = found.covariance()
-    covariance = covariance[:, :6, :6]
+    covariance = wider[:, None, None] * covariance[:, :6, :6]
     kept, usable = (segment_sum((x > 0).sum(-1), owner, rows) for x in (fit.weight, fit.usable))
     good = determined & covariance.isfinite().all(-1).all(-1)
     spread = cast(Spread, found.unknowns.own["blur"])
-    refined = Refined(pose.R, pose.t, covariance, spread.covariance, fit.variance.sqrt(), kept / usable, good)
+    part = cast(Eliminated, found.normal.eliminated)
+    normals = of_markers(fit.sums, fit.variance, part, fit.mask, found.step.own).over(wider)
     seen, of_them = (segment_sum(b.valid.sum(-1).double(), owner, rows) for b in (fit.blocks, fit.coarse))
     more = (seen / of_them.clamp_min(1)).clamp_min(1)
     doubt = doubtful(fit.sectors, fit.clear, fit.variance[owner], owner, found.step.own_chi2, more)
-    return _Result(refined, doubt, fit.misshapen)
+    noise, kept = fit.variance.sqrt(), kept / usable
+    refined = Refined(pose.R, pose.t, covariance, spread.covariance, noise, kept, good, doubt, normals)
+    return _Result(refined, fit.misshapen)
 
 
 def _minimised(fit: _Fit, start: Pose, spread: Spread, stages: tuple[_Stage, ...]) -> Minimum:
@@ -160,11 +185,14 @@ class _Fit:
     ``most_coarse``: pixels of a marker in the coarse stages.
     """
 
+    sums: Tensor
     sectors: Sectors
     clear: Tensor
+    factor: Tensor
     misshapen: Tensor
 
     def __init__(self, sight: Sight, band: Tensor, prior: PosePrior | None, most_coarse: int | None = None) -> None:
+        self.mask = sight.mask
         self.blocks = gather_pixels(sight, band, TILE * _COARSE)
         self.coarse = self.blocks.every(_COARSE, most_coarse)
         self.prior = prior
@@ -179,16 +207,17 @@ class _Fit:
         spread = cast(Spread, unknowns.own["blur"])
         model = ring_model(part, pose.R, pose.t, spread, check=True)
         columns, slope = columns_of(part, model, levels)
-        residual = columns[:, :, -1].flatten(1)
+        residual = columns[:, :, -2].flatten(1)
         self.usable, self.weight = inliers(residual, part, model, levels)
         if not stage.coarse:
             self.misshapen = self._stands_out(residual, slope, levels)
             self.sectors = sum_sectors(residual, slope, self.usable, self.weight, part, model)
             factor = self._trusted(noise_spread(residual, part), model_misfit(levels))
-            self.weight = self.weight * self.sectors.of_pixels(factor.to(self.weight.dtype))
-        sums = sum_products(columns, self.weight)
+            self.factor = factor.to(self.weight.dtype)
+            self.weight = self.weight * self.sectors.of_pixels(self.factor)
+        self.sums = sum_products(columns, self.weight)
         prior = None if self.prior is None else self.prior.at(pose, POSE)
-        normal, self.variance = normal_equations(sums, self.weight.sum(-1), levels, part.row, self.least, prior)
+        normal, self.variance = normal_equations(self.sums, self.weight.sum(-1), levels, part.row, self.least, prior)
         return normal
 
     def _stands_out(self, residual: Tensor, slope: Tensor, levels: Tensor) -> Tensor:

@@ -59,7 +59,8 @@ def _pure_levels(blocks: PixelBlocks, fraction: Tensor) -> tuple[Tensor, Tensor]
 
 
 def columns_of(blocks: PixelBlocks, model: RingModel, levels: Tensor) -> tuple[Tensor, Tensor]:
-    """Derivatives by pose (6), blur (3) and levels (L), and the residual, by tiles: (K, P / 256, 10 + L, 256) float32.
+    """Derivatives by pose (6), blur (3) and levels (L), the residual, and the derivative by the edge gain, by tiles:
+    (K, P / 256, 11 + L, 256) float32.
 
     Also the derivative by the distance from the edges (K, P).
     """
@@ -74,7 +75,8 @@ def columns_of(blocks: PixelBlocks, model: RingModel, levels: Tensor) -> tuple[T
     residual = blocks.grey - (ring + contrast * model.fraction)
     basis = _basis(model, bool(curved))
     by_blur = (contrast * v for v in model.by_blur)
-    return _tiled((*(by_d * v for v in model.by_pose), *by_blur, *basis, residual)), by_d
+    by_pose = (by_d * v for v in model.by_pose)
+    return _tiled((*by_pose, *by_blur, *basis, residual, contrast * model.by_gain)), by_d
 
 
 def _basis(model: RingModel, curved: bool = False) -> tuple[Tensor, ...]:

@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from torchpose.geometry.blurred_edge import BLUR
-from torchpose.geometry.least_squares import Eliminated, Normal
+from torchpose.geometry.least_squares import Eliminated, Normal, solve_scaled
 from torchpose.geometry.segments import segment_mean, segment_sum
+from torchpose.pose import MarkerNormals
 
 POSE, LEVELS = 6 + BLUR, 6  # unknowns of a frame (translation, rotation, blur) and of a marker, at least
 _GRADIENTS = (1, 2, 4, 5)  # among the levels
@@ -34,8 +35,8 @@ def normal_equations(
     """Normal equations of N frames in units of the noise, with the prior about the levels, and the noise's variance.
 
     Args:
-        sums: (K, 10 + L, 10 + L), of every marker, weight times products of the derivatives by pose (9) and levels (L)
-            and the residual.
+        sums: (K, 11 + L, 11 + L), of every marker, weight times products of the derivatives by pose (9) and levels (L),
+            the residual, and the derivative by the edge gain.
         used: (K,) sum of weights.
         levels: (K, L) so far, L = 6, or 12 with the light's curvature.
         owner: (K,) int64, frame of every marker.
@@ -44,16 +45,16 @@ def normal_equations(
     """
     rows = len(least)
     count = torch.bincount(owner, minlength=rows)
-    chi2 = segment_sum(sums[:, -1, -1], owner, rows)
+    chi2 = segment_sum(sums[:, -2, -2], owner, rows)
     freedom = segment_sum(used, owner, rows) - POSE - levels.shape[1] * count
     variance = (chi2 / freedom.clamp_min(1)).maximum(least)
     sums = sums / variance[owner, None, None]
-    own, mixed, of_levels = sums[:, :POSE, :POSE], sums[:, :POSE, POSE:-1], sums[:, POSE:-1, POSE:-1]
+    own, mixed, of_levels = sums[:, :POSE, :POSE], sums[:, :POSE, POSE:-2], sums[:, POSE:-2, POSE:-2]
     ridge = (_RIDGE * of_levels.diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)).expand(levels.shape)
-    part = Eliminated(mixed, of_levels + torch.diag_embed(ridge), sums[:, POSE:-1, -1], owner)
+    part = Eliminated(mixed, of_levels + torch.diag_embed(ridge), sums[:, POSE:-2, -2], owner)
     own = segment_sum(own, owner, rows)
     own.diagonal(dim1=-2, dim2=-1)[:, POSE - BLUR :] += _BLUR_KNOWN
-    normal = Normal(own, segment_sum(sums[:, :POSE, -1], owner, rows), chi2 / variance, part)
+    normal = Normal(own, segment_sum(sums[:, :POSE, -2], owner, rows), chi2 / variance, part)
     normal = normal if prior is None else normal.with_prior(*prior)
     precision = _precision(normal, part, levels)
     held = replace(
@@ -62,6 +63,29 @@ def normal_equations(
         right=part.right - precision * levels,
     )
     return replace(normal, eliminated=held), variance
+
+
+def of_markers(sums: Tensor, variance: Tensor, levels: Eliminated, mask: Tensor, step: Tensor) -> MarkerNormals:
+    """What every marker tells of pose, blur and edge gain, its levels being unknown, after the last step.
+
+    Args:
+        sums: as for `normal_equations`.
+        variance: (N,) of the noise.
+        levels: part of the normal equations, with the prior.
+        mask: (N, M), markers seen.
+        step: (N, 9), of pose and blur, made since.
+    """
+    scaled = sums / variance[levels.owner, None, None]
+    chosen = [*range(POSE), sums.shape[-1] - 1]  # gain stands last
+    by_level = torch.cat([levels.mixed, scaled[:, -1:, POSE:-2]], 1)
+    taken = by_level @ solve_scaled(levels.information, torch.cat([by_level.mT, levels.right[..., None]], -1))
+    information = scaled[:, chosen][:, :, chosen] - taken[..., :-1]
+    right = scaled[:, chosen, -2] - taken[..., -1]
+    right = right - (information[..., :POSE] @ step[levels.owner, :, None])[..., 0]
+    held = torch.zeros(POSE + 1, dtype=right.dtype, device=right.device)
+    held[POSE - BLUR : POSE] = _BLUR_KNOWN
+    count = mask.sum(-1)[levels.owner].clamp_min(1)
+    return MarkerNormals.laid_out(information + torch.diag(held) / count[:, None, None], right, mask)
 
 
 def _precision(normal: Normal, part: Eliminated, levels: Tensor) -> Tensor:

@@ -47,6 +47,7 @@ class PixelBlocks(Rows):
         center: of the marker, target frame.
         normal: the same.
         radii: outer and inner.
+        polarity: as in `Sight`.
         limits: the grey levels at which the frame's noise is clipped, -inf and inf where it is not.
         quantisation: variance of rounding, grey levels^2.
     """
@@ -62,6 +63,7 @@ class PixelBlocks(Rows):
     center: Float[Tensor, "K 3"]
     normal: Float[Tensor, "K 3"]
     radii: Float[Tensor, "K 2"]
+    polarity: Float[Tensor, " K"]
     limits: Float[Tensor, "K 2"]
     quantisation: float = shared()
 
@@ -84,6 +86,7 @@ class RingModel(NamedTuple):
     """Prediction and derivatives at one pose; planes (K, P) in float32.
 
     fraction: of paper, F. by_d: dF/dd through both circles. by_blur: 3 planes. by_pose: 6 planes, derivative of d.
+    by_gain: dF/d(edge gain), 1/mm.
     x, y: plane coordinates over the outer radius. sound: bool, False where the expansions below do not hold: deep in
     a hole that is small for its blur, or where it is flat; None if not asked for.
     """
@@ -92,6 +95,7 @@ class RingModel(NamedTuple):
     by_d: Tensor
     by_blur: tuple[Tensor, ...]
     by_pose: tuple[Tensor, ...]
+    by_gain: Tensor
     x: Tensor
     y: Tensor
     sound: Tensor | None
@@ -147,6 +151,7 @@ def gather_pixels(sight: Sight, band: Tensor, grain: int) -> PixelBlocks:
         sight.centers[row, marker],
         sight.normals[row, marker],
         sight.radii[row, marker],
+        sight.polarity[row, marker],
         limits,
         sight.quantisation,
     )
@@ -268,4 +273,6 @@ def ring_model(blocks: PixelBlocks, R: Tensor, t: Tensor, spread: Spread, *, che
     by_blur = tuple(one - other for one, other in zip(outer.by_blur, inner.by_blur, strict=True))
     size = blocks.radii[:, :1].float()
     fraction, by_d = outer.fraction + 1 - inner.fraction, outer.by_distance - inner.by_distance
-    return RingModel(fraction, by_d, by_blur, rim.by_pose, foot.x / size, foot.y / size, sound)
+    # dark edges move outwards: those of a dark ring away from each other
+    by_gain = -blocks.polarity[:, None].float() * (outer.by_distance + inner.by_distance) * rim.per_mm
+    return RingModel(fraction, by_d, by_blur, rim.by_pose, by_gain, foot.x / size, foot.y / size, sound)
