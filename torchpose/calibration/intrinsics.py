@@ -268,7 +268,7 @@ def _check_residuals(views: Views, bundle: Bundle, before: int) -> None:
     if rms > _MOST_RESIDUAL * apart:
         raise ConfigError(
             f"INPUT: points that are {apart:.0f} px apart fit to {rms:.2g} px only, which no lens or print explains; "
-            "check that --target or --board is what the frames show, and that all frames are of one camera with one focus"
+            "check that --target or --board is what they show, and that all frames are of one camera with one focus"
         )
 
 
