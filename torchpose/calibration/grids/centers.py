@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -68,7 +69,9 @@ def mark_sight(frames: Tensor, marks: Marks, grid: Grid, camera: Camera) -> tupl
     radius = _radius(marks, grid, camera, R, t)
     known, view, point, start = _starts(marks, grid, camera, R, t)
     one = torch.ones_like(start[:, :1])
-    shape = torch.tensor([1.0, float(marks.ratio.nanmedian()) if grid.radii else _DISC]).to(start)
+    nominal = grid.radii[1] / grid.radii[0] if grid.radii else _DISC
+    measured = float(marks.ratio.nanmedian()) if grid.radii else _DISC
+    shape = torch.tensor([1.0, nominal if math.isnan(measured) else measured]).to(start)
     ellipse = _predicted(camera, R[view], start, radius)
     inner = torch.cat([ellipse[:, :2], ellipse[:, 2:4] * shape[1], ellipse[:, 4:]], -1) if grid.radii else ellipse
     sight = Sight(

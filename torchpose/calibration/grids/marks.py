@@ -20,10 +20,12 @@ from torchpose.detect import Candidates, find_candidates
 from torchpose.detect.reduce import reduction_factor
 from torchpose.geometry import blur as blurs
 from torchpose.geometry.rows import Rows, shared
+from torchpose.geometry.segments import marked, near_pairs
 from torchpose.pose import common_center, raw_centers
 from torchpose.rings import measure_rings
 
 _RATIO = 1.5  # of the radii, measured over nominal or the other way: dot gain and blur change it, another shape more
+_ROUGH = 0.1  # px, of the centres of small ellipses
 _START_BLUR = 0.8  # px, of discs, whose edges nothing has told yet
 
 
@@ -35,7 +37,7 @@ class Marks(Rows):
         view: index of the view.
         point: number on the board.
         ellipse: outer circle, raw px.
-        ratio: of the inner to the outer circle; 0 of a disc.
+        ratio: of the inner to the outer circle; 0 of a disc, NaN where it is not known.
         polarity: +1 dark on light, -1 light on dark.
         blur: px^2, see `geometry.blur`.
         center: px; of a ring the common centre of both circles, of a disc that of the ellipse.
@@ -146,4 +148,11 @@ def _rings(frames: Tensor, candidates: Candidates, grid: Grid, camera: Camera) -
     ratio = rings.ratio
     center, covariance = common_center(rings.outer, rings.inner, torch.stack([torch.ones_like(ratio), ratio], -1))
     center, covariance = raw_centers(camera, center, covariance)
-    return _Shapes(rings.frame, rings.outer_raw, ratio, rings.polarity, rings.blur, center, covariance)
+    found = _Shapes(rings.frame, rings.outer_raw, ratio, rings.polarity, rings.blur, center, covariance)
+    # what is refused as a ring, by its size first of all, is one if it has its place in the lattice
+    outer, reach = candidates.ellipse[:, :2], 0.5 * candidates.ellipse[:, 3]
+    near, ring = near_pairs(outer, found.ellipse[:, :2], reach, (candidates.frame, found.frame))
+    near = near[torch.linalg.vector_norm(outer[near] - found.ellipse[ring, :2], dim=-1) < reach[near]]
+    rest = _discs(candidates[~marked(near, len(candidates))])
+    rough = _ROUGH**2 * torch.eye(2).to(rest.covariance).expand_as(rest.covariance)
+    return _Shapes.cat([found, replace(rest, ratio=torch.full_like(rest.ratio, torch.nan), covariance=rough)])
