@@ -1,10 +1,10 @@
-"""Boards of discs and rings in rendered frames: marks found, errors of their centres, and whether covariances are right.
+"""Boards of discs and rings in rendered frames: marks found, errors of centres, and whether covariances are right.
 
     python scripts/board_statistics.py
 
-Views of 912 x 608 px, f = 751 px, distorted, tilted by 35 degrees in all directions, blur 0.7 px, noise 1, 8 bit. Columns:
-diameter of a mark in px, marks found of those there are, marks fitted to the grey values, RMS length of the errors of
-their centres (px), the same as claimed, mean chi-squared of a centre over its 2 degrees of freedom.
+Views of 912 x 608 px, f = 751 px, distorted, tilted by 35 degrees in all directions, blur 0.7 px, noise 1, 8 bit.
+Columns: diameter of a mark in px, marks found of those there are, marks fitted to the grey values, RMS length of errors
+of centres (px), the same as claimed, mean chi-squared of a centre over its 2 degrees of freedom.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ def line(text: str, outer: float, inner: float, views: int) -> str:
     claimed = found.covariance.diagonal(dim1=-2, dim2=-1).sum(-1).mean().sqrt()
     diameter = 2 * outer * float(CAMERA.matrix[0, 0]) / DISTANCE
     return (
-        f"| {grid.name} | {diameter:.1f} | {len(marks)} of {views * len(grid.points)} | {len(found.view)} | {rms:.4f} | "
-        f"{claimed:.4f} | {chi2:.2f} |"
+        f"| {grid.name} | {diameter:.1f} | {len(marks)} of {views * len(grid.points)} | {len(found.view)} | "
+        f"{rms:.4f} | {claimed:.4f} | {chi2:.2f} |"
     )
 
 

@@ -2,10 +2,11 @@
 
     python scripts/photograph_statistics.py FOLDER --board rings:10x7:20mm:7mm:3.5mm
 
-Prints the marks found, the tone that they tell, and chi-squared over freedom of the centres by the grey values, with the
-covariance that the frames give them and none added: for the board as it is named, flat and regular, and with the places
-of its marks freed in three dimensions. The second is 1 where centres err by no more than they claim; the first says how
-far the print is off. Places are freed by turns with camera and poses, until chi-squared falls by less than 1e-4 of itself.
+Prints the marks found, the tone that they tell, and chi-squared over freedom of the centres by the grey values, with
+the covariance that the frames give them and none added: for the board as it is named, flat and regular, and with the
+places of its marks freed in three dimensions. The second is 1 where centres err by no more than they claim; the first
+says how far the print is off. Places are freed by turns with camera and poses, until chi-squared falls by less than
+1e-4 of itself.
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ def test_camera_files_hold_it(tmp_path: Path, suffix: str, tone: Tone | None) ->
     camera.save(file)
     assert tp.Camera.load(file).tone == tone
     for format in ("ros", "kalibr"):
-        camera.save(file.with_suffix(".yaml"), format)  # type: ignore[arg-type]
+        camera.save(file.with_suffix(".yaml"), format)
         assert tp.Camera.load(file.with_suffix(".yaml")).tone == tone
 
 
