@@ -89,9 +89,8 @@ def main() -> None:
     chi2, shaped = freed(used, bundle.camera, bundle.R, bundle.t, len(grid.points))
     bundle = adjust(shaped, bundle.camera, bundle.R, bundle.t)
     good = bundle.chi2 < OUTLIER
-    print(
-        f"places freed: chi-squared over freedom {chi2 / (degrees - 3 * places + GAUGE):.2f}, {int((~good).sum())} beyond 1e-6"
-    )
+    reduced = chi2 / (degrees - 3 * places + GAUGE)
+    print(f"places freed: chi-squared over freedom {reduced:.2f}, {int((~good).sum())} centres beyond chance (1e-6)")
 
 
 def sigma(views: Views) -> Tensor:

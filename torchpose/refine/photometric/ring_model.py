@@ -30,7 +30,6 @@ from torchpose.refine.sight import Sight
 # blur's variance over the squared radius of curvature: nearer to its centre edges are on all sides (measured: with 0.16
 # a third of the pixels of a covered ring under 2.5 px of blur is lost, tests/refine/test_sectors.py)
 _CURVED = 0.2
-_FEW = 256  # pixels of a marker 16 px wide, of which a sixth would not tell its 15 unknowns; a tile, so that all fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,12 +72,15 @@ class PixelBlocks(Rows):
     limits: Float[Tensor, "K 2"]
     quantisation: float = shared()
 
-    def every(self, nth: int, most: int | None = None) -> PixelBlocks:
-        """The same with one pixel of ``nth``, or as many fewer as leave ``most`` of each marker; of small ones all."""
+    def every(self, nth: int, most: int | None = None, whole: int = 0) -> PixelBlocks:
+        """The same with one pixel of ``nth``, or as many fewer as leave ``most`` of each marker; all of up to ``whole``.
+
+        Of a marker 6 px wide a sixth of its pixels would not tell its 15 unknowns.
+        """
         count = self.grey.shape[1] // nth
         count = count if most is None else min(count, most)
         i = torch.arange(count, device=self.row.device)
-        stretched = torch.where(self.size <= min(_FEW, count), count, self.size.clamp_min(nth * count))
+        stretched = torch.where(self.size <= min(whole, count), count, self.size.clamp_min(nth * count))
         index = i * stretched[:, None] // count
         inside = index < self.size[:, None]
         index = index.minimum((self.size[:, None] - 1).clamp_min(0))
