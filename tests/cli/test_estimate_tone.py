@@ -22,8 +22,8 @@ CAMERA = tp.Camera(912, 608, [[751.0, 0, 453], [0, 750, 306], [0, 0, 1]], [])
 def ratios(folder: Path, *options: str) -> list[float]:
     """Measured ratios of the radii, in the order of the table."""
     out, markers = folder / "poses.csv", folder / "markers.csv"
+    given = ["--camera", str(folder / "camera.yaml"), "--target", "hexa50", "--out", str(out)]
     with pytest.raises(SystemExit) as end:
-        given = ["--camera", str(folder / "camera.yaml"), "--target", "hexa50", "--out", str(out)]
         main(["estimate", str(folder / "frames"), *given, "--detections", str(markers), "--quiet", *options])
     assert end.value.code == 0
     with markers.open() as file:

@@ -73,7 +73,7 @@ class PixelBlocks(Rows):
     quantisation: float = shared()
 
     def every(self, nth: int, most: int | None = None, whole: int = 0) -> PixelBlocks:
-        """The same with one pixel of ``nth``, or as many fewer as leave ``most`` of each marker; all of up to ``whole``.
+        """The same with one pixel of ``nth``, or as many fewer as leave ``most`` of a marker; all of up to ``whole``.
 
         Of a marker 6 px wide a sixth of its pixels would not tell its 15 unknowns.
         """
