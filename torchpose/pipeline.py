@@ -39,7 +39,7 @@ from torchpose.pose import (
 )
 from torchpose.refine import METHODS, Recipe, Sight
 from torchpose.results import Poses, Reason, Status
-from torchpose.rings import Circles, Rings, find_circles, measure_circles, rough_rings
+from torchpose.rings import Circles, Rings, find_circles, measure_circles, measure_exactly, rough_rings
 from torchpose.target import Target
 
 _LEAST_CANDIDATE = (
@@ -221,12 +221,21 @@ class PoseEstimator(nn.Module):
 
         Also how many copies (B T,) were seen.
         """
-        circles, precise = self._circles(scene, candidates), not self._recipe.on_rims
+        # frames with fewer circles than markers are searched at all scales anyway
+        circles = _of_full_frames(self._circles(scene, candidates), int(scene.table.valid.sum()))
+        precise = not self._recipe.on_rims
         # the code of a much blurred ring is not to be read off its profile
         blurred = blurs.axes(circles.inside.blur)[1] > _LEGIBLE**2
         sharp, known = circles[~blurred], self._rings(scene, circles[blurred], precise=precise)
         rough = Rings.cat([rough_rings(sharp, scene.camera), known])
         likely = identify(rough, scene.table, scene.camera, len(scene.frames), instances=1)
+        lacking = _lacking(scene, likely)[known.frame]
+        if not precise and bool(lacking.any()):
+            # of a blurred ring the quicker model reads most codes; the dearer one reads those that are missing
+            again = measure_exactly(scene.frames, known[lacking], scene.camera)
+            known = Rings.cat([known[~lacking], again])
+            rough = Rings.cat([rough[torch.arange(len(sharp), device=again.frame.device)], known])
+            likely = identify(rough, scene.table, scene.camera, len(scene.frames), instances=1)
         named = marked(likely.ring[likely.ring >= 0], len(rough))
         others = self._rings(scene, sharp[named[: len(sharp)]], precise=precise)
         return Rings.cat([others, known[named[len(sharp) :]]]), likely.copies
@@ -270,6 +279,18 @@ class PoseEstimator(nn.Module):
         for step in self._recipe.steps:
             solutions = step(solutions, evidence, sight)
         return solutions
+
+
+def _of_full_frames(circles: Circles, least: int) -> Circles:
+    """Those of frames that have at least so many."""
+    frame = circles.outer.frame
+    return circles[(torch.bincount(frame) >= least)[frame]]
+
+
+def _lacking(scene: Scene, identified: Identified) -> Tensor:
+    """Frames (B,) bool in which a target has a row that lacks a marker."""
+    lacks = (scene.table.valid[identified.group % len(scene.table)] & (identified.ring < 0)).any(1)
+    return marked(identified.group[lacks] // len(scene.table), len(scene.frames))
 
 
 def _settled(scene: Scene, found: Found) -> Tensor:

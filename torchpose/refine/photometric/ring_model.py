@@ -287,11 +287,10 @@ def ring_model(blocks: PixelBlocks, R: Tensor, t: Tensor, spread: Spread, *, che
         most = blurs.axes(blur)[1][:, None]
         near = (rim.bend.square() * most < _CURVED) & ((rim.second * straight).abs() < HOLDS)
         sound = near | (d_inner.square() > CUT**2 * blurs.across(blur[:, None], *rim.normal))
-    edge = spread.at(blocks.row, *rim.normal)
-    outer, inner = edge(d_outer, rim.bend), edge(d_inner, rim.bend)
-    by_blur = tuple(one - other for one, other in zip(outer.by_blur, inner.by_blur, strict=True))
+    both = spread.at(blocks.row, *rim.normal)(torch.stack([d_outer, d_inner]), rim.bend)
+    by_blur = tuple(one - other for one, other in both.by_blur)
     size = blocks.radii[:, :1].float()
-    fraction, by_d = outer.fraction + 1 - inner.fraction, outer.by_distance - inner.by_distance
+    fraction, by_d = both.fraction[0] + 1 - both.fraction[1], both.by_distance[0] - both.by_distance[1]
     # dark edges move outwards: those of a dark ring away from each other
-    by_gain = -blocks.polarity[:, None].float() * (outer.by_distance + inner.by_distance) * rim.per_mm
+    by_gain = -blocks.polarity[:, None].float() * both.by_distance.sum(0) * rim.per_mm
     return RingModel(fraction, by_d, by_blur, rim.by_pose, by_gain, foot.x / size, foot.y / size, sound)
