@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor, nn
 
-from torchpose.camera import Camera
+from torchpose.camera import LINEAR, Camera, Tone
 from torchpose.camera.model import Model
 from torchpose.detect import Candidates, Wanted, find_candidates, find_coarse
 from torchpose.errors import ConfigError, FrameError
@@ -62,8 +62,9 @@ class PoseEstimator(nn.Module):
             "centers" stops at the pose of the centres of their ellipses; "paper" is the paper's chain: Zernike edges as
             read, centres by eq. (7), PnP.
         float_range: grey value of white in floating-point frames: 1.0 or 255.0.
-        srgb: the grey values are sRGB-encoded and are taken back to linear ones first. Edges are half-way in linear
-            grey, so encoded frames that are taken as linear ones shift them (docs/precision.md).
+        srgb: the grey values are sRGB-encoded, whatever the camera says of its tone. Frames that are not linear are
+            taken back to linear ones first: edges are half-way in linear grey, so encoded frames that are taken as
+            linear ones shift them (docs/precision.md).
         compile: solve small problems in compiled loops (`torchpose.kernels`), on the CPU; the first call takes seconds.
 
     Raises:
@@ -97,7 +98,7 @@ class PoseEstimator(nn.Module):
         self.instances = instances
         self.method = method
         self.float_range = float_range
-        self.srgb = srgb
+        self.tone = Tone("srgb") if srgb else camera.tone or LINEAR
         self.solves_compiled = compile
         if compile:
             find_compiler()
@@ -182,8 +183,8 @@ class PoseEstimator(nn.Module):
         if tuple(frames.shape[1:]) != size:
             got, need = f"{frames.shape[2]} x {frames.shape[1]}", f"{size[1]} x {size[0]}"
             raise FrameError(f"frames: size {got}, but the camera has {need}; use the camera file of these frames")
-        if self.srgb:
-            frames = _linear(frames, self.float_range)
+        if self.tone != LINEAR:
+            frames = self.tone.linear(frames, self.float_range)
         elif frames.is_floating_point():
             # the detector's least contrast counts in 1/255 of white
             frames = frames.float() * (255.0 / self.float_range)
@@ -348,11 +349,3 @@ def _tensors(owner: Camera | MarkerTable) -> dict[str, Tensor]:
     """The tensors of a dataclass by name."""
     values = {f.name: getattr(owner, f.name) for f in fields(owner)}
     return {name: value for name, value in values.items() if isinstance(value, Tensor)}
-
-
-def _linear(frames: Tensor, white: float) -> Tensor:
-    """sRGB-encoded frames as linear grey, float32 with white at 255 (IEC 61966-2-1)."""
-    if not frames.is_floating_point():
-        white = float(torch.iinfo(frames.dtype).max)
-    x = (frames.float() / white).nan_to_num(nan=0.0)
-    return 255.0 * torch.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055).clamp_min(0).pow(2.4))

@@ -17,6 +17,7 @@ import torch
 from torch.nn.functional import pad
 
 from torchpose.camera.model import Camera, Model
+from torchpose.camera.tone import Tone
 from torchpose.config import format_list, format_number, parse_mapping, read_text, suggest, within, write_text
 from torchpose.errors import ConfigError
 
@@ -94,7 +95,7 @@ def save(camera: Camera, path: str | os.PathLike[str], format: str | None = None
         camera: what to write.
         path: where to.
         format: opencv (also readable by cv2.FileStorage), json, ros (camera_info), kalibr (camchain of one camera) or
-            colmap (cameras.txt with CAMERA_ID 1; it has no place for the covariance, which is left out).
+            colmap (cameras.txt with CAMERA_ID 1; it has no place for covariance and tone, which are left out).
             None: .yaml and .yml are opencv, .json is json, .txt is colmap.
 
     Raises:
@@ -142,6 +143,7 @@ def _native(data: Mapping[str, Any]) -> Camera:
         _numbers(get("distortion_coefficients"), "distortion_coefficients").flatten(),
         _model(data.get("distortion_model", default)),
         _covariance(data),
+        tone=_tone(data),
     )
 
 
@@ -173,6 +175,7 @@ def _kalibr(key: str, entry: Any) -> Camera:
             _numbers(entry["distortion_coeffs"], "distortion_coefficients").flatten(),
             _model(entry["distortion_model"]),
             _covariance(entry),
+            tone=_tone(entry),
         )
 
 
@@ -226,6 +229,10 @@ def _covariance(data: Mapping[str, Any]) -> torch.Tensor | None:
     return None if data.get(field) is None else _numbers(data[field], field)
 
 
+def _tone(data: Mapping[str, Any]) -> Tone | None:
+    return None if data.get("tone") is None else Tone.parse(data["tone"])
+
+
 def _numbers(value: Any, field: str) -> torch.Tensor:
     """Float64 tensor of nested lists or of a mapping with rows, cols and data."""
     shape = None
@@ -267,7 +274,8 @@ def _yaml(entries: Mapping[str, Any], tag: str = "") -> str:
             rows, cols = value.shape if value.ndim == 2 else ((1, len(value)) if len(value) else (0, 0))
             text += f"{name}:{tag}\n   rows: {rows}\n   cols: {cols}{kind}\n   data: {_row(value)}\n"
         elif value is not None:
-            text += f"{name}: {value}\n"
+            # a colon within a word would start a mapping
+            text += f'{name}: "{value}"\n' if ":" in str(value) else f"{name}: {value}\n"
     return text
 
 
@@ -279,6 +287,7 @@ def _entries(camera: Camera) -> dict[str, Any]:
         "distortion_model": camera.model,
         "distortion_coefficients": camera.distortion,
         "camera_matrix_covariance": camera.covariance,
+        "tone": None if camera.tone is None else str(camera.tone),
     }
 
 
@@ -298,7 +307,8 @@ def _json_text(camera: Camera) -> str:
 
 def _ros_text(camera: Camera) -> str:
     entries, model = _entries(camera), "equidistant"
-    coefficients, covariance = camera.distortion, entries.pop("camera_matrix_covariance")
+    coefficients = camera.distortion
+    covariance, tone = entries.pop("camera_matrix_covariance"), entries.pop("tone")
     if camera.model == "brown_conrady":  # plumb_bob has five coefficients, rational_polynomial eight
         model = "rational_polynomial" if len(coefficients) == 8 else "plumb_bob"
         coefficients = pad(coefficients, (0, (8 if len(coefficients) == 8 else 5) - len(coefficients)))
@@ -309,6 +319,7 @@ def _ros_text(camera: Camera) -> str:
         "rectification_matrix": torch.eye(3),
         "projection_matrix": pad(camera.matrix, (0, 1)),
         "camera_matrix_covariance": covariance,
+        "tone": tone,
     }
     return _yaml(entries)
 
@@ -332,6 +343,8 @@ def _kalibr_text(camera: Camera) -> str:
     )
     if camera.covariance is not None:
         text += "  camera_matrix_covariance:\n" + "".join(f"    - {_row(row)}\n" for row in camera.covariance)
+    if camera.tone is not None:
+        text += f'  tone: "{camera.tone}"\n'
     return text
 
 

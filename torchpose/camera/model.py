@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchpose.camera.tone import Tone
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -51,6 +52,7 @@ class Camera:
             thin-prism and tilted models are accepted where those beyond the eighth are zero.
         model: which of the two.
         covariance: (4, 4) float64 of fx, fy, cx, cy in px^2, or None.
+        tone: how stored grey values follow light; None where nothing is said, which counts as linear.
 
     Arguments may be anything that `torch.as_tensor` accepts. All methods take any leading dimensions (...), work in the
     dtype and on the device of their points, and are differentiable in the points, ``matrix`` and ``distortion``.
@@ -65,6 +67,7 @@ class Camera:
     distortion: Tensor
     model: Model = "brown_conrady"
     covariance: Tensor | None = None
+    tone: Tone | None = None
 
     if TYPE_CHECKING:  # of tensors the fields are made by __post_init__
 
@@ -76,6 +79,7 @@ class Camera:
             distortion: Tensor | np.ndarray | Sequence[float],
             model: Model = "brown_conrady",
             covariance: Tensor | np.ndarray | Sequence[Sequence[float]] | None = None,
+            tone: Tone | None = None,
         ) -> None: ...
 
     @classmethod

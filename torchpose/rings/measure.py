@@ -250,7 +250,8 @@ def _by_edges(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
     reach = torch.cat([gap, gap]).clamp(1.0, REACH)
     outward = torch.cat([candidates.polarity, -candidates.polarity])
     edges = ring_edges(frames, frame, rough, outward, reach)
-    sector = sector_about(*edges.points.unbind(-1), rough, edges.ring)
+    u, v = edges.points.unbind(-1)
+    sector = sector_about(u, v, rough, edges.ring)
     shown = clear.repeat(2, 1)[edges.ring, sector]
     edges, sector = edges[shown], sector[shown]
 

@@ -60,7 +60,7 @@ _BLURRED_MARGIN = 2.5  # blurs around the outer ellipse
 _LEAST_EXPLAINED = 0.75
 _PART = 400_000  # pixels times nodes at a time
 _FEW = (
-    10_000  # pixels: the calls of a part cost as much, so that fewer are padded to one size (measured: docs/tried.md)
+    10_000  # pixels: the calls of a part cost as much, so fewer are padded to one size (measured: docs/tried.md)
 )
 _UNEVEN = 2.0  # most pixels of a window over the least, of those that are padded to one size
 _RATIO_SIGMA = 0.1  # of the ratio: an inner circle that is not sure is none (convention)

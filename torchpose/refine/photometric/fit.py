@@ -204,7 +204,7 @@ class _Fit:
     def __init__(self, sight: Sight, band: Tensor, prior: PosePrior | None, most_coarse: int | None = None) -> None:
         self.mask = sight.mask
         self.blocks = gather_pixels(sight, band, TILE * _COARSE)
-        self.coarse = self.blocks.every(_COARSE, most_coarse)
+        self.coarse = self.blocks.every(_COARSE, most_coarse, whole=TILE)
         self.prior = prior
         self.stage = _QUICK[0]
         self.variance = torch.ones_like(band)
