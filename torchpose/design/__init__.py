@@ -9,16 +9,19 @@ from torchpose.design.predict import (
     predicted_covariance,
     sharp_range,
 )
+from torchpose.design.printing import PRINTS, PrintClass, measured, print_of
 from torchpose.design.search import Design, design_target
 from torchpose.design.sheet import Sheet, make_sheet, plate_around
 from torchpose.design.volume import WorkingVolume
 
 __all__ = [
+    "PRINTS",
     "Design",
     "Imaging",
     "Need",
     "Precision",
     "PrecisionMap",
+    "PrintClass",
     "Sheet",
     "WorkingVolume",
     "best_focus",
@@ -26,9 +29,11 @@ __all__ = [
     "deviations",
     "edge_covariance",
     "make_sheet",
+    "measured",
     "plate_around",
     "precision_map",
     "predict_volume",
     "predicted_covariance",
+    "print_of",
     "sharp_range",
 ]
