@@ -9,12 +9,13 @@ from torchpose.design.predict import (
     predicted_covariance,
     sharp_range,
 )
-from torchpose.design.printing import PRINTS, PrintClass, measured, print_of
+from torchpose.design.printing import MEASURING_VIEWS, PRINTS, PrintClass, measured, print_of, scale_deviation
 from torchpose.design.search import Design, design_target
 from torchpose.design.sheet import Sheet, make_sheet, plate_around
 from torchpose.design.volume import WorkingVolume
 
 __all__ = [
+    "MEASURING_VIEWS",
     "PRINTS",
     "Design",
     "Imaging",
@@ -35,5 +36,6 @@ __all__ = [
     "predict_volume",
     "predicted_covariance",
     "print_of",
+    "scale_deviation",
     "sharp_range",
 ]

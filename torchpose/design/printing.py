@@ -59,11 +59,6 @@ class PrintClass:
         covariance = torch.diag(torch.cat([each, each.new_tensor([self.gain])]).square())
         return replace(target, covariance=covariance)
 
-    def scale(self, target: Target) -> float:
-        """Relative standard deviation of the scale in which the places fit those of the file best."""
-        arm = target.centers - target.centers.mean(0)
-        return self.places / float(arm.square().sum().sqrt())
-
 
 # places: the issue of office laser printers off by 50 to 100 um, photo plotters by 10, chrome on glass by 1, as
 # photogrammetry has them; gain: of office prints 60 um are ordinary, the other two stand for one or two steps of the
@@ -97,7 +92,7 @@ def measured(camera: Camera, target: Target, volume: WorkingVolume, imaging: Ima
 
     `MEASURING_VIEWS` views from the middle of the volume, tilted in all directions, tell of them what is left when each
     view has a pose of its own; what no view tells stays as the file states it. The frame is the one that fits the
-    places of the file best, so shift, turn and scale have no part: a millimetre is that of the file (`PrintClass.scale`).
+    places of the file best, so shift, turn and scale have no part: a millimetre is that of the file (`scale_deviation`).
     The camera is taken as known.
     """
     assert target.covariance is not None
@@ -114,6 +109,13 @@ def measured(camera: Camera, target: Target, volume: WorkingVolume, imaging: Ima
     covariance = factor @ left[0] @ factor.mT
     inner = _inner(target.centers)
     return replace(target, covariance=inner @ covariance @ inner)
+
+
+def scale_deviation(target: Target) -> float:
+    """Relative standard deviation of the scale in which the places of a print fit those of its file best."""
+    assert target.covariance is not None
+    arm = (target.centers - target.centers.mean(0)).flatten()
+    return float((arm @ target.covariance[:-1, :-1] @ arm).sqrt() / arm.square().sum())
 
 
 def _inner(places: Float[Tensor, "M 3"]) -> Float[Tensor, "D D"]:
