@@ -41,7 +41,9 @@ def poses(count: int) -> tuple[torch.Tensor, torch.Tensor]:
     return VOLUME.random(count, torch.Generator().manual_seed(3))
 
 
-def stated_by_estimate(cam: tp.Camera, target: tp.Target, R: torch.Tensor, t: torch.Tensor, noise: float) -> torch.Tensor:
+def stated_by_estimate(
+    cam: tp.Camera, target: tp.Target, R: torch.Tensor, t: torch.Tensor, noise: float
+) -> torch.Tensor:
     """Median of what the estimator states for each pose in five frames."""
     levels = render(cam, target, R, t, psf_sigma=0.7)
     every = [tp.PoseEstimator(cam, target)(add_noise(levels, noise, seed=seed)) for seed in range(5)]

@@ -44,7 +44,7 @@ def test_classes_by_name_and_by_numbers(tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match="is none of glass, plotter, laser, nor PLACES,GAIN"):
             print_of(text)
     for text in ("-1,2", "nan,1", "1,inf", "1,1,-1"):
-        with pytest.raises(ConfigError, match="print: .*give standard deviations from 0"):
+        with pytest.raises(ConfigError, match=r"print: .*give standard deviations from 0"):
             print_of(text)
     for made, line in (("20,15", "center_sigma: 0.02\n"), ("20,15,40", "center_sigma: [0.02, 0.02, 0.04]\n")):
         stated = print_of(made).stated_by(tp.Target.load("quad40"))
@@ -131,10 +131,10 @@ def test_a_coarse_print_is_designed_to_be_measured() -> None:
 
 
 def test_out_of_reach_even_when_measured_is_said() -> None:
-    with pytest.raises(ConfigError, match=r"print of places off by 10 um, edges by 15 um, not even once it is measured"):
-        design_target(
-            camera(), VOLUME, (50.0, 50.0), Need(0.02, 9.0), IMAGING, printing=PRINTS["plotter"], markers=4
-        )
+    with pytest.raises(
+        ConfigError, match=r"print of places off by 10 um, edges by 15 um, not even once it is measured"
+    ):
+        design_target(camera(), VOLUME, (50.0, 50.0), Need(0.02, 9.0), IMAGING, printing=PRINTS["plotter"], markers=4)
 
 
 @pytest.mark.slow

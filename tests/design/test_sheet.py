@@ -74,7 +74,9 @@ def test_the_sheet_says_what_the_print_has_to_hold() -> None:
         assert len(words) == 1
         page = make_sheet(target, (75.0, 52.0)).page
         assert words[0].y < page.height - 1
-        width = cv2.getTextSize(words[0].text, cv2.FONT_HERSHEY_SIMPLEX, 1.0, 1)[0][0] / 30 * words[0].size  # wider letters
+        width = (
+            cv2.getTextSize(words[0].text, cv2.FONT_HERSHEY_SIMPLEX, 1.0, 1)[0][0] / 30 * words[0].size
+        )  # wider letters
         assert words[0].x + width < page.width - 28
         return words[0].text
 

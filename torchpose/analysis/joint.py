@@ -11,8 +11,8 @@ from torchpose.geometry.least_squares import covariance_factor, scaled_inverse
 from torchpose.target import Target
 
 POSE = 6
-# px of an edge averaged over 1 px: noise-free frames are rounded at least, and edges known exactly would leave the print
-# without any prior (convention, a hundredth of `sensitivity.edge_noise` at ordinary noise)
+# px of an edge averaged over 1 px: noise-free frames are rounded at least, and edges known exactly would leave the
+# print without any prior (convention, a hundredth of `sensitivity.edge_noise` at ordinary noise)
 _LEAST_NOISE = 1e-4
 
 
@@ -34,7 +34,9 @@ def marker_columns(target: Target, R: Float[Tensor, "B 3 3"]) -> Float[Tensor, "
     numbers = print_numbers(target)
     own = torch.eye(POSE + 1, dtype=R.dtype, device=R.device)[:, :POSE].expand(len(R), len(target), -1, -1)
     aside = R[:, None] @ numbers[:, :3]
-    return torch.cat([own, torch.cat([aside, torch.zeros_like(aside), numbers[:, 3:].expand_as(aside[:, :, :1])], 2)], -1)
+    return torch.cat(
+        [own, torch.cat([aside, torch.zeros_like(aside), numbers[:, 3:].expand_as(aside[:, :, :1])], 2)], -1
+    )
 
 
 def joint_inverse(

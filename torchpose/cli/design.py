@@ -70,12 +70,7 @@ def design(
     from torchpose.target import Target
 
     sides = None if plate is None else _sides(plate)
-    if target is None:
-        for option, value in (("--plate", plate), ("--accuracy-um", accuracy_um)):
-            if value is None:
-                raise ConfigError(f"{option}: is missing; a design needs it (--target draws an existing target alone)")
-    elif name is not None or markers is not None or print_gain is not None:
-        raise ConfigError("--target: is there already; leave --name, --markers and --print-gain out")
+    _check({"--plate": plate, "--accuracy-um": accuracy_um}, target, (name, markers, print_gain))
     existing = None if target is None else Target.load(target)
     scene = None
     if existing is None or camera is not None or distance is not None or distance_range is not None:
@@ -84,24 +79,34 @@ def design(
     made = None if printing is None else print_of(printing)
     need = None if accuracy_um is None else Need(*accuracy_um, *(() if accuracy_deg is None else (accuracy_deg,)))
     make_folder(out, "--out")
-    promise, written = None, []
+    promise: _Promise | None
+    written: list[Path] = []
     if existing is None:
-        assert scene is not None
-        assert need is not None
-        assert sides is not None
+        assert scene
+        assert need
+        assert sides
         gain = None if print_gain is None else print_gain / 1e3
         choice = {"name": name, "background": background, "markers": markers, "printing": made, "print_gain": gain}
         chosen, promise, written = _new_target(scene, sides, need, out, choice)
     else:
         chosen = existing if made is None else made.stated_by(existing)
-        if scene is not None:
-            promise = _Promise.of(scene, chosen)
+        promise = None if scene is None else _Promise.of(scene, chosen)
     written += make_sheet(chosen, sides or plate_around(chosen)).save(out, chosen.name)
     if scene is not None and promise is not None:
         written += _tell_precision(chosen, scene, promise, need, out)
     for path in written:
         typer.echo(str(path))
     return 0
+
+
+def _check(needed: dict[str, object], target: str | None, chosen: tuple[object, ...]) -> None:
+    """Refuses a design without what it needs, and choices about a target that is there already."""
+    if target is None:
+        for option, value in needed.items():
+            if value is None:
+                raise ConfigError(f"{option}: is missing; a design needs it (--target draws an existing target alone)")
+    elif any(value is not None for value in chosen):
+        raise ConfigError("--target: is there already; leave --name, --markers and --print-gain out")
 
 
 @dataclass(frozen=True)
@@ -222,8 +227,8 @@ def _print_told(target: Target, promise: _Promise, need: Need | None) -> str:
         enough = float(need.excess(promise.printed.worst)) <= 1
         verdict = "good enough as it comes" if enough else "too coarse as it comes, good enough once it is measured"
     return (
-        f"print: {verdict}; worst measured: after torchpose calibrate --measure-target with {MEASURING_VIEWS} views, in "
-        f"the scale of the print, which --distance tells: without it {100 * scale_deviation(target):.2g} % of any length"
+        f"print: {verdict}; worst measured: after torchpose calibrate --measure-target with {MEASURING_VIEWS} views, "
+        f"in the scale of the print: {100 * scale_deviation(target):.2g} % of any length, unless --distance tells it"
     )
 
 

@@ -23,8 +23,11 @@ _Sigmas = Annotated[
     typer.Option(help="Standard deviation of a marker centre on each axis; may be repeated. By default 0.2 and 1."),
 ]
 _Distances = Annotated[tuple[float, float], typer.Option(metavar="NEAR FAR", help="Working distances, mm.")]
-_NOISE = "Standard deviation of the noise, grey levels of 255: adds the budget of the rings' edges, as estimate claims it."
+_NOISE = (
+    "Standard deviation of the noise, grey levels of 255: adds the budget of the rings' edges, as estimate claims it."
+)
 _LEVELS = "Grey levels of print and paper, with --noise."
+_FOCAL = "Error of the focal length; by default 0.25, or 0 where the camera file states a covariance."
 _DISTORTION = "Standard deviations of the camera's coefficients: 1e-3,1e-3,1e-5,1e-5."
 
 
@@ -36,7 +39,7 @@ def sensitivity(
     steps: Annotated[int, typer.Option(min=3, max=1000, help="Number of distances.")] = 11,
     tilt_deg: Annotated[float, typer.Option(help="Tilt of the target about the x axis.")] = 0.0,
     sigma_px: _Sigmas = None,
-    focal_error_percent: Annotated[float, typer.Option(help="Error of the focal length.")] = 0.25,
+    focal_error_percent: Annotated[float | None, typer.Option(help=_FOCAL)] = None,
     principal_point_px: Annotated[float, typer.Option(help="Standard deviation of cx and cy.")] = 0.0,
     distortion: Annotated[str, typer.Option(metavar="LIST", help=_DISTORTION)] = "",
     print_um: Annotated[float, typer.Option(help="Standard deviation of a printed centre, on each axis.")] = 0.0,
@@ -54,34 +57,25 @@ def sensitivity(
     What target file and camera file state of themselves is counted: center_sigma, edge_gain_sigma, centers_covariance,
     and the covariance of the camera's parameters.
     """
-    sizes = {
-        "--principal-point-px": principal_point_px,
-        "--print-um": print_um,
-        "--flatness-um": flatness_um,
-        "--radius-um": radius_um,
-        "--scale-percent": scale_percent,
-        "--focal-error-percent": focal_error_percent,
-    }
+    lens = _lens(camera)
+    if focal_error_percent is None:
+        focal_error_percent = 0.25 if lens.covariance is None else 0.0
+    options = ("focal-error-percent", "principal-point-px", "print-um", "flatness-um", "radius-um", "scale-percent")
+    values = (focal_error_percent, principal_point_px, print_um, flatness_um, radius_um, scale_percent)
+    sizes = {f"--{option}": value for option, value in zip(options, values, strict=True)}
     sigmas = list(dict.fromkeys(sigma_px or [0.2, 1.0]))
     _check(sizes, sigmas, distance, tilt_deg)
     import torch
 
-    from torchpose.analysis.sensitivity import Uncertainty, edge_noise
+    from torchpose.analysis.sensitivity import Uncertainty
     from torchpose.analysis.sweep import sweep, sweep_rings
-    from torchpose.camera import Camera
-    from torchpose.studies.fig04_sensitivity import cases_of, paper_camera, tabulate
+    from torchpose.studies.fig04_sensitivity import cases_of, tabulate
     from torchpose.target import Target
 
-    lens, printed = Camera.load(camera) if camera else paper_camera(), Target.load(target)
-    size = Uncertainty(
-        focal_length=focal_error_percent / 100,
-        principal_point=principal_point_px,
-        distortion=_coefficients(distortion, len(lens.distortion)),
-        print_centers=print_um / 1000,
-        print_flatness=flatness_um / 1000,
-        print_radii=radius_um / 1000,
-        print_scale=scale_percent / 100,
-    )
+    printed = Target.load(target)
+    bent = _coefficients(distortion, len(lens.distortion))
+    of_print = (print_um / 1000, flatness_um / 1000, radius_um / 1000, scale_percent / 100)
+    size = Uncertainty(0.0, focal_error_percent / 100, principal_point_px, bent, *of_print)
     at, tilt = torch.linspace(*distance, steps, dtype=torch.float64), math.radians(tilt_deg)
     cases = {
         title: sweep(lens, printed, at, case, tilt=tilt, draws=draws, seed=seed)
@@ -90,15 +84,20 @@ def sensitivity(
     _check_view(cases)
     rings: dict[str, Swept] = {}
     if noise is not None:
-        edges = replace(size, image=edge_noise(_with_rounding(noise), _contrast(levels), _positive("--blur", blur)))
+        edges = replace(size, image=_of_edges(noise, levels, blur))
         rings[f"edges of the rings, noise {noise:g}"] = sweep_rings(lens, printed, at, edges, tilt=tilt)
     files = tabulate(cases, rings).save(out)
     _show(cases | rings, size)
-    if lens.covariance is None or printed.covariance is None:
-        typer.echo(_unstated(lens, printed))
-    for path in files:
-        typer.echo(str(path))
+    for line in (*_unstated(lens, printed), *files):
+        typer.echo(str(line))
     return 0
+
+
+def _lens(path: Path | None) -> Camera:
+    from torchpose.camera import Camera
+    from torchpose.studies.fig04_sensitivity import paper_camera
+
+    return Camera.load(path) if path else paper_camera()
 
 
 def _check(sizes: dict[str, float], sigmas: list[float], distance: tuple[float, float], tilt_deg: float) -> None:
@@ -115,32 +114,27 @@ def _check(sizes: dict[str, float], sigmas: list[float], distance: tuple[float, 
         raise ConfigError(f"sensitivity: --tilt-deg: is {tilt_deg}; give an angle between -85 and 85")
 
 
-def _with_rounding(noise: float) -> float:
-    """Noise with that of rounding to grey levels."""
-    return math.sqrt(_positive("--noise", noise) ** 2 + 1 / 12)
+def _of_edges(noise: float, levels: tuple[float, float], blur: float) -> float:
+    """Of `Uncertainty.image`: px of an edge averaged over 1 px, with the noise of rounding to grey levels."""
+    from torchpose.analysis.sensitivity import edge_noise
 
-
-def _contrast(levels: tuple[float, float]) -> float:
+    for option, value in (("--noise", noise), ("--blur", blur)):
+        if not 0 < value < math.inf:
+            raise ConfigError(f"sensitivity: {option}: is {value}; give a number above 0")
     dark, light = levels
     if not 0 <= dark < light <= 255:
         raise ConfigError(f"sensitivity: --levels: is {dark:g} {light:g}; give 0 <= DARK < LIGHT <= 255")
-    return light - dark
+    return edge_noise(math.sqrt(noise**2 + 1 / 12), light - dark, blur)
 
 
-def _positive(option: str, value: float) -> float:
-    if not 0 < value < math.inf:
-        raise ConfigError(f"sensitivity: {option}: is {value}; give a number above 0")
-    return value
-
-
-def _unstated(camera: Camera, target: Target) -> str:
+def _unstated(camera: Camera, target: Target) -> list[str]:
     """What the budget takes for exact because its file says nothing."""
     keys = []
     if target.covariance is None:
         keys.append(f"target {target.name} (center_sigma, edge_gain_sigma)")
     if camera.covariance is None:
         keys.append("camera (its covariance, which torchpose calibrate writes)")
-    return f"stated by no file, so exact but for the options: {' and '.join(keys)}"
+    return [f"stated by no file, so exact but for the options: {' and '.join(keys)}"] if keys else []
 
 
 def _coefficients(text: str, count: int) -> tuple[float, ...]:

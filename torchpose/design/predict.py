@@ -106,7 +106,10 @@ def edge_covariance(camera: Camera, target: Target, R: Tensor, t: Tensor, imagin
 def marker_information(
     camera: Camera, target: Target, R: Tensor, t: Tensor, imaging: Imaging
 ) -> Float[Tensor, "B M 7 7"]:
-    """What the edges of every marker tell of a pose of its own and of the edge gain; arguments as of `edge_covariance`."""
+    """What the edges of every marker tell of a pose of its own and of the edge gain.
+
+    Arguments as of `edge_covariance`.
+    """
     edge = ring_edges(camera, target, R, t, _SAMPLES)
     jacobian = torch.cat([by_pose(edge.by_point, edge.arm), edge.by_radii @ grown(target)[:, None]], -1)
     blur = (imaging.blur(camera, edge.depth).square() + _PIXEL_VARIANCE).sqrt()
@@ -142,9 +145,12 @@ def predicted_covariance(
         levels = render(crop, target, *pose, **look)
         twice = index.new_tensor([i, i + len(t)])
         noisy = add_noise(levels.expand(2, -1, -1), imaging.noise, index=twice)
-        seen = ellipse.fit((pixel - low).flatten(0, 1), index, len(pixel)).view(1, len(target), 2, 5).expand(2, -1, -1, -1)
+        seen = (
+            ellipse.fit((pixel - low).flatten(0, 1), index, len(pixel)).view(1, len(target), 2, 5).expand(2, -1, -1, -1)
+        )
         refined = refine_photometric(
-            Sight.of(noisy, crop, target, torch.arange(2).to(index), seen), *(part.repeat(2, *[1] * (part.ndim - 1)) for part in pose)
+            Sight.of(noisy, crop, target, torch.arange(2).to(index), seen),
+            *(part.repeat(2, *[1] * (part.ndim - 1)) for part in pose),
         )
         found = torch.where(refined.good[:, None, None], _stated(refined, crop, target), torch.inf)
         least = found.diagonal(dim1=1, dim2=2).sum(-1).argmin()
@@ -155,7 +161,8 @@ def predicted_covariance(
 def _stated(refined: Refined, camera: Camera, target: Target) -> Float[Tensor, "B 6 6"]:
     """Covariance of refined poses with that of print and camera, all markers seen, residuals as the noise has them."""
     rows, markers = len(refined), len(target)
-    table = MarkerTable.of([target])[torch.zeros(rows, dtype=torch.int64, device=refined.t.device)]
+    table = MarkerTable.of([target]).to(refined.t.device)
+    table = table[torch.zeros(rows, dtype=torch.int64, device=refined.t.device)]
     nothing = refined.t.new_zeros(rows, markers, 2)
     square = torch.eye(2).to(nothing).expand(rows, markers, 2, 2)
     ellipses, shapes = nothing.new_zeros(rows, markers, 2, 5), nothing.new_zeros(rows, markers, 2, 5, 5)

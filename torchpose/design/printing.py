@@ -92,8 +92,8 @@ def measured(camera: Camera, target: Target, volume: WorkingVolume, imaging: Ima
 
     `MEASURING_VIEWS` views from the middle of the volume, tilted in all directions, tell of them what is left when each
     view has a pose of its own; what no view tells stays as the file states it. The frame is the one that fits the
-    places of the file best, so shift, turn and scale have no part: a millimetre is that of the file (`scale_deviation`).
-    The camera is taken as known.
+    places of the file best, so shift, turn and scale have no part: a millimetre is that of the file
+    (`scale_deviation`). The camera is taken as known.
     """
     assert target.covariance is not None
     z = float(volume.middle[1][0, 2])
@@ -104,11 +104,12 @@ def measured(camera: Camera, target: Target, volume: WorkingVolume, imaging: Ima
     matrix = (columns.mT @ information @ columns).sum(1)
     inverse, _ = scaled_inverse(matrix[:, :POSE, :POSE])
     told = matrix[:, POSE:, POSE:] - matrix[:, POSE:, :POSE] @ inverse @ matrix[:, :POSE, POSE:]
-    left, _ = scaled_inverse((told.sum(0) + torch.eye(told.shape[-1]).to(told))[None])
-    factor = covariance_factor(target.covariance)
-    covariance = factor @ left[0] @ factor.mT
-    inner = _inner(target.centers)
-    return replace(target, covariance=inner @ covariance @ inner)
+    told = 0.5 * (told + told.mT).sum(0)
+    root = torch.linalg.cholesky(told + torch.eye(len(told)).to(told))
+    # as a square, which no rounding makes negative: what is left may be 1e-5 of what the file states
+    factor = _inner(target.centers) @ covariance_factor(target.covariance)
+    left = torch.linalg.solve_triangular(root, factor.mT, upper=False)
+    return replace(target, covariance=left.mT @ left)
 
 
 def scale_deviation(target: Target) -> float:

@@ -63,7 +63,9 @@ class Choice:
 
     def __post_init__(self) -> None:
         if self.markers is not None and self.markers not in ARRANGEMENTS:
-            raise ConfigError(f"markers: {self.markers}; there are layouts of {', '.join(map(str, ARRANGEMENTS))} rings")
+            raise ConfigError(
+                f"markers: {self.markers}; there are layouts of {', '.join(map(str, ARRANGEMENTS))} rings"
+            )
         if self.print_gain is not None and not 0 <= self.print_gain < math.inf:
             raise ConfigError(f"print_gain: {self.print_gain:g} mm; give a length from 0")
 
@@ -112,7 +114,8 @@ def design_target(
 
     For every number of rings the outer radius is the one with the smallest excess over the need: large rings have long
     edges, small ones lie farther out. Radii are compared by `edge_covariance`; what is promised comes from
-    `predicted_covariance`. Where the print is too coarse, the target is the one that meets the need once it is measured.
+    `predicted_covariance`. Where the print is too coarse, the target is the one that meets the need once it is
+    measured.
 
     Args:
         plate: width and height, mm.

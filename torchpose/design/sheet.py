@@ -141,7 +141,9 @@ def _needed(target: Target) -> str:
     deviation = target.covariance.diagonal().sqrt()
     x, y, flat = deviation[:-1].unflatten(0, (-1, 3)).amax(0).tolist()
     off_plane = "" if flat == max(x, y) else f" ({1e3 * flat:.3g} along z)"
-    return f"Print: centres to {1e3 * max(x, y):.3g} um{off_plane}, edges to {1e3 * float(deviation[-1]):.3g} um, 1 sigma."
+    return (
+        f"Print: centres to {1e3 * max(x, y):.3g} um{off_plane}, edges to {1e3 * float(deviation[-1]):.3g} um, 1 sigma."
+    )
 
 
 def _legend(target: Target, plate: tuple[float, float], page_width: float, bottom: float) -> list[Shape]:
