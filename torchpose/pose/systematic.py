@@ -243,11 +243,17 @@ def _camera_shifts(setting: Setting) -> Tensor:
 
 
 def _print_shifts(setting: Setting) -> Tensor:
-    """The same (N, M, 7, 3 M + 1) of every marker's place (target frame) and of the gain, 1 mm each."""
+    """The same (N, M, 7, 3 M + 1) of every marker's place, 1 mm along the print and 2 across, and of the gain, 1 mm.
+
+    Paper and plates bend by more than they stretch: twice as much is a convention.
+    """
     rows, markers = setting.evidence.mask.shape
-    eye = torch.eye(markers, dtype=setting.R.dtype, device=setting.R.device)
-    columns = setting.R.new_zeros(rows, markers, POSE + 1, 3 * markers + 1)
-    columns[:, :, :3, :-1] = (eye[:, None, :, None] * setting.R[:, None, :, None]).flatten(-2)
+    normal = setting.evidence.normals
+    eye = torch.eye(3, dtype=normal.dtype, device=normal.device)
+    moved = setting.R[:, None] @ (eye + normal[..., :, None] * normal[..., None, :])
+    each = torch.eye(markers, dtype=normal.dtype, device=normal.device)
+    columns = normal.new_zeros(rows, markers, POSE + 1, 3 * markers + 1)
+    columns[:, :, :3, :-1] = (each[:, None, :, None] * moved[:, :, :, None]).flatten(-2)
     columns[:, :, -1, -1] = 1
     return columns
 
