@@ -36,7 +36,7 @@ def intrinsics_covariance(evidence: Evidence, R: Tensor, t: Tensor, camera: Came
     weighted = jacobian.mT @ weight
     covariance, _ = scaled_inverse((weighted @ jacobian).sum(1))
     gain = -covariance @ (weighted @ _by_intrinsics(camera, xy)).sum(1)
-    return gain @ camera.covariance.to(gain) @ gain.mT
+    return gain @ camera.covariance[:4, :4].to(gain) @ gain.mT
 
 
 def _rim_jacobian(evidence: Evidence, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
