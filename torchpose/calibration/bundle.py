@@ -1,4 +1,4 @@
-"""Joint least squares of a camera's intrinsics and the poses of all views (bundle adjustment of a known target)."""
+"""Joint least squares of a camera's intrinsics, the poses of all views and what is unknown of the target."""
 
 from dataclasses import dataclass, replace
 
@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchpose.calibration.plate import Layout, Plate
 from torchpose.calibration.views import Views
 from torchpose.camera import Camera
 from torchpose.camera.derivatives import by_intrinsics
@@ -22,60 +23,67 @@ _RELATIVE = 1e-10  # decrease that a step must promise, of the cost
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Least-squares estimate of n intrinsics (fx, fy, cx, cy, then the distortion) and N poses, target to camera."""
+    """Least-squares estimate of n intrinsics (fx, fy, cx, cy, then the distortion), k unknowns of the plate, N poses.
+
+    Poses are target to camera. What is said of the intrinsics is said whether they were unknown or not; k is 0 where
+    the plate is known.
+    """
 
     camera: Camera
     R: Float[Tensor, "N 3 3"]
     t: Float[Tensor, "N 3"]  # mm
     residual: Float[Tensor, "K 2"]  # seen - predicted, px
     chi2: Float[Tensor, " K"]  # in the covariances of the points
-    information: Float[Tensor, "n n"]  # about the intrinsics, the poses being unknown
+    information: Float[Tensor, "u u"]  # about these u = n + k unknowns, the poses being unknown, with what is known
     pose_covariance: Float[Tensor, "N 6 6"]  # translation (mm), rotation about the camera axes; for exact intrinsics
-    gain: Float[Tensor, "N 6 n"]  # d pose / d intrinsics at the optimum
+    gain: Float[Tensor, "N 6 u"]  # d pose / d intrinsics and plate at the optimum
     converged: bool  # whether the last step promised next to nothing
+    plate: Float[Tensor, " k"]  # unknowns of the plate
+    rims: Float[Tensor, "K r"]  # seen - predicted, depth and gain (r = 2); none where they were not asked
 
 
-def adjust(views: Views, camera: Camera, R: Tensor, t: Tensor, *, free: bool = True) -> Bundle:
-    """Levenberg-Marquardt over intrinsics and poses, the latter eliminated; residuals are whitened.
+def adjust(
+    views: Views, camera: Camera, R: Tensor, t: Tensor, *, free: bool = True, plate: Plate | None = None,
+    start: Tensor | None = None,
+) -> Bundle:
+    """Levenberg-Marquardt over intrinsics, plate and poses, the latter eliminated; residuals are whitened.
 
     Args:
         views: with regular covariances.
         camera: to start from; its model and number of coefficients stay.
         R: (N, 3, 3), to start from.
         t: (N, 3), to start from, mm.
-        free: whether the intrinsics are unknown; otherwise only poses are found.
+        free: whether the intrinsics are unknown.
+        plate: what is unknown of the plate, None for nothing: then the points of the views count.
+        start: (k,), unknowns of the plate to start from.
 
     Raises:
         ConfigError: the start puts points behind the camera, or the points of a view leave its pose open.
     """
-    whiten = torch.linalg.inv(torch.linalg.cholesky(views.covariance))
+    problem = _Problem(views, camera, plate, free)
     own = {"intrinsics": Vector(views.pixels.new_zeros(1, 4 + len(camera.distortion)))} if free else {}
-    start = Unknowns(own, {"pose": Pose(R, t)}, views.view.new_zeros(len(views)))
-
-    def bent(unknowns: Unknowns) -> Camera | None:
-        return moved_camera(camera, unknowns.values("intrinsics")[0]) if free else camera
-
-    def problem(unknowns: Unknowns) -> Normal:
-        moved = bent(unknowns)
-        if moved is None:
-            return replace(problem(start), cost=views.pixels.new_full((1,), torch.inf))
-        return _normal(views, moved, unknowns.pose, whiten, free)
-
-    found = least_squares.minimise(problem, start, _ITERATIONS, damping=_DAMPING, adaptive=True, tolerance=_RELATIVE)
-    moved, pose = bent(found.unknowns), found.unknowns.pose
-    normal = found.normal if free or moved is None else _normal(views, moved, pose, whiten, True)
+    if plate is not None:
+        own["plate"] = Vector((plate.known.new_zeros(len(plate)) if start is None else start)[None])
+    first = Unknowns(own, {"pose": Pose(R, t)}, views.view.new_zeros(len(views)))
+    found = least_squares.minimise(problem, first, _ITERATIONS, damping=_DAMPING, adaptive=True, tolerance=_RELATIVE)
+    unknowns = found.unknowns
+    moved, pose = problem.camera_at(unknowns), unknowns.pose
+    normal = found.normal if free or moved is None else problem.normal(unknowns, moved, by_camera=True)
     part = normal.eliminated
     if moved is None or part is None or not bool(normal.cost.isfinite().all()):
         raise ConfigError("INPUT: a view has points behind the camera that calibration starts from; remove --camera")
     covariance, determined = least_squares.scaled_inverse(part.information)
     if not bool(determined.all()):
         raise ConfigError("INPUT: the points of a view leave its pose open; use targets whose points are not on a line")
-    residual = views.pixels - moved.project(_placed(views, pose)[1])
-    chi2 = (whiten @ residual[..., None]).square().sum((-1, -2))
+    residual = problem.residual(unknowns, moved)
+    whiten = torch.linalg.inv(torch.linalg.cholesky(views.covariance))
+    chi2 = (whiten @ residual[:, :2, None]).square().sum((-1, -2))
     gain, converged = -covariance @ part.mixed.mT, int(found.code) == Code.CONVERGED
     # without the trace of a diagonal that steps are solved with: whether the views tell is decided by this
     information = normal.information[0] - (part.mixed @ covariance @ part.mixed.mT).sum(0)
-    return Bundle(moved, pose.R, pose.t, residual, chi2, information, covariance, gain, converged)
+    z = residual.new_zeros(0) if plate is None else unknowns.values("plate")[0]
+    found_at = (moved, pose.R, pose.t, residual[:, :2], chi2, information, covariance, gain, converged)
+    return Bundle(*found_at, z, residual[:, 2:])
 
 
 def moved_camera(camera: Camera, step: Tensor) -> Camera | None:
@@ -87,32 +95,96 @@ def moved_camera(camera: Camera, step: Tensor) -> Camera | None:
     return replace(camera, matrix=matrix, distortion=camera.distortion + step[4:])
 
 
-def _placed(views: Views, pose: Pose) -> tuple[Tensor, Tensor]:
-    """Points about the target's origin (K, 3), and in the camera (K, 3), camera axes."""
-    arm = (pose.R[views.view] @ views.points[..., None])[..., 0]
-    return arm, arm + pose.t[views.view]
+class _Problem:
+    """The normal equations of K observations; of the rims too, where the plate has unknowns that these tell of."""
 
+    def __init__(self, views: Views, camera: Camera, plate: Plate | None, free: bool) -> None:
+        self.views, self.plate, self.free = views, plate, free
+        self.start = camera
+        self.point = None if plate is None else plate.index(views.point)
+        self.rims = views.rims if plate is not None and plate.rims else None
+        covariance = views.covariance if self.rims is None else self.rims.covariance
+        self.whiten = torch.linalg.inv(torch.linalg.cholesky(covariance))
 
-def _normal(views: Views, camera: Camera, pose: Pose, whiten: Tensor, free: bool) -> Normal:
-    """Normal equations, of infinite cost where a point is behind the camera or beyond the lens model."""
-    arm, at = _placed(views, pose)
-    depth, xy = at[:, 2], at[:, :2] / at[:, 2:]
-    possible = (depth > 0).all() & (xy.norm(dim=-1) < camera.fold_radius).all()
-    residual = whiten @ (views.pixels - camera.distort(xy))[..., None]
-    by_view = whiten @ by_pose(camera.J_distort(xy) @ image_by_point(xy, depth), arm)
-    by_camera = whiten @ (by_intrinsics(camera, xy) if free else xy.new_zeros(len(xy), 2, 0))
+    def __call__(self, unknowns: Unknowns) -> Normal:
+        moved = self.camera_at(unknowns)
+        if moved is None:
+            normal = self.normal(unknowns, self.start, by_camera=self.free)
+            return replace(normal, cost=torch.full_like(normal.cost, torch.inf))
+        return self.normal(unknowns, moved, by_camera=self.free)
 
-    def of_views(values: Tensor) -> Tensor:
-        return segment_sum(values, views.view, len(views))
+    def camera_at(self, unknowns: Unknowns) -> Camera | None:
+        return moved_camera(self.start, unknowns.values("intrinsics")[0]) if self.free else self.start
 
-    return Normal(
-        (by_camera.mT @ by_camera).sum(0, keepdim=True),
-        (by_camera.mT @ residual).sum(0)[None, :, 0],
-        torch.where(possible, residual.square().sum(), torch.inf)[None],
-        Eliminated(
-            of_views(by_camera.mT @ by_view),
-            of_views(by_view.mT @ by_view),
-            of_views((by_view.mT @ residual)[..., 0]),
-            views.view.new_zeros(len(views)),
-        ),
-    )
+    def layout(self, unknowns: Unknowns) -> Layout:
+        """Of the observations."""
+        if self.plate is None or self.point is None:
+            nothing = torch.zeros_like(self.views.points[:, 0])
+            return Layout(self.views.points, nothing, nothing)
+        return self.plate.at(unknowns.values("plate")[0]).of(self.point)
+
+    def placed(self, unknowns: Unknowns, layout: Layout) -> tuple[Tensor, Tensor]:
+        """Points about the target's origin (K, 3), and in the camera (K, 3), camera axes."""
+        pose, view = unknowns.pose, self.views.view
+        arm = (pose.R[view] @ layout.places[..., None])[..., 0]
+        return arm, arm + pose.t[view]
+
+    def residual(self, unknowns: Unknowns, camera: Camera) -> Tensor:
+        """Seen less predicted (K, 2), with the rims (K, 4); not whitened."""
+        layout = self.layout(unknowns)
+        _, at = self.placed(unknowns, layout)
+        pixels = self.views.pixels - camera.distort(at[:, :2] / at[:, 2:])
+        if self.rims is None:
+            return pixels
+        depth = self.rims.depth - at[:, 2].clamp_min(1e-9).log() + layout.sizes
+        return torch.cat([pixels, depth[:, None], (self.rims.gain - layout.gain)[:, None]], -1)
+
+    def normal(self, unknowns: Unknowns, camera: Camera, *, by_camera: bool) -> Normal:
+        """Normal equations, of infinite cost where a point is behind the camera or beyond the lens model."""
+        views = self.views
+        arm, at = self.placed(unknowns, self.layout(unknowns))
+        depth, xy = at[:, 2], at[:, :2] / at[:, 2:]
+        possible = (depth > 0).all() & (xy.norm(dim=-1) < camera.fold_radius).all()
+        residual = self.whiten @ self.residual(unknowns, camera)[..., None]
+        by_point = camera.J_distort(xy) @ image_by_point(xy, depth)
+        if self.rims is not None:
+            rows = torch.zeros_like(by_point)
+            rows[:, 0, 2] = 1 / depth
+            by_point = torch.cat([by_point, rows], 1)
+        by_view = self.whiten @ by_pose(by_point, arm)
+        columns = []
+        if by_camera:
+            more = (0, 0, 0, by_point.shape[1] - 2)
+            columns.append(torch.nn.functional.pad(by_intrinsics(camera, xy), more))
+        if self.plate is not None:
+            columns.append(self._by_plate(by_point @ unknowns.pose.R[views.view]))
+        own = self.whiten @ torch.cat(columns, -1) if columns else by_view[..., :0]
+
+        def of_views(values: Tensor) -> Tensor:
+            return segment_sum(values, views.view, len(views))
+
+        normal = Normal(
+            (own.mT @ own).sum(0, keepdim=True),
+            (own.mT @ residual).sum(0)[None, :, 0],
+            torch.where(possible, residual.square().sum(), torch.inf)[None],
+            Eliminated(
+                of_views(own.mT @ by_view),
+                of_views(by_view.mT @ by_view),
+                of_views((by_view.mT @ residual)[..., 0]),
+                views.view.new_zeros(len(views)),
+            ),
+        )
+        if self.plate is None:
+            return normal
+        prior = torch.nn.functional.pad(self.plate.known, (own.shape[-1] - len(self.plate), 0))
+        moved = torch.nn.functional.pad(unknowns.values("plate"), (own.shape[-1] - len(self.plate), 0))
+        return normal.with_prior(torch.diag(prior)[None], moved)
+
+    def _by_plate(self, by_place: Tensor) -> Tensor:
+        """Derivatives (K, 2|4, k) by the plate's unknowns, from those by the places in the frame of the target."""
+        assert self.plate is not None
+        columns = by_place @ self.plate.places[self.point]
+        if self.rims is not None:
+            columns[:, 2] -= self.plate.sizes[self.point]
+            columns[:, 3] += self.plate.gain
+        return columns

@@ -1,7 +1,10 @@
 """Intrinsics of a camera from views of known points, with their covariance and what there is to doubt about them."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -9,10 +12,12 @@ from torch import Tensor
 
 from torchpose import pnp
 from torchpose.calibration.bundle import Bundle, adjust
+from torchpose.calibration.plate import Plate
 from torchpose.calibration.views import Views
 from torchpose.camera import Camera
 from torchpose.camera.model import Model
 from torchpose.errors import ConfigError
+from torchpose.geometry.least_squares import scaled_inverse
 
 LENS_MODELS: dict[str, tuple[Model, tuple[str, ...]]] = {
     "pinhole": ("brown_conrady", ()),
@@ -29,6 +34,7 @@ _START_SIGMA = 1.0  # px, of points without a covariance, until their residuals 
 _OUTLIER = 27.6  # chi-squared of a point beyond which it is left out: 1e-6 of good points
 _MEDIAN = 2 * math.log(2)  # of chi-squared with two degrees of freedom
 _ROUNDS = 4  # of leaving out points and finding the common error
+_PLATE_ROUNDS = 2  # more where the plate has unknowns: the first starts from the residuals of the nominal places
 _WIDE_SIGMA = 1e-3  # of a focal length, above which views are called too alike
 _LITTLE_TILT_DEG = 15.0  # between the views' normals, below which they are
 _LARGE_ERROR = 1.0  # px, of all points, above which something else than their noise is wrong
@@ -40,17 +46,20 @@ _SINGULAR = 1e-12  # least eigenvalue of the information, scaled to a unit diago
 class Calibration:
     """Result of `calibrate_intrinsics`."""
 
-    camera: Camera  # with ``camera.covariance`` of fx, fy, cx, cy
+    camera: Camera  # with its covariance
     covariance: Float[Tensor, "n n"]  # of fx, fy, cx, cy (px) and the distortion
+    joint: Float[Tensor, "u u"]  # of these and the unknowns of the plate
     names: tuple[str, ...]  # of the intrinsics
     views: Views  # that were used, with the points that were used
     bundle: Bundle  # poses and residuals of these
     left_out: int  # points left out because they contradict the others
     chi2: float  # sum over all points
-    degrees: int  # of freedom
+    degrees: float  # of freedom
     # px per axis, that had to be added to every point (print, flatness, lens model) to make the reduced chi-squared 1;
     # 0 where the covariances of the points explain the residuals
     common_sigma_px: float
+    plate: Plate | None = None  # what was unknown of the target
+    seen: Views | None = None  # all views that there were
     warnings: list[str] = field(default_factory=list)  # what makes the result doubtful, one sentence each
 
     @property
@@ -64,9 +73,9 @@ class Calibration:
 
     @property
     def pose_covariance(self) -> Float[Tensor, "N 6 6"]:
-        """Of the views' poses, the uncertainty of the intrinsics included."""
+        """Of the views' poses, the uncertainty of the intrinsics and of the plate included."""
         gain = self.bundle.gain
-        return self.bundle.pose_covariance + gain @ self.covariance @ gain.mT
+        return self.bundle.pose_covariance + gain @ self.joint @ gain.mT
 
 
 def start_cameras(width: int, height: int, lens: str) -> list[Camera]:
@@ -98,25 +107,28 @@ def with_lens(camera: Camera, lens: str) -> Camera:
     return replace(camera, model=model, distortion=distortion, covariance=None).to(torch.float64)
 
 
-def calibrate_intrinsics(views: Views, starts: list[Camera], *, lens: str = "brown5") -> Calibration:
+def calibrate_intrinsics(
+    views: Views, starts: list[Camera], *, lens: str = "brown5", plate: Plate | None = None
+) -> Calibration:
     """Maximum-likelihood intrinsics of one camera and the poses of its views.
 
     All points of all views are adjusted together (`torchpose.calibration.bundle.adjust`). Points that contradict the
     others by more than 1e-6 of good ones would are left out. Where the residuals are larger than the covariances of the
     points say, an error common to all points and axes is added to these (variance component by its residuals, as
-    Foerstner 1979), so that the covariance of the result covers it; errors that repeat in every view, such as those of
-    the print, are then counted as if they did not.
+    Foerstner 1979), so that the covariance of the result covers it. Errors that repeat in every view, such as those of
+    the print, are counted as such where ``plate`` has them, and else as if they did not repeat.
 
     Args:
         views: a covariance of zero means unknown; the common error then stands for it.
         starts: cameras to start from; the one that fits best is taken. `start_cameras` where nothing is known.
         lens: a name of `LENS_MODELS`.
+        plate: what is unknown of the target beside its poses; None where its points are exact.
 
     Raises:
         ConfigError: too few views or points, views that do not determine the intrinsics, or no convergence.
     """
     _, coefficients = _lens(lens)
-    names = ("fx", "fy", "cx", "cy", *coefficients)
+    names, seen = ("fx", "fy", "cx", "cy", *coefficients), views
     views = views.of_views(views.counts >= MIN_POINTS)
     _check_count(views, len(names))
     fits = [_first_fit(views, with_lens(start, lens).to(views.pixels)) for start in starts]
@@ -124,21 +136,25 @@ def calibrate_intrinsics(views: Views, starts: list[Camera], *, lens: str = "bro
     if best is None:
         raise ConfigError("INPUT: no pose explains the views; give --camera to start from and check the target")
     before = len(best[0].view)
-    views, bundle, common = _weigh(*best, len(names))
+    views, bundle, common = _weigh(*best, len(names), plate)
     if not bundle.converged:
         raise ConfigError("INPUT: calibration did not converge; use a simpler --model or more varied views")
-    covariance = _covariance(bundle, names)
+    joint = _covariance(bundle, names)
+    covariance = joint[: len(names), : len(names)]
     return Calibration(
-        replace(bundle.camera, covariance=covariance[:4, :4]),
+        replace(bundle.camera, covariance=covariance, adjustment=None),
         covariance,
+        joint,
         names,
         views,
         bundle,
         before - len(views.view),
         float(bundle.chi2.sum()),
-        _degrees(views, len(names)),
-        common,
-        _warnings(views, bundle, covariance, common),
+        _degrees(views, len(names) + _places_told(bundle, plate)),
+        common.px,
+        plate,
+        seen,
+        _warnings(views, bundle, covariance, common.px),
     )
 
 
@@ -148,32 +164,114 @@ def locate_views(views: Views, camera: Camera) -> tuple[Views, Bundle]:
     Raises:
         ConfigError: no view has a pose.
     """
+    return _located(views, camera, None)[:2]
+
+
+def measure_plate(views: Views, camera: Camera, plate: Plate) -> Calibration:
+    """What is unknown of a plate seen by a camera that is known, held as it is; its covariance is carried through.
+
+    Raises:
+        ConfigError: no view has a pose, or the views do not determine the plate.
+    """
+    seen, n = views, 4 + len(camera.distortion)
+    views, bundle, common = _located(views, camera, plate)
+    if not bundle.converged:
+        raise ConfigError("INPUT: the target could not be measured; use more varied views")
+    names = ("fx", "fy", "cx", "cy", *(f"d{k}" for k in range(1, n - 3)))
+    of_plate = _covariance(replace(bundle, information=bundle.information[n:, n:]), ())
+    held = bundle.information.new_zeros(n, n)
+    if camera.covariance is not None:
+        known = len(camera.covariance)
+        held[:known, :known] = camera.covariance
+    moved = -of_plate @ bundle.information[n:, :n]  # d plate / d intrinsics
+    cross = moved @ held
+    joint = torch.cat([torch.cat([held, cross.mT], 1), torch.cat([cross, of_plate + cross @ moved.mT], 1)])
+    degrees = _degrees(views, _places_told(bundle, plate))
+    left_out, chi2 = len(seen.view) - len(views.view), float(bundle.chi2.sum())
+    return Calibration(
+        camera, held, joint, names, views, bundle, left_out, chi2, degrees, common.px, plate, seen
+    )
+
+
+def _located(views: Views, camera: Camera, plate: Plate | None) -> tuple[Views, Bundle, Common]:
     views = views.of_views(views.counts >= MIN_POINTS)
     first = _first_fit(views, camera.to(views.pixels), free=False) if len(views) else None
     if first is None:
         raise ConfigError("INPUT: no view has a pose; check --camera, the target and the frames")
-    return _weigh(*first, 0)[:2]
+    return _weigh(*first, 0, plate)
 
 
-def _weigh(views: Views, bundle: Bundle, unknowns: int) -> tuple[Views, Bundle, float]:
-    """Views without contradicting points, their fit, weighted, of n unknown intrinsics, and the common error in px."""
-    free, common = unknowns > 0, 0.0
-    for _ in range(_ROUNDS):
-        common = common_sigma(bundle.residual, views.covariance, _degrees(views, unknowns))
-        bundle = adjust(_with_common(views, common), bundle.camera, bundle.R, bundle.t, free=free)
-        keep = bundle.chi2 < _OUTLIER * max(1.0, float(bundle.chi2.median()) / _MEDIAN)
+class Common(NamedTuple):
+    """Standard deviations that are added to every point (px), and to what its rim tells (relative depth, gain in mm)."""
+
+    px: float = 0.0
+    depth: float = 0.0
+    gain: float = 0.0
+
+
+def _weigh(
+    views: Views, bundle: Bundle, unknowns: int, plate: Plate | None = None
+) -> tuple[Views, Bundle, Common]:
+    """Views without contradicting points, their fit, weighted, of n unknown intrinsics, and the common error."""
+    common = Common()
+
+    def fit(bundle: Bundle, views: Views, common: Common, rows: slice | Tensor = slice(None)) -> Bundle:
+        start = bundle.plate if len(bundle.plate) else None
+        poses = bundle.R[rows], bundle.t[rows]
+        return adjust(_with_common(views, common), bundle.camera, *poses, free=unknowns > 0, plate=plate, start=start)
+
+    for _ in range(_ROUNDS + (0 if plate is None else _PLATE_ROUNDS)):
+        common = _common(views, bundle, unknowns, plate)
+        bundle = fit(bundle, views, common)
+        keep = _agree(bundle.chi2) & _agree(_rim_chi2(views, bundle, common))
         if bool(keep.all()):
             continue
         views = views[keep]
         enough = views.counts >= MIN_POINTS
         views = views.of_views(enough)
         _check_count(views, unknowns)
-        bundle = adjust(_with_common(views, common), bundle.camera, bundle.R[enough], bundle.t[enough], free=free)
+        bundle = fit(bundle, views, common, enough)
     return views, bundle, common
 
 
-def common_sigma(residual: Float[Tensor, "K 2"], covariance: Float[Tensor, "K 2 2"], degrees: int) -> float:
-    """Standard deviation s, px per axis, with sum of r^T (C + s^2 I)^-1 r = degrees of freedom; 0 where C suffices.
+def _agree(chi2: Tensor) -> Tensor:
+    """Which points (K,) do not contradict the others."""
+    return chi2 < _OUTLIER * max(1.0, float(chi2.median()) / _MEDIAN)
+
+
+def _rim_chi2(views: Views, bundle: Bundle, common: Common) -> Tensor:
+    """Chi-squared (K,) of what the rims tell, zero where they were not asked."""
+    rims = _with_common(views, common).rims
+    if rims is None or bundle.rims.shape[1] == 0:
+        return torch.zeros_like(bundle.chi2)
+    solved = torch.linalg.solve(rims.covariance[:, 2:, 2:], bundle.rims[..., None])
+    return (bundle.rims[..., None] * solved).sum((-1, -2))
+
+
+def _common(views: Views, bundle: Bundle, unknowns: int, plate: Plate | None) -> Common:
+    """The common errors that the residuals of a fit show."""
+    degrees = _degrees(views, unknowns + _places_told(bundle, plate))
+    px = common_sigma(bundle.residual, views.covariance, degrees)
+    if views.rims is None or plate is None or bundle.rims.shape[1] == 0:
+        return Common(px)
+    variance, freedom = views.rims.covariance.diagonal(dim1=-2, dim2=-1), len(views.view) - len(plate.ids)
+    depth, gain = (
+        common_sigma(bundle.rims[:, k : k + 1], variance[:, 2 + k, None, None], max(1, freedom)) for k in (0, 1)
+    )
+    return Common(px, depth, gain)
+
+
+def _places_told(bundle: Bundle, plate: Plate | None) -> float:
+    """How many unknowns of the places the views determine; what is known of them besides is not counted."""
+    if plate is None or not len(bundle.plate):
+        return 0.0
+    variance = scaled_inverse(bundle.information)[0].diagonal()[-len(plate) :]
+    share = torch.where(plate.known > 0, 1 - plate.known * variance, 1.0)
+    return float(share[plate.places.flatten(0, 1).any(0)].sum())
+
+
+def common_sigma(residual: Float[Tensor, "K d"], covariance: Float[Tensor, "K d d"], degrees: float) -> float:
+    """Standard deviation s per axis, with sum of r^T (C + s^2 I)^-1 r = degrees of freedom; 0 where C suffices.
 
     The covariance C is zero where it is unknown.
     """
@@ -193,11 +291,16 @@ def common_sigma(residual: Float[Tensor, "K 2"], covariance: Float[Tensor, "K 2 
 
 
 def _widened(covariance: Tensor, sigma: float) -> Tensor:
-    return covariance + sigma * sigma * torch.eye(2, dtype=covariance.dtype, device=covariance.device)
+    size = covariance.shape[-1]
+    return covariance + sigma * sigma * torch.eye(size, dtype=covariance.dtype, device=covariance.device)
 
 
-def _with_common(views: Views, sigma: float) -> Views:
-    return replace(views, covariance=_widened(views.covariance, sigma))
+def _with_common(views: Views, common: Common) -> Views:
+    rims = views.rims
+    if rims is not None:
+        more = torch.diag(rims.covariance.new_tensor([common.px, common.px, common.depth, common.gain]).square())
+        rims = replace(rims, covariance=rims.covariance + more)
+    return replace(views, covariance=_widened(views.covariance, common.px), rims=rims)
 
 
 def _first_fit(views: Views, camera: Camera, *, free: bool = True) -> tuple[Views, Bundle] | None:
@@ -210,7 +313,7 @@ def _first_fit(views: Views, camera: Camera, *, free: bool = True) -> tuple[View
         if not bool(solved.any()):
             return None
         views = views.of_views(solved)
-        equal = _with_common(replace(views, covariance=torch.zeros_like(views.covariance)), _START_SIGMA)
+        equal = replace(views, covariance=_widened(torch.zeros_like(views.covariance), _START_SIGMA))
         try:
             bundle = adjust(equal, camera, poses.R[solved], poses.t[solved], free=free)
         except (ConfigError, torch.linalg.LinAlgError):
@@ -219,7 +322,7 @@ def _first_fit(views: Views, camera: Camera, *, free: bool = True) -> tuple[View
     return None if bundle is None else (views, bundle)
 
 
-def _degrees(views: Views, unknowns: int) -> int:
+def _degrees(views: Views, unknowns: float) -> float:
     return 2 * len(views.view) - 6 * len(views) - unknowns
 
 
@@ -238,9 +341,11 @@ def _covariance(bundle: Bundle, names: tuple[str, ...]) -> Tensor:
     scale = information.diagonal().clamp_min(1e-300).rsqrt()
     values, vectors = torch.linalg.eigh(information * scale[:, None] * scale)
     if not float(values[0]) > _SINGULAR:
-        direction = ", ".join(names[i] for i in vectors[:, 0].abs().topk(2).indices.sort().values.tolist())
+        told = dict(enumerate(names))
+        most = vectors[:, 0].abs().topk(2).indices.sort().values.tolist()
+        direction = ", ".join(dict.fromkeys(told.get(i, "places of the target") for i in most))
         raise ConfigError(
-            f"INPUT: the views are too alike to tell the intrinsics apart (mostly {direction}); "
+            f"INPUT: the views are too alike to tell the {'intrinsics' if names else 'places'} apart (mostly {direction}); "
             "add views tilted by 20 to 45 degrees in different directions"
         )
     root = scale[:, None] * vectors * values.rsqrt()

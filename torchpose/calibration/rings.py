@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchpose.calibration.views import Views
+from torchpose.calibration.views import Rims, Views
 from torchpose.camera import Camera
 from torchpose.detect import find_candidates
 from torchpose.geometry.projection import image_by_point
@@ -13,12 +13,15 @@ from torchpose.geometry.robust import LEAST_KEPT
 from torchpose.identify import MarkerTable, identify
 from torchpose.pipeline import PoseEstimator
 from torchpose.pose import common_center, raw_centers
-from torchpose.refine import Sight, refine_photometric
+from torchpose.refine import Refined, Sight, refine_photometric
 from torchpose.results import Status
 from torchpose.rings import measure_rings
 from torchpose.target import Target
 
 _HELD = 1e12  # information about the rotation of a marker: as good as known
+_TURNED = 3e-3  # rad: a plate out of flat by 40 um turns its markers by so much against the plane of the file
+_GAIN_OPEN = 1e-8  # information about the edge gain, mm^-2: none
+_GAIN_SIGMA = 0.1  # of the width of a ring, where only centres are asked for: enough for any print
 
 
 def find_rings(names: Sequence[str], frames: Tensor, cameras: Sequence[Camera], target: Target) -> list[Views]:
@@ -52,12 +55,18 @@ def _grey(frames: Tensor) -> Tensor:
     return 255.0 * frames if frames.is_floating_point() else frames
 
 
-def measure_centers(names: Sequence[str], frames: Tensor, camera: Camera, target: Target) -> Views:
+def measure_centers(
+    names: Sequence[str], frames: Tensor, camera: Camera, target: Target, *, rims: bool = False
+) -> Views:
     """Views of a target by a camera that is known well: centres of single markers, fitted to the grey values.
 
-    Every marker is moved as a whole, its tilt held at that of the target's pose, until its rendered rings agree with
-    the pixels around them; its centre then projects to the point seen. So no ellipse is fitted, and no centre is
-    compensated. Errors of the camera enter through the small tilt and distortion across one marker only.
+    Every marker is moved as a whole, its tilt held at that of the target's pose and its edges moved by an edge gain of
+    its own, until its rendered rings agree with the pixels around them; its centre then projects to the point seen. So
+    no ellipse is fitted, and no centre is compensated. Errors of the camera enter through the small tilt and distortion
+    across one marker only.
+
+    Args:
+        rims: what the rims tell is asked for, too, and the tilt of every marker is known to a few mrad only.
     """
     poses = PoseEstimator(camera, target)(frames)
     found = poses.detections
@@ -66,7 +75,10 @@ def measure_centers(names: Sequence[str], frames: Tensor, camera: Camera, target
     marker = (found.marker[:, None] == target.ids).long().argmax(1)
     points, rotation = target.centers[marker], poses.R[found.frame]
     arm = (rotation @ points[..., None])[..., 0]
-    held = torch.diag(points.new_tensor([0.0, 0, 0, _HELD, _HELD, _HELD])).expand(len(marker), 6, 6)
+    radii = target.printed_radii[marker]
+    gain = _GAIN_OPEN if rims else (_GAIN_SIGMA * (radii[:, 0] - radii[:, 1])) ** -2
+    prior = points.new_zeros(len(points), 7)
+    prior[:, 3:6], prior[:, 6] = _TURNED**-2 if rims else _HELD, gain
     one = torch.ones_like(points[:, :1])
     sight = Sight(
         found.frame,
@@ -75,14 +87,29 @@ def measure_centers(names: Sequence[str], frames: Tensor, camera: Camera, target
         one if target.background == "light" else -one,
         torch.zeros_like(points)[:, None],
         target.normals[marker][:, None],
-        target.printed_radii[marker][:, None],
+        radii[:, None],
         _grey(frames),
         camera,
     )
-    refined = refine_photometric(sight, rotation, arm + poses.t[found.frame], prior=held)
+    refined = refine_photometric(sight, rotation, arm + poses.t[found.frame], prior=torch.diag_embed(prior))
     xy = refined.t[:, :2] / refined.t[:, 2:]
     jacobian = camera.J_distort(xy) @ image_by_point(xy, refined.t[:, 2])
     covariance = jacobian @ refined.covariance[:, :3, :3] @ jacobian.mT
     pixels = camera.distort(xy)
     good = refined.good & (refined.kept > LEAST_KEPT) & pixels.isfinite().all(-1)
-    return Views(found.frame, found.marker, points, pixels, covariance, tuple(names))[good]
+    shapes = _rims(refined, jacobian) if rims else None
+    return Views(found.frame, found.marker, points, pixels, covariance, tuple(names), shapes)[good]
+
+
+def _rims(refined: Refined, by_place: Tensor) -> Rims:
+    """Sizes and gains of K rings, with the covariance that they share with the pixels, whose derivatives are given."""
+    assert refined.gain is not None  # asked for by the prior
+    assert refined.gain_covariance is not None
+    place, depth = refined.covariance[:, :3, :3], refined.t[:, 2]
+    by_depth = torch.zeros_like(by_place[:, :1]).index_fill(-1, torch.tensor(2), 1.0) / depth[:, None, None]
+    jacobian = torch.cat([by_place, by_depth], 1)  # (K, 3, 3)
+    with_gain = (jacobian @ refined.gain_covariance[:, :3, None]).squeeze(-1)
+    covariance = torch.nn.functional.pad(jacobian @ place @ jacobian.mT, (0, 1, 0, 1))
+    covariance[:, :3, 3] = covariance[:, 3, :3] = with_gain
+    covariance[:, 3, 3] = refined.gain_covariance[:, 6]
+    return Rims(depth.log(), refined.gain, covariance)

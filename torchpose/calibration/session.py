@@ -1,13 +1,30 @@
 """From frames to a calibration: one camera, a ring target or a board, and the robot's poses where there are any."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 from torch import Tensor
 
 from torchpose.calibration.boards import Board, find_corners
 from torchpose.calibration.bundle import Bundle
 from torchpose.calibration.hand_eye import HandEyeFit, Mount, calibrate_hand_eye
-from torchpose.calibration.intrinsics import Calibration, calibrate_intrinsics, locate_views, start_cameras, with_lens
+from torchpose.calibration.intrinsics import (
+    Calibration,
+    calibrate_intrinsics,
+    locate_views,
+    measure_plate,
+    start_cameras,
+    with_lens,
+)
+from torchpose.calibration.measured import (
+    Distance,
+    check_seen,
+    doubts,
+    measured_target,
+    scaled_by_distance,
+    scaled_by_prior,
+)
+from torchpose.calibration.plate import free_plate, stated_plate
 from torchpose.calibration.rings import find_rings, measure_centers
 from torchpose.calibration.views import Views
 from torchpose.camera import Camera
@@ -18,14 +35,15 @@ from torchpose.target import Target
 Frames = Callable[[], Iterable[tuple[Sequence[str], Tensor]]]
 """Gives names and frames (B, H, W) in batches, from the first on each time it is called."""
 
+_MEASURED = 2  # times that the grey values are fitted: the second changes places by less than their deviation
 _MOST_NOISE = (5.0, 0.05)  # mm, rad: a robot that is farther off was not there when the frames were taken
 
 
 def calibrate_camera(frames: Frames, shown: Target | Board, start: Camera, *, guess: bool, lens: str) -> Calibration:
     """Intrinsics from frames of a ring target or a board.
 
-    A ring target is measured in two rounds: rough centres to calibrate the camera, with which `measure_centers` fits
-    the grey values.
+    A ring target is seen in two rounds: rough centres to calibrate the camera, with which `measure_centers` fits the
+    grey values. Its places are unknowns with the covariance that its file states.
 
     Args:
         frames: read once for a board, twice for a target.
@@ -38,13 +56,79 @@ def calibrate_camera(frames: Frames, shown: Target | Board, start: Camera, *, gu
     starts = start_cameras(start.width, start.height, lens) if guess else [with_lens(start, lens)]
     if isinstance(shown, Board):
         return calibrate_intrinsics(_all_corners(frames, shown), starts, lens=lens)
-    batches = [find_rings(names, part, starts, shown) for names, part in frames()]
+    camera = _rough(frames, shown, starts, lens)
+    plate = None
+    if shown.covariance is not None:
+        plate = stated_plate(shown.ids, shown.centers, shown.covariance[:-1, :-1])
+    return calibrate_intrinsics(_all_centers(frames, shown, camera), [camera], lens=lens, plate=plate)
+
+
+def _rough(frames: Frames, target: Target, starts: Sequence[Camera], lens: str) -> Camera:
+    """The camera from the ellipses of a target that is taken as exact."""
+    batches = [find_rings(names, part, starts, target) for names, part in frames()]
     every = [Views.cat(views) for views in zip(*batches, strict=True)]
     rough = max(every, key=lambda views: len(views.view), default=None)
     if rough is None or not len(rough.view):
-        raise ConfigError(f"INPUT: no marker of target {shown.name} in any frame; check --target and the frames")
-    camera = calibrate_intrinsics(rough, starts, lens=lens).camera
-    return calibrate_intrinsics(_all_centers(frames, shown, camera), [camera], lens=lens)
+        raise ConfigError(f"INPUT: no marker of target {target.name} in any frame; check --target and the frames")
+    return calibrate_intrinsics(rough, list(starts), lens=lens).camera
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """A target measured by a camera: the adjustment, and both as their files hold them."""
+
+    calibration: Calibration
+    nominal: Target
+    target: Target
+    camera: Camera
+
+
+def measure_target(
+    frames: Frames,
+    target: Target,
+    start: Camera,
+    *,
+    held: bool,
+    guess: bool = False,
+    lens: str = "brown5",
+    distance: Distance | None = None,
+) -> Measurement:
+    """Places, edge gain and sizes of a target's rings, and the camera with them unless it is known.
+
+    The grey values are fitted twice: with the target as its file has it, then as it was measured, so that neither the
+    tilt at which a ring is fitted nor the pixels that are taken depend on the print's errors.
+
+    Args:
+        frames: read twice where the camera is ``held``, else three times.
+        held: ``start`` is the camera, its covariance is carried through.
+        guess: see `calibrate_camera`.
+        lens: the same.
+        distance: what gives the scale; None: the mean of the nominal distances.
+
+    Raises:
+        ConfigError: nothing in view, a marker that is in too few views, or as `calibrate_intrinsics`.
+    """
+    camera, known = start, target
+    if not held:
+        starts = start_cameras(start.width, start.height, lens) if guess else [with_lens(start, lens)]
+        camera = _rough(frames, target, starts, lens)
+    for _ in range(_MEASURED):
+        views = _all_centers(frames, known, camera, rims=True)
+        check_seen(views, target)
+        plate = free_plate(target.ids, target.centers, rims=True)
+        if held:
+            found = measure_plate(views, camera, plate)
+        else:
+            found = calibrate_intrinsics(views, [camera], lens=lens, plate=plate)
+        if distance is not None:
+            found = scaled_by_distance(found, distance)
+        else:
+            stated = None if target.covariance is None else target.covariance[:-1, :-1]
+            found = scaled_by_prior(found, stated)
+        measured, camera_of = measured_target(found, known)
+        camera, known = (camera if held else camera_of), measured
+    found = replace(found, camera=camera_of, warnings=[*found.warnings, *doubts(found, target)])
+    return Measurement(found, target, measured, camera_of)
 
 
 def locate_camera(frames: Frames, shown: Target | Board, camera: Camera) -> tuple[Views, Bundle]:
@@ -64,8 +148,8 @@ def _all_corners(frames: Frames, board: Board) -> Views:
     return views
 
 
-def _all_centers(frames: Frames, target: Target, camera: Camera) -> Views:
-    return Views.cat([measure_centers(names, part, camera, target) for names, part in frames()])
+def _all_centers(frames: Frames, target: Target, camera: Camera, *, rims: bool = False) -> Views:
+    return Views.cat([measure_centers(names, part, camera, target, rims=rims) for names, part in frames()])
 
 
 def calibrate_robot(

@@ -14,6 +14,21 @@ from torchpose.geometry.segments import rank_in_group
 
 
 @dataclass(frozen=True, eq=False)
+class Rims(Rows):
+    """What the two circles of K rings tell beside their centres.
+
+    Attributes:
+        depth: logarithm of the distance along the optical axis, mm, at which the ring of the file looks so large.
+        gain: apparent edge gain beyond that of the file: every edge lies outwards by so much, mm.
+        covariance: of u, v (px), depth and gain.
+    """
+
+    depth: Float[Tensor, " K"]
+    gain: Float[Tensor, " K"]
+    covariance: Float[Tensor, "K 4 4"]
+
+
+@dataclass(frozen=True, eq=False)
 class Views(Rows):
     """K points seen in N views of one camera. Indexing selects points, `len` is the number of views.
 
@@ -24,6 +39,7 @@ class Views(Rows):
         pixels: raw (distorted) px.
         covariance: px^2; zero where it is not known, see `torchpose.calibration.intrinsics.calibrate_intrinsics`.
         names: of the N views (of the frames).
+        rims: of the rings, where they were measured.
     """
 
     view: Int[Tensor, " K"]
@@ -32,6 +48,7 @@ class Views(Rows):
     pixels: Float[Tensor, "K 2"]
     covariance: Float[Tensor, "K 2 2"]
     names: tuple[str, ...] = shared()
+    rims: Rims | None = None
 
     def __len__(self) -> int:
         return len(self.names)

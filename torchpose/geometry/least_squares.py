@@ -83,9 +83,12 @@ class Vector(Rows):
 
 @dataclass(frozen=True, eq=False)
 class PosePrior(Rows):
-    """What is known of poses beside the data: the information about them, and where it has them."""
+    """What is known of poses beside the data: the information about them, and where it has them.
 
-    information: Float[Tensor, "N 6 6"]
+    It may be about more unknowns than the pose, which come after it and are known to be about zero.
+    """
+
+    information: Float[Tensor, "N k k"]
     pose: Pose
 
     def at(self, pose: Pose, size: int = 6) -> tuple[Tensor, Tensor]:

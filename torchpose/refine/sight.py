@@ -104,7 +104,7 @@ def refined_by_blur(
     """N rows refined in parts, each in frames reduced by its ``factor``; blurs in px of the frames themselves.
 
     Args:
-        prior: (N, 6, 6), information about the pose where it starts.
+        prior: (N, 6, 6), information about the pose where it starts, or (N, 7, 7) with an edge gain of zero.
     """
     known = None if prior is None else PosePrior(prior, start)
     order, parts = [], []
@@ -128,6 +128,8 @@ class Refined(Rows):
         noise: standard deviation of the residuals kept: grey levels (photometric), px (edges).
         kept: share of the pixels, or edge points, kept.
         good: where False the refinement failed and the other fields mean nothing.
+        gain: by which every edge of the rings lies outwards, mm, where it was an unknown.
+        gain_covariance: of the gain with translation and rotation, and its variance.
     """
 
     R: Float[Tensor, "N 3 3"]
@@ -137,6 +139,8 @@ class Refined(Rows):
     noise: Float[Tensor, " N"]
     kept: Float[Tensor, " N"]
     good: Bool[Tensor, " N"]
+    gain: Float[Tensor, " N"] | None = None
+    gain_covariance: Float[Tensor, "N 7"] | None = None
 
     @property
     def blur(self) -> Float[Tensor, " N"]:

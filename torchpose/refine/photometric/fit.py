@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torchpose.detect.reduce import reduction_for
 from torchpose.geometry import blur as blurs
-from torchpose.geometry.blurred_edge import LEAST, MOST, Kind, Spread
+from torchpose.geometry.blurred_edge import BLUR, LEAST, MOST, Kind, Spread
 from torchpose.geometry.least_squares import Block, Minimum, Normal, Pose, PosePrior, Unknowns, Vector, minimise
 from torchpose.geometry.robust import of_chance
 from torchpose.geometry.rows import Rows
@@ -34,7 +34,7 @@ from torchpose.refine.photometric.grey_levels import (
     noise_spread,
     sum_products,
 )
-from torchpose.refine.photometric.light import LEVELS, POSE, normal_equations
+from torchpose.refine.photometric.light import GAIN, LEVELS, POSE, normal_equations
 from torchpose.refine.photometric.ring_model import gather_pixels, ring_model
 from torchpose.refine.photometric.sectors import Sectors, away_from_unclear, clear_sectors, doubtful, sum_sectors, trust
 from torchpose.refine.sight import Refined, Sight, refined_by_blur
@@ -61,6 +61,7 @@ _KINDS: tuple[Kind, ...] = ("gauss", "line", "disc")
 _LONG = 1.7  # variance along the major axis over the minor one: a motion of 2 px, from which on it may be a line
 _MATTERS = 0.004  # of the contrast, RMS at the edges: that of a disc of 2 px, which costs a tenth in the covariance
 _FEWER = 0.02  # of the pixels that a shape of the blur may keep less than a Gaussian, and still explain them better
+_MOST_GAIN = 0.5  # of what would close the smallest hole, or the thinnest ring
 _QUICK = (_Stage(3, coarse=True), _Stage(1))
 _THOROUGH = (_Stage(3, coarse=True, wary=True), _Stage(2, wary=True), _Stage(2, wary=True, tempered=True))
 
@@ -73,7 +74,8 @@ def refine_photometric(sight: Sight, rotation: Tensor, translation: Tensor, *, p
         rotation: (N, 3, 3) to start from, within about a pixel.
         translation: (N, 3), the same.
         prior: (N, 6, 6), information about the pose besides the frames, that is the inverse covariance of the start:
-            from the robot, or to hold what is known.
+            from the robot, or to hold what is known. (N, 7, 7): the edge gain is an unknown too, in mm, and this is
+            known of it, about zero.
     """
     factor = reduction_for(blurs.axes(sight.common_blur)[0].clamp_min(0).sqrt(), _WIDEST)
     return refined_by_blur(_refined_in, sight, Pose(rotation, translation), prior, factor)
@@ -128,12 +130,15 @@ def _refined(fit: _Fit, start: Pose, spread: Spread, stages: tuple[_Stage, ...])
     """Rows refined in stages from poses and blurs."""
     found = _minimised(fit, start, spread, stages)
     pose, owner, rows = found.unknowns.pose, fit.blocks.row, len(spread)
-    covariance, determined = found.covariance()
-    covariance = covariance[:, :6, :6]
+    whole, determined = found.covariance()
+    covariance = whole[:, :6, :6]
     kept, usable = (segment_sum((x > 0).sum(-1), owner, rows) for x in (fit.weight, fit.usable))
     good = determined & covariance.isfinite().all(-1).all(-1)
     spread = cast(Spread, found.unknowns.own["blur"])
     refined = Refined(pose.R, pose.t, covariance, spread.covariance, fit.variance.sqrt(), kept / usable, good)
+    if fit.gain:
+        with_gain = whole[:, GAIN, [*range(6), GAIN]]
+        refined = replace(refined, gain=found.unknowns.values("gain")[:, 0], gain_covariance=with_gain)
     seen, of_them = (segment_sum(b.valid.sum(-1).double(), owner, rows) for b in (fit.blocks, fit.coarse))
     more = (seen / of_them.clamp_min(1)).clamp_min(1)
     doubt = doubtful(fit.sectors, fit.clear, fit.variance[owner], owner, found.step.own_chi2, more)
@@ -142,6 +147,10 @@ def _refined(fit: _Fit, start: Pose, spread: Spread, stages: tuple[_Stage, ...])
 
 def _minimised(fit: _Fit, start: Pose, spread: Spread, stages: tuple[_Stage, ...]) -> Minimum:
     own: dict[str, Block] = {"pose": start, "blur": spread}
+    if fit.gain:
+        outer, inner = fit.blocks.radii.unbind(-1)
+        most = _MOST_GAIN * torch.minimum(inner, 0.5 * (outer - inner)).amin().reshape(1)
+        own["gain"] = Vector(torch.zeros_like(start.t[:, :1]), low=-most, high=most)
     levels = first_levels(fit.coarse, start.R, start.t, spread)
     unknowns = Unknowns(own, {"levels": Vector(levels)}, fit.blocks.row)
     for stage in stages:
@@ -168,6 +177,7 @@ class _Fit:
         self.blocks = gather_pixels(sight, band, TILE * _COARSE)
         self.coarse = self.blocks.every(_COARSE, most_coarse)
         self.prior = prior
+        self.gain = prior is not None and prior.information.shape[-1] > POSE - BLUR
         self.stage = _QUICK[0]
         self.variance = torch.ones_like(band)
         self.least = torch.full_like(band, sight.quantisation)
@@ -177,8 +187,10 @@ class _Fit:
         stage, part, pose = self.stage, self.coarse if self.stage.coarse else self.blocks, unknowns.pose
         levels = unknowns.values("levels")
         spread = cast(Spread, unknowns.own["blur"])
+        if self.gain:
+            part = part.wider(unknowns.values("gain")[:, 0])
         model = ring_model(part, pose.R, pose.t, spread, check=True)
-        columns, slope = columns_of(part, model, levels)
+        columns, slope = columns_of(part, model, levels, gain=self.gain)
         residual = columns[:, :, -1].flatten(1)
         self.usable, self.weight = inliers(residual, part, model, levels)
         if not stage.coarse:
@@ -187,9 +199,20 @@ class _Fit:
             factor = self._trusted(noise_spread(residual, part), model_misfit(levels))
             self.weight = self.weight * self.sectors.of_pixels(factor.to(self.weight.dtype))
         sums = sum_products(columns, self.weight)
-        prior = None if self.prior is None else self.prior.at(pose, POSE)
+        prior = self._known(unknowns)
         normal, self.variance = normal_equations(sums, self.weight.sum(-1), levels, part.row, self.least, prior)
         return normal
+
+    def _known(self, unknowns: Unknowns) -> tuple[Tensor, Tensor] | None:
+        """The prior's information (N, n, n) about the frames' unknowns, and how far these moved from it (N, n)."""
+        if self.prior is None or not self.gain:
+            return None if self.prior is None else self.prior.at(unknowns.pose, POSE)
+        both = self.prior.information
+        _, moved = replace(self.prior, information=both[:, :6, :6]).at(unknowns.pose, POSE)
+        place = [*range(6), GAIN]
+        information = both.new_zeros(len(both), GAIN + 1, GAIN + 1)
+        information[:, torch.tensor(place)[:, None], torch.tensor(place)] = both
+        return information, torch.cat([moved, unknowns.values("gain")], -1)
 
     def _stands_out(self, residual: Tensor, slope: Tensor, levels: Tensor) -> Tensor:
         """Rows (N,) bool whose mean square residual is larger at the edges than elsewhere, beyond chance and by so much

@@ -16,6 +16,7 @@ from torchpose.geometry.least_squares import Eliminated, Normal
 from torchpose.geometry.segments import segment_mean, segment_sum
 
 POSE, LEVELS = 6 + BLUR, 6  # unknowns of a frame (translation, rotation, blur) and of a marker, at least
+GAIN = POSE  # column of the edge gain, where it is an unknown of the frame
 _GRADIENTS = (1, 2, 4, 5)  # among the levels
 _CURVATURES = (6, 7, 8, 9, 10, 11)  # where there are any
 _BLUR_KNOWN = 1e-4  # information about each number of a blur, px^-4: a disc has two, so that the third is open
@@ -35,25 +36,25 @@ def normal_equations(
 
     Args:
         sums: (K, 10 + L, 10 + L), of every marker, weight times products of the derivatives by pose (9) and levels (L)
-            and the residual.
+            and the residual; one more each where the edge gain is an unknown of the frame, after the blur.
         used: (K,) sum of weights.
         levels: (K, L) so far, L = 6, or 12 with the light's curvature.
         owner: (K,) int64, frame of every marker.
         least: (N,) variance below which the noise's does not fall.
         prior: information (N, 9, 9) about the pose, and how far the pose is from the prior's (N, 9).
     """
-    rows = len(least)
+    rows, pose = len(least), sums.shape[-1] - 1 - levels.shape[1]
     count = torch.bincount(owner, minlength=rows)
     chi2 = segment_sum(sums[:, -1, -1], owner, rows)
-    freedom = segment_sum(used, owner, rows) - POSE - levels.shape[1] * count
+    freedom = segment_sum(used, owner, rows) - pose - levels.shape[1] * count
     variance = (chi2 / freedom.clamp_min(1)).maximum(least)
     sums = sums / variance[owner, None, None]
-    own, mixed, of_levels = sums[:, :POSE, :POSE], sums[:, :POSE, POSE:-1], sums[:, POSE:-1, POSE:-1]
+    own, mixed, of_levels = sums[:, :pose, :pose], sums[:, :pose, pose:-1], sums[:, pose:-1, pose:-1]
     ridge = (_RIDGE * of_levels.diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)).expand(levels.shape)
-    part = Eliminated(mixed, of_levels + torch.diag_embed(ridge), sums[:, POSE:-1, -1], owner)
+    part = Eliminated(mixed, of_levels + torch.diag_embed(ridge), sums[:, pose:-1, -1], owner)
     own = segment_sum(own, owner, rows)
-    own.diagonal(dim1=-2, dim2=-1)[:, POSE - BLUR :] += _BLUR_KNOWN
-    normal = Normal(own, segment_sum(sums[:, :POSE, -1], owner, rows), chi2 / variance, part)
+    own.diagonal(dim1=-2, dim2=-1)[:, POSE - BLUR : POSE] += _BLUR_KNOWN
+    normal = Normal(own, segment_sum(sums[:, :pose, -1], owner, rows), chi2 / variance, part)
     normal = normal if prior is None else normal.with_prior(*prior)
     precision = _precision(normal, part, levels)
     held = replace(

@@ -64,6 +64,10 @@ class PixelBlocks(Rows):
     limits: Float[Tensor, "K 2"]
     quantisation: float = shared()
 
+    def wider(self, gain: Tensor) -> PixelBlocks:
+        """Rings whose every edge lies outwards by the edge gain (N,) of their row, mm."""
+        return replace(self, radii=self.radii + gain[self.row, None] * gain.new_tensor([1.0, -1.0]))
+
     def every(self, nth: int, most: int | None = None) -> PixelBlocks:
         """The same with one pixel of ``nth``, or as many fewer as leave ``most`` of each marker."""
         count = self.grey.shape[1] // nth
@@ -83,7 +87,7 @@ class RingModel(NamedTuple):
 
     fraction: of paper, F. by_d: dF/dd through both circles. by_blur: 3 planes. by_pose: 6 planes, derivative of d.
     x, y: plane coordinates over the outer radius. sound: bool, False where the expansions below do not hold: deep in
-    a hole that is small for its blur, or where it is flat; None if not asked for.
+    a hole that is small for its blur, or where it is flat; None if not asked for. by_gain: dF by the edge gain, mm.
     """
 
     fraction: Tensor
@@ -93,6 +97,7 @@ class RingModel(NamedTuple):
     x: Tensor
     y: Tensor
     sound: Tensor | None
+    by_gain: Tensor
 
 
 def gather_pixels(sight: Sight, band: Tensor, grain: int) -> PixelBlocks:
@@ -266,4 +271,5 @@ def ring_model(blocks: PixelBlocks, R: Tensor, t: Tensor, spread: Spread, *, che
     by_blur = tuple(one - other for one, other in zip(outer.by_blur, inner.by_blur, strict=True))
     size = blocks.radii[:, :1].float()
     fraction, by_d = outer.fraction + 1 - inner.fraction, outer.by_distance - inner.by_distance
-    return RingModel(fraction, by_d, by_blur, rim.by_pose, foot.x / size, foot.y / size, sound)
+    by_gain = -rim.per_mm * (outer.by_distance + inner.by_distance)
+    return RingModel(fraction, by_d, by_blur, rim.by_pose, foot.x / size, foot.y / size, sound, by_gain)

@@ -1,0 +1,234 @@
+"""A target measured by a camera: places, edge gain and sizes of its rings, with the covariance of all of it.
+
+The frame of a measured target is the one in which its places fit the nominal ones best. Views tell no scale: it is that
+of the nominal places too, as uncertain as their file says, or a distance between two of them that was measured.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchpose.calibration.intrinsics import Calibration
+from torchpose.calibration.plate import Plate
+from torchpose.calibration.views import Views
+from torchpose.camera import Camera
+from torchpose.errors import ConfigError
+from torchpose.geometry.segments import segment_mean
+from torchpose.target import Target
+
+_DIGITS = 12  # of the name of an adjustment
+_LEAST_VIEWS = 3  # of a marker: two give a place, without anything to check it by
+_POOR = 1e-3  # deviation of a place over the extent of the plate, above which it is called poorly known
+_OFTEN = 0.15  # share of a marker's points left out, from which on chance is no explanation
+_SHOWN = 3  # names in a sentence
+_BENT = 2.0  # residual of a view over the median of all, above which it is named
+
+
+@dataclass(frozen=True)
+class Distance:
+    """Between the centres of two markers, by their ids, in mm, with its standard deviation."""
+
+    first: int
+    second: int
+    length: float
+    sigma: float = 0.0
+
+    def check(self, target: Target) -> None:
+        """Raises ConfigError where the target has no such markers, or the numbers are none."""
+        known = target.ids.tolist()
+        for marker in (self.first, self.second):
+            if marker not in known:
+                raise ConfigError(f"--distance: target {target.name} has no marker {marker}; its ids are {known}")
+        if self.first == self.second or not self.length > 0 or not self.sigma >= 0:
+            raise ConfigError("--distance: give two different markers, a length above 0 mm and a deviation from 0 mm")
+
+
+def scaled_by_prior(calibration: Calibration, covariance: Tensor | None) -> Calibration:
+    """The calibration with the scale of the nominal places as uncertain as their covariance (3M, 3M) makes it."""
+    arm = _arms(calibration).flatten()
+    size = arm.square().sum()
+    variance = 0.0 if covariance is None else float(arm @ covariance @ arm / size.square())
+    return _scaled(calibration, 1.0, torch.zeros_like(calibration.joint[0]), variance)
+
+
+def scaled_by_distance(calibration: Calibration, distance: Distance) -> Calibration:
+    """The calibration with its places, and poses, scaled so that a distance between two of them is as measured."""
+    plate = calibration.plate
+    assert plate is not None  # what was measured
+    ends = plate.index(plate.ids.new_tensor([distance.first, distance.second]))
+    places = plate.at(calibration.bundle.plate).places[ends]
+    between = places[0] - places[1]
+    length = between.norm()
+    by_unknown = -(between / length.square()) @ (plate.places[ends[0]] - plate.places[ends[1]])
+    row = pad(by_unknown, (len(calibration.joint) - len(plate), 0))
+    factor = distance.length / float(length)
+    return _scaled(calibration, factor, row, (distance.sigma / distance.length) ** 2)
+
+
+def _arms(calibration: Calibration) -> Float[Tensor, "M 3"]:
+    assert calibration.plate is not None  # what was measured
+    places = calibration.plate.at(calibration.bundle.plate).places
+    return places - places.mean(0)
+
+
+def _scaled(calibration: Calibration, factor: float, row: Float[Tensor, " u"], variance: float) -> Calibration:
+    """Places scaled about their middle, with the scale as one more unknown of the plate.
+
+    Args:
+        row: how the relative change of scale follows the unknowns that there are.
+        variance: of it besides.
+    """
+    plate, bundle = calibration.plate, calibration.bundle
+    assert plate is not None  # what was measured
+    layout = plate.at(bundle.plate)
+    middle = layout.places.mean(0)
+    arm = factor * (layout.places - middle)
+
+    def about(places: Tensor) -> Tensor:
+        return middle + factor * (places - middle)
+
+    wider = replace(
+        plate,
+        nominal=about(plate.nominal),
+        places=torch.cat([factor * plate.places, arm[..., None]], -1),
+        gain=pad(plate.gain, (0, 1)),
+        larger=plate.larger + math.log(factor),
+        sizes=pad(plate.sizes, (0, 1), value=1.0),
+        known=pad(plate.known, (0, 1)),
+    )
+    to_scale = torch.cat([torch.eye(len(row)).to(row), row[None]])
+    joint = to_scale @ calibration.joint @ to_scale.mT
+    joint[-1, -1] += variance
+    turned = bundle.R @ middle
+    t = factor * bundle.t + (factor - 1) * turned
+    units = torch.cat([torch.full((3,), factor), torch.ones(3)]).to(t)
+    by_scale = pad(t + turned, (0, 3))[..., None]
+    poses = replace(
+        bundle,
+        t=t,
+        plate=pad(bundle.plate, (0, 1)),
+        pose_covariance=units[:, None] * bundle.pose_covariance * units,
+        gain=torch.cat([units[:, None] * bundle.gain, by_scale], -1),
+    )
+    return replace(calibration, plate=wider, bundle=poses, joint=joint)
+
+
+def measured_target(calibration: Calibration, target: Target) -> tuple[Target, Camera]:
+    """The target as measured, and the camera, each with its covariance; both know of their common adjustment.
+
+    Args:
+        calibration: with all markers of the target in its plate.
+        target: that the rings were measured with: its radii and edge gain are what the calibration's count from.
+    """
+    plate, n = calibration.plate, len(calibration.covariance)
+    assert plate is not None  # what was measured
+    layout = plate.at(calibration.bundle.plate)
+    order = plate.index(target.ids)
+    outwards = 1.0 if target.background == "light" else -1.0
+    rows = torch.cat([plate.places[order].flatten(0, 1), outwards * plate.gain[None]])
+    of_plate, cross = calibration.joint[n:, n:], rows @ calibration.joint[n:, :n]
+    covariance = rows @ of_plate @ rows.mT
+    # files hold the deviation of the gain, not what it shares with the places, which is next to nothing
+    covariance[-1, :-1] = covariance[:-1, -1] = 0.0
+    name = _name_of(calibration.joint, layout.places)
+    measured = replace(
+        target,
+        centers=layout.places[order],
+        radii=target.radii * layout.sizes[order, None].exp(),
+        edge_gain=target.edge_gain + outwards * float(layout.gain),
+        covariance=0.5 * (covariance + covariance.mT),
+        adjustment=name,
+        cross_covariance=cross,
+    )
+    return measured, replace(calibration.camera, adjustment=name)
+
+
+def check_seen(views: Views, target: Target) -> None:
+    """Raises ConfigError where a marker is in too few views to have a place in three dimensions."""
+    counts = (views.point[:, None] == target.ids).sum(0)
+    if bool((counts < _LEAST_VIEWS).any()):
+        few = ", ".join(map(str, target.ids[counts < _LEAST_VIEWS].tolist()))
+        raise ConfigError(
+            f"INPUT: marker {few} of target {target.name} is in fewer than {_LEAST_VIEWS} views; add views that show it"
+        )
+
+
+def doubts(calibration: Calibration, target: Target) -> list[str]:
+    """What makes a measured target doubtful, one sentence each."""
+    return [*_poorly_known(calibration, target), *_moved(calibration), *_bent(calibration)]
+
+
+def _poorly_known(calibration: Calibration, target: Target) -> list[str]:
+    plate, n = calibration.plate, len(calibration.covariance)
+    assert plate is not None  # what was measured
+    of_plate = calibration.joint[n:, n:]
+    sigma = (plate.places @ of_plate * plate.places).sum(-1).clamp_min(0).sqrt()  # (M, 3)
+    stated = torch.full_like(sigma, torch.inf)
+    if target.covariance is not None:
+        stated = target.covariance.diagonal()[:-1].sqrt().view(-1, 3)[target_order(plate, target)]
+    extent = float(_arms(calibration).norm(dim=-1).max())
+    worst, axis = divmod(int(sigma.argmax()), 3)
+    found = []
+    if float(sigma.max()) > _POOR * extent:
+        found.append(
+            f"marker {int(plate.ids[worst])} is known to {float(sigma.max()):.2g} mm along {'xyz'[axis]} only; the "
+            "views are too alike: add views tilted by 20 to 45 degrees in different directions"
+        )
+    if bool((sigma > stated).all(-1).any()):
+        found.append("the file states places better than these views tell them; take more views, or keep the file")
+    return found
+
+
+def target_order(plate: Plate, target: Target) -> Tensor:
+    """Which of the target's markers each of the plate's points (M,) is."""
+    return (plate.ids[:, None] == target.ids).long().argmax(1)
+
+
+def _moved(calibration: Calibration) -> list[str]:
+    """Markers of which more points were left out than chance would."""
+    seen, used = calibration.seen, calibration.views
+    if seen is None:
+        return []
+    kept = {(used.names[v], p) for v, p in zip(used.view.tolist(), used.point.tolist(), strict=True)}
+    out = [
+        (seen.names[v], p)
+        for v, p in zip(seen.view.tolist(), seen.point.tolist(), strict=True)
+        if seen.names[v] in used.names and (seen.names[v], p) not in kept
+    ]
+    found = []
+    for marker in sorted({p for _, p in out}):
+        frames = [name for name, p in out if p == marker]
+        if len(frames) >= max(_LEAST_VIEWS, _OFTEN * int((seen.point == marker).sum())):
+            names = ", ".join(frames[:_SHOWN]) + (" and others" if len(frames) > _SHOWN else "")
+            found.append(f"marker {marker} is elsewhere in {len(frames)} views ({names}): it moved, or is damaged")
+    return found
+
+
+def _bent(calibration: Calibration) -> list[str]:
+    """Residuals beyond the noise of the frames although the places are free: the plate is not the same in all views."""
+    own = float(calibration.views.covariance.diagonal(dim1=-2, dim2=-1).mean().sqrt())
+    if calibration.common_sigma_px < own:
+        return []
+    rms = segment_mean(
+        calibration.bundle.residual.square().sum(-1), calibration.views.view, len(calibration.views)
+    ).sqrt()
+    high = rms > _BENT * rms.median()
+    names = [name for name, much in zip(calibration.views.names, high.tolist(), strict=True) if much]
+    where = f", most in {', '.join(names[:_SHOWN])}" if names else ""
+    return [
+        f"residuals are {calibration.common_sigma_px:.2g} px beyond noise with all places free{where}: the plate changes "
+        "its shape between views, or --model does not describe the lens"
+    ]
+
+
+def _name_of(*tensors: Tensor) -> str:
+    """A name that two adjustments of different frames do not share."""
+    digest = hashlib.sha256(b"".join(tensor.double().cpu().numpy().tobytes() for tensor in tensors))
+    return f"ba-{digest.hexdigest()[:_DIGITS]}"
