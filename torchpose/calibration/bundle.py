@@ -5,13 +5,14 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import pad
 
-from torchpose.calibration.plate import Layout, Plate
+from torchpose.calibration.plate import Plate
 from torchpose.calibration.views import Views
 from torchpose.camera import Camera
 from torchpose.camera.derivatives import by_intrinsics
 from torchpose.errors import ConfigError
-from torchpose.geometry import least_squares
+from torchpose.geometry import least_squares, rotations
 from torchpose.geometry.least_squares import Code, Eliminated, Normal, Pose, Unknowns, Vector
 from torchpose.geometry.projection import by_pose, image_by_point
 from torchpose.geometry.segments import segment_sum
@@ -39,7 +40,7 @@ class Bundle:
     gain: Float[Tensor, "N 6 u"]  # d pose / d intrinsics and plate at the optimum
     converged: bool  # whether the last step promised next to nothing
     plate: Float[Tensor, " k"]  # unknowns of the plate
-    rims: Float[Tensor, "K r"]  # seen - predicted, depth and gain (r = 2); none where they were not asked
+    rims: Float[Tensor, "K r"]  # what rims tell less what is predicted (r = 7); none where they were not asked
 
 
 def adjust(
@@ -75,15 +76,15 @@ def adjust(
     covariance, determined = least_squares.scaled_inverse(part.information)
     if not bool(determined.all()):
         raise ConfigError("INPUT: the points of a view leave its pose open; use targets whose points are not on a line")
-    residual = problem.residual(unknowns, moved)
+    residual = problem.of_pixels(unknowns, moved)
     whiten = torch.linalg.inv(torch.linalg.cholesky(views.covariance))
-    chi2 = (whiten @ residual[:, :2, None]).square().sum((-1, -2))
+    chi2 = (whiten @ residual[..., None]).square().sum((-1, -2))
     gain, converged = -covariance @ part.mixed.mT, int(found.code) == Code.CONVERGED
     # without the trace of a diagonal that steps are solved with: whether the views tell is decided by this
     information = normal.information[0] - (part.mixed @ covariance @ part.mixed.mT).sum(0)
     z = residual.new_zeros(0) if plate is None else unknowns.values("plate")[0]
-    found_at = (moved, pose.R, pose.t, residual[:, :2], chi2, information, covariance, gain, converged)
-    return Bundle(*found_at, z, residual[:, 2:])
+    found_at = (moved, pose.R, pose.t, residual, chi2, information, covariance, gain, converged)
+    return Bundle(*found_at, z, problem.of_rims(unknowns, moved))
 
 
 def moved_camera(camera: Camera, step: Tensor) -> Camera | None:
@@ -95,16 +96,24 @@ def moved_camera(camera: Camera, step: Tensor) -> Camera | None:
     return replace(camera, matrix=matrix, distortion=camera.distortion + step[4:])
 
 
+def intrinsics_between(camera: Camera, other: Camera) -> Tensor:
+    """Intrinsics (n,) of a camera less those of another."""
+    one, two = (torch.cat([c.matrix.diagonal()[:2], c.matrix[:2, 2], c.distortion]) for c in (camera, other))
+    return one - two
+
+
 class _Problem:
-    """The normal equations of K observations; of the rims too, where the plate has unknowns that these tell of."""
+    """The normal equations of K observations: pixels, or all that rims tell where the plate has unknowns for it."""
 
     def __init__(self, views: Views, camera: Camera, plate: Plate | None, free: bool) -> None:
         self.views, self.plate, self.free = views, plate, free
         self.start = camera
-        self.point = None if plate is None else plate.index(views.point)
+        self.point = views.point if plate is None else plate.index(views.point)
         self.rims = views.rims if plate is not None and plate.rims else None
-        covariance = views.covariance if self.rims is None else self.rims.covariance
-        self.whiten = torch.linalg.inv(torch.linalg.cholesky(covariance))
+        if self.rims is None:
+            self.whiten = torch.linalg.inv(torch.linalg.cholesky(views.covariance))
+        else:
+            self.whiten, self.best = self.rims.roots, self.rims.best
 
     def __call__(self, unknowns: Unknowns) -> Normal:
         moved = self.camera_at(unknowns)
@@ -116,49 +125,48 @@ class _Problem:
     def camera_at(self, unknowns: Unknowns) -> Camera | None:
         return moved_camera(self.start, unknowns.values("intrinsics")[0]) if self.free else self.start
 
-    def layout(self, unknowns: Unknowns) -> Layout:
-        """Of the observations."""
-        if self.plate is None or self.point is None:
-            nothing = torch.zeros_like(self.views.points[:, 0])
-            return Layout(self.views.points, nothing, nothing)
-        return self.plate.at(unknowns.values("plate")[0]).of(self.point)
-
-    def placed(self, unknowns: Unknowns, layout: Layout) -> tuple[Tensor, Tensor]:
+    def placed(self, unknowns: Unknowns) -> tuple[Tensor, Tensor]:
         """Points about the target's origin (K, 3), and in the camera (K, 3), camera axes."""
         pose, view = unknowns.pose, self.views.view
-        arm = (pose.R[view] @ layout.places[..., None])[..., 0]
+        points = self.views.points
+        if self.plate is not None:
+            points = self.plate.at(unknowns.values("plate")[0]).places[self.point]
+        arm = (pose.R[view] @ points[..., None])[..., 0]
         return arm, arm + pose.t[view]
 
-    def residual(self, unknowns: Unknowns, camera: Camera) -> Tensor:
-        """Seen less predicted (K, 2), with the rims (K, 4); not whitened."""
-        layout = self.layout(unknowns)
-        _, at = self.placed(unknowns, layout)
-        pixels = self.views.pixels - camera.distort(at[:, :2] / at[:, 2:])
-        if self.rims is None:
-            return pixels
-        depth = self.rims.depth - at[:, 2].clamp_min(1e-9).log() + layout.sizes
-        return torch.cat([pixels, depth[:, None], (self.rims.gain - layout.gain)[:, None]], -1)
+    def of_pixels(self, unknowns: Unknowns, camera: Camera) -> Tensor:
+        """Seen less predicted (K, 2)."""
+        _, at = self.placed(unknowns)
+        return self.views.pixels - camera.distort(at[:, :2] / at[:, 2:])
+
+    def of_rims(self, unknowns: Unknowns, camera: Camera) -> Tensor:
+        """What the rims tell less what is predicted (K, 7); (K, 0) where they are not asked."""
+        if self.rims is None or self.plate is None:
+            return self.views.pixels[:, :0]
+        _, at = self.placed(unknowns)
+        layout = self.plate.at(unknowns.values("plate")[0]).of(self.point)
+        rims, turn = self.rims, unknowns.pose.R[self.views.view] @ rotations.exp(layout.turns)
+        ring = torch.cat(
+            [
+                rims.t - at * torch.exp(-layout.sizes)[:, None],
+                rotations.log(rims.R @ turn.mT),
+                (rims.gain - layout.gain)[:, None],
+            ],
+            -1,
+        )
+        return ring + self.best - rims.by_camera @ intrinsics_between(camera, rims.camera)
 
     def normal(self, unknowns: Unknowns, camera: Camera, *, by_camera: bool) -> Normal:
         """Normal equations, of infinite cost where a point is behind the camera or beyond the lens model."""
         views = self.views
-        arm, at = self.placed(unknowns, self.layout(unknowns))
+        arm, at = self.placed(unknowns)
         depth, xy = at[:, 2], at[:, :2] / at[:, 2:]
         possible = (depth > 0).all() & (xy.norm(dim=-1) < camera.fold_radius).all()
-        residual = self.whiten @ self.residual(unknowns, camera)[..., None]
-        by_point = camera.J_distort(xy) @ image_by_point(xy, depth)
-        if self.rims is not None:
-            rows = torch.zeros_like(by_point)
-            rows[:, 0, 2] = 1 / depth
-            by_point = torch.cat([by_point, rows], 1)
-        by_view = self.whiten @ by_pose(by_point, arm)
-        columns = []
-        if by_camera:
-            more = (0, 0, 0, by_point.shape[1] - 2)
-            columns.append(torch.nn.functional.pad(by_intrinsics(camera, xy), more))
-        if self.plate is not None:
-            columns.append(self._by_plate(by_point @ unknowns.pose.R[views.view]))
-        own = self.whiten @ torch.cat(columns, -1) if columns else by_view[..., :0]
+        residual, by_view, columns = (self._by_rims if self.rims is not None else self._by_pixels)(
+            unknowns, camera, arm, at
+        )
+        own = torch.cat(columns if by_camera else columns[1:], -1) if by_camera or columns[1:] else by_view[..., :0]
+        residual, by_view, own = self.whiten @ residual[..., None], self.whiten @ by_view, self.whiten @ own
 
         def of_views(values: Tensor) -> Tensor:
             return segment_sum(values, views.view, len(views))
@@ -176,15 +184,35 @@ class _Problem:
         )
         if self.plate is None:
             return normal
-        prior = torch.nn.functional.pad(self.plate.known, (own.shape[-1] - len(self.plate), 0))
-        moved = torch.nn.functional.pad(unknowns.values("plate"), (own.shape[-1] - len(self.plate), 0))
+        before = own.shape[-1] - len(self.plate)
+        prior, moved = (pad(values, (before, 0)) for values in (self.plate.known, unknowns.values("plate")))
         return normal.with_prior(torch.diag(prior)[None], moved)
 
-    def _by_plate(self, by_place: Tensor) -> Tensor:
-        """Derivatives (K, 2|4, k) by the plate's unknowns, from those by the places in the frame of the target."""
+    def _by_pixels(
+        self, unknowns: Unknowns, camera: Camera, arm: Tensor, at: Tensor
+    ) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """Residuals (K, 2), derivatives of what is predicted by the pose, and by the camera and the plate."""
+        xy = at[:, :2] / at[:, 2:]
+        by_point = camera.J_distort(xy) @ image_by_point(xy, at[:, 2])
+        columns = [by_intrinsics(camera, xy)]
+        if self.plate is not None:
+            columns.append(by_point @ unknowns.pose.R[self.views.view] @ self.plate.places[self.point])
+        return self.of_pixels(unknowns, camera), by_pose(by_point, arm), columns
+
+    def _by_rims(
+        self, unknowns: Unknowns, camera: Camera, arm: Tensor, at: Tensor
+    ) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """The same of the rims, (K, 7)."""
+        assert self.rims is not None
         assert self.plate is not None
-        columns = by_place @ self.plate.places[self.point]
-        if self.rims is not None:
-            columns[:, 2] -= self.plate.sizes[self.point]
-            columns[:, 3] += self.plate.gain
-        return columns
+        plate, rotation = self.plate, unknowns.pose.R[self.views.view]
+        smaller = torch.exp(-self.plate.at(unknowns.values("plate")[0]).sizes[self.point])[:, None, None]
+        eye = torch.eye(3, dtype=at.dtype, device=at.device).expand(len(at), 3, 3)
+        turning = pad(eye, (3, 0))
+        by_view = pad(torch.cat([by_pose(smaller * eye, arm), turning], 1), (0, 0, 0, 1))
+        sizes = plate.sizes[self.point][:, None]
+        places = smaller * (rotation @ plate.places[self.point] - at[..., None] * sizes)
+        turns = rotation @ plate.turns[self.point]
+        gain = plate.gain.expand(len(at), 1, -1)
+        residual = self.of_rims(unknowns, camera)
+        return residual, by_view, [self.rims.by_camera, torch.cat([places, turns, gain], 1)]

@@ -244,8 +244,8 @@ def _rim_chi2(views: Views, bundle: Bundle, common: Common) -> Tensor:
     rims = _with_common(views, common).rims
     if rims is None or bundle.rims.shape[1] == 0:
         return torch.zeros_like(bundle.chi2)
-    solved = torch.linalg.solve(rims.covariance[:, 2:, 2:], bundle.rims[..., None])
-    return (bundle.rims[..., None] * solved).sum((-1, -2))
+    # of the six that tell something, scaled as if they were two as of a point
+    return (rims.roots @ bundle.rims[..., None]).square().sum((-1, -2)) / 3
 
 
 def _common(views: Views, bundle: Bundle, unknowns: int, plate: Plate | None) -> Common:
@@ -255,8 +255,11 @@ def _common(views: Views, bundle: Bundle, unknowns: int, plate: Plate | None) ->
     if views.rims is None or plate is None or bundle.rims.shape[1] == 0:
         return Common(px)
     variance, freedom = views.rims.covariance.diagonal(dim1=-2, dim2=-1), len(views.view) - len(plate.ids)
+    distance = views.rims.t[:, 2:]
+    off = torch.cat([bundle.rims[:, 2:3] / distance, bundle.rims[:, 6:]], -1)
+    variance = torch.cat([variance[:, 2:3] / distance.square(), variance[:, 6:]], -1)
     depth, gain = (
-        common_sigma(bundle.rims[:, k : k + 1], variance[:, 2 + k, None, None], max(1, freedom)) for k in (0, 1)
+        common_sigma(off[:, k : k + 1], variance[:, k, None, None], max(1, freedom)) for k in (0, 1)
     )
     return Common(px, depth, gain)
 
@@ -297,9 +300,11 @@ def _widened(covariance: Tensor, sigma: float) -> Tensor:
 
 def _with_common(views: Views, common: Common) -> Views:
     rims = views.rims
-    if rims is not None:
-        more = torch.diag(rims.covariance.new_tensor([common.px, common.px, common.depth, common.gain]).square())
-        rims = replace(rims, covariance=rims.covariance + more)
+    if rims is not None and any(common):
+        aside, along = common.px / rims.camera.matrix[0, 0] * rims.t[:, 2], common.depth * rims.t[:, 2]
+        none = torch.zeros_like(aside)
+        sigma = torch.stack([aside, aside, along, none, none, none, none + common.gain], -1)
+        rims = rims.widened(sigma.square())
     return replace(views, covariance=_widened(views.covariance, common.px), rims=rims)
 
 

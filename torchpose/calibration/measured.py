@@ -20,6 +20,7 @@ from torchpose.calibration.plate import Plate
 from torchpose.calibration.views import Views
 from torchpose.camera import Camera
 from torchpose.errors import ConfigError
+from torchpose.geometry import rotations
 from torchpose.geometry.segments import segment_mean
 from torchpose.target import Target
 
@@ -101,6 +102,7 @@ def _scaled(calibration: Calibration, factor: float, row: Float[Tensor, " u"], v
         gain=pad(plate.gain, (0, 1)),
         larger=plate.larger + math.log(factor),
         sizes=pad(plate.sizes, (0, 1), value=1.0),
+        turns=pad(plate.turns, (0, 1)),
         known=pad(plate.known, (0, 1)),
     )
     to_scale = torch.cat([torch.eye(len(row)).to(row), row[None]])
@@ -141,6 +143,7 @@ def measured_target(calibration: Calibration, target: Target) -> tuple[Target, C
     measured = replace(
         target,
         centers=layout.places[order],
+        normals=(rotations.exp(layout.turns[order]) @ target.normals[..., None]).squeeze(-1),
         radii=target.radii * layout.sizes[order, None].exp(),
         edge_gain=target.edge_gain + outwards * float(layout.gain),
         covariance=0.5 * (covariance + covariance.mT),

@@ -1,5 +1,6 @@
 """Views of ring targets: markers found with a rough camera, then their centres from the grey values."""
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -8,7 +9,10 @@ from torch import Tensor
 from torchpose.calibration.views import Rims, Views
 from torchpose.camera import Camera
 from torchpose.detect import find_candidates
-from torchpose.geometry.projection import image_by_point
+from torchpose.camera.derivatives import by_intrinsics
+from torchpose.geometry import rotations
+from torchpose.geometry.projection import by_pose, image_by_point
+from torchpose.geometry.rotations import plane_axes
 from torchpose.geometry.robust import LEAST_KEPT
 from torchpose.identify import MarkerTable, identify
 from torchpose.pipeline import PoseEstimator
@@ -21,6 +25,8 @@ from torchpose.target import Target
 _HELD = 1e12  # information about the rotation of a marker: as good as known
 _TURNED = 3e-3  # rad: a plate out of flat by 40 um turns its markers by so much against the plane of the file
 _GAIN_OPEN = 1e-8  # information about the edge gain, mm^-2: none
+_RIM_POINTS = 24  # of a circle: sums over it are exact up to the perspective's high orders
+_LEAST_TURN = 1e-6  # px^2 of displacement a rad^2 that a turn must make to count: one about the normal makes none
 _GAIN_SIGMA = 0.1  # of the width of a ring, where only centres are asked for: enough for any print
 
 
@@ -97,19 +103,61 @@ def measure_centers(
     covariance = jacobian @ refined.covariance[:, :3, :3] @ jacobian.mT
     pixels = camera.distort(xy)
     good = refined.good & (refined.kept > LEAST_KEPT) & pixels.isfinite().all(-1)
-    shapes = _rims(refined, jacobian) if rims else None
+    shapes = _rims(refined, rotation, prior, sight) if rims else None
     return Views(found.frame, found.marker, points, pixels, covariance, tuple(names), shapes)[good]
 
 
-def _rims(refined: Refined, by_place: Tensor) -> Rims:
-    """Sizes and gains of K rings, with the covariance that they share with the pixels, whose derivatives are given."""
+def _rims(refined: Refined, start: Tensor, prior: Tensor, sight: Sight) -> Rims:
+    """What the rims of K rings tell, the prior (K, 7) about rotations that started at (K, 3, 3) taken off again."""
     assert refined.gain is not None  # asked for by the prior
     assert refined.gain_covariance is not None
-    place, depth = refined.covariance[:, :3, :3], refined.t[:, 2]
-    by_depth = torch.zeros_like(by_place[:, :1]).index_fill(-1, torch.tensor(2), 1.0) / depth[:, None, None]
-    jacobian = torch.cat([by_place, by_depth], 1)  # (K, 3, 3)
-    with_gain = (jacobian @ refined.gain_covariance[:, :3, None]).squeeze(-1)
-    covariance = torch.nn.functional.pad(jacobian @ place @ jacobian.mT, (0, 1, 0, 1))
-    covariance[:, :3, 3] = covariance[:, 3, :3] = with_gain
-    covariance[:, 3, 3] = refined.gain_covariance[:, 6]
-    return Rims(depth.log(), refined.gain, covariance)
+    covariance = torch.nn.functional.pad(refined.covariance, (0, 1, 0, 1))
+    covariance[:, 6] = covariance[:, :, 6] = refined.gain_covariance
+    information = torch.linalg.inv(0.5 * (covariance + covariance.mT)) - torch.diag_embed(prior)
+    # at the optimum the grey values pull as much as the prior holds
+    turned = rotations.log(refined.R @ start.mT)
+    pull = prior * torch.nn.functional.pad(turned, (3, 1)) + torch.nn.functional.pad(
+        prior[:, 6:] * refined.gain[:, None], (6, 0)
+    )
+    radii = sight.radii[:, 0] + refined.gain[:, None] * refined.gain.new_tensor([1.0, -1.0])
+    by_camera = rims_by_camera(sight.camera, refined.R, refined.t, sight.normals[:, 0], radii)
+    return Rims(
+        refined.R, refined.t, refined.gain, 0.5 * (information + information.mT), pull, by_camera, sight.camera
+    )
+
+
+def rims_by_camera(camera: Camera, R: Tensor, t: Tensor, normals: Tensor, radii: Tensor) -> Tensor:
+    """How place, turn and edge gain of K rings, fitted to their rims, follow the intrinsics (K, 7, n).
+
+    Args:
+        R: (K, 3, 3), of the target's frame.
+        t: (K, 3), centres, mm.
+        normals: (K, 3), in the frame of the target.
+        radii: (K, 2).
+    """
+    jacobian, by_camera = rim_derivatives(camera, R, t, normals, radii)
+    held = torch.nn.functional.pad(t.new_full((3,), _LEAST_TURN), (3, 1))
+    return torch.linalg.solve(jacobian.mT @ jacobian + torch.diag(held), jacobian.mT @ by_camera)
+
+
+def rim_derivatives(camera: Camera, R: Tensor, t: Tensor, normals: Tensor, radii: Tensor) -> tuple[Tensor, Tensor]:
+    """Displacements of rims across themselves, times the root of their length in px, at points all along them.
+
+    Returns:
+        By place, turn and edge gain (K, E, 7), and by the intrinsics (K, E, n).
+    """
+    angle = torch.arange(_RIM_POINTS, dtype=t.dtype, device=t.device) * (2 * math.pi / _RIM_POINTS)
+    one, two = ((R @ axis[..., None]).squeeze(-1)[:, None, None] for axis in plane_axes(normals))
+    cos, sin = angle.cos()[:, None], angle.sin()[:, None]
+    out, around = cos * one + sin * two, cos * two - sin * one  # (K, 1, E, 3)
+    arm = radii[..., None, None] * out
+    at = (arm + t[:, None, None]).flatten(1, 2)
+    xy = at[..., :2] / at[..., 2:]
+    by_point = camera.J_distort(xy) @ image_by_point(xy, at[..., 2])
+    tangent = (by_point @ (radii[..., None, None] * around).flatten(1, 2)[..., None]).squeeze(-1)
+    length = tangent.norm(dim=-1, keepdim=True) * (2 * math.pi / _RIM_POINTS)
+    across = torch.stack([-tangent[..., 1], tangent[..., 0]], -1) / tangent.norm(dim=-1, keepdim=True)
+    across = (across * length.sqrt())[..., None, :]
+    outwards = (out * radii.new_tensor([1.0, -1.0])[:, None, None]).flatten(1, 2)[..., None]
+    by_ring = torch.cat([by_pose(by_point, arm.flatten(1, 2)), by_point @ outwards], -1)
+    return (across @ by_ring).squeeze(-2), (across @ by_intrinsics(camera, xy)).squeeze(-2)

@@ -115,7 +115,7 @@ def measure_target(
     for _ in range(_MEASURED):
         views = _all_centers(frames, known, camera, rims=True)
         check_seen(views, target)
-        plate = free_plate(target.ids, target.centers, rims=True)
+        plate = free_plate(target.ids, target.centers, known.normals)
         if held:
             found = measure_plate(views, camera, plate)
         else:

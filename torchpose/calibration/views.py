@@ -9,23 +9,72 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchpose.camera import Camera
 from torchpose.geometry.rows import Rows, shared
 from torchpose.geometry.segments import rank_in_group
+
+_TURNS_KNOWN = 0.02  # rad
+_NO_VARIANCE = 1e-18  # mm^2, rad^2: none
+_UNITS = (1e-3, 1e-3, 1e-2, 1e-3, 1e-3, 1e-3, 1e-3)  # mm and rad, of about the size of a ring's deviations
 
 
 @dataclass(frozen=True, eq=False)
 class Rims(Rows):
-    """What the two circles of K rings tell beside their centres.
+    """What the grey values along both rims of K rings tell of the pose of each, fitted by itself with a camera.
+
+    The unknowns of a ring are its place (3, mm), its turn about that (3, camera axes) and the edge gain (1, mm). Their
+    chi-squared is that at the fit and d^T information d - 2 d^T pull for a change d.
 
     Attributes:
-        depth: logarithm of the distance along the optical axis, mm, at which the ring of the file looks so large.
-        gain: apparent edge gain beyond that of the file: every edge lies outwards by so much, mm.
-        covariance: of u, v (px), depth and gain.
+        R: of the frame of the target, as the ring has it; a turn about its normal tells nothing.
+        t: centre of the ring, camera axes, mm, where it has the size of the file.
+        gain: every edge lies outwards by so much more than in the file, mm.
+        information: of the grey values alone.
+        pull: of the grey values at the fit, where something else held it.
+        by_camera: how the unknowns would follow the intrinsics of the camera that they were fitted with.
+        camera: this one.
     """
 
-    depth: Float[Tensor, " K"]
+    R: Float[Tensor, "K 3 3"]
+    t: Float[Tensor, "K 3"]
     gain: Float[Tensor, " K"]
-    covariance: Float[Tensor, "K 4 4"]
+    information: Float[Tensor, "K 7 7"]
+    pull: Float[Tensor, "K 7"]
+    by_camera: Float[Tensor, "K 7 n"]
+    camera: Camera = shared()
+
+    @property
+    def covariance(self) -> Float[Tensor, "K 7 7"]:
+        """Of the unknowns, turns being known to a degree or so: what circles do not tell of them is not needed."""
+        turns = torch.nn.functional.pad(self.t.new_full((3,), _TURNS_KNOWN**-2), (3, 1))
+        return torch.linalg.inv(self.information + torch.diag(turns))
+
+    @property
+    def roots(self) -> Float[Tensor, "K 7 7"]:
+        """U with U^T U = information."""
+        values, vectors = torch.linalg.eigh(self._scaled(self.information))
+        root = values.clamp_min(0).sqrt()[..., None] * vectors.mT
+        return root / self._units
+
+    @property
+    def best(self) -> Float[Tensor, "K 7"]:
+        """The change to the unknowns of least chi-squared, with turns as in `covariance`."""
+        return (self.covariance @ self.pull[..., None]).squeeze(-1)
+
+    def widened(self, variance: Float[Tensor, "K 7"]) -> Self:
+        """The same with errors of these variances besides, independent of each other."""
+        inner = self.information + torch.diag_embed(variance.clamp_min(_NO_VARIANCE).reciprocal())
+        solved = torch.linalg.solve(inner, torch.cat([self.information, self.pull[..., None]], -1))
+        less = self.information @ solved
+        information = self.information - less[..., :-1]
+        return replace(self, information=0.5 * (information + information.mT), pull=self.pull - less[..., -1])
+
+    @property
+    def _units(self) -> Tensor:
+        return torch.tensor(_UNITS).to(self.t)
+
+    def _scaled(self, information: Tensor) -> Tensor:
+        return information * self._units[:, None] * self._units
 
 
 @dataclass(frozen=True, eq=False)
