@@ -19,6 +19,7 @@ from torchpose.geometry.segments import segment_sum
 
 _ITERATIONS = 200
 _DAMPING = 1e-3  # to begin with
+Linear = tuple[Tensor, Tensor, list[Tensor]]
 _RELATIVE = 1e-10  # decrease that a step must promise, of the cost
 
 
@@ -40,6 +41,8 @@ class Bundle:
     gain: Float[Tensor, "N 6 u"]  # d pose / d intrinsics and plate at the optimum
     converged: bool  # whether the last step promised next to nothing
     plate: Float[Tensor, " k"]  # unknowns of the plate
+    # of what is predicted, by the fit alone: of the pixels (d = 2), or of what the rims tell (d = 7)
+    predicted: Float[Tensor, "K d d"]
     rims: Float[Tensor, "K r"]  # what rims tell less what is predicted (r = 7); none where they were not asked
 
 
@@ -84,7 +87,9 @@ def adjust(
     information = normal.information[0] - (part.mixed @ covariance @ part.mixed.mT).sum(0)
     z = residual.new_zeros(0) if plate is None else unknowns.values("plate")[0]
     found_at = (moved, pose.R, pose.t, residual, chi2, information, covariance, gain, converged)
-    return Bundle(*found_at, z, problem.of_rims(unknowns, moved))
+    unknown = 0 if free else 4 + len(camera.distortion)
+    predicted = problem.predicted(unknowns, moved, information, covariance, gain, unknown)
+    return Bundle(*found_at, z, predicted, problem.of_rims(unknowns, moved))
 
 
 def moved_camera(camera: Camera, step: Tensor) -> Camera | None:
@@ -162,9 +167,7 @@ class _Problem:
         arm, at = self.placed(unknowns)
         depth, xy = at[:, 2], at[:, :2] / at[:, 2:]
         possible = (depth > 0).all() & (xy.norm(dim=-1) < camera.fold_radius).all()
-        residual, by_view, columns = (self._by_rims if self.rims is not None else self._by_pixels)(
-            unknowns, camera, arm, at
-        )
+        residual, by_view, columns = self._linear(unknowns, camera, arm, at)
         own = torch.cat(columns if by_camera else columns[1:], -1) if by_camera or columns[1:] else by_view[..., :0]
         residual, by_view, own = self.whiten @ residual[..., None], self.whiten @ by_view, self.whiten @ own
 
@@ -188,9 +191,21 @@ class _Problem:
         prior, moved = (pad(values, (before, 0)) for values in (self.plate.known, unknowns.values("plate")))
         return normal.with_prior(torch.diag(prior)[None], moved)
 
-    def _by_pixels(
-        self, unknowns: Unknowns, camera: Camera, arm: Tensor, at: Tensor
-    ) -> tuple[Tensor, Tensor, list[Tensor]]:
+    def predicted(
+        self, unknowns: Unknowns, camera: Camera, information: Tensor, poses: Tensor, gain: Tensor, known: int
+    ) -> Tensor:
+        """Covariance (K, d, d) of what is predicted, from that of the fit; the first intrinsics are not unknown."""
+        arm, at = self.placed(unknowns)
+        _, by_view, columns = self._linear(unknowns, camera, arm, at)
+        view = self.views.view
+        by_own = torch.cat(columns, -1)[..., known:] + by_view @ gain[view][..., known:]
+        own, _ = least_squares.scaled_inverse(information[known:, known:])
+        return by_own @ own @ by_own.mT + by_view @ poses[view] @ by_view.mT
+
+    def _linear(self, unknowns: Unknowns, camera: Camera, arm: Tensor, at: Tensor) -> Linear:
+        return (self._by_rims if self.rims is not None else self._by_pixels)(unknowns, camera, arm, at)
+
+    def _by_pixels(self, unknowns: Unknowns, camera: Camera, arm: Tensor, at: Tensor) -> Linear:
         """Residuals (K, 2), derivatives of what is predicted by the pose, and by the camera and the plate."""
         xy = at[:, :2] / at[:, 2:]
         by_point = camera.J_distort(xy) @ image_by_point(xy, at[:, 2])
@@ -199,9 +214,7 @@ class _Problem:
             columns.append(by_point @ unknowns.pose.R[self.views.view] @ self.plate.places[self.point])
         return self.of_pixels(unknowns, camera), by_pose(by_point, arm), columns
 
-    def _by_rims(
-        self, unknowns: Unknowns, camera: Camera, arm: Tensor, at: Tensor
-    ) -> tuple[Tensor, Tensor, list[Tensor]]:
+    def _by_rims(self, unknowns: Unknowns, camera: Camera, arm: Tensor, at: Tensor) -> Linear:
         """The same of the rims, (K, 7)."""
         assert self.rims is not None
         assert self.plate is not None

@@ -17,7 +17,7 @@ from torchpose.calibration.views import Views
 from torchpose.camera import Camera
 from torchpose.camera.model import Model
 from torchpose.errors import ConfigError
-from torchpose.geometry.least_squares import scaled_inverse
+from torchpose.geometry.projection import image_by_point
 
 LENS_MODELS: dict[str, tuple[Model, tuple[str, ...]]] = {
     "pinhole": ("brown_conrady", ()),
@@ -33,6 +33,7 @@ _START_FOCALS = (0.6, 1.0, 1.8, 3.5)  # over the width, tried where no camera is
 _START_SIGMA = 1.0  # px, of points without a covariance, until their residuals tell
 _OUTLIER = 27.6  # chi-squared of a point beyond which it is left out: 1e-6 of good points
 _MEDIAN = 2 * math.log(2)  # of chi-squared with two degrees of freedom
+_RIM_OUTLIER, _RIM_MEDIAN = 38.3, 5.35  # the same of a ring, with six degrees of freedom
 _ROUNDS = 4  # of leaving out points and finding the common error
 _PLATE_ROUNDS = 2  # more where the plate has unknowns: the first starts from the residuals of the nominal places
 _WIDE_SIGMA = 1e-3  # of a focal length, above which views are called too alike
@@ -150,7 +151,7 @@ def calibrate_intrinsics(
         bundle,
         before - len(views.view),
         float(bundle.chi2.sum()),
-        _degrees(views, len(names) + _places_told(bundle, plate)),
+        _channels(views, bundle)[0].redundancy(common.px),
         common.px,
         plate,
         seen,
@@ -186,7 +187,7 @@ def measure_plate(views: Views, camera: Camera, plate: Plate) -> Calibration:
     moved = -of_plate @ bundle.information[n:, :n]  # d plate / d intrinsics
     cross = moved @ held
     joint = torch.cat([torch.cat([held, cross.mT], 1), torch.cat([cross, of_plate + cross @ moved.mT], 1)])
-    degrees = _degrees(views, _places_told(bundle, plate))
+    degrees = _channels(views, bundle)[0].redundancy(common.px)
     left_out, chi2 = len(seen.view) - len(views.view), float(bundle.chi2.sum())
     return Calibration(
         camera, held, joint, names, views, bundle, left_out, chi2, degrees, common.px, plate, seen
@@ -212,8 +213,11 @@ class Common(NamedTuple):
 def _weigh(
     views: Views, bundle: Bundle, unknowns: int, plate: Plate | None = None
 ) -> tuple[Views, Bundle, Common]:
-    """Views without contradicting points, their fit, weighted, of n unknown intrinsics, and the common error."""
-    common = Common()
+    """Views without contradicting points, their fit, weighted, of n unknown intrinsics, and the common error.
+
+    ``bundle`` is a `_first_fit`: with equal weights.
+    """
+    common = Common(_START_SIGMA)
 
     def fit(bundle: Bundle, views: Views, common: Common, rows: slice | Tensor = slice(None)) -> Bundle:
         start = bundle.plate if len(bundle.plate) else None
@@ -221,9 +225,10 @@ def _weigh(
         return adjust(_with_common(views, common), bundle.camera, *poses, free=unknowns > 0, plate=plate, start=start)
 
     for _ in range(_ROUNDS + (0 if plate is None else _PLATE_ROUNDS)):
-        common = _common(views, bundle, unknowns, plate)
+        common = _common(views, bundle, common)
         bundle = fit(bundle, views, common)
-        keep = _agree(bundle.chi2) & _agree(_rim_chi2(views, bundle, common))
+        keep = _agree(bundle.chi2, _OUTLIER, _MEDIAN)
+        keep &= _agree(_rim_chi2(views, bundle, common), _RIM_OUTLIER, _RIM_MEDIAN)
         if bool(keep.all()):
             continue
         views = views[keep]
@@ -234,9 +239,9 @@ def _weigh(
     return views, bundle, common
 
 
-def _agree(chi2: Tensor) -> Tensor:
-    """Which points (K,) do not contradict the others."""
-    return chi2 < _OUTLIER * max(1.0, float(chi2.median()) / _MEDIAN)
+def _agree(chi2: Tensor, most: float, median: float) -> Tensor:
+    """Which points (K,) do not contradict the others, by the chi-squared of one in 10^6 and of every second good one."""
+    return chi2 < most * max(1.0, float(chi2.median()) / median)
 
 
 def _rim_chi2(views: Views, bundle: Bundle, common: Common) -> Tensor:
@@ -244,33 +249,45 @@ def _rim_chi2(views: Views, bundle: Bundle, common: Common) -> Tensor:
     rims = _with_common(views, common).rims
     if rims is None or bundle.rims.shape[1] == 0:
         return torch.zeros_like(bundle.chi2)
-    # of the six that tell something, scaled as if they were two as of a point
-    return (rims.roots @ bundle.rims[..., None]).square().sum((-1, -2)) / 3
+    return (rims.roots @ bundle.rims[..., None]).square().sum((-1, -2))
 
 
-def _common(views: Views, bundle: Bundle, unknowns: int, plate: Plate | None) -> Common:
-    """The common errors that the residuals of a fit show."""
-    degrees = _degrees(views, unknowns + _places_told(bundle, plate))
-    px = common_sigma(bundle.residual, views.covariance, degrees)
-    if views.rims is None or plate is None or bundle.rims.shape[1] == 0:
-        return Common(px)
-    variance, freedom = views.rims.covariance.diagonal(dim1=-2, dim2=-1), len(views.view) - len(plate.ids)
-    distance = views.rims.t[:, 2:]
-    off = torch.cat([bundle.rims[:, 2:3] / distance, bundle.rims[:, 6:]], -1)
-    variance = torch.cat([variance[:, 2:3] / distance.square(), variance[:, 6:]], -1)
-    depth, gain = (
-        common_sigma(off[:, k : k + 1], variance[:, k, None, None], max(1, freedom)) for k in (0, 1)
+class _Channel(NamedTuple):
+    """Residuals of K observations that share a common error, their covariance by noise, and that of the prediction."""
+
+    residual: Float[Tensor, "K d"]
+    covariance: Float[Tensor, "K d d"]
+    predicted: Float[Tensor, "K d d"]
+
+    def redundancy(self, common: float) -> float:
+        """The sum of the observations' redundancies: degrees of freedom of their residuals."""
+        share = torch.linalg.solve(_widened(self.covariance, common), self.predicted)
+        return float(self.residual.numel() - share.diagonal(dim1=-2, dim2=-1).sum())
+
+
+def _channels(views: Views, bundle: Bundle) -> tuple[_Channel, ...]:
+    """Pixels, and where rims were asked their relative distances and edge gains."""
+    rims = views.rims
+    if rims is None or bundle.rims.shape[1] == 0:
+        return (_Channel(bundle.residual, views.covariance, bundle.predicted),)
+    xy = rims.t[:, :2] / rims.t[:, 2:]
+    by_place = rims.camera.J_distort(xy) @ image_by_point(xy, rims.t[:, 2])
+    parts = [_Channel(bundle.residual, views.covariance, by_place @ bundle.predicted[:, :3, :3] @ by_place.mT)]
+    for k, unit in ((2, rims.t[:, 2]), (6, torch.ones_like(rims.t[:, 2]))):
+        of = (values[:, k, k, None, None] / unit[:, None, None].square() for values in (rims.covariance, bundle.predicted))
+        parts.append(_Channel((bundle.rims[:, k] / unit)[:, None], *of))
+    return tuple(parts)
+
+
+def _common(views: Views, bundle: Bundle, before: Common) -> Common:
+    """The common errors that the residuals of a fit show, which was made with other ones."""
+    channels = _channels(views, bundle)
+    return Common(
+        *(
+            common_sigma(one.residual, one.covariance, max(1.0, one.redundancy(sigma)))
+            for one, sigma in zip(channels, before, strict=False)
+        )
     )
-    return Common(px, depth, gain)
-
-
-def _places_told(bundle: Bundle, plate: Plate | None) -> float:
-    """How many unknowns of the places the views determine; what is known of them besides is not counted."""
-    if plate is None or not len(bundle.plate):
-        return 0.0
-    variance = scaled_inverse(bundle.information)[0].diagonal()[-len(plate) :]
-    share = torch.where(plate.known > 0, 1 - plate.known * variance, 1.0)
-    return float(share[plate.places.flatten(0, 1).any(0)].sum())
 
 
 def common_sigma(residual: Float[Tensor, "K d"], covariance: Float[Tensor, "K d d"], degrees: float) -> float:
@@ -327,7 +344,7 @@ def _first_fit(views: Views, camera: Camera, *, free: bool = True) -> tuple[View
     return None if bundle is None else (views, bundle)
 
 
-def _degrees(views: Views, unknowns: float) -> float:
+def _degrees(views: Views, unknowns: int) -> int:
     return 2 * len(views.view) - 6 * len(views) - unknowns
 
 
