@@ -35,7 +35,7 @@ _OUTLIER = 27.6  # chi-squared of a point beyond which it is left out: 1e-6 of g
 _MEDIAN = 2 * math.log(2)  # of chi-squared with two degrees of freedom
 _RIM_OUTLIER, _RIM_MEDIAN = 38.3, 5.35  # the same of a ring, with six degrees of freedom
 _ROUNDS = 4  # of leaving out points and finding the common error
-_PLATE_ROUNDS = 2  # more where the plate has unknowns: the first starts from the residuals of the nominal places
+_PLATE_ROUNDS = 1  # more where the plate has unknowns: the first fit of its places
 _WIDE_SIGMA = 1e-3  # of a focal length, above which views are called too alike
 _LITTLE_TILT_DEG = 15.0  # between the views' normals, below which they are
 _LARGE_ERROR = 1.0  # px, of all points, above which something else than their noise is wrong
@@ -140,7 +140,7 @@ def calibrate_intrinsics(
     views, bundle, common = _weigh(*best, len(names), plate)
     if not bundle.converged:
         raise ConfigError("INPUT: calibration did not converge; use a simpler --model or more varied views")
-    joint = _covariance(bundle, names)
+    joint = _covariance(bundle.information, names)
     covariance = joint[: len(names), : len(names)]
     return Calibration(
         replace(bundle.camera, covariance=covariance, adjustment=None),
@@ -179,7 +179,7 @@ def measure_plate(views: Views, camera: Camera, plate: Plate) -> Calibration:
     if not bundle.converged:
         raise ConfigError("INPUT: the target could not be measured; use more varied views")
     names = ("fx", "fy", "cx", "cy", *(f"d{k}" for k in range(1, n - 3)))
-    of_plate = _covariance(replace(bundle, information=bundle.information[n:, n:]), ())
+    of_plate = _covariance(bundle.information[n:, n:], ())
     held = bundle.information.new_zeros(n, n)
     if camera.covariance is not None:
         known = len(camera.covariance)
@@ -217,15 +217,18 @@ def _weigh(
 
     ``bundle`` is a `_first_fit`: with equal weights.
     """
-    common = Common(_START_SIGMA)
+    # with wrong places residuals tell nothing of the noise: the first fit that moves them goes by the covariances alone
+    told = plate is not None and bool(views.covariance.any())
+    common = Common() if told else _common(views, bundle, Common(_START_SIGMA))
 
     def fit(bundle: Bundle, views: Views, common: Common, rows: slice | Tensor = slice(None)) -> Bundle:
         start = bundle.plate if len(bundle.plate) else None
         poses = bundle.R[rows], bundle.t[rows]
         return adjust(_with_common(views, common), bundle.camera, *poses, free=unknowns > 0, plate=plate, start=start)
 
-    for _ in range(_ROUNDS + (0 if plate is None else _PLATE_ROUNDS)):
-        common = _common(views, bundle, common)
+    for number in range(_ROUNDS + (0 if plate is None else _PLATE_ROUNDS)):
+        if number:
+            common = _common(views, bundle, common)
         bundle = fit(bundle, views, common)
         keep = _agree(bundle.chi2, _OUTLIER, _MEDIAN)
         keep &= _agree(_rim_chi2(views, bundle, common), _RIM_OUTLIER, _RIM_MEDIAN)
@@ -358,8 +361,8 @@ def _check_count(views: Views, unknowns: int) -> None:
         )
 
 
-def _covariance(bundle: Bundle, names: tuple[str, ...]) -> Tensor:
-    information = bundle.information
+def _covariance(information: Tensor, names: tuple[str, ...]) -> Tensor:
+    """Inverse of the information about the intrinsics of these names, and whatever follows them."""
     scale = information.diagonal().clamp_min(1e-300).rsqrt()
     values, vectors = torch.linalg.eigh(information * scale[:, None] * scale)
     if not float(values[0]) > _SINGULAR:

@@ -116,6 +116,7 @@ def _scaled(calibration: Calibration, factor: float, row: Float[Tensor, " u"], v
         bundle,
         t=t,
         plate=pad(bundle.plate, (0, 1)),
+        information=pad(bundle.information, (0, 1, 0, 1)),  # views tell nothing of it
         pose_covariance=units[:, None] * bundle.pose_covariance * units,
         gain=torch.cat([units[:, None] * bundle.gain, by_scale], -1),
     )

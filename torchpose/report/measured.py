@@ -57,10 +57,10 @@ def _plot_places(panel: Any, found: Measurement) -> None:
     for marker, at, z, known in zip(found.target.ids.tolist(), nominal, off[:, 2], sigma[:, 2], strict=True):
         text = f"{marker}: z {1e3 * float(z):+.1f} +- {1e3 * float(known):.1f} um"
         panel.annotate(text, at[:2].tolist(), xytext=(4, -10), textcoords="offset points", fontsize=7)
-    panel.set_aspect("equal", "datalim")
-    panel.margins(0.15)
-    panel.invert_yaxis()
-    panel.set(xlabel="x, mm", ylabel="y, mm")
+    room = 1.5 * _LONGEST * extent
+    (left, top), (right, bottom) = ((nominal[:, :2].amin(0) - room).tolist(), (nominal[:, :2].amax(0) + room).tolist())
+    panel.set(xlim=(left, right), ylim=(bottom, top), xlabel="x, mm", ylabel="y, mm")
+    panel.set_aspect("equal", "box")
     panel.set_title(f"places less nominal places, enlarged {enlarged:g} times", fontsize=10)
 
 
