@@ -89,9 +89,7 @@ def random_scene(options: argparse.Namespace, seed: int) -> Scene:
     nominal = replace(nominal, covariance=stated.double())
     poses = random_poses(camera, nominal, options.views + options.tests, g)
     cut = options.views
-    return Scene(
-        nominal, printed, camera, start, (poses[0][:cut], poses[1][:cut]), (poses[0][cut:], poses[1][cut:])
-    )
+    return Scene(nominal, printed, camera, start, (poses[0][:cut], poses[1][:cut]), (poses[0][cut:], poses[1][cut:]))
 
 
 def random_poses(camera: tp.Camera, target: tp.Target, count: int, g: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -263,9 +261,7 @@ def print_scale(scene: Scene) -> float:
     return float((a * b).sum() / a.square().sum())
 
 
-def pose_errors(
-    scene: Scene, R: Tensor, t: Tensor, found: tuple[Tensor, Tensor]
-) -> Tensor:
+def pose_errors(scene: Scene, R: Tensor, t: Tensor, found: tuple[Tensor, Tensor]) -> Tensor:
     """(N, 6) of poses of the measured target: translation, then rotation from the left."""
     _, r0, t0 = true_frame(scene)
     true_r, true_t = R @ r0, (R @ t0[:, None])[..., 0] + t
@@ -327,7 +323,9 @@ def drawn_set(options: argparse.Namespace, seed: int) -> dict[str, float]:
     return row | later_poses(scene, tests, target, camera, found.covariance)
 
 
-def later_poses(scene: Scene, tests: Views, target: tp.Target, camera: tp.Camera, of_camera: Tensor) -> dict[str, float]:
+def later_poses(
+    scene: Scene, tests: Views, target: tp.Target, camera: tp.Camera, of_camera: Tensor
+) -> dict[str, float]:
     """Poses from the centres of later frames with the measured files, whose covariance is carried through."""
     seen = replace(tests, points=target.centers.repeat(len(tests), 1), rims=None)
     _, r0, t0 = true_frame(scene)

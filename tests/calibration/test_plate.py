@@ -208,7 +208,9 @@ def test_places_that_are_stated_only_widen_the_camera() -> None:
     """Print errors repeat in every view: with their deviation stated the camera's NEES is right, else it is larger."""
     stated_nees, exact_nees = [], []
     for seed in range(6):
-        scene = statistics.random_scene(argparse.Namespace(**{**vars(OPTIONS), "bow": 0.0, "targets": ["hexa50"], "views": 50}), 20 + seed)
+        scene = statistics.random_scene(
+            argparse.Namespace(**{**vars(OPTIONS), "bow": 0.0, "targets": ["hexa50"], "views": 50}), 20 + seed
+        )
         views = replace(statistics.drawn_views(scene, scene.views, torch.Generator().manual_seed(seed)), rims=None)
         assert scene.nominal.covariance is not None
         plate = stated_plate(scene.nominal.ids, scene.nominal.centers, scene.nominal.covariance[:-1, :-1])

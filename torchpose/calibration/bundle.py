@@ -47,7 +47,13 @@ class Bundle:
 
 
 def adjust(
-    views: Views, camera: Camera, R: Tensor, t: Tensor, *, free: bool = True, plate: Plate | None = None,
+    views: Views,
+    camera: Camera,
+    R: Tensor,
+    t: Tensor,
+    *,
+    free: bool = True,
+    plate: Plate | None = None,
     start: Tensor | None = None,
 ) -> Bundle:
     """Levenberg-Marquardt over intrinsics, plate and poses, the latter eliminated; residuals are whitened.

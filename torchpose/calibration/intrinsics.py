@@ -189,9 +189,7 @@ def measure_plate(views: Views, camera: Camera, plate: Plate) -> Calibration:
     joint = torch.cat([torch.cat([held, cross.mT], 1), torch.cat([cross, of_plate + cross @ moved.mT], 1)])
     degrees = _channels(views, bundle)[0].redundancy(common.px)
     left_out, chi2 = len(seen.view) - len(views.view), float(bundle.chi2.sum())
-    return Calibration(
-        camera, held, joint, names, views, bundle, left_out, chi2, degrees, common.px, plate, seen
-    )
+    return Calibration(camera, held, joint, names, views, bundle, left_out, chi2, degrees, common.px, plate, seen)
 
 
 def _located(views: Views, camera: Camera, plate: Plate | None) -> tuple[Views, Bundle, Common]:
@@ -210,9 +208,7 @@ class Common(NamedTuple):
     gain: float = 0.0
 
 
-def _weigh(
-    views: Views, bundle: Bundle, unknowns: int, plate: Plate | None = None
-) -> tuple[Views, Bundle, Common]:
+def _weigh(views: Views, bundle: Bundle, unknowns: int, plate: Plate | None = None) -> tuple[Views, Bundle, Common]:
     """Views without contradicting points, their fit, weighted, of n unknown intrinsics, and the common error.
 
     ``bundle`` is a `_first_fit`: with equal weights.
@@ -277,7 +273,9 @@ def _channels(views: Views, bundle: Bundle) -> tuple[_Channel, ...]:
     by_place = rims.camera.J_distort(xy) @ image_by_point(xy, rims.t[:, 2])
     parts = [_Channel(bundle.residual, views.covariance, by_place @ bundle.predicted[:, :3, :3] @ by_place.mT)]
     for k, unit in ((2, rims.t[:, 2]), (6, torch.ones_like(rims.t[:, 2]))):
-        of = (values[:, k, k, None, None] / unit[:, None, None].square() for values in (rims.covariance, bundle.predicted))
+        of = (
+            values[:, k, k, None, None] / unit[:, None, None].square() for values in (rims.covariance, bundle.predicted)
+        )
         parts.append(_Channel((bundle.rims[:, k] / unit)[:, None], *of))
     return tuple(parts)
 

@@ -121,9 +121,7 @@ def _rims(refined: Refined, start: Tensor, prior: Tensor, sight: Sight) -> Rims:
     )
     radii = sight.radii[:, 0] + refined.gain[:, None] * refined.gain.new_tensor([1.0, -1.0])
     by_camera = rims_by_camera(sight.camera, refined.R, refined.t, sight.normals[:, 0], radii)
-    return Rims(
-        refined.R, refined.t, refined.gain, 0.5 * (information + information.mT), pull, by_camera, sight.camera
-    )
+    return Rims(refined.R, refined.t, refined.gain, 0.5 * (information + information.mT), pull, by_camera, sight.camera)
 
 
 def rims_by_camera(camera: Camera, R: Tensor, t: Tensor, normals: Tensor, radii: Tensor) -> Tensor:

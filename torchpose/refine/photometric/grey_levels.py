@@ -58,9 +58,7 @@ def _pure_levels(blocks: PixelBlocks, fraction: Tensor) -> tuple[Tensor, Tensor]
     return ring - at_ring * slope, paper + (1 - at_paper) * slope
 
 
-def columns_of(
-    blocks: PixelBlocks, model: RingModel, levels: Tensor, *, gain: bool = False
-) -> tuple[Tensor, Tensor]:
+def columns_of(blocks: PixelBlocks, model: RingModel, levels: Tensor, *, gain: bool = False) -> tuple[Tensor, Tensor]:
     """Derivatives by pose (6), blur (3) and levels (L), and the residual, by tiles: (K, P / 256, 10 + L, 256) float32.
 
     With ``gain`` also by the edge gain, after the blur. And the derivative by the distance from the edges (K, P).
