@@ -319,10 +319,7 @@ def _widened(covariance: Tensor, sigma: float) -> Tensor:
 def _with_common(views: Views, common: Common) -> Views:
     rims = views.rims
     if rims is not None and any(common):
-        aside, along = common.px / rims.camera.matrix[0, 0] * rims.t[:, 2], common.depth * rims.t[:, 2]
-        none = torch.zeros_like(aside)
-        sigma = torch.stack([aside, aside, along, none, none, none, none + common.gain], -1)
-        rims = rims.widened(sigma.square())
+        rims = rims.widened(*common)
     return replace(views, covariance=_widened(views.covariance, common.px), rims=rims)
 
 

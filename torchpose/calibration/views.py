@@ -14,7 +14,6 @@ from torchpose.geometry.rows import Rows, shared
 from torchpose.geometry.segments import rank_in_group
 
 _TURNS_KNOWN = 0.02  # rad
-_NO_VARIANCE = 1e-18  # mm^2, rad^2: none
 _UNITS = (1e-3, 1e-3, 1e-2, 1e-3, 1e-3, 1e-3, 1e-3)  # mm and rad, of about the size of a ring's deviations
 
 
@@ -61,11 +60,17 @@ class Rims(Rows):
         """The change to the unknowns of least chi-squared, with turns as in `covariance`."""
         return (self.covariance @ self.pull[..., None]).squeeze(-1)
 
-    def widened(self, variance: Float[Tensor, "K 7"]) -> Self:
-        """The same with errors of these variances besides, independent of each other."""
-        inner = self.information + torch.diag_embed(variance.clamp_min(_NO_VARIANCE).reciprocal())
-        solved = torch.linalg.solve(inner, torch.cat([self.information, self.pull[..., None]], -1))
-        less = self.information @ solved
+    def widened(self, px: float, depth: float, gain: float) -> Self:
+        """The same with errors besides: of the centre's pixel, per axis, of the relative distance, and of the gain."""
+        distance = self.t[:, 2]
+        root = torch.diag_embed(torch.nn.functional.pad(self.t.new_zeros(len(self), 6), (0, 1), value=gain))
+        root[:, [0, 1], [0, 1]] = (px / self.camera.matrix.diagonal()[:2]).to(distance) * distance[:, None]
+        root[:, :3, 2] = depth * self.t  # along the ray: the pixel stays
+        # (A^-1 + S S^T)^-1 = A - A S (1 + S^T A S)^-1 S^T A, which needs no inverse of what is zero
+        left = root.mT @ self.information
+        inner = left @ root + torch.eye(7).to(root)
+        right = torch.cat([left, root.mT @ self.pull[..., None]], -1)
+        less = left.mT @ torch.linalg.solve(inner, right)
         information = self.information - less[..., :-1]
         return replace(self, information=0.5 * (information + information.mT), pull=self.pull - less[..., -1])
 
