@@ -12,6 +12,7 @@ from torch import Tensor
 
 import torchpose as tp
 from tests.exact import F64, pinhole, random_poses
+from torchpose.geometry import rotations
 from torchpose.kernels import has_compiler
 from torchpose.pipeline import Method
 from torchpose.refine import METHODS
@@ -150,15 +151,15 @@ def test_the_module_moves_as_any_other(estimator: tp.PoseEstimator) -> None:
 
 @pytest.mark.skipif(not has_compiler(), reason="no C++ compiler")
 def test_compiled_poses_are_the_same(estimator: tp.PoseEstimator) -> None:
-    """With missing markers and an uncertain camera, and in any batch."""
+    """With missing markers and an uncertain camera, and in any batch: to a thousandth of a standard deviation."""
     compiled = tp.PoseEstimator(estimator.camera, QUAD, compile=True)
     frames = torch.cat([FRAMES[kind] for kind in ("good", "three markers", "black")] * 3)
     expected, found = estimator(frames), compiled(frames)
     assert torch.equal(found.status, expected.status)
-    torch.testing.assert_close(found.t, expected.t, rtol=0, atol=1e-6, equal_nan=True)
-    torch.testing.assert_close(found.R, expected.R, rtol=0, atol=1e-8, equal_nan=True)
+    moved = torch.cat([found.t - expected.t, rotations.log(found.R @ expected.R.mT)], -1)[expected.ok]
+    assert (moved.abs() < 1e-3 * expected.std[expected.ok]).all()
     torch.testing.assert_close(found.std, expected.std, rtol=1e-4, atol=0, equal_nan=True)
-    torch.testing.assert_close(compiled(frames[:1]).t, expected.t[:1], rtol=0, atol=1e-6)
+    assert ((compiled(frames[:1]).t - expected.t[:1]).abs() < 1e-3 * expected.std[:1, :3]).all()
 
 
 def test_compiled_without_a_compiler_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

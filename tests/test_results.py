@@ -40,6 +40,8 @@ def poses() -> Poses:
         R=rotations.exp(floats(3)),
         t=100 * floats(3),
         covariance=root @ root.mT,
+        noise=0.25 * root @ root.mT,
+        systematic=0.75**0.5 * root,
         rms=floats().abs(),
         status=status,
         reason=torch.zeros(4, dtype=torch.int64),
@@ -51,7 +53,7 @@ def poses() -> Poses:
         chi2_alt=floats().abs(),
         detections=detections(),
     )
-    for name in ("R", "t", "covariance"):
+    for name in ("R", "t", "covariance", "noise", "systematic"):
         getattr(result, name)[3] = torch.nan
     return result
 

@@ -34,7 +34,6 @@ from torchpose.pose import (
     best_copies,
     crossed_out,
     gather_evidence,
-    intrinsics_covariance,
     outcome,
     solve_poses,
 )
@@ -242,7 +241,7 @@ class PoseEstimator(nn.Module):
     def _solved(self, scene: Scene, rings: Rings, identified: Identified) -> Found:
         """The evidence of every row, and the solutions of those rows that have enough of it."""
         markers = scene.table[scene.target]
-        evidence = gather_evidence(rings, identified.ring, markers, scene.camera.matrix, self._recipe.locate)
+        evidence = gather_evidence(rings, identified.ring, markers, scene.camera, self._recipe.locate)
         solvable = (evidence.mask.sum(-1) >= MIN_MARKERS).nonzero()[:, 0]
         rough = identified.R[solvable], identified.t[solvable]
         return Found(
@@ -262,16 +261,12 @@ class PoseEstimator(nn.Module):
         return look_again(scene, found.rings, identified, seen, R, t, correct=self._recipe.correct)
 
     def _refined(self, scene: Scene, found: Found) -> Solutions:
-        """The solutions after the steps of the method, with the covariance that the camera adds."""
+        """The solutions after the steps of the method."""
         evidence, solutions = found.evidence[found.solvable], _doubted(scene, found)
         sight = _sight(scene, found, evidence)
         for step in self._recipe.steps:
             solutions = step(solutions, evidence, sight)
-        if scene.camera.covariance is None:
-            return solutions
-        used = replace(evidence, mask=solutions.mask)
-        more = intrinsics_covariance(used, solutions.R, solutions.t, scene.camera, refined=self._recipe.on_rims)
-        return replace(solutions, covariance=solutions.covariance + more)
+        return solutions
 
 
 def _settled(scene: Scene, found: Found) -> Tensor:

@@ -85,7 +85,10 @@ class Poses(Rows):
             Where one copy is looked for, those at the coarse scale are counted, and there may be more.
         R, t: target to camera: X_cam = R X_target + t, mm.
         covariance: translation (mm) first, then rotation (rad, left-multiplied: R = exp(w) R_est, that is about the
-            camera axes).
+            camera axes). Of everything: noise, target and camera.
+        noise: the part of it that is the frame's own: how far the pose would scatter if the frame were taken again.
+        systematic: how the pose errs with each of L numbers of unit variance that are the same in all frames: the
+            uncertain parameters of the camera, the first ``of_camera``, and what is uncertain of the target.
         rms: reprojection RMS of the compensated marker centres, px.
         status, reason: `Status` and `Reason`.
         markers: number of markers used.
@@ -103,6 +106,8 @@ class Poses(Rows):
     R: Float[Tensor, "N 3 3"]
     t: Float[Tensor, "N 3"]
     covariance: Float[Tensor, "N 6 6"]
+    noise: Float[Tensor, "N 6 6"]
+    systematic: Float[Tensor, "N 6 L"]
     rms: Float[Tensor, " N"]
     status: Int[Tensor, " N"]
     reason: Int[Tensor, " N"]
@@ -113,6 +118,7 @@ class Poses(Rows):
     rms_alt: Float[Tensor, " N"]
     chi2_alt: Float[Tensor, " N"]
     detections: Detections = shared()
+    of_camera: int = shared(0)
 
     @classmethod
     def cat(cls, parts: Sequence[Self]) -> Self:
@@ -142,8 +148,13 @@ class Poses(Rows):
 
     @property
     def std(self) -> Float[Tensor, "N 6"]:
-        """Standard deviations of t (mm) and of the rotation (rad)."""
+        """Standard deviations of t (mm) and of the rotation (rad), of everything."""
         return self.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+
+    @property
+    def noise_std(self) -> Float[Tensor, "N 6"]:
+        """The same of the noise of the frame alone: repeatability."""
+        return self.noise.diagonal(dim1=-2, dim2=-1).sqrt()
 
     def se3(self) -> Se3:
         """The N poses as kornia's `Se3`, camera from target, mm; back by ``pose.so3.matrix(), pose.t``."""
@@ -165,8 +176,12 @@ class Poses(Rows):
         # t' = t + R d with R = exp(w) R_est, so dt'/dw = -[R d]x
         jacobian = torch.eye(6, dtype=self.t.dtype, device=self.t.device).repeat(len(self), 1, 1)
         jacobian[:, :3, 3:] = -rotations.skew(t - self.t)
-        covariance = jacobian @ self.covariance @ jacobian.mT
-        return replace(self, R=r, t=t, covariance=covariance, R_alt=r_alt, t_alt=t_alt)
+        return replace(self, R=r, t=t, R_alt=r_alt, t_alt=t_alt, **self._spread(jacobian))
+
+    def _spread(self, jacobian: Tensor) -> dict[str, Tensor]:
+        """What belongs to the covariance, of errors that are ``jacobian`` (N, 6, 6) times those of these poses."""
+        whole, noise = (jacobian @ matrix @ jacobian.mT for matrix in (self.covariance, self.noise))
+        return {"covariance": whole, "noise": noise, "systematic": jacobian @ self.systematic}
 
     def seen_from(self, rotation: Tensor, translation: Tensor) -> Poses:
         """Poses in another fixed frame whose coordinates are ``rotation @ X_cam + translation`` (hand-eye).
@@ -180,4 +195,4 @@ class Poses(Rows):
         r_alt, t_alt = rotations.compose(ra, ta, self.R_alt, self.t_alt)
         turn = torch.zeros(*ra.shape[:-2], 6, 6, dtype=ra.dtype, device=ra.device)
         turn[..., :3, :3] = turn[..., 3:, 3:] = ra
-        return replace(self, R=r, t=t, covariance=turn @ self.covariance @ turn.mT, R_alt=r_alt, t_alt=t_alt)
+        return replace(self, R=r, t=t, R_alt=r_alt, t_alt=t_alt, **self._spread(turn))

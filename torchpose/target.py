@@ -144,7 +144,7 @@ class Target:
         printed = self.printed_radii
         if not bool((printed > 0).all() & (printed[:, 1] < printed[:, 0]).all()):
             raise ConfigError(
-                f"edge_gain: {self.edge_gain:g} mm leaves a ring without width or hole; it is the shift of an edge, in mm"
+                f"edge_gain: {self.edge_gain:g} mm leaves a ring without width or hole; give an edge shift in mm"
             )
 
     def _check_markers(self) -> None:

@@ -118,6 +118,7 @@ def test_poses_and_truth_are_what_is_compared() -> None:
         **{name: torch.zeros(0, size) for name, size in (("center", 2), ("outer", 5), ("inner", 5))},
         center_cov=torch.zeros(0, 2, 2),
     )
-    poses = Poses(R=eye, t=t, covariance=covariance, R_alt=eye, t_alt=t, detections=none, **zeros, **whole)
+    parts = {"covariance": covariance, "noise": covariance, "systematic": covariance[..., :0]}
+    poses = Poses(R=eye, t=t, R_alt=eye, t_alt=t, detections=none, **parts, **zeros, **whole)
     truth = Truth(["a", "b"], ["x", "x"], torch.zeros_like(t), torch.zeros_like(t))
     assert pose_errors(poses, truth).nees.tolist() == [3.0, 3.0]

@@ -65,6 +65,8 @@ def some_poses(frames: int = 3, targets: int = 2, seed: int = 0) -> Poses:
         R=torch.where(gone[:, None, None], NAN, rotations.exp(vectors)),
         t=torch.where(gone[:, None], NAN, 500 * normal(n, 3)),
         covariance=torch.where(gone[:, None, None], NAN, root @ root.mT),
+        noise=torch.where(gone[:, None, None], NAN, 0.5 * root @ root.mT),
+        systematic=torch.where(gone[:, None, None], NAN, 0.5**0.5 * root),
         rms=torch.where(gone, NAN, normal(n).square()),
         status=torch.where(gone, Status.REJECTED, torch.where(second, Status.AMBIGUOUS, Status.OK)),
         reason=torch.where(gone, Reason.RING_SHAPE, torch.where(second, Reason.TWO_SOLUTIONS, Reason.NONE)),

@@ -34,7 +34,8 @@ def problem() -> Tensor:
 def step(columns: Tensor, levels: Tensor, noise: Tensor) -> Step:
     """Step from the true pose and ``levels`` (4, 6) under ``noise`` (T, 4, 300), every trial a frame."""
     trials = len(noise)
-    every = torch.cat([columns.expand(trials, -1, -1, -1), noise[..., None]], -1).flatten(0, 1)
+    by_gain = torch.zeros_like(noise)
+    every = torch.cat([columns.expand(trials, -1, -1, -1), torch.stack([noise, by_gain], -1)], -1).flatten(0, 1)
     row = torch.arange(trials).repeat_interleave(MARKERS)
     used = torch.full((trials * MARKERS,), float(PIXELS), dtype=F64)
     normal, variance = normal_equations(every.mT @ every, used, levels.repeat(trials, 1), row, levels.new_zeros(trials))

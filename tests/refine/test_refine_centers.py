@@ -24,7 +24,7 @@ def evidence(r: torch.Tensor, t: torch.Tensor, sigma: float) -> Evidence:
     ellipses = exact_ellipses(QUAD, CAMERA, r, t).flatten(0, 1)
     rings = rings_of(ellipses, torch.arange(count).repeat_interleave(markers), sigma, seed=3)
     every = MarkerTable.of([QUAD])[torch.zeros(count, dtype=torch.int64)]
-    return gather_evidence(rings, torch.arange(count * markers).view(count, markers), every, CAMERA.matrix)
+    return gather_evidence(rings, torch.arange(count * markers).view(count, markers), every, CAMERA)
 
 
 def errors(found_r: torch.Tensor, found_t: torch.Tensor, r: torch.Tensor, t: torch.Tensor) -> torch.Tensor:

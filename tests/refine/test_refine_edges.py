@@ -77,9 +77,12 @@ def test_derivative_by_the_pose() -> None:
         return circle_distance(ray, warp, rotations.exp(delta[3:]) @ r, t + delta[:3], *model)[0]
 
     step = 1e-5 * torch.eye(6, dtype=F64)
-    numeric = torch.stack([(distance(s) - distance(-s)) / 2e-5 for s in step], -1)
-    _, _, _, by_pose = circle_distance(ray, warp, r, t, *model)
-    torch.testing.assert_close(by_pose, numeric, rtol=1e-6, atol=1e-6)
+    numeric = [(distance(s) - distance(-s)) / 2e-5 for s in step]
+    center, normal, radius = model
+    larger = circle_distance(ray, warp, r, t, center, normal, radius + 1e-5)[0]
+    smaller = circle_distance(ray, warp, r, t, center, normal, radius - 1e-5)[0]
+    _, _, _, derivative = circle_distance(ray, warp, r, t, *model)
+    torch.testing.assert_close(derivative, torch.stack([*numeric, (larger - smaller) / 2e-5], -1), rtol=1e-6, atol=1e-6)
 
 
 def refined(noise: float, count: int = 8, prior: Tensor | None = None) -> tuple[Refined, Tensor, Tensor]:

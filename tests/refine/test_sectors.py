@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import torch
 from torch import Tensor
 
@@ -113,7 +115,7 @@ def test_grey_values_tell_a_tilt_from_its_mirror_image() -> None:
     line = torch.nn.functional.normalize(t, dim=-1)
     flip = torch.eye(3, dtype=F64) - 2 * line[:, :, None] * line[:, None]
     normal = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=F64))
-    mirrored = Refined(flip @ r @ normal, t, right.covariance, right.spread, right.noise, right.kept, right.good)
+    mirrored = dataclasses.replace(right, R=flip @ r @ normal, t=t)
     chi2, there, explained = grey_chi2(given[0], right, mirrored)
     assert (chi2 > 20).all()
     assert there[:, 0].all()

@@ -44,6 +44,9 @@ def evidence(r: Tensor, t: Tensor) -> Evidence:
         torch.ones_like(mask, dtype=F64),
         mask,
         flat,
+        torch.ones(count, dtype=F64),
+        torch.zeros(*mask.shape, 2, 2, dtype=F64),
+        torch.zeros(*mask.shape, 4, 0, dtype=F64),
         CAMERA.matrix,
     )
 
@@ -54,7 +57,8 @@ def solutions(r: Tensor, t: Tensor, r_alt: Tensor, t_alt: Tensor, status: Status
     codes, reasons = (torch.full((len(r),), int(s)) for s in (status, reason))
     mask = torch.ones(len(r), len(QUAD), dtype=torch.bool)
     covariance = torch.eye(6, dtype=F64).repeat(len(r), 1, 1)
-    return Solutions(r, t, covariance, one, 10 * one, r_alt, t_alt, 2 * one, 20 * one, codes, reasons, mask)
+    parts = (covariance, covariance, covariance[..., :0])
+    return Solutions(r, t, *parts, one, 10 * one, r_alt, t_alt, 2 * one, 20 * one, codes, reasons, mask)
 
 
 def decided(s: Solutions, frames: Tensor, r: Tensor, t: Tensor) -> Solutions:

@@ -54,6 +54,8 @@ def one_pose(
         R=rotations.exp(torch.tensor([rotation], dtype=torch.float64)),
         t=torch.tensor([translation], dtype=torch.float64),
         covariance=1e-6 * torch.eye(6, dtype=torch.float64)[None],
+        noise=1e-6 * torch.eye(6, dtype=torch.float64)[None],
+        systematic=torch.zeros(1, 6, 0, dtype=torch.float64),
         rms=torch.full((1,), 0.01, dtype=torch.float64),
         status=zero[:1] + status,
         reason=zero[:1] + reason,

@@ -134,8 +134,7 @@ def measured_target(calibration: Calibration, target: Target) -> tuple[Target, C
     assert plate is not None  # what was measured
     layout = plate.at(calibration.bundle.plate)
     order = plate.index(target.ids)
-    outwards = 1.0 if target.background == "light" else -1.0
-    rows = torch.cat([plate.places[order].flatten(0, 1), outwards * plate.gain[None]])
+    rows = torch.cat([plate.places[order].flatten(0, 1), plate.gain[None]])
     of_plate, cross = calibration.joint[n:, n:], rows @ calibration.joint[n:, :n]
     covariance = rows @ of_plate @ rows.mT
     # files hold the deviation of the gain, not what it shares with the places, which is next to nothing
@@ -146,7 +145,7 @@ def measured_target(calibration: Calibration, target: Target) -> tuple[Target, C
         centers=layout.places[order],
         normals=(rotations.exp(layout.turns[order]) @ target.normals[..., None]).squeeze(-1),
         radii=target.radii * layout.sizes[order, None].exp(),
-        edge_gain=target.edge_gain + outwards * float(layout.gain),
+        edge_gain=target.edge_gain + float(layout.gain),
         covariance=0.5 * (covariance + covariance.mT),
         adjustment=name,
         cross_covariance=cross,

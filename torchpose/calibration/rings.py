@@ -10,7 +10,7 @@ from torchpose.calibration.views import Rims, Views
 from torchpose.camera import Camera
 from torchpose.detect import find_candidates
 from torchpose.camera.derivatives import by_intrinsics
-from torchpose.geometry import rotations
+from torchpose.geometry.least_squares import solve_scaled
 from torchpose.geometry.projection import by_pose, image_by_point
 from torchpose.geometry.rotations import plane_axes
 from torchpose.geometry.robust import LEAST_KEPT
@@ -103,25 +103,26 @@ def measure_centers(
     covariance = jacobian @ refined.covariance[:, :3, :3] @ jacobian.mT
     pixels = camera.distort(xy)
     good = refined.good & (refined.kept > LEAST_KEPT) & pixels.isfinite().all(-1)
-    shapes = _rims(refined, rotation, prior, sight) if rims else None
+    shapes = _rims(refined, sight) if rims else None
     return Views(found.frame, found.marker, points, pixels, covariance, tuple(names), shapes)[good]
 
 
-def _rims(refined: Refined, start: Tensor, prior: Tensor, sight: Sight) -> Rims:
-    """What the rims of K rings tell, the prior (K, 7) about rotations that started at (K, 3, 3) taken off again."""
+def _rims(refined: Refined, sight: Sight) -> Rims:
+    """What the rims of K rings tell, each a row with one marker; their blurs are unknown."""
     assert refined.gain is not None  # asked for by the prior
-    assert refined.gain_covariance is not None
-    covariance = torch.nn.functional.pad(refined.covariance, (0, 1, 0, 1))
-    covariance[:, 6] = covariance[:, :, 6] = refined.gain_covariance
-    information = torch.linalg.inv(0.5 * (covariance + covariance.mT)) - torch.diag_embed(prior)
-    # at the optimum the grey values pull as much as the prior holds
-    turned = rotations.log(refined.R @ start.mT)
-    pull = prior * torch.nn.functional.pad(turned, (3, 1)) + torch.nn.functional.pad(
-        prior[:, 6:] * refined.gain[:, None], (6, 0)
-    )
-    radii = sight.radii[:, 0] + refined.gain[:, None] * refined.gain.new_tensor([1.0, -1.0])
+    information, pull = refined.normals.information[:, 0], refined.normals.right[:, 0]
+    asked = [*range(6), information.shape[-1] - 1]
+    blur = [k for k in range(information.shape[-1]) if k not in asked]
+    mixed = information[:, asked][:, :, blur]
+    columns = torch.cat([mixed.mT, pull[:, blur, None]], -1)
+    taken = mixed @ solve_scaled(information[:, blur][:, :, blur], columns)
+    information, pull = information[:, asked][:, :, asked] - taken[..., :-1], pull[:, asked] - taken[..., -1]
+    gain = (sight.polarity * refined.gain[:, None])
+    radii = sight.radii[:, 0] + gain * gain.new_tensor([1.0, -1.0])
     by_camera = rims_by_camera(sight.camera, refined.R, refined.t, sight.normals[:, 0], radii)
-    return Rims(refined.R, refined.t, refined.gain, 0.5 * (information + information.mT), pull, by_camera, sight.camera)
+    by_camera[:, 6] *= sight.polarity  # its gain is that of the rings, not of what is dark
+    information = 0.5 * (information + information.mT)
+    return Rims(refined.R, refined.t, refined.gain, information, pull, by_camera, sight.camera)
 
 
 def rims_by_camera(camera: Camera, R: Tensor, t: Tensor, normals: Tensor, radii: Tensor) -> Tensor:

@@ -25,6 +25,7 @@ _RIDGE = 1e-12  # of a unit diagonal
 _LEAST_DIAGONAL = 1e-30  # of unknowns that nothing tells of
 _LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e12  # beyond the latter rounding decides: nowhere lower
 _PROMISED = 1e-12  # chi-squared: a step that promises less is none
+_LEAST_DIRECTION = 1e-9  # of the largest variance of correlations: less is rounding of what a file holds
 _MOST_INFLATION = 1e10  # of a parameter's variance by the others' freedom, beyond which it counts as open
 
 
@@ -334,6 +335,14 @@ def scaled_inverse(information: Tensor) -> tuple[Tensor, Tensor]:
     variance = inverse.diagonal(dim1=-2, dim2=-1)
     determined = (info == 0) & ((variance > 0) & (variance < _MOST_INFLATION)).all(-1)
     return inverse * scale, determined
+
+
+def covariance_factor(covariance: Float[Tensor, "n n"]) -> Float[Tensor, "n k"]:
+    """L with L L^T = covariance, by its k directions of any variance."""
+    scale = covariance.diagonal().clamp_min(torch.finfo(covariance.dtype).tiny).sqrt()
+    values, vectors = torch.linalg.eigh(covariance / scale / scale[:, None])
+    there = values > _LEAST_DIRECTION * values.amax()
+    return scale[:, None] * vectors[:, there] * values[there].sqrt()
 
 
 def geman_mcclure(deviation: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.camera import Camera
+from torchpose.geometry.least_squares import covariance_factor
 from torchpose.geometry.rows import Rows
 from torchpose.target import Target
 
@@ -27,6 +28,8 @@ class MarkerTable(Rows):
         valid: False where padded.
         polarity: +1 dark rings, -1 light ones.
         coplanar: whether all markers lie in one plane.
+        by_print: how place (mm) and edge gain (mm) of the markers vary with each of Q numbers of unit variance, as
+            `Target.covariance` says.
     """
 
     ids: Int[Tensor, "T M"]
@@ -36,6 +39,7 @@ class MarkerTable(Rows):
     valid: Bool[Tensor, "T M"]
     polarity: Float[Tensor, " T"]
     coplanar: Bool[Tensor, " T"]
+    by_print: Float[Tensor, "T M 4 Q"]
 
     @classmethod
     def of(cls, targets: Sequence[Target]) -> Self:
@@ -50,6 +54,7 @@ class MarkerTable(Rows):
             padded([torch.ones(len(t), dtype=torch.bool) for t in targets], False),
             torch.tensor([1.0 if t.background == "light" else -1.0 for t in targets], dtype=torch.float64),
             torch.tensor([t.coplanar for t in targets]),
+            _by_print(targets),
         )
 
     @property
@@ -59,6 +64,18 @@ class MarkerTable(Rows):
         apart = (ratio[:, :, None] - ratio[:, None]).abs()
         both = self.valid[:, :, None] & self.valid[:, None] & (apart > _SAME_CODE)
         return 0.5 * torch.where(both, apart, torch.inf).flatten(1).amin(1)
+
+
+def _by_print(targets: Sequence[Target]) -> Tensor:
+    """`MarkerTable.by_print`; Q is the most directions that a covariance has, 0 where all targets are perfect."""
+    factors = [covariance_factor(t.centers.new_zeros(1, 1) if t.covariance is None else t.covariance) for t in targets]
+    table = torch.zeros(len(targets), max(map(len, targets)), 4, max(f.shape[1] for f in factors), dtype=torch.float64)
+    for of_target, target, factor in zip(table, targets, factors, strict=True):
+        if target.covariance is not None:
+            places = factor[:-1].unflatten(0, (-1, 3))
+            of_target[: len(target), :3, : factor.shape[1]] = places
+            of_target[: len(target), 3, : factor.shape[1]] = factor[-1]
+    return table
 
 
 class Scene(NamedTuple):

@@ -2,25 +2,30 @@
 
 from torchpose.pose.centers import common_center, compensate, raw_centers
 from torchpose.pose.copies import best_copies
-from torchpose.pose.covariance import intrinsics_covariance, pose_covariance
+from torchpose.pose.covariance import pose_covariance
 from torchpose.pose.doubt import crossed_out
 from torchpose.pose.evidence import Evidence, center_rms, gather_evidence, shape_chi2
 from torchpose.pose.outcome import Found, outcome
 from torchpose.pose.solutions import AMBIGUOUS_CHI2, Solutions
 from torchpose.pose.solve import solve_poses
+from torchpose.pose.systematic import MarkerNormals, OnPrint, Setting, center_normals, on_print
 
 __all__ = [
     "AMBIGUOUS_CHI2",
     "Evidence",
     "Found",
+    "MarkerNormals",
+    "OnPrint",
+    "Setting",
     "Solutions",
     "best_copies",
+    "center_normals",
     "center_rms",
     "common_center",
     "compensate",
     "crossed_out",
     "gather_evidence",
-    "intrinsics_covariance",
+    "on_print",
     "outcome",
     "pose_covariance",
     "raw_centers",

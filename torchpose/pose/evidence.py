@@ -9,8 +9,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose.camera import Camera
 from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
+from torchpose.geometry.least_squares import covariance_factor
 from torchpose.geometry.rows import Rows, shared
 from torchpose.identify import MarkerTable
 from torchpose.pose.centers import common_center
@@ -36,6 +38,9 @@ class Evidence(Rows):
         blur: of the rings, variance along the major axis, px^2.
         mask: marker seen.
         coplanar: whether all markers of the target lie in one plane.
+        polarity: of the target, as `MarkerTable.polarity`.
+        placed: covariance that uncertain places on the print add to the centres, at most, ideal px^2.
+        by_target: `MarkerTable.by_print`, after as many zeros as the camera has uncertain parameters.
         matrix: of the camera.
     """
 
@@ -49,6 +54,9 @@ class Evidence(Rows):
     blur: Float[Tensor, "N M"]
     mask: Bool[Tensor, "N M"]
     coplanar: Bool[Tensor, " N"]
+    polarity: Float[Tensor, " N"]
+    placed: Float[Tensor, "N M 2 2"]
+    by_target: Float[Tensor, "N M 4 L"]
     matrix: Float[Tensor, "3 3"] = shared()
 
     def without(self, marker: Tensor) -> Evidence:
@@ -62,7 +70,7 @@ def gather_evidence(
     rings: Rings,
     ring: Int[Tensor, "N M"],
     markers: MarkerTable,
-    matrix: Float[Tensor, "3 3"],
+    camera: Camera,
     locate: Callable[..., tuple[Tensor, Tensor]] = common_center,
 ) -> Evidence:
     """Lays the measurements of flat rings out by row and marker.
@@ -71,7 +79,7 @@ def gather_evidence(
         rings: of all frames.
         ring: which one each marker is, -1 where not seen.
         markers: of the target of each row.
-        matrix: of the camera.
+        camera: for its matrix, and how many of its parameters are uncertain.
         locate: centres from both ellipses of a ring, as `centers.common_center`.
     """
     mask = ring >= 0
@@ -83,18 +91,26 @@ def gather_evidence(
         empty = torch.full((*ring.shape, *values.shape[1:]), fill, dtype=torch.float64, device=ring.device)
         return empty.index_put((row, marker), values)
 
+    ellipses = laid_out(torch.stack([seen.outer.params, seen.inner.params], 1), 1.0)
+    # a circle of the radius r has the shape matrix r A, A from the plane to the image
+    variance = markers.by_print[:, :, :3].square().sum(-1).amax(-1) / markers.radii[..., 0].square()
+    shape = conics.shape_matrix(ellipses[:, :, 0])
+    uncertain = 0 if camera.covariance is None else covariance_factor(camera.covariance).shape[1]
     return Evidence(
         markers.centers,
         markers.normals,
         markers.radii,
         laid_out(center, torch.nan),
         laid_out(covariance, torch.nan),
-        laid_out(torch.stack([seen.outer.params, seen.inner.params], 1), 1.0),
+        ellipses,
         laid_out(torch.stack([seen.outer.covariance, seen.inner.covariance], 1), 1.0),
         laid_out(blurs.axes(seen.blur)[1], 1.0),
         mask,
         markers.coplanar,
-        matrix,
+        markers.polarity,
+        variance[..., None, None] * shape @ shape,
+        torch.nn.functional.pad(markers.by_print, (uncertain, 0)),
+        camera.matrix,
     )
 
 

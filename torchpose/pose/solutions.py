@@ -21,6 +21,8 @@ class Solutions(Rows):
     R: Float[Tensor, "N 3 3"]
     t: Float[Tensor, "N 3"]
     covariance: Float[Tensor, "N 6 6"]
+    noise: Float[Tensor, "N 6 6"]
+    systematic: Float[Tensor, "N 6 L"]
     rms: Float[Tensor, " N"]
     chi2: Float[Tensor, " N"]
     R_alt: Float[Tensor, "N 3 3"]
@@ -35,6 +37,11 @@ class Solutions(Rows):
     def solved(self) -> Tensor:
         """(N,) bool, rows that have a pose."""
         return self.status != Status.REJECTED
+
+    @property
+    def ok(self) -> Tensor:
+        """(N,) bool, rows whose pose nothing speaks against."""
+        return self.status == Status.OK
 
     def swapped(self, condition: Tensor) -> Solutions:
         """With both minima exchanged where the condition (N,) bool holds; the covariance is left as it is."""

@@ -57,7 +57,7 @@ def _solve(evidence: Evidence, rough: tuple[Tensor, Tensor], iterations: int, co
         evidence.points,
         torch.where(evidence.mask[..., None], evidence.center, 0.0),
         evidence.matrix,
-        covariances=visible(evidence.covariance, evidence.mask),
+        covariances=visible(evidence.covariance + evidence.placed, evidence.mask),
         mask=evidence.mask,
         initial=_starts(evidence, rough),
         max_iterations=iterations,
@@ -88,13 +88,16 @@ def _solve(evidence: Evidence, rough: tuple[Tensor, Tensor], iterations: int, co
     status = torch.where(reason == Reason.NONE, int(Status.OK), int(Status.REJECTED))
     status = torch.where(reason == Reason.TWO_SOLUTIONS, int(Status.AMBIGUOUS), status)
     one, two = ((R[:, k], t[:, k], rms[:, k]) for k in range(2))
-    return Solutions(one[0], one[1], covariance, one[2], chi2[:, 0], *two, chi2_alt, status, reason, evidence.mask)
+    alone = covariance.new_zeros(*evidence.mask.shape[:1], 6, evidence.by_target.shape[-1])
+    parts = (covariance, covariance, alone)
+    return Solutions(one[0], one[1], *parts, one[2], chi2[:, 0], *two, chi2_alt, status, reason, evidence.mask)
 
 
 def _no_solutions(evidence: Evidence, R: Tensor, t: Tensor) -> Solutions:
     """Of no rows: frames without a target cost nothing here."""
     one, code = t.new_empty(0), evidence.mask.new_empty(0, dtype=torch.int64)
-    return Solutions(R, t, t.new_empty(0, 6, 6), one, one, R, t, one, one, code, code, evidence.mask)
+    parts = (t.new_empty(0, 6, 6), t.new_empty(0, 6, 6), t.new_empty(0, 6, evidence.by_target.shape[-1]))
+    return Solutions(R, t, *parts, one, one, R, t, one, one, code, code, evidence.mask)
 
 
 def _starts(evidence: Evidence, rough: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchpose.geometry import rotations
 from torchpose.geometry.least_squares import Normal, Pose, Unknowns, minimise
 from torchpose.geometry.rows import Rows
-from torchpose.pose import Evidence
+from torchpose.pose import Evidence, MarkerNormals
 
 _STEPS = 4  # from within a few standard deviations: the last one changes no digit that counts
 
@@ -29,6 +29,7 @@ class OnCenters(Rows):
         covariance: as in `results.Poses`.
         chi2: of the centres.
         good: where False no better pose than the start was found, and R, t and chi2 are those of the start.
+        normals: what each marker tells at that pose.
     """
 
     R: Float[Tensor, "N 3 3"]
@@ -36,6 +37,7 @@ class OnCenters(Rows):
     covariance: Float[Tensor, "N 6 6"]
     chi2: Float[Tensor, " N"]
     good: Bool[Tensor, " N"]
+    normals: MarkerNormals
 
 
 def refine_centers(evidence: Evidence, rotation: Tensor, translation: Tensor) -> OnCenters:
@@ -56,21 +58,26 @@ def refine_centers(evidence: Evidence, rotation: Tensor, translation: Tensor) ->
     measured = torch.where(seen[..., None], evidence.shape[..., :2], 0.0)
     focal, principal = evidence.matrix.diagonal()[:2], evidence.matrix[:2, 2]
 
-    def problem(unknowns: Unknowns) -> Normal:
-        pose = unknowns.pose
+    def of_markers(pose: Pose) -> tuple[MarkerNormals, Tensor]:
         center, by_pose = ellipse_centers(pose.R, pose.t, evidence.points, evidence.normals, evidence.radii)
         error = torch.where(seen[..., None], measured - (focal * center + principal), 0.0)[..., None]
-        jacobian = focal[:, None] * by_pose
+        # dot gain hardly moves a centre; that of the eccentricity is left out
+        jacobian = torch.nn.functional.pad(focal[:, None] * by_pose, (0, 1))
         weighted = jacobian.mT @ weight
         cost = (error.mT @ weight @ error).sum((1, 2, 3, 4))
-        return Normal((weighted @ jacobian).sum((1, 2)), (weighted @ error).sum((1, 2)).squeeze(-1), cost)
+        return MarkerNormals((weighted @ jacobian).sum(2), (weighted @ error).sum(2).squeeze(-1)), cost
+
+    def problem(unknowns: Unknowns) -> Normal:
+        each, cost = of_markers(unknowns.pose)
+        return Normal(each.information[..., :6, :6].sum(1), each.right[..., :6].sum(1), cost)
 
     start = Pose(rotation, translation)
     found = minimise(problem, Unknowns({"pose": start}), _STEPS)
     covariance, determined = found.covariance()
     good = determined & (found.normal.cost <= found.first_cost)
     pose = found.unknowns.pose.where(good, start)
-    return OnCenters(pose.R, pose.t, covariance, torch.where(good, found.normal.cost, found.first_cost), good)
+    chi2 = torch.where(good, found.normal.cost, found.first_cost)
+    return OnCenters(pose.R, pose.t, covariance, chi2, good, of_markers(pose)[0])
 
 
 def ellipse_centers(

@@ -37,7 +37,8 @@ def decide(solutions: Solutions, evidence: Evidence, sight: Sight | None = None)
     open_ones = solutions[row]
     some = replace(evidence[row], mask=open_ones.mask)
     floor = torch.diag(torch.tensor([_FLOOR**2] * 2 + [0.0] * 3, dtype=some.shape.dtype, device=row.device))
-    wide = replace(some, shape_covariance=some.shape_covariance + floor)
+    placed = torch.nn.functional.pad(some.placed, (0, 3, 0, 3))[:, :, None]
+    wide = replace(some, shape_covariance=some.shape_covariance + placed + floor)
     both = [refine_centers(wide, R, t) for R, t in _both(open_ones)]
     R, t, covariance, of_centers, good = (
         torch.stack([getattr(one, name) for one in both], 1) for name in ("R", "t", "covariance", "chi2", "good")
@@ -50,7 +51,14 @@ def decide(solutions: Solutions, evidence: Evidence, sight: Sight | None = None)
     explained = good[:, 0] & (of_centers[:, 0] < _MOST_CHI2 * freedom)
     sure = explained & (chi2[:, 1] - chi2[:, 0] > AMBIGUOUS_CHI2)
     rms = [center_rms(some, R[:, k], t[:, k]) for k in range(2)]
-    first = {"R": R[:, 0], "t": t[:, 0], "rms": rms[0], "chi2": chi2[:, 0], "covariance": covariance[:, 0]}
+    first = {
+        "R": R[:, 0],
+        "t": t[:, 0],
+        "rms": rms[0],
+        "chi2": chi2[:, 0],
+        "covariance": covariance[:, 0],
+        "noise": covariance[:, 0],
+    }
     second = {"R_alt": R[:, 1], "t_alt": t[:, 1], "rms_alt": rms[1], "chi2_alt": chi2[:, 1]}
     decided = replace(open_ones, **first, **second).marked(sure, Status.OK, Reason.NONE)
     return solutions.replaced(row[sure], decided[sure])
@@ -88,7 +96,8 @@ def decide_on_grey(solutions: Solutions, evidence: Evidence, sight: Sight) -> So
     decided = open_ones.swapped(swap).marked(sure, Status.OK, Reason.NONE)
     # the covariance is that of the pose which it stands beside
     own = pose_covariance(replace(evidence[row], mask=open_ones.mask), decided.R, decided.t)[0]
-    decided = replace(decided, covariance=torch.where(swap[:, None, None], own, decided.covariance))
+    own = torch.where(swap[:, None, None], own, decided.covariance)
+    decided = replace(decided, covariance=own, noise=own)
     return solutions.replaced(row[sure], decided[sure])
 
 

@@ -2,18 +2,35 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
-from torchpose.pose import Evidence, Solutions, center_rms, common_center, compensate
+from torchpose.camera import Camera
+from torchpose.geometry.least_squares import Pose
+from torchpose.pose import (
+    Evidence,
+    OnPrint,
+    Setting,
+    Solutions,
+    center_normals,
+    center_rms,
+    common_center,
+    compensate,
+    on_print,
+)
 from torchpose.refine.centers import refine_centers
 from torchpose.refine.decide import decide, decide_on_grey
 from torchpose.refine.edges.fit import refine_edges
 from torchpose.refine.photometric.fit import refine_photometric
 from torchpose.refine.sight import LEAST_KEPT, Refined, Sight
+from torchpose.results import Reason, Status
 
 _LEAST_KEPT_NEAR = 0.2  # of the pixels, where the pose stays near: of wires over half of every ring 0.27 (`wires 3`)
+_BESIDE = 0.05  # px, by which a marker may sit beside its place before it is looked at there: edges bend little so far
+_ASIDE = 0.02  # px, RMS of the centres, from where on they tell first how far
+_ROUNDS = 3  # of fits with markers where the last one found them; the second one ends nearly always
 _NEAR = 0.3  # px, RMS of the centres about a pose that they do not contradict (`pose.solve`)
 
 Step = Callable[[Solutions, Evidence, Sight], Solutions]
@@ -37,35 +54,123 @@ class Recipe:
     on_rims: bool = False
 
 
-def on_frames(refine: Callable[[Sight, Tensor, Tensor], Refined]) -> Step:
-    """The step that refines every pose on the frames themselves, where that holds."""
+def on_frames(refine: Callable[..., Refined]) -> Step:
+    """The step that refines every pose on the frames themselves where that holds, and on the centres where not.
+
+    Markers that sit beside their places are looked at where they are: what is found of the print moves them, and the
+    rows are refined again.
+    """
 
     def step(solutions: Solutions, evidence: Evidence, sight: Sight) -> Solutions:
         index = solutions.solved.nonzero()[:, 0]
+        if index.numel() == 0:
+            return solutions
         rows = solutions[index]
-        refined = refine(replace(sight[index], mask=rows.mask), rows.R, rows.t)
-        rms = center_rms(replace(evidence[index], mask=rows.mask), refined.R, refined.t)
-        better = replace(rows, R=refined.R, t=refined.t, covariance=refined.covariance, rms=rms)
-        near = rms < torch.maximum(rows.rms, torch.full_like(rows.rms, _NEAR))
-        good = refined.good & ((refined.kept > LEAST_KEPT) | (near & (refined.kept > _LEAST_KEPT_NEAR)))
-        return solutions.replaced(index[good], better[good])
+        seen, sight = replace(evidence[index], mask=rows.mask), replace(sight[index], mask=rows.mask)
+        start, place = _start(rows, seen, sight.camera)
+        found, good, active = rows, torch.zeros_like(rows.status, dtype=torch.bool), torch.arange(len(rows)).to(index)
+        for number in range(_ROUNDS):
+            some = rows[active], seen[active], sight[active].displaced(place[active])
+            # what seems to contradict the model may be a marker beside its place
+            now, joint, held, doubt = _refined(
+                partial(refine, thorough=number > 0), *some, start[active], place[active]
+            )
+            better = held.nonzero()[:, 0]
+            found, good = found.replaced(active[better], now[better]), good.index_fill(0, active[better], True)
+            beside = (joint.place - place[active]).abs().amax((-1, -2)) * seen.matrix[0, 0] / now.t[:, 2]
+            start, place = start.replaced(active, Pose(now.R, now.t)), place.index_copy(0, active, joint.place)
+            active = active[(held & (beside > _BESIDE)) | (doubt & (number == 0))]
+            if active.numel() == 0:
+                break
+        bad = (~good).nonzero()[:, 0]
+        if bad.numel():
+            found = found.replaced(bad, _by_centers(rows[bad], seen[bad], sight.camera)[0])
+        return solutions.replaced(index, found)
 
     return step
 
 
+def _start(rows: Solutions, seen: Evidence, camera: Camera) -> tuple[Pose, Tensor]:
+    """Poses, and places (N, M, 4) of markers and edges beside those of the file, as `OnPrint.place`, by the centres."""
+    start, place = Pose(rows.R, rows.t), rows.t.new_zeros(*seen.mask.shape, 4)
+    off = (rows.rms > _ASIDE).nonzero()[:, 0]
+    if off.numel() == 0:
+        return start, place
+    found, joint = _by_centers(rows[off], seen[off], camera)
+    return start.replaced(off, Pose(found.R, found.t)), place.index_copy(0, off, joint.place)
+
+
+def _refined(
+    refine: Callable[..., Refined],
+    rows: Solutions,
+    seen: Evidence,
+    sight: Sight,
+    start: Pose,
+    place: Tensor,
+) -> tuple[Solutions, OnPrint, Tensor, Tensor]:
+    """Rows refined on frames with markers displaced to ``place``, then on the print.
+
+    Also where that holds (N,) bool, and where something contradicts the model (N,) bool.
+    """
+    refined = refine(sight, start.R, start.t)
+    joint = on_print(refined.normals, Setting(seen, refined.R, refined.t, sight.camera, True), place)
+    found = _of_joint(rows, seen, Pose(refined.R, refined.t), joint)
+    near = found.rms < torch.maximum(rows.rms, torch.full_like(rows.rms, _NEAR))
+    kept = (refined.kept > LEAST_KEPT) | (near & (refined.kept > _LEAST_KEPT_NEAR))
+    return found, joint, refined.good & joint.known & kept, refined.doubt
+
+
+def _by_centers(rows: Solutions, seen: Evidence, camera: Camera) -> tuple[Solutions, OnPrint]:
+    """Rows refined on the centres of the ellipses, then on the print."""
+    refined = refine_centers(seen, rows.R, rows.t)
+    nowhere = rows.t.new_zeros(*seen.mask.shape, 4)
+    joint = on_print(refined.normals, Setting(seen, refined.R, refined.t, camera, False), nowhere)
+    found = _of_joint(rows, seen, Pose(refined.R, refined.t), joint)
+    return found.where(joint.known & found.t.isfinite().all(-1), rows), joint
+
+
+def _of_joint(rows: Solutions, seen: Evidence, pose: Pose, joint: OnPrint) -> Solutions:
+    """The rows at the poses of the joint problem, from where its normal equations were formed."""
+    pose = pose.moved(joint.step.nan_to_num(nan=0.0))
+    better = replace(
+        rows,
+        R=pose.R,
+        t=pose.t,
+        covariance=joint.covariance,
+        noise=joint.noise,
+        systematic=joint.systematic,
+        rms=center_rms(seen, pose.R, pose.t),
+    )
+    return better.marked(joint.known & ~joint.explained & better.ok, Status.REJECTED, Reason.RESIDUAL)
+
+
 def on_centers(solutions: Solutions, evidence: Evidence, sight: Sight) -> Solutions:
     """Refines every pose on the ellipses' own centres, where that holds."""
-    seen = replace(evidence, mask=solutions.mask)
-    refined = refine_centers(seen, solutions.R, solutions.t)
-    rms = center_rms(seen, refined.R, refined.t)
-    better = replace(solutions, R=refined.R, t=refined.t, covariance=refined.covariance, rms=rms)
-    return better.where(refined.good & solutions.solved, solutions)
+    index = solutions.solved.nonzero()[:, 0]
+    if index.numel() == 0:
+        return solutions
+    rows = solutions[index]
+    seen = replace(evidence[index], mask=rows.mask)
+    return solutions.replaced(index, _by_centers(rows, seen, sight.camera)[0])
+
+
+def as_they_are(solutions: Solutions, evidence: Evidence, sight: Sight) -> Solutions:
+    """The poses of the compensated centres, with what print and camera do to them."""
+    index = solutions.solved.nonzero()[:, 0]
+    if index.numel() == 0:
+        return solutions
+    rows = solutions[index]
+    seen = replace(evidence[index], mask=rows.mask)
+    nowhere, setting = rows.t.new_zeros(*seen.mask.shape, 4), Setting(seen, rows.R, rows.t, sight.camera, False)
+    joint = on_print(center_normals(seen, rows.R, rows.t), setting, nowhere, estimate=False)
+    found = _of_joint(rows, seen, Pose(rows.R, rows.t), joint)
+    return solutions.replaced(index, found.where(joint.known, rows))
 
 
 METHODS = {
     "photometric": Recipe(steps=(decide, decide_on_grey, on_frames(refine_photometric)), on_rims=True),
     "edges": Recipe(steps=(decide, on_frames(refine_edges)), on_rims=True),
     "centers": Recipe(steps=(decide, on_centers)),
-    "paper": Recipe(correct=False, locate=compensate),
+    "paper": Recipe(correct=False, locate=compensate, steps=(as_they_are,)),
 }
 """By name, as `PoseEstimator` and the command line take it."""

@@ -17,6 +17,7 @@ from torchpose.geometry import conics
 from torchpose.geometry.least_squares import Pose, PosePrior
 from torchpose.geometry.robust import LEAST_KEPT as LEAST_KEPT
 from torchpose.geometry.rows import Rows, shared
+from torchpose.pose import MarkerNormals
 from torchpose.target import Target
 
 QUANTISATION = 1 / 12  # variance of rounding, in grey levels^2, below which no noise estimate falls
@@ -78,6 +79,11 @@ class Sight(Rows):
         median = torch.where(self.mask[..., None], self.blur, torch.nan).nanmedian(1).values
         return torch.where(median.isnan(), blurs.isotropic(start), median)
 
+    def displaced(self, by: Float[Tensor, "N M 4"]) -> Self:
+        """The same rows with their markers moved in the target's frame, mm, and all dark edges outwards, mm."""
+        grown = (self.polarity * by[..., 3])[..., None] * by.new_tensor([1.0, -1.0])
+        return replace(self, centers=self.centers + by[..., :3], radii=self.radii + grown)
+
     def reduced(self, factor: int) -> Sight:
         """The same rows in frames of which blocks of ``factor`` px make one; only those frames that they need."""
         if factor == 1:
@@ -128,8 +134,9 @@ class Refined(Rows):
         noise: standard deviation of the residuals kept: grey levels (photometric), px (edges).
         kept: share of the pixels, or edge points, kept.
         good: where False the refinement failed and the other fields mean nothing.
-        gain: by which every edge of the rings lies outwards, mm, where it was an unknown.
-        gain_covariance: of the gain with translation and rotation, and its variance.
+        doubt: something in the frame contradicts the model of the rings.
+        normals: what each marker tells, at the pose.
+        gain: by which every dark edge lies outwards, mm, where it was an unknown.
     """
 
     R: Float[Tensor, "N 3 3"]
@@ -139,8 +146,9 @@ class Refined(Rows):
     noise: Float[Tensor, " N"]
     kept: Float[Tensor, " N"]
     good: Bool[Tensor, " N"]
+    doubt: Bool[Tensor, " N"]
+    normals: MarkerNormals
     gain: Float[Tensor, " N"] | None = None
-    gain_covariance: Float[Tensor, "N 7"] | None = None
 
     @property
     def blur(self) -> Float[Tensor, " N"]:

@@ -32,6 +32,7 @@ from torchpose.geometry.least_squares import (
 )
 from torchpose.geometry.robust import CUT
 from torchpose.geometry.segments import segment_mean, segment_sum
+from torchpose.pose import MarkerNormals
 from torchpose.refine.edges.step_filter import StepOffsets, step_offsets, window_correlation
 from torchpose.refine.sight import Refined, Sight, refined_by_blur
 from torchpose.rings import zernike
@@ -49,11 +50,17 @@ _ROOM = 1.2  # of half the ring's width: a filter that sees the other circle tak
 _WIDEST = 1.3  # px, of a blur's major axis: a wider one is out of the mask's reach
 _MOST_BLUR = 3.0  # px, about what a window of the filter holds
 _MOST_CHANGE = 0.6  # px, of the blur in a step, times the blur itself: of its variance
+_PRODUCTS = 7 * 8  # of derivatives by pose and gain with each other and the error
 _CUT_FLOOR = 0.02  # px, added to the cut: what pixels alias to
 
 
-def refine_edges(sight: Sight, rotation: Tensor, translation: Tensor, *, prior: Tensor | None = None) -> Refined:
-    """Refines N poses on the edge points of their rings; arguments as in `refine_photometric`."""
+def refine_edges(
+    sight: Sight, rotation: Tensor, translation: Tensor, *, prior: Tensor | None = None, thorough: bool = True
+) -> Refined:
+    """Refines N poses on the edge points of their rings; arguments as in `refine_photometric`.
+
+    There is no second look at what contradicts the model, so ``thorough`` changes nothing.
+    """
     factor = reduction_for(blurs.axes(sight.common_blur)[1].clamp_min(0).sqrt(), _WIDEST)
     return refined_by_blur(_refined_in, sight, Pose(rotation, translation), prior, factor)
 
@@ -69,15 +76,24 @@ def _refined_in(sight: Sight, start: Pose, known: PosePrior | None) -> Refined:
     good = determined & covariance.isfinite().all(-1).all(-1)
     kept = segment_mean(fit.keep, fit.seen.of, len(sight), fit.seen.sound)
     noise = (fit.variance / fit.correlation).sqrt()
-    return Refined(unknowns.pose.R, unknowns.pose.t, covariance, fit.blur, noise, kept, good)
+    # what the markers tell after the last step
+    step = torch.nn.functional.pad(found.step.own, (0, 1))[:, None, :, None]
+    at = fit.normals
+    normals = MarkerNormals(at.information, at.right - (at.information @ step)[..., 0])
+    return Refined(
+        unknowns.pose.R, unknowns.pose.t, covariance, fit.blur, noise, kept, good, torch.zeros_like(good), normals
+    )
 
 
 class _Fit:
     """The normal equations of N rows in three ways, and the blur, spread and choice of points that the last left."""
 
+    normals: MarkerNormals
+
     def __init__(self, sight: Sight, prior: PosePrior | None) -> None:
         self.sight, self.prior = sight, prior
         row, marker = sight.mask.nonzero().unbind(-1)
+        self.row = row
         both = sight.rings[row, marker]  # (K, 2, 5)
         gap = 0.5 * (both[:, 0, 3] - both[:, 1, 3])
         reach = torch.minimum(gap, 0.6 * both[:, 1, 3]).clamp(1.0, _REACH).repeat_interleave(2)
@@ -130,7 +146,7 @@ class _Fit:
         self.blur = blurs.limited(self.blur + change, LEAST**2, _MOST_BLUR**2)
 
     def _zernike(self, pose: Pose) -> tuple[Tensor, Tensor]:
-        """How far Zernike edges lie outside the circles (E,), px, and derivatives (E, 6) of the distance."""
+        """How far Zernike edges lie outside the circles (E,), px, and derivatives (E, 7) of the distance."""
         edges, of, sign, rows = self.seen.edges, self.seen.of, self.seen.sign, len(self.sight)
         distance, bend, _, by_pose = self.seen.circles(pose)
         true = edges.offset - sign * distance  # of the projected circle from the pixel's centre
@@ -150,18 +166,20 @@ class _Fit:
         self.keep = sound * (error.abs() < (CUT * self.spread + _CUT_FLOOR)[of])
         return soft
 
-    def _normal(self, pose: Pose, error: Tensor, by_pose: Tensor, weight: Tensor) -> Normal:
+    def _normal(self, pose: Pose, error: Tensor, by: Tensor, weight: Tensor) -> Normal:
         """In units of the points' variance; of neighbours ``correlation`` tell as much as one that is independent."""
-        products = by_pose[:, :, None] * torch.cat([by_pose, error[:, None]], -1)[:, None, :]
+        products = by[:, :, None] * torch.cat([by, error[:, None]], -1)[:, None, :]
         extra = torch.stack([weight * error.square(), (weight > 0).double()], -1)
         columns = torch.cat([weight[:, None] * products.flatten(1), extra], -1)
-        sums = segment_sum(columns, self.seen.of, len(self.sight))
-        information, right = sums[:, :42].unflatten(1, (6, 7)).split([6, 1], -1)
-        chi2, count = sums[:, 42:].unbind(-1)
+        rows, owner = len(self.sight), self.row
+        sums = segment_sum(columns, self.seen.edges.ring // 2, len(owner))
+        chi2, count = segment_sum(sums[:, _PRODUCTS:], owner, rows).unbind(-1)
         variance = self.correlation * chi2 / (count - 7 * self.correlation).clamp_min(1)
         self.variance = variance
-        scale = 1 / variance[:, None, None]
-        normal = Normal(information * scale, -(right * scale).squeeze(-1), chi2 / variance)
+        each = sums[:, :_PRODUCTS].unflatten(1, (7, 8)) / variance[owner, None, None]
+        self.normals = MarkerNormals.laid_out(each[..., :7], -each[..., 7], self.sight.mask)
+        every = segment_sum(each[:, :6], owner, rows)
+        normal = Normal(every[..., :6], -every[..., 7], chi2 / variance)
         return normal if self.prior is None else normal.with_prior(*self.prior.at(pose))
 
 
@@ -184,9 +202,11 @@ class _Seen(NamedTuple):
     room: Tensor
 
     def circles(self, pose: Pose) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """`circle_distance` of the poses of N rows."""
+        """`circle_distance` of the poses of N rows; the last derivative is by the edge gain."""
         of = self.of
-        return circle_distance(self.ray, self.warp, pose.R[of], pose.t[of], self.center, self.normal, self.radius)
+        circles = (pose.R[of], pose.t[of], self.center, self.normal, self.radius)
+        distance, bend, normal, by = circle_distance(self.ray, self.warp, *circles)
+        return distance, bend, normal, torch.cat([by[:, :6], by[:, 6:] * self.sign[:, None]], -1)
 
 
 def _seen(
@@ -200,7 +220,7 @@ def _seen(
 
 
 def _filter_errors(seen: _Seen, sight: Sight, pose: Pose, blur: Tensor) -> tuple[Tensor, Tensor, StepOffsets]:
-    """Derivatives (E, 6) of the distance, normals (E, 2), and what the matched filters see in the same windows."""
+    """Derivatives (E, 7) of the distance, normals (E, 2), and what the matched filters see in the same windows."""
     edges = seen.edges
     pixel = (edges.points - edges.offset[:, None] * edges.normal).round()
     distance, bend, across, by_pose = seen.circles(pose)
@@ -222,7 +242,7 @@ def circle_distance(
 
     Returns:
         distance (E,) px, positive outside; curvature (E,) 1/px of the circle's image; its unit normal (E, 2) there;
-        derivative (E, 6) of the distance by the pose: translation, then rotation from the left.
+        derivative (E, 7) of the distance by the pose: translation, then rotation from the left; and by the radius.
     """
     n = (rotation @ normal[..., None]).squeeze(-1)
     c = (rotation @ center[..., None]).squeeze(-1) + translation
@@ -239,5 +259,5 @@ def circle_distance(
     # |det| of pixel -> plane, and with it the curvature of the level line
     area = depth.square() * torch.linalg.det(warp).abs() / along.abs()
     bend = area.square() / (slope.pow(3) * reach)
-    by_pose = -torch.cat([m, torch.linalg.cross(point - translation, m)], -1) / slope[:, None]
-    return (reach - radius) / slope, bend, gradient / slope[:, None], by_pose
+    by = -torch.cat([m, torch.linalg.cross(point - translation, m), torch.ones_like(slope)[:, None]], -1)
+    return (reach - radius) / slope, bend, gradient / slope[:, None], by / slope[:, None]

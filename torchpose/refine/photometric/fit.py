@@ -12,6 +12,7 @@ are padded blocks of pixels: one sequence of tensor operations for the whole bat
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple, cast
 
 import torch
@@ -20,7 +21,17 @@ from torch import Tensor
 from torchpose.detect.reduce import reduction_for
 from torchpose.geometry import blur as blurs
 from torchpose.geometry.blurred_edge import BLUR, LEAST, MOST, Kind, Spread
-from torchpose.geometry.least_squares import Block, Minimum, Normal, Pose, PosePrior, Unknowns, Vector, minimise
+from torchpose.geometry.least_squares import (
+    Block,
+    Eliminated,
+    Minimum,
+    Normal,
+    Pose,
+    PosePrior,
+    Unknowns,
+    Vector,
+    minimise,
+)
 from torchpose.geometry.robust import of_chance
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import segment_mean, segment_sum
@@ -34,9 +45,17 @@ from torchpose.refine.photometric.grey_levels import (
     noise_spread,
     sum_products,
 )
-from torchpose.refine.photometric.light import GAIN, LEVELS, POSE, normal_equations
+from torchpose.refine.photometric.light import LEVELS, POSE, normal_equations, of_markers
 from torchpose.refine.photometric.ring_model import gather_pixels, ring_model
-from torchpose.refine.photometric.sectors import Sectors, away_from_unclear, clear_sectors, doubtful, sum_sectors, trust
+from torchpose.refine.photometric.sectors import (
+    Sectors,
+    away_from_unclear,
+    clear_sectors,
+    doubtful,
+    overdispersion,
+    sum_sectors,
+    trust,
+)
 from torchpose.refine.sight import Refined, Sight, refined_by_blur
 
 _COARSE = 6  # the first steps take one pixel of so many; both are whole numbers of tiles
@@ -66,7 +85,9 @@ _QUICK = (_Stage(3, coarse=True), _Stage(1))
 _THOROUGH = (_Stage(3, coarse=True, wary=True), _Stage(2, wary=True), _Stage(2, wary=True, tempered=True))
 
 
-def refine_photometric(sight: Sight, rotation: Tensor, translation: Tensor, *, prior: Tensor | None = None) -> Refined:
+def refine_photometric(
+    sight: Sight, rotation: Tensor, translation: Tensor, *, prior: Tensor | None = None, thorough: bool = True
+) -> Refined:
     """Refines N poses on the grey values around the rings of their markers.
 
     Args:
@@ -74,23 +95,23 @@ def refine_photometric(sight: Sight, rotation: Tensor, translation: Tensor, *, p
         rotation: (N, 3, 3) to start from, within about a pixel.
         translation: (N, 3), the same.
         prior: (N, 6, 6), information about the pose besides the frames, that is the inverse covariance of the start:
-            from the robot, or to hold what is known. (N, 7, 7): the edge gain is an unknown too, in mm, and this is
+            from the robot, or to hold what is known. (N, 7, 7): the edge gain, mm, is an unknown too, and this is
             known of it, about zero.
+        thorough: rows whose grey values contradict the model are refined once more, without what does not follow it.
     """
     factor = reduction_for(blurs.axes(sight.common_blur)[0].clamp_min(0).sqrt(), _WIDEST)
-    return refined_by_blur(_refined_in, sight, Pose(rotation, translation), prior, factor)
+    return refined_by_blur(partial(_refined_in, thorough=thorough), sight, Pose(rotation, translation), prior, factor)
 
 
 @dataclass(frozen=True, eq=False)
 class _Result(Rows):
-    """Refined rows, which of them are `doubtful`, and whether their residuals stand out at the edges."""
+    """Refined rows, and whether their residuals stand out at the edges."""
 
     refined: Refined
-    doubt: Tensor
     misshapen: Tensor
 
 
-def _refined_in(sight: Sight, start: Pose, known: PosePrior | None) -> Refined:
+def _refined_in(sight: Sight, start: Pose, known: PosePrior | None, thorough: bool) -> Refined:
     """Rows refined in the frames as they are: again with a band or a shape of the blur that suits it better."""
     spread = Spread(blurs.limited(sight.common_blur, LEAST**2, MOST**2))
     band = band_width(spread)
@@ -119,8 +140,8 @@ def _refined_in(sight: Sight, start: Pose, known: PosePrior | None) -> Refined:
         better &= other.refined.kept > result.refined.kept[index] - _FEWER
         result = result.replaced(index[better], other[better])
         kind = kind.index_fill(0, index[better], number)
-    for number, name in enumerate(_KINDS):
-        doubt = result.doubt & (kind == number)
+    for number, name in enumerate(_KINDS if thorough else ()):
+        doubt = result.refined.doubt & (kind == number)
         if bool(doubt.any()):
             result = result.replaced(*again(doubt, name, _THOROUGH))
     return result.refined
@@ -130,19 +151,21 @@ def _refined(fit: _Fit, start: Pose, spread: Spread, stages: tuple[_Stage, ...])
     """Rows refined in stages from poses and blurs."""
     found = _minimised(fit, start, spread, stages)
     pose, owner, rows = found.unknowns.pose, fit.blocks.row, len(spread)
-    whole, determined = found.covariance()
-    covariance = whole[:, :6, :6]
+    wider = overdispersion(fit.sectors.scaled(fit.factor), fit.variance[owner], owner, rows)
+    covariance, determined = found.covariance()
+    covariance = wider[:, None, None] * covariance[:, :6, :6]
     kept, usable = (segment_sum((x > 0).sum(-1), owner, rows) for x in (fit.weight, fit.usable))
     good = determined & covariance.isfinite().all(-1).all(-1)
     spread = cast(Spread, found.unknowns.own["blur"])
-    refined = Refined(pose.R, pose.t, covariance, spread.covariance, fit.variance.sqrt(), kept / usable, good)
-    if fit.gain:
-        with_gain = whole[:, GAIN, [*range(6), GAIN]]
-        refined = replace(refined, gain=found.unknowns.values("gain")[:, 0], gain_covariance=with_gain)
+    part = cast(Eliminated, found.normal.eliminated)
+    normals = of_markers(fit.sums, fit.variance, part, fit.mask, found.step.own).over(wider)
     seen, of_them = (segment_sum(b.valid.sum(-1).double(), owner, rows) for b in (fit.blocks, fit.coarse))
     more = (seen / of_them.clamp_min(1)).clamp_min(1)
     doubt = doubtful(fit.sectors, fit.clear, fit.variance[owner], owner, found.step.own_chi2, more)
-    return _Result(refined, doubt, fit.misshapen)
+    noise, kept = fit.variance.sqrt(), kept / usable
+    gain = found.unknowns.values("gain")[:, 0] if fit.gain else None
+    refined = Refined(pose.R, pose.t, covariance, spread.covariance, noise, kept, good, doubt, normals, gain)
+    return _Result(refined, fit.misshapen)
 
 
 def _minimised(fit: _Fit, start: Pose, spread: Spread, stages: tuple[_Stage, ...]) -> Minimum:
@@ -169,11 +192,14 @@ class _Fit:
     ``most_coarse``: pixels of a marker in the coarse stages.
     """
 
+    sums: Tensor
     sectors: Sectors
     clear: Tensor
+    factor: Tensor
     misshapen: Tensor
 
     def __init__(self, sight: Sight, band: Tensor, prior: PosePrior | None, most_coarse: int | None = None) -> None:
+        self.mask = sight.mask
         self.blocks = gather_pixels(sight, band, TILE * _COARSE)
         self.coarse = self.blocks.every(_COARSE, most_coarse)
         self.prior = prior
@@ -190,17 +216,20 @@ class _Fit:
         if self.gain:
             part = part.wider(unknowns.values("gain")[:, 0])
         model = ring_model(part, pose.R, pose.t, spread, check=True)
-        columns, slope = columns_of(part, model, levels, gain=self.gain)
-        residual = columns[:, :, -1].flatten(1)
+        columns, slope = columns_of(part, model, levels)
+        residual = columns[:, :, -2].flatten(1)
         self.usable, self.weight = inliers(residual, part, model, levels)
         if not stage.coarse:
             self.misshapen = self._stands_out(residual, slope, levels)
             self.sectors = sum_sectors(residual, slope, self.usable, self.weight, part, model)
             factor = self._trusted(noise_spread(residual, part), model_misfit(levels))
-            self.weight = self.weight * self.sectors.of_pixels(factor.to(self.weight.dtype))
-        sums = sum_products(columns, self.weight)
-        prior = self._known(unknowns)
-        normal, self.variance = normal_equations(sums, self.weight.sum(-1), levels, part.row, self.least, prior)
+            self.factor = factor.to(self.weight.dtype)
+            self.weight = self.weight * self.sectors.of_pixels(self.factor)
+        self.sums = sum_products(columns, self.weight)
+        used, known = self.weight.sum(-1), self._known(unknowns)
+        normal, self.variance = normal_equations(
+            self.sums, used, levels, part.row, self.least, known, gain=self.gain
+        )
         return normal
 
     def _known(self, unknowns: Unknowns) -> tuple[Tensor, Tensor] | None:
@@ -209,9 +238,9 @@ class _Fit:
             return None if self.prior is None else self.prior.at(unknowns.pose, POSE)
         both = self.prior.information
         _, moved = replace(self.prior, information=both[:, :6, :6]).at(unknowns.pose, POSE)
-        place = [*range(6), GAIN]
-        information = both.new_zeros(len(both), GAIN + 1, GAIN + 1)
-        information[:, torch.tensor(place)[:, None], torch.tensor(place)] = both
+        place = torch.tensor([*range(6), POSE], device=both.device)
+        information = both.new_zeros(len(both), POSE + 1, POSE + 1)
+        information[:, place[:, None], place] = both
         return information, torch.cat([moved, unknowns.values("gain")], -1)
 
     def _stands_out(self, residual: Tensor, slope: Tensor, levels: Tensor) -> Tensor:

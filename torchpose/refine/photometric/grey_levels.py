@@ -58,10 +58,11 @@ def _pure_levels(blocks: PixelBlocks, fraction: Tensor) -> tuple[Tensor, Tensor]
     return ring - at_ring * slope, paper + (1 - at_paper) * slope
 
 
-def columns_of(blocks: PixelBlocks, model: RingModel, levels: Tensor, *, gain: bool = False) -> tuple[Tensor, Tensor]:
-    """Derivatives by pose (6), blur (3) and levels (L), and the residual, by tiles: (K, P / 256, 10 + L, 256) float32.
+def columns_of(blocks: PixelBlocks, model: RingModel, levels: Tensor) -> tuple[Tensor, Tensor]:
+    """Derivatives by pose (6), blur (3) and levels (L), the residual, and the derivative by the edge gain, by tiles:
+    (K, P / 256, 11 + L, 256) float32.
 
-    With ``gain`` also by the edge gain, after the blur. And the derivative by the distance from the edges (K, P).
+    Also the derivative by the distance from the edges (K, P).
     """
     a0, ax, ay, p0, px, py, *curved = (v[:, None].float() for v in levels.unbind(-1))
     ring, paper = a0 + ax * model.x + ay * model.y, p0 + px * model.x + py * model.y
@@ -73,8 +74,9 @@ def columns_of(blocks: PixelBlocks, model: RingModel, levels: Tensor, *, gain: b
     by_d = contrast * model.by_d
     residual = blocks.grey - (ring + contrast * model.fraction)
     basis = _basis(model, bool(curved))
-    by_blur = (contrast * v for v in (*model.by_blur, *((model.by_gain,) if gain else ())))
-    return _tiled((*(by_d * v for v in model.by_pose), *by_blur, *basis, residual)), by_d
+    by_blur = (contrast * v for v in model.by_blur)
+    by_pose = (by_d * v for v in model.by_pose)
+    return _tiled((*by_pose, *by_blur, *basis, residual, contrast * model.by_gain)), by_d
 
 
 def _basis(model: RingModel, curved: bool = False) -> tuple[Tensor, ...]:

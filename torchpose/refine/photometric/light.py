@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from torchpose.geometry.blurred_edge import BLUR
-from torchpose.geometry.least_squares import Eliminated, Normal
+from torchpose.geometry.least_squares import Eliminated, Normal, solve_scaled
 from torchpose.geometry.segments import segment_mean, segment_sum
+from torchpose.pose import MarkerNormals
 
 POSE, LEVELS = 6 + BLUR, 6  # unknowns of a frame (translation, rotation, blur) and of a marker, at least
-GAIN = POSE  # column of the edge gain, where it is an unknown of the frame
 _GRADIENTS = (1, 2, 4, 5)  # among the levels
 _CURVATURES = (6, 7, 8, 9, 10, 11)  # where there are any
 _BLUR_KNOWN = 1e-4  # information about each number of a blur, px^-4: a disc has two, so that the third is open
@@ -31,30 +31,33 @@ def normal_equations(
     owner: Tensor,
     least: Tensor,
     prior: tuple[Tensor, Tensor] | None = None,
+    *,
+    gain: bool = False,
 ) -> tuple[Normal, Tensor]:
     """Normal equations of N frames in units of the noise, with the prior about the levels, and the noise's variance.
 
     Args:
-        sums: (K, 10 + L, 10 + L), of every marker, weight times products of the derivatives by pose (9) and levels (L)
-            and the residual; one more each where the edge gain is an unknown of the frame, after the blur.
+        sums: (K, 11 + L, 11 + L), of every marker, weight times products of the derivatives by pose (9) and levels (L),
+            the residual, and the derivative by the edge gain.
         used: (K,) sum of weights.
         levels: (K, L) so far, L = 6, or 12 with the light's curvature.
         owner: (K,) int64, frame of every marker.
         least: (N,) variance below which the noise's does not fall.
         prior: information (N, 9, 9) about the pose, and how far the pose is from the prior's (N, 9).
+        gain: the edge gain is an unknown of the frame, too, the tenth; the prior is about it as well.
     """
-    rows, pose = len(least), sums.shape[-1] - 1 - levels.shape[1]
+    rows, chosen = len(least), _chosen(sums) if gain else [*range(POSE)]
     count = torch.bincount(owner, minlength=rows)
-    chi2 = segment_sum(sums[:, -1, -1], owner, rows)
-    freedom = segment_sum(used, owner, rows) - pose - levels.shape[1] * count
+    chi2 = segment_sum(sums[:, -2, -2], owner, rows)
+    freedom = segment_sum(used, owner, rows) - len(chosen) - levels.shape[1] * count
     variance = (chi2 / freedom.clamp_min(1)).maximum(least)
     sums = sums / variance[owner, None, None]
-    own, mixed, of_levels = sums[:, :pose, :pose], sums[:, :pose, pose:-1], sums[:, pose:-1, pose:-1]
+    own, mixed, of_levels = sums[:, chosen][:, :, chosen], sums[:, chosen, POSE:-2], sums[:, POSE:-2, POSE:-2]
     ridge = (_RIDGE * of_levels.diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)).expand(levels.shape)
-    part = Eliminated(mixed, of_levels + torch.diag_embed(ridge), sums[:, pose:-1, -1], owner)
+    part = Eliminated(mixed, of_levels + torch.diag_embed(ridge), sums[:, POSE:-2, -2], owner)
     own = segment_sum(own, owner, rows)
     own.diagonal(dim1=-2, dim2=-1)[:, POSE - BLUR : POSE] += _BLUR_KNOWN
-    normal = Normal(own, segment_sum(sums[:, :pose, -1], owner, rows), chi2 / variance, part)
+    normal = Normal(own, segment_sum(sums[:, chosen, -2], owner, rows), chi2 / variance, part)
     normal = normal if prior is None else normal.with_prior(*prior)
     precision = _precision(normal, part, levels)
     held = replace(
@@ -63,6 +66,34 @@ def normal_equations(
         right=part.right - precision * levels,
     )
     return replace(normal, eliminated=held), variance
+
+
+def of_markers(sums: Tensor, variance: Tensor, levels: Eliminated, mask: Tensor, step: Tensor) -> MarkerNormals:
+    """What every marker tells of pose, blur and edge gain, its levels being unknown, after the last step.
+
+    Args:
+        sums: as for `normal_equations`.
+        variance: (N,) of the noise.
+        levels: part of the normal equations, with the prior.
+        mask: (N, M), markers seen.
+        step: (N, 9), of pose and blur, made since; (N, 10) where the edge gain is an unknown, too.
+    """
+    scaled = sums / variance[levels.owner, None, None]
+    chosen, moved = _chosen(sums), step.shape[-1]
+    by_level = scaled[:, chosen, POSE:-2]
+    taken = by_level @ solve_scaled(levels.information, torch.cat([by_level.mT, levels.right[..., None]], -1))
+    information = scaled[:, chosen][:, :, chosen] - taken[..., :-1]
+    right = scaled[:, chosen, -2] - taken[..., -1]
+    right = right - (information[..., :moved] @ step[levels.owner, :, None])[..., 0]
+    held = torch.zeros(POSE + 1, dtype=right.dtype, device=right.device)
+    held[POSE - BLUR : POSE] = _BLUR_KNOWN
+    count = mask.sum(-1)[levels.owner].clamp_min(1)
+    return MarkerNormals.laid_out(information + torch.diag(held) / count[:, None, None], right, mask)
+
+
+def _chosen(sums: Tensor) -> list[int]:
+    """Columns of pose, blur and edge gain: the latter stands last."""
+    return [*range(POSE), sums.shape[-1] - 1]
 
 
 def _precision(normal: Normal, part: Eliminated, levels: Tensor) -> Tensor:

@@ -46,6 +46,7 @@ class PixelBlocks(Rows):
         center: of the marker, target frame.
         normal: the same.
         radii: outer and inner.
+        polarity: as in `Sight`.
         limits: the grey levels at which the frame's noise is clipped, -inf and inf where it is not.
         quantisation: variance of rounding, grey levels^2.
     """
@@ -61,12 +62,14 @@ class PixelBlocks(Rows):
     center: Float[Tensor, "K 3"]
     normal: Float[Tensor, "K 3"]
     radii: Float[Tensor, "K 2"]
+    polarity: Float[Tensor, " K"]
     limits: Float[Tensor, "K 2"]
     quantisation: float = shared()
 
     def wider(self, gain: Tensor) -> PixelBlocks:
-        """Rings whose every edge lies outwards by the edge gain (N,) of their row, mm."""
-        return replace(self, radii=self.radii + gain[self.row, None] * gain.new_tensor([1.0, -1.0]))
+        """The same with every dark edge outwards by the edge gain (N,) of its row, mm."""
+        grown = (self.polarity * gain[self.row])[:, None] * gain.new_tensor([1.0, -1.0])
+        return replace(self, radii=self.radii + grown)
 
     def every(self, nth: int, most: int | None = None) -> PixelBlocks:
         """The same with one pixel of ``nth``, or as many fewer as leave ``most`` of each marker."""
@@ -86,18 +89,19 @@ class RingModel(NamedTuple):
     """Prediction and derivatives at one pose; planes (K, P) in float32.
 
     fraction: of paper, F. by_d: dF/dd through both circles. by_blur: 3 planes. by_pose: 6 planes, derivative of d.
+    by_gain: dF/d(edge gain), 1/mm.
     x, y: plane coordinates over the outer radius. sound: bool, False where the expansions below do not hold: deep in
-    a hole that is small for its blur, or where it is flat; None if not asked for. by_gain: dF by the edge gain, mm.
+    a hole that is small for its blur, or where it is flat; None if not asked for.
     """
 
     fraction: Tensor
     by_d: Tensor
     by_blur: tuple[Tensor, ...]
     by_pose: tuple[Tensor, ...]
+    by_gain: Tensor
     x: Tensor
     y: Tensor
     sound: Tensor | None
-    by_gain: Tensor
 
 
 def gather_pixels(sight: Sight, band: Tensor, grain: int) -> PixelBlocks:
@@ -150,6 +154,7 @@ def gather_pixels(sight: Sight, band: Tensor, grain: int) -> PixelBlocks:
         sight.centers[row, marker],
         sight.normals[row, marker],
         sight.radii[row, marker],
+        sight.polarity[row, marker],
         limits,
         sight.quantisation,
     )
@@ -271,5 +276,6 @@ def ring_model(blocks: PixelBlocks, R: Tensor, t: Tensor, spread: Spread, *, che
     by_blur = tuple(one - other for one, other in zip(outer.by_blur, inner.by_blur, strict=True))
     size = blocks.radii[:, :1].float()
     fraction, by_d = outer.fraction + 1 - inner.fraction, outer.by_distance - inner.by_distance
-    by_gain = -rim.per_mm * (outer.by_distance + inner.by_distance)
-    return RingModel(fraction, by_d, by_blur, rim.by_pose, foot.x / size, foot.y / size, sound, by_gain)
+    # dark edges move outwards: those of a dark ring away from each other
+    by_gain = -blocks.polarity[:, None].float() * (outer.by_distance + inner.by_distance) * rim.per_mm
+    return RingModel(fraction, by_d, by_blur, rim.by_pose, by_gain, foot.x / size, foot.y / size, sound)

@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchpose.geometry.least_squares import solve_scaled
 from torchpose.geometry.robust import CUT, of_chance
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import segment_sum
@@ -30,6 +31,7 @@ _CELL = 4  # sectors over which a misfit is taken for one
 _UNCLEAR = 3  # sectors of an outer circle: more are no chance
 _RESTLESS = 24.3  # chi-squared of seven unknowns, exceeded once in a thousand
 _DISPLACED = 0.005  # px, displacement that a camera or print slightly off may cause: no reason for doubt
+_BEYOND = 2.0  # standard deviations of a mean chi-squared: a wrong factor then costs little, and seldom
 _TINY = 1e-12
 
 
@@ -119,7 +121,10 @@ def trust(sectors: Sectors, clear: Tensor, variance: Tensor) -> Tensor:
         variance: (K,) of noise.
     """
     noise = variance[:, None].to(sectors.pull.dtype)
-    good = clear & (sectors.pull.square() < CUT**2 * noise * sectors.hold.clamp_min(_TINY))
+    # in deviations of noise; where all sectors scatter by more (paper, compression), more is no reason to drop one
+    deviation = sectors.pull / (noise * sectors.hold.clamp_min(_TINY)).sqrt()
+    usual = 1.4826 * deviation.abs().masked_fill(~clear, torch.nan).nanmedian(-1, keepdim=True).values
+    good = clear & (deviation.abs() < CUT * usual.nan_to_num(nan=1.0).clamp_min(1.0))
     chi2, hold = _cells(sectors.scaled(good.to(sectors.pull.dtype)), noise)
     excess = (chi2 - (hold > 0).to(chi2.dtype)).sum(-1).clamp_min(0)
     spread = (excess / hold.sum(-1).clamp_min(_TINY))[:, None] * hold  # tau^2 over the variance of each cell
@@ -138,6 +143,30 @@ def misfit(sectors: Sectors, clear: Tensor, variance: Tensor, row: Tensor, rows:
     chi2, hold = _cells(sectors.scaled(clear.to(sectors.pull.dtype)), variance[:, None].to(sectors.pull.dtype))
     count = segment_sum((hold > 0).double().sum(-1), row, rows).clamp_min(1)
     return segment_sum(chi2.double().sum(-1), row, rows) / count
+
+
+def overdispersion(sectors: Sectors, variance: Tensor, row: Tensor, rows: int) -> Tensor:
+    """By how much the scatter of edges along the rims exceeds that of independent noise (N,), as a factor of variance.
+
+    Noise that is correlated between pixels (paper, compression, filters of the camera) pulls at an edge in step over
+    many of them. Every cell's displacement shows how much. What moves a circle as a whole, or makes it larger, is no
+    noise and taken off: a mean and a first harmonic of each.
+
+    Args:
+        sectors: weighted as in the fit. variance: (K,) of noise. row: (K,) of ``rows``.
+    """
+    pull, hold = (v.double().unflatten(1, (2, -1, _CELL)).sum(-1) for v in (sectors.pull, sectors.hold))
+    hold = hold / variance[:, None, None]
+    error = torch.where(hold > 0, pull / variance[:, None, None] / hold.clamp_min(_TINY), 0.0)
+    angle = (torch.arange(hold.shape[-1], dtype=hold.dtype, device=hold.device) + 0.5) * (2 * math.pi / hold.shape[-1])
+    basis = torch.stack([torch.ones_like(angle), angle.cos(), angle.sin()], -1)
+    weighted = hold[..., None] * basis
+    right = (weighted * error[..., None]).sum(-2)
+    taken = (solve_scaled((weighted.mT @ basis).flatten(0, 1), right.flatten(0, 1)).view_as(right) * right).sum(-1)
+    chi2 = segment_sum(((hold * error.square()).sum(-1) - taken).sum(-1), row, rows)
+    freedom = segment_sum(((hold > 0).sum(-1) - basis.shape[-1]).clamp_min(0).sum(-1).double(), row, rows).clamp_min(1)
+    factor = chi2 / freedom
+    return torch.where(factor > 1 + _BEYOND * (2 / freedom).sqrt(), factor, 1.0)
 
 
 def doubtful(sectors: Sectors, clear: Tensor, variance: Tensor, row: Tensor, step_chi2: Tensor, more: Tensor) -> Tensor:

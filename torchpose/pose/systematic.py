@@ -1,0 +1,321 @@
+"""What a print and a camera that are not as their files say do to poses.
+
+Every marker of a row tells something of the pose by itself: its own part of the normal equations. That its centre sits
+elsewhere on the print, or that the camera's parameters differ, is for that marker a motion of its own, and dot gain one
+unknown more. So what is not known of the target and the camera is a list of numbers of unit variance that each move all
+markers a little , common to all frames. They are unknowns of the row with this prior, and the pose is the one
+of the joint problem (generalised least squares). Its covariance has three parts: the noise of the frame, what these
+numbers leave open, and what the residuals show beyond both (`pose.excess`).
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple, Self
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchpose.camera import Camera
+from torchpose.camera.derivatives import by_intrinsics
+from torchpose.geometry.least_squares import covariance_factor, scaled_inverse, solve_scaled
+from torchpose.geometry.projection import by_pose
+from torchpose.geometry.rotations import plane_axes
+from torchpose.geometry.rows import Rows
+from torchpose.pose.covariance import center_jacobian, derivative
+from torchpose.pose.evidence import Evidence
+from torchpose.pose.excess import CAMERA, Excess, excess_of
+
+POSE = 6
+_RIM_POINTS = 24  # of a circle: sums over it are exact up to the perspective's high orders
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerNormals(Rows):
+    """What each of M markers of N rows tells, as its part of normal equations at a pose; 0 for markers not seen.
+
+    The n unknowns are the pose (6: translation, rotation from the left), what else the row has (blur), and last the
+    edge gain, mm.
+
+    Attributes:
+        information: J^T W J.
+        right: J^T W r, r measured less predicted.
+    """
+
+    information: Float[Tensor, "N M n n"]
+    right: Float[Tensor, "N M n"]
+
+    def over(self, variance: Float[Tensor, " N"]) -> Self:
+        """Of noise with so many times the variance."""
+        return type(self)(self.information / variance[:, None, None, None], self.right / variance[:, None, None])
+
+    @classmethod
+    def laid_out(cls, information: Tensor, right: Tensor, mask: Tensor) -> Self:
+        """Of the parts (K, n, n), (K, n) of the markers seen, in the order of the mask (N, M)."""
+        row, marker = mask.nonzero().unbind(-1)
+        n = right.shape[-1]
+        every = information.new_zeros(*mask.shape, n, n).index_put((row, marker), information)
+        return cls(every, right.new_zeros(*mask.shape, n).index_put((row, marker), right))
+
+
+class Setting(NamedTuple):
+    """N rows at poses: what was measured, R (N, 3, 3), t (N, 3) mm, the camera, and what the poses are fitted to.
+
+    on_rims: to the edges of the rings, which tell their size and shape too, and not to their centres.
+    """
+
+    evidence: Evidence
+    R: Tensor
+    t: Tensor
+    camera: Camera
+    on_rims: bool
+
+    def of_rows(self, index: Tensor) -> Self:
+        return self._replace(evidence=self.evidence[index], R=self.R[index], t=self.t[index])
+
+
+@dataclass(frozen=True, eq=False)
+class OnPrint(Rows):
+    """The poses of the joint problem, from where the normal equations were formed.
+
+    Attributes:
+        step: of the pose.
+        covariance: of everything.
+        noise: the part of it that is the frame's own.
+        systematic: how the pose errs with each of the L numbers, one deviation of them; the same in all frames.
+        place: where the markers sit beside their places, target frame, mm, and the edge gain, all as estimated.
+        explained: whether the residuals agree with print, camera and what a print may have besides.
+        known: whether the pose is determined.
+    """
+
+    step: Float[Tensor, "N 6"]
+    covariance: Float[Tensor, "N 6 6"]
+    noise: Float[Tensor, "N 6 6"]
+    systematic: Float[Tensor, "N 6 L"]
+    place: Float[Tensor, "N M 4"]
+    explained: Bool[Tensor, " N"]
+    known: Bool[Tensor, " N"]
+
+    @property
+    def moved(self) -> Tensor:
+        """(N,) mm, the largest displacement of a marker or of the edges."""
+        return torch.linalg.vector_norm(self.place[..., :3], dim=-1).amax(-1).maximum(self.place[..., 3].abs().amax(-1))
+
+
+def on_print(
+    normals: MarkerNormals, setting: Setting, moved: Float[Tensor, "N M 4"], *, estimate: bool = True
+) -> OnPrint:
+    """The joint problem of N rows.
+
+    Args:
+        normals: at the poses of the setting.
+        setting: the rows.
+        moved: how the markers were displaced already (target frame, mm), and the edge gain, mm, when the normal
+            equations were formed.
+        estimate: find poses; without, those that noise alone weighs stay, and their covariance counts what the rest
+            does to them.
+    """
+    R, n = setting.R, normals.right.shape[-1]
+    aside = (R[:, None] @ moved[..., :3, None])[..., 0]
+    back = torch.cat([aside, torch.zeros_like(aside), moved[..., 3:]], -1)
+    right = normals.right + (normals.information @ _among(back[..., None], n))[..., 0]
+    normals = MarkerNormals(normals.information, right)
+    own = torch.eye(n, dtype=right.dtype, device=right.device)[:, :-1].expand(*right.shape[:2], n, n - 1)
+    shifts = _shifts(setting)
+    known, count = torch.cat([own, _among(shifts, n)], -1), shifts.shape[-1]
+    excess, further = _excess(normals, known, count, setting)
+    normals = normals.over(excess.factor)
+    every = shifts
+    if bool((excess.deviation > 0).any()):
+        every = torch.cat([shifts, further * excess.deviation[:, None, None]], -1)
+    joint = _Joint.of(normals, own, _among(every, n), estimate)
+    place = torch.cat([R.mT[:, None] @ every[:, :, :3], every[:, :, POSE:]], 2)
+    place = (place @ joint.numbers[:, None, :, None])[..., 0]
+    sure = joint.known & (torch.linalg.cholesky_ex(joint.covariance)[1] == 0)
+    common = joint.systematic[..., :count]
+    return OnPrint(joint.step, joint.covariance, joint.noise, common, place, excess.explained, sure)
+
+
+class _Joint(NamedTuple):
+    """Solution of N problems of own unknowns and L numbers of unit variance: pose, and ``numbers`` (N, L).
+
+    step (N, 6). covariance, noise (N, 6, 6), systematic (N, 6, L), as in `OnPrint`. known (N,).
+    """
+
+    step: Tensor
+    numbers: Tensor
+    covariance: Tensor
+    noise: Tensor
+    systematic: Tensor
+    known: Tensor
+
+    @classmethod
+    def of(cls, normals: MarkerNormals, own: Tensor, by: Tensor, estimate: bool) -> Self:
+        """With the columns ``own`` and ``by`` of the markers' unknowns.
+
+        By what the data tell of the numbers when the own unknowns are free, S' = V diag(l) V^T: then the numbers have
+        the covariance (I + S')^-1, and every part of the pose's covariance is a sum of squares, whatever is large.
+        """
+        matrix, right = _assembled(normals, torch.cat([own, by], -1))
+        k = own.shape[-1]
+        alone, known = scaled_inverse(matrix[:, :k, :k])
+        shift = alone @ matrix[:, :k, k:]  # of the own unknowns, found without the numbers, by these
+        step = (alone @ right[:, :k, None])[..., 0]
+        told = matrix[:, k:, k:] - matrix[:, k:, :k] @ shift
+        values, vectors = torch.linalg.eigh(0.5 * (told + told.mT))
+        values = values.clamp_min(0.0)[:, None]
+        turned = shift[:, :POSE] @ vectors
+        if not estimate:
+            more, none = turned @ turned.mT, torch.zeros_like(right[:, k:])
+            noise = alone[:, :POSE, :POSE]
+            return cls(torch.zeros_like(step[:, :POSE]), none, noise + more, noise, shift[:, :POSE], known)
+        held = turned / (1 + values)
+        numbers = right[:, k:] - (matrix[:, k:, :k] @ step[..., None])[..., 0]
+        numbers = (vectors / (1 + values) @ (vectors.mT @ numbers[..., None]))[..., 0]
+        step = step - (shift @ numbers[..., None])[..., 0]
+        noise = alone[:, :POSE, :POSE] + (held * values) @ held.mT
+        return cls(step[:, :POSE], numbers, noise + held @ held.mT, noise, held @ vectors.mT, known)
+
+
+def _excess(normals: MarkerNormals, known: Tensor, count: int, setting: Setting) -> tuple[Excess, Tensor]:
+    """What the residuals show beyond the ``known`` columns, and the motions (N, M, 7, E) of what may be behind it."""
+    n = known.shape[2]
+    further = _print_shifts(setting)
+    camera = further.new_zeros(*further.shape[:3], CAMERA)
+    every = torch.cat([further, camera], -1)
+    excess = excess_of(*_remaining(normals, known, _among(every, n), count))
+    wide = (~excess.explained | (excess.factor > 1) | (excess.deviation > 0).any(-1)).nonzero()[:, 0]
+    if wide.numel() == 0:
+        return excess, every
+    # only where the print alone would have to explain it, the camera is asked, too
+    camera = camera.index_copy(0, wide, _camera_shifts(setting.of_rows(wide)))
+    every = torch.cat([further, camera], -1)
+    some = MarkerNormals(normals.information[wide], normals.right[wide])
+    again = excess_of(*_remaining(some, known[wide], _among(every[wide], n), count))
+    return excess.replaced(wide, again), every
+
+
+def _shifts(setting: Setting) -> Tensor:
+    """How markers seem moved (N, M, 7, L), each alone, by the numbers of unit variance of camera and target.
+
+    A camera's error moves the image of a ring; the motion of the marker that does the same, by its own information, is
+    the least-squares solution over its rims, or over its centre.
+    """
+    R, by_target = setting.R, setting.evidence.by_target
+    aside = R[:, None] @ by_target[:, :, :3]
+    apart = torch.cat([aside, torch.zeros_like(aside), by_target[:, :, 3:]], 2)
+    if setting.camera.covariance is None:
+        return apart
+    factor = covariance_factor(setting.camera.covariance.to(R))
+    moved = _as_motions(setting, lambda xy: by_intrinsics(setting.camera, xy)[..., : len(factor)] @ factor)
+    return torch.cat([moved, apart[..., factor.shape[1] :]], -1)
+
+
+def _camera_shifts(setting: Setting) -> Tensor:
+    """The same of focal length, principal point and radial distortion, each off by 1 px at the frame's corner."""
+    camera = setting.camera
+    focal = camera.matrix.diagonal()[:2]
+    reach = 0.5 * math.hypot(camera.width, camera.height) / float(focal.mean())
+
+    def by(xy: Tensor) -> Tensor:
+        eye = torch.eye(2, dtype=xy.dtype, device=xy.device).expand(*xy.shape, 2)
+        radial = xy / reach
+        cubic = radial * (xy.square().sum(-1, keepdim=True) / reach**2)
+        return torch.cat([radial[..., None], eye, cubic[..., None]], -1)
+
+    return _as_motions(setting, by)
+
+
+def _print_shifts(setting: Setting) -> Tensor:
+    """The same (N, M, 7, 3 M + 1) of every marker's place (target frame) and of the gain, 1 mm each."""
+    rows, markers = setting.evidence.mask.shape
+    eye = torch.eye(markers, dtype=setting.R.dtype, device=setting.R.device)
+    columns = setting.R.new_zeros(rows, markers, POSE + 1, 3 * markers + 1)
+    columns[:, :, :3, :-1] = (eye[:, None, :, None] * setting.R[:, None, :, None]).flatten(-2)
+    columns[:, :, -1, -1] = 1
+    return columns
+
+
+def _as_motions(setting: Setting, by: Callable[[Tensor], Tensor]) -> Tensor:
+    """Motions (N, M, 7, n) of single markers by which pixels move as by the columns ``by`` (..., 2, n) of their images.
+
+    Measured are the pixels of the frame: a changed camera moves the ideal pixels made of them.
+    """
+    evidence, camera = setting.evidence, setting.camera
+    jacobian, xy, weight = (_rim_jacobian if setting.on_rims else _center_jacobian)(evidence, setting.R, setting.t)
+    weighted = jacobian.mT @ weight
+    ideal = camera.matrix.diagonal()[:2, None] * torch.linalg.inv(camera.J_distort(xy))
+    markers = evidence.mask.shape[1]
+    moved = solve_scaled(_by_marker(weighted @ jacobian, markers), _by_marker(weighted @ ideal @ by(xy), markers))
+    return torch.where(evidence.mask[..., None, None], moved, 0.0)
+
+
+def _remaining(normals: MarkerNormals, known: Tensor, excess: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Information (N, E, E) about the ``excess`` columns and their right side (N, E), with the ``known`` unknowns.
+
+    The last ``count`` of these are numbers with a prior of unit variance about 0.
+    """
+    matrix, right = _assembled(normals, torch.cat([known, excess], -1))
+    k = known.shape[-1]
+    matrix.diagonal(dim1=-2, dim2=-1)[:, k - count : k] += 1
+    both = torch.cat([matrix[:, :k, k:], right[:, :k, None]], -1)
+    taken = matrix[:, k:, :k] @ solve_scaled(matrix[:, :k, :k], both)
+    return matrix[:, k:, k:] - taken[..., :-1], right[:, k:] - taken[..., -1]
+
+
+def _assembled(normals: MarkerNormals, columns: Tensor) -> tuple[Tensor, Tensor]:
+    """Normal equations (N, k, k), (N, k) of unknowns with these columns (N, M, n, k)."""
+    matrix = (columns.mT @ (normals.information @ columns)).sum(1)
+    return matrix, (columns.mT @ normals.right[..., None]).sum(1)[..., 0]
+
+
+def _among(by: Tensor, n: int) -> Tensor:
+    """Columns (N, M, n, L) of pose and gain (N, M, 7, L), with 0 for what stands between."""
+    between = by.new_zeros(*by.shape[:2], n - POSE - 1, by.shape[-1])
+    return torch.cat([by[:, :, :POSE], between, by[:, :, POSE:]], 2)
+
+
+def _rim_jacobian(evidence: Evidence, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Derivatives (N, P, 2, 7) of points all along both rims by pose and gain, their normalised images, weights.
+
+    A point counts across the edge, by its share of the rim's length.
+    """
+    angle = torch.arange(_RIM_POINTS, dtype=t.dtype, device=t.device) * (2 * torch.pi / _RIM_POINTS)
+    one, two = (x[..., None, None, :] for x in plane_axes(evidence.normals))
+    cos, sin = angle.cos()[:, None], angle.sin()[:, None]
+    radii = evidence.radii[..., None, None]
+    outward = cos * one + sin * two
+    points = (evidence.points[:, :, None, None] + radii * outward).flatten(1, 3)
+    along = (radii * (cos * two - sin * one)).flatten(1, 3)
+    side = evidence.polarity[:, None, None, None, None] * t.new_tensor([1.0, -1.0])[:, None, None]
+    grows = (side * outward).flatten(1, 3)
+    arm = points @ R.mT
+    by_point, xy = derivative(arm + t[:, None], evidence.matrix)
+    tangent = (by_point @ (along @ R.mT)[..., None]).squeeze(-1)  # px per rad
+    length = torch.linalg.vector_norm(tangent, dim=-1)
+    normal = torch.stack([-tangent[..., 1], tangent[..., 0]], -1) / length[..., None]
+    seen = evidence.mask.repeat_interleave(2 * _RIM_POINTS, 1)
+    weight = normal[..., :, None] * normal[..., None, :] * (length * seen)[..., None, None]
+    by_gain = by_point @ (grows @ R.mT)[..., None]
+    return torch.cat([by_pose(by_point, arm), by_gain], -1), xy, weight
+
+
+def _center_jacobian(evidence: Evidence, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The same of the markers' centres, (N, M, 2, 7), which gain does not move."""
+    jacobian, xy, weight = center_jacobian(evidence, R, t)
+    return torch.nn.functional.pad(jacobian, (0, 1)), xy, weight
+
+
+def center_normals(evidence: Evidence, R: Tensor, t: Tensor) -> MarkerNormals:
+    """What the compensated centres tell; gain moves none."""
+    jacobian, xy, weight = _center_jacobian(evidence, R, t)
+    at = xy * evidence.matrix.diagonal()[:2] + evidence.matrix[:2, 2]
+    error = torch.where(evidence.mask[..., None], evidence.center - at, 0.0)
+    weighted = jacobian.mT @ weight
+    return MarkerNormals(weighted @ jacobian, (weighted @ error[..., None])[..., 0])
+
+
+def _by_marker(values: Tensor, markers: int) -> Tensor:
+    """Sums (N, M, ...) over the points (N, P, ...) of each marker."""
+    return values.unflatten(1, (markers, -1)).sum(2)
