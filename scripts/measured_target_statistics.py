@@ -3,17 +3,19 @@
     python scripts/measured_target_statistics.py --sets 200
     python scripts/measured_target_statistics.py --rendered 3
 
-Every set has a random print of a built-in target (places off by --print mm in all directions and a bow of --bow mm, edge
-gain --gain mm), a random camera and random views: --views to calibrate, --tests to estimate poses from. The estimator
-knows the nominal file, with what it states of the print, and starts from a focal length 0.25 % off and no distortion.
+Every set has a random print of a built-in target (places off by --print mm in all directions and a bow of --bow mm,
+rings turned by 2 mrad, edge gain --gain mm), a random camera and random views: --views to calibrate, --tests for
+poses. The estimator knows the nominal file, with what it states of the print, and starts from a focal length
+0.25 % off and no distortion.
 
---sets: what a ring's grey values tell of its place, turn and edge gain is drawn with exact noise, of the covariance that
-both of its rims give. --rendered: frames are rendered, and everything is as `torchpose calibrate --measure-target` and
-`torchpose estimate` do it.
+--sets: what a ring's grey values tell of its place, turn and edge gain is drawn with exact noise, of the covariance
+that both of its rims give. --rendered: frames are rendered, and everything is as `torchpose calibrate --measure-target`
+and `torchpose estimate` do it.
 
 NEES: squared errors in units of their covariance over their number, 1 is right: marker places in millimetres (scale
-included), intrinsics, poses of later frames. bound: RMS error over that of the joint problem: all pixels along all rims,
-with intrinsics, poses, places, tilts, sizes and edge gain unknown; its information is formed here by finite differences.
+included), intrinsics, poses of later frames (from their centres). bound: that of the joint problem, all pixels along
+all rims with intrinsics, poses, places, tilts, sizes and edge gain unknown; its information is formed here by finite
+differences. claimed: the deviations that the files state over this bound.
 """
 
 from __future__ import annotations
@@ -147,7 +149,7 @@ class Joint:
         return camera.project((R[:, None, None, None] @ rims[..., None])[..., 0] + t[:, None, None, None])
 
     def jacobians(self) -> tuple[Tensor, Tensor]:
-        """Displacements across the rims in their deviations, by common unknowns (N, E, u) and by the poses (N, E, 6)."""
+        """Displacements across the rims in deviations, by the common unknowns (N, E, u) and by the poses (N, E, 6)."""
         R, t = self.poses
         none = torch.zeros(self.n + 1 + 6 * self.m, dtype=F64)
         at = self.pixels(none, R, t)

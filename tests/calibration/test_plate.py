@@ -150,7 +150,7 @@ def calibrated(distance: Distance | None = None) -> tuple[statistics.Scene, tp.T
 def test_a_distance_gives_the_scale() -> None:
     scene = statistics.random_scene(OPTIONS, 5)
     true = float((scene.printed.centers[0] - scene.printed.centers[2]).norm())
-    _, target, camera = calibrated(Distance(0, 2, true, 0.003))
+    _, target, _ = calibrated(Distance(0, 2, true, 0.003))
     between = target.centers[0] - target.centers[2]
     assert float(between.norm()) == pytest.approx(true, abs=1e-9)
     assert target.covariance is not None
@@ -194,7 +194,7 @@ def test_a_held_camera_carries_its_covariance_to_the_target() -> None:
         target, _ = measured_target(scaled_by_prior(measure_plate(views, moved, plate), None), nominal)
         return target.centers.flatten(), target
 
-    at, target = measured(torch.zeros(8, dtype=F64))
+    _, target = measured(torch.zeros(8, dtype=F64))
     exact = measure_plate(views, scene.camera, plate)
     noise = (plate.places.flatten(0, 1) @ exact.joint[8:, 8:]) @ plate.places.flatten(0, 1).mT
     steps = torch.eye(8, dtype=F64)[:4] * sigma[:, None]

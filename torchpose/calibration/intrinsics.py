@@ -201,7 +201,7 @@ def _located(views: Views, camera: Camera, plate: Plate | None) -> tuple[Views, 
 
 
 class Common(NamedTuple):
-    """Standard deviations that are added to every point (px), and to what its rim tells (relative depth, gain in mm)."""
+    """Standard deviations that are added to every point (px) and to what its rims tell (relative depth, gain in mm)."""
 
     px: float = 0.0
     depth: float = 0.0
@@ -239,7 +239,7 @@ def _weigh(views: Views, bundle: Bundle, unknowns: int, plate: Plate | None = No
 
 
 def _agree(chi2: Tensor, most: float, median: float) -> Tensor:
-    """Which points (K,) do not contradict the others, by the chi-squared of one in 10^6 and of every second good one."""
+    """Points (K,) that do not contradict the others, by the chi-squared of one in 10^6 and of every second good one."""
     return chi2 < most * max(1.0, float(chi2.median()) / median)
 
 
@@ -361,11 +361,11 @@ def _covariance(information: Tensor, names: tuple[str, ...]) -> Tensor:
     scale = information.diagonal().clamp_min(1e-300).rsqrt()
     values, vectors = torch.linalg.eigh(information * scale[:, None] * scale)
     if not float(values[0]) > _SINGULAR:
-        told = dict(enumerate(names))
+        told, what = dict(enumerate(names)), "intrinsics" if names else "places"
         most = vectors[:, 0].abs().topk(2).indices.sort().values.tolist()
         direction = ", ".join(dict.fromkeys(told.get(i, "places of the target") for i in most))
         raise ConfigError(
-            f"INPUT: the views are too alike to tell the {'intrinsics' if names else 'places'} apart (mostly {direction}); "
+            f"INPUT: the views are too alike to tell the {what} apart (mostly {direction}); "
             "add views tilted by 20 to 45 degrees in different directions"
         )
     root = scale[:, None] * vectors * values.rsqrt()

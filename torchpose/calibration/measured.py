@@ -226,8 +226,8 @@ def _bent(calibration: Calibration) -> list[str]:
     names = [name for name, much in zip(calibration.views.names, high.tolist(), strict=True) if much]
     where = f", most in {', '.join(names[:_SHOWN])}" if names else ""
     return [
-        f"residuals are {calibration.common_sigma_px:.2g} px beyond noise with all places free{where}: the plate changes "
-        "its shape between views, or --model does not describe the lens"
+        f"residuals are {calibration.common_sigma_px:.2g} px beyond noise with all places free{where}: the plate "
+        "changes its shape between views, or --model does not describe the lens"
     ]
 
 

@@ -1,9 +1,9 @@
-"""What is unknown of a plate of M points while it is seen by a camera: places, and edge gain, sizes, tilts of its rings.
+"""What is unknown of a plate of M points while a camera sees it: places, and edge gain, sizes, tilts of its rings.
 
 All of it is linear in few unknowns z: p = p0 + B z, with p the places x, y, z of every point, the edge gain, the
-logarithms of the sizes of all rings, and how they are turned out of the plane of the file. The columns of B are either those directions in which the places can be told
-at all by views of an unknown camera pose (`free_plate`), or the deviations that a target file states (`stated_plate`),
-then with z of unit variance a priori.
+logarithms of the sizes of all rings, and how they are turned out of the plane of the file. The columns of B are either
+those directions in which the places can be told at all by views of an unknown camera pose (`free_plate`), or the
+deviations that a target file states (`stated_plate`), then with z of unit variance a priori.
 """
 
 from __future__ import annotations

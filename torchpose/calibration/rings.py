@@ -8,12 +8,12 @@ from torch import Tensor
 
 from torchpose.calibration.views import Rims, Views
 from torchpose.camera import Camera
-from torchpose.detect import find_candidates
 from torchpose.camera.derivatives import by_intrinsics
+from torchpose.detect import find_candidates
 from torchpose.geometry.least_squares import solve_scaled
 from torchpose.geometry.projection import by_pose, image_by_point
-from torchpose.geometry.rotations import plane_axes
 from torchpose.geometry.robust import LEAST_KEPT
+from torchpose.geometry.rotations import plane_axes
 from torchpose.identify import MarkerTable, identify
 from torchpose.pipeline import PoseEstimator
 from torchpose.pose import common_center, raw_centers
@@ -117,7 +117,7 @@ def _rims(refined: Refined, sight: Sight) -> Rims:
     columns = torch.cat([mixed.mT, pull[:, blur, None]], -1)
     taken = mixed @ solve_scaled(information[:, blur][:, :, blur], columns)
     information, pull = information[:, asked][:, :, asked] - taken[..., :-1], pull[:, asked] - taken[..., -1]
-    gain = (sight.polarity * refined.gain[:, None])
+    gain = sight.polarity * refined.gain[:, None]
     radii = sight.radii[:, 0] + gain * gain.new_tensor([1.0, -1.0])
     by_camera = rims_by_camera(sight.camera, refined.R, refined.t, sight.normals[:, 0], radii)
     by_camera[:, 6] *= sight.polarity  # its gain is that of the rings, not of what is dark

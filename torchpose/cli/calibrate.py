@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from torchpose.calibration import Calibration, HandEyeFit
+    from torchpose.calibration.boards import Board
     from torchpose.calibration.measured import Distance
     from torchpose.calibration.session import Measurement
-    from torchpose.calibration.boards import Board
     from torchpose.camera import Camera
     from torchpose.io.sources import Source
     from torchpose.target import Target

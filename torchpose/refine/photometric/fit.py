@@ -227,9 +227,7 @@ class _Fit:
             self.weight = self.weight * self.sectors.of_pixels(self.factor)
         self.sums = sum_products(columns, self.weight)
         used, known = self.weight.sum(-1), self._known(unknowns)
-        normal, self.variance = normal_equations(
-            self.sums, used, levels, part.row, self.least, known, gain=self.gain
-        )
+        normal, self.variance = normal_equations(self.sums, used, levels, part.row, self.least, known, gain=self.gain)
         return normal
 
     def _known(self, unknowns: Unknowns) -> tuple[Tensor, Tensor] | None:
