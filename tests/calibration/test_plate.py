@@ -206,7 +206,8 @@ def test_a_held_camera_carries_its_covariance_to_the_target() -> None:
 
 def test_places_that_are_stated_only_widen_the_camera() -> None:
     """Print errors repeat in every view: with their deviation stated the camera's NEES is right, else it is larger."""
-    stated_nees, exact_nees = [], []
+    stated_nees: list[float] = []
+    exact_nees: list[float] = []
     for seed in range(6):
         scene = statistics.random_scene(
             argparse.Namespace(**{**vars(OPTIONS), "bow": 0.0, "targets": ["hexa50"], "views": 50}), 20 + seed

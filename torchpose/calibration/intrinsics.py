@@ -280,6 +280,11 @@ def _channels(views: Views, bundle: Bundle) -> tuple[_Channel, ...]:
     return tuple(parts)
 
 
+def redundancy(views: Views, bundle: Bundle) -> float:
+    """Degrees of freedom of the residuals of a fit to pixels."""
+    return _channels(replace(views, rims=None), bundle)[0].redundancy(0.0)
+
+
 def _common(views: Views, bundle: Bundle, before: Common) -> Common:
     """The common errors that the residuals of a fit show, which was made with other ones."""
     channels = _channels(views, bundle)

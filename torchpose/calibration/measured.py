@@ -15,8 +15,10 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchpose.calibration.intrinsics import Calibration
-from torchpose.calibration.plate import Plate
+from torchpose import pnp
+from torchpose.calibration.bundle import adjust
+from torchpose.calibration.intrinsics import MIN_POINTS, Calibration, common_sigma, redundancy
+from torchpose.calibration.plate import Plate, free_plate
 from torchpose.calibration.views import Views
 from torchpose.camera import Camera
 from torchpose.errors import ConfigError
@@ -28,7 +30,9 @@ _DIGITS = 12  # of the name of an adjustment
 _LEAST_VIEWS = 3  # of a marker: two give a place, without anything to check it by
 _POOR = 1e-3  # deviation of a place over the extent of the plate, above which it is called poorly known
 _OFTEN = 0.15  # share of a marker's points left out, from which on chance is no explanation
+_ODD = 0.3  # residual without a marker over that with it, below which this marker alone contradicts a view
 _SHOWN = 3  # names in a sentence
+_FEWEST, _MOST_TRIED = 5, 24  # markers of a plate of which one may be left out to see what the others say, and be tried
 _BENT = 2.0  # residual of a view over the median of all, above which it is named
 
 
@@ -165,7 +169,7 @@ def check_seen(views: Views, target: Target) -> None:
 
 def doubts(calibration: Calibration, target: Target) -> list[str]:
     """What makes a measured target doubtful, one sentence each."""
-    return [*_poorly_known(calibration, target), *_moved(calibration), *_bent(calibration)]
+    return [*_poorly_known(calibration, target), *(_left_out(calibration) or _moved(calibration) or _bent(calibration))]
 
 
 def _poorly_known(calibration: Calibration, target: Target) -> list[str]:
@@ -194,24 +198,81 @@ def target_order(plate: Plate, target: Target) -> Tensor:
     return (plate.ids[:, None] == target.ids).long().argmax(1)
 
 
-def _moved(calibration: Calibration) -> list[str]:
-    """Markers of which more points were left out than chance would."""
+def _left_out(calibration: Calibration) -> list[str]:
+    """Markers of which more points were left out than chance would, and views of which most were."""
     seen, used = calibration.seen, calibration.views
     if seen is None:
         return []
+    dropped = torch.tensor([name not in used.names for name in seen.names]) & (seen.counts >= MIN_POINTS)
+    odd = _odd_ones(seen.of_views(dropped), calibration)
     kept = {(used.names[v], p) for v, p in zip(used.view.tolist(), used.point.tolist(), strict=True)}
-    out = [
-        (seen.names[v], p)
-        for v, p in zip(seen.view.tolist(), seen.point.tolist(), strict=True)
-        if seen.names[v] in used.names and (seen.names[v], p) not in kept
-    ]
+    every = [(seen.names[v], p) for v, p in zip(seen.view.tolist(), seen.point.tolist(), strict=True)]
+    out = [one for one in every if one[0] in used.names and one not in kept] + odd
     found = []
     for marker in sorted({p for _, p in out}):
-        frames = [name for name, p in out if p == marker]
+        frames = sorted(name for name, p in out if p == marker)
         if len(frames) >= max(_LEAST_VIEWS, _OFTEN * int((seen.point == marker).sum())):
-            names = ", ".join(frames[:_SHOWN]) + (" and others" if len(frames) > _SHOWN else "")
-            found.append(f"marker {marker} is elsewhere in {len(frames)} views ({names}): it moved, or is damaged")
+            found.append(_elsewhere(marker, frames))
+    rest = [name for name, out in zip(seen.names, dropped.tolist(), strict=True) if out]
+    rest = [name for name in rest if name not in {name for name, _ in odd}]
+    if rest:
+        names = ", ".join(rest[:_SHOWN]) + (" and others" if len(rest) > _SHOWN else "")
+        found.append(
+            f"{len(rest)} views ({names}) contradict the places that the others tell: the plate had another shape"
+        )
     return found
+
+
+def _odd_ones(views: Views, calibration: Calibration) -> list[tuple[str, int]]:
+    """Views that one marker alone keeps from having a pose, with this marker."""
+    plate = calibration.plate
+    assert plate is not None  # what was measured
+    views = views.of_views(views.counts >= _FEWEST)
+    if not len(views):
+        return []
+    places = plate.at(calibration.bundle.plate).places[plate.index(views.point)]
+    points, pixels, mask = replace(views, points=places).padded()
+    n, m = mask.shape
+    ids = torch.zeros(n, m, dtype=torch.int64)
+    ids[mask] = views.point[torch.argsort(views.view, stable=True)]
+    # every row anew without each of its points, and last with all of them
+    without = torch.cat([torch.eye(m, dtype=torch.bool), torch.zeros(1, m, dtype=torch.bool)])
+    use = (mask[:, None] & ~without).flatten(0, 1)
+    points, pixels = (x[:, None].expand(n, m + 1, m, -1).flatten(0, 1) for x in (points, pixels))
+    pose = pnp.solve(points, pixels, calibration.camera, mask=use)
+    error = pixels - calibration.camera.project(points @ pose.R.mT + pose.t[:, None])
+    freedom = (2 * use.sum(-1) - 6).clamp_min(1)
+    rms = (torch.where(use, error.square().sum(-1), 0.0).sum(-1) / freedom).sqrt().nan_to_num(nan=torch.inf)
+    least, which = torch.where(mask, rms.view(n, m + 1)[:, :m], torch.inf).min(-1)
+    odd = least < _ODD * rms.view(n, m + 1)[:, m]
+    return [(views.names[k], int(ids[k, which[k]])) for k in odd.nonzero()[:, 0].tolist()]
+
+
+def _elsewhere(marker: int, frames: list[str]) -> str:
+    names = ", ".join(frames[:_SHOWN]) + (" and others" if len(frames) > _SHOWN else "")
+    return f"marker {marker} is elsewhere in {len(frames)} views ({names}): it moved, or is damaged"
+
+
+def _moved(calibration: Calibration) -> list[str]:
+    """The marker without which the residuals are those of noise, where they are not with it."""
+    plate, views, bundle = calibration.plate, calibration.views, calibration.bundle
+    own = float(views.covariance.diagonal(dim1=-2, dim2=-1).mean().sqrt())
+    assert plate is not None  # what was measured
+    if calibration.common_sigma_px < own or not _FEWEST <= len(plate.ids) <= _MOST_TRIED:
+        return []
+    nominal = plate.at(bundle.plate).places
+    for place, marker in enumerate(plate.ids.tolist()):
+        others = replace(views, rims=None)[views.point != marker]
+        enough = others.counts > _FEWEST - 2
+        keep = torch.arange(len(plate.ids)) != place
+        rest = others.of_views(enough)
+        poses = bundle.R[enough], bundle.t[enough]
+        fit = adjust(rest, calibration.camera, *poses, plate=free_plate(plate.ids[keep], nominal[keep]))
+        if common_sigma(fit.residual, rest.covariance, redundancy(rest, fit)) < own:
+            off = torch.where(views.point == marker, bundle.residual.norm(dim=-1), torch.nan)
+            high = (off > _BENT * off.nanmedian()).nonzero()[:, 0]
+            return [_elsewhere(marker, [views.names[v] for v in views.view[high].tolist()])]
+    return []
 
 
 def _bent(calibration: Calibration) -> list[str]:

@@ -252,8 +252,8 @@ def _show_target(found: Measurement) -> None:
         known_um = 1e3 * float(known.square().mean().sqrt())
         typer.echo(f"places {name}: {1e3 * rms:.3g} um RMS off, {1e3 * most:.3g} at most; known to {known_um:.2g} um")
     size = float((target.radii / nominal.radii).mean())
-    gain, known = 1e3 * target.edge_gain, 1e3 * float(target.covariance[-1, -1].sqrt())
-    typer.echo(f"edge gain {gain:.3g} +- {known:.2g} um, rings {size:.5f} times as large as in the file")
+    gain, gain_sigma = 1e3 * target.edge_gain, 1e3 * float(target.covariance[-1, -1].sqrt())
+    typer.echo(f"edge gain {gain:.3g} +- {gain_sigma:.2g} um, rings {size:.5f} times as large as in the file")
 
 
 def _show_intrinsics(found: Calibration) -> None:
