@@ -15,7 +15,8 @@ and `torchpose estimate` do it.
 NEES: squared errors in units of their covariance over their number, 1 is right: marker places in millimetres (scale
 included), intrinsics, poses of later frames (from their centres). bound: that of the joint problem, all pixels along
 all rims with intrinsics, poses, places, tilts, sizes and edge gain unknown; its information is formed here by finite
-differences. claimed: the deviations that the files state over this bound.
+differences. claimed: the deviations that the files state over this bound; by_centers: those that the same adjustment of
+the centres alone, without sizes and tilts of the rings, would state.
 """
 
 from __future__ import annotations
@@ -310,9 +311,12 @@ def drawn_set(options: argparse.Namespace, seed: int) -> dict[str, float]:
     # without the scale, which no view tells
     arm = (nominal.centers - nominal.centers.mean(0)).flatten()
     shape = error - arm * (arm @ error) / (arm @ arm)
+    thin = centers_alone(scene, views)
     row = {
         "places_nees": nees(error, target.covariance[:-1, :-1]),
         "intrinsics_nees": nees(of_camera, found.covariance),
+        "places_by_centers": math.sqrt(float(thin[0] / in_bound.diagonal().sum())),
+        "focal_by_centers": math.sqrt(float(thin[1] / bound.diagonal()[:2].sum())),
         "places_um2": 1e6 * float(shape.square().mean()),
         "places_bound_um2": 1e6 * float(in_bound.diagonal().mean()),
         "focal_px2": float(of_camera[:2].square().mean()),
@@ -323,6 +327,14 @@ def drawn_set(options: argparse.Namespace, seed: int) -> dict[str, float]:
         "seconds": seconds,
     }
     return row | later_poses(scene, tests, target, camera, found.covariance)
+
+
+def centers_alone(scene: Scene, views: Views) -> tuple[Tensor, Tensor]:
+    """Variances, summed, of places and of both focal lengths that the centres alone give, sizes and tilts unused."""
+    plate = free_plate(scene.nominal.ids, scene.nominal.centers)
+    found = calibrate_intrinsics(replace(views, rims=None), [scene.start], lens=LENS, plate=plate)
+    rows, n = plate.places.flatten(0, 1), len(found.covariance)
+    return (rows @ found.joint[n:, n:] * rows).sum(), found.covariance.diagonal()[:2].sum()
 
 
 def later_poses(
