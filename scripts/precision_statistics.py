@@ -2,13 +2,19 @@
 
     python scripts/precision_statistics.py --case tilt --frames 5000 --out precision.csv
     python scripts/precision_statistics.py --case all --frames 200 --method photometric edges
+    python scripts/precision_statistics.py --case faults --frames 60
 
 Simulated 2-megapixel frames of the built-in target quad40, 8 bit. One row a case and method: frames with a pose, RMS
 error over RMS bound across and along the optical axis and of the rotation, the claimed deviation across over the same
-bound, the RMS errors, mean NEES (ideal 6), the share inside the 99 % ellipsoid. Point-spread functions outside the
-model are mixtures of shifted frames: a shift of the principal point is a shift of the picture. The bound of a covered
-ring takes the covered part of that marker's information off; that of a foreign point-spread function is the bound of a
-Gaussian of the same variance.
+bound, the RMS errors and claimed deviations, mean NEES (ideal 6), the share inside the 99 % ellipsoid. Point-spread
+functions outside the model are mixtures of shifted frames: a shift of the principal point is a shift of the picture.
+The bound of a covered ring takes the covered part of that marker's information off; that of a foreign point-spread
+function is the bound of a Gaussian of the same variance.
+
+`faults` are what differs from the files, and what cameras do to pictures: `print`, `warp` and `gain` have another print
+in every frame, `k1-off` a camera file that is off. Column `file`: `perfect` where the files claim nothing of it,
+`stated` where the target file has the right `center_sigma` and `edge_gain_sigma`. The bound is that of the nominal
+target and camera, without the fault.
 """
 
 from __future__ import annotations
@@ -17,7 +23,7 @@ import argparse
 import math
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -30,7 +36,22 @@ from torchpose.analysis import pose_crlb, pose_errors
 from torchpose.geometry import rotations
 from torchpose.io.writers import write_rows
 from torchpose.pipeline import Method
-from torchpose.sim import add_noise, render
+from torchpose.sim import (
+    Disturbances,
+    PrintErrors,
+    Prints,
+    Processing,
+    SensorPattern,
+    Texture,
+    add_noise,
+    disturbed,
+    printed,
+    processed,
+    read_out,
+    render,
+)
+from torchpose.sim.fields import keys_of
+from torchpose.sim.sensor import toned
 
 F64 = torch.float64
 FOCAL, WIDTH, HEIGHT = 1111.11, 1824, 1216
@@ -55,6 +76,13 @@ class Case:
     missing: bool = False
     encoded: bool = False
     srgb: bool = False
+    gamma: float = 1.0
+    errors: PrintErrors | None = None
+    k1_error: float = 0.0
+    texture: tuple[float, float] | None = None  # share, px
+    disturbances: dict[str, float] = field(default_factory=dict)
+    pattern: SensorPattern = field(default_factory=SensorPattern)
+    processing: Processing = field(default_factory=Processing)
 
 
 def tilted(tilt_deg: float, near: float = 140.0, far: float = 190.0) -> Callable[..., tuple[Tensor, Tensor]]:
@@ -108,6 +136,34 @@ CASES = {
     "srgb": Case(tilted(60), encoded=True, srgb=True),
     "srgb-as-linear": Case(tilted(60), encoded=True),
 }
+# what differs from the files of target and camera, and what cameras do to pictures
+FAULTS = {
+    "as-filed": Case(tilted(40)),
+    "print-10": Case(tilted(40), errors=PrintErrors(center_sigma=0.010)),
+    "print-50": Case(tilted(40), errors=PrintErrors(center_sigma=0.050)),
+    "warp-50": Case(tilted(40), errors=PrintErrors(warp=0.050)),
+    "gain-30": Case(tilted(40), errors=PrintErrors(gain=0.030)),
+    "raster-600": Case(tilted(40), errors=PrintErrors(dpi=600.0)),
+    "raster-150": Case(tilted(40), errors=PrintErrors(dpi=150.0)),
+    "k1-off": Case(tilted(40), k1_error=0.002),
+    "texture": Case(tilted(40), texture=(0.02, 4.0)),
+    "coma": Case(tilted(40), disturbances={"coma_px": 2.0, "coma_deg": 30.0}),
+    "haze": Case(tilted(40), disturbances={"haze_px": 0.1}),
+    "haze-fine": Case(tilted(40), disturbances={"haze_px": 0.1, "haze_length": 10.0}),
+    "ghost": Case(tilted(40), disturbances={"ghost": 15.0}),
+    "speckle": Case(tilted(40), disturbances={"speckle": 0.05}),
+    "flicker": Case(tilted(40), disturbances={"flicker": 0.05}),
+    "prnu": Case(tilted(40), pattern=SensorPattern(prnu=0.01)),
+    "columns": Case(tilted(40), pattern=SensorPattern(column_noise=2.0)),
+    "jitter": Case(tilted(40), pattern=SensorPattern(line_jitter=0.1)),
+    "coarse": Case(tilted(40), bits=4),
+    "gamma-as-linear": Case(tilted(40), gamma=2.2),
+    "bayer": Case(tilted(40), processing=Processing(bayer=True)),
+    "denoise": Case(tilted(40), processing=Processing(denoise=10.0)),
+    "sharpen": Case(tilted(40), processing=Processing(sharpen=1.0)),
+    "jpeg-80": Case(tilted(40), processing=Processing(jpeg=80)),
+}
+MIDDLE = 165.0  # mm, the distance at which a texture's length in mm is that in px
 
 
 def camera_of(k1: float) -> tp.Camera:
@@ -127,7 +183,10 @@ def spread(psf: str) -> Tensor:
     return 1.2 * square[square.norm(dim=-1) <= 1.01]  # a disc of radius 1.2 px
 
 
-def picture(case: Case, camera: tp.Camera, target: tp.Target, r: Tensor, t: Tensor) -> Tensor:
+Drawn = tp.Target | Prints
+
+
+def picture(case: Case, camera: tp.Camera, target: Drawn, r: Tensor, t: Tensor) -> Tensor:
     """Frames (B, H, W), free of noise."""
     if case.psf == "blackman-harris":
         return filtered(case, camera, target, r, t)
@@ -137,11 +196,21 @@ def picture(case: Case, camera: tp.Camera, target: tp.Target, r: Tensor, t: Tens
         matrix = camera.matrix.clone()
         matrix[:2, 2] += shift
         moved = replace(camera, matrix=matrix)
-        out += render(moved, target, r, t, psf_sigma=case.blur, plate=PLATE, dark=DARK, light=LIGHT) / len(shifts)
+        out += render(moved, target, r, t, psf_sigma=case.blur, **plate_of(case, len(t))) / len(shifts)
     return out
 
 
-def filtered(case: Case, camera: tp.Camera, target: tp.Target, r: Tensor, t: Tensor, finer: int = 3) -> Tensor:
+def plate_of(case: Case, frames: int) -> dict[str, Any]:
+    """Options of `render`; the paper has the same texture in all frames, which see it from elsewhere."""
+    options: dict[str, Any] = {"plate": PLATE, "dark": DARK, "light": LIGHT}
+    if case.texture is None:
+        return options
+    share, length = case.texture
+    key = keys_of(1, 0, "paper").expand(frames)
+    return options | {"texture": Texture(key, share, length * MIDDLE / FOCAL)}
+
+
+def filtered(case: Case, camera: tp.Camera, target: Drawn, r: Tensor, t: Tensor, finer: int = 3) -> Tensor:
     """Frames through a Blackman-Harris pixel filter 1.5 px wide in place of the pixel's square (Harris 1978)."""
     matrix = camera.matrix.clone()
     matrix[:2] *= finer
@@ -154,7 +223,7 @@ def filtered(case: Case, camera: tp.Camera, target: tp.Target, r: Tensor, t: Ten
     window = torch.where(x.abs() <= 0.5, window, 0.0)
     kernel = (window[:, None] * window / window.sum().square())[None, None].float()
     pad = reach - (finer - 1) // 2
-    sharp = render(fine, target, r, t, psf_sigma=finer * case.blur, plate=PLATE, dark=DARK, light=LIGHT)
+    sharp = render(fine, target, r, t, psf_sigma=finer * case.blur, **plate_of(case, len(t)))
     sharp = torch.nn.functional.pad(sharp[:, None], (pad, pad, pad, pad), mode="replicate")
     return torch.nn.functional.conv2d(sharp, kernel, stride=finer)[:, 0]
 
@@ -194,42 +263,80 @@ def without_first(target: tp.Target) -> tp.Target:
     )
 
 
+def printed_anew(case: Case, frames: int, g: torch.Generator) -> Prints | None:
+    """A print for every frame; plates are bent in any direction."""
+    if case.errors is None:
+        return None
+    direction = math.pi * torch.rand(frames, dtype=F64, generator=g)
+    return printed(TARGET, replace(case.errors, direction=direction), frames, g)
+
+
+def stated(errors: PrintErrors) -> tp.Target:
+    """The target with what its file may say of such prints; it has no word for a raster."""
+    sigma = torch.as_tensor(errors.center_sigma, dtype=F64).expand(3).clone()
+    reach = TARGET.centers[:, :2].norm(dim=1)
+    # a saddle of any direction: its height over the markers, RMS
+    saddle = float(errors.warp) * (reach / (reach + TARGET.radii[:, 0]).max()).square().mean() / math.sqrt(2)
+    sigma[2] = torch.hypot(sigma[2], saddle)
+    deviations = torch.cat([sigma.repeat(len(TARGET)), torch.tensor([float(errors.gain)], dtype=F64)])
+    return replace(TARGET, covariance=torch.diag(deviations.square()))
+
+
+def photographed(case: Case, clean: Tensor, seed: int, index: Tensor) -> Tensor:
+    """Frames as the file has them, of those that fall on the lens: the camera's faults, noise and processing."""
+    clean = disturbed(clean, Disturbances.of(len(clean), seed=seed, **case.disturbances), index)
+    clean = read_out(clean, case.pattern, seed, index)
+    if case.processing.wanted:
+        raw = add_noise(clean, case.noise, seed=seed, index=index, bits=16)
+        return processed(raw.float() * (255 / 65535), case.processing, case.bits, case.gamma)
+    clean = toned(clean, "srgb") if case.encoded else clean  # with even noise in the file
+    frames = add_noise(clean, case.noise, seed=seed, index=index, bits=case.bits, gamma=case.gamma)
+    if case.bits < 8:  # files have 8
+        frames = (frames * (255 / (2**case.bits - 1))).round().to(torch.uint8)
+    return frames
+
+
 def run(name: str, case: Case, methods: list[Method], frames: int, seed: int) -> list[dict[str, Any]]:
     g = torch.Generator().manual_seed(seed)
     camera = camera_of(case.k1)
     r, t = case.poses(frames, g)
-    drawn = without_first(TARGET) if case.missing else TARGET
-    estimators = {m: tp.PoseEstimator(camera, TARGET, method=m, srgb=case.srgb) for m in methods}
-    parts: dict[str, list[tuple[Tensor, ...]]] = {m: [] for m in methods}
+    prints = printed_anew(case, frames, g)
+    filed = camera_of(case.k1 + case.k1_error)
+    files = {"perfect": TARGET} | ({} if case.errors is None else {"stated": stated(case.errors)})
+    estimators = {
+        (m, file): tp.PoseEstimator(filed, target, method=m, srgb=case.srgb)
+        for m in methods
+        for file, target in files.items()
+    }
+    parts: dict[tuple[str, str], list[tuple[Tensor, ...]]] = {key: [] for key in estimators}
     bounds = []
     for a in range(0, frames, BATCH):
         s = slice(a, a + BATCH)
-        clean = picture(case, camera, drawn, r[s], t[s])
+        drawn = without_first(TARGET) if case.missing else TARGET
+        clean = picture(case, camera, drawn if prints is None else prints[s], r[s], t[s])
         if case.cover:
             clean = covered(case, camera, clean, r[s], t[s], g)
-        if case.encoded:
-            x = clean / 255
-            clean = 255 * torch.where(x <= 0.0031308, 12.92 * x, 1.055 * x.clamp_min(0.0031308) ** (1 / 2.4) - 0.055)
-        noisy = add_noise(clean, case.noise, seed=seed, index=torch.arange(a, a + len(clean)), bits=case.bits)
+        noisy = photographed(case, clean, seed, torch.arange(a, a + len(clean)))
         bounds.append(bound_of(case, camera, r[s], t[s]))
-        for m, estimator in estimators.items():
+        for key, estimator in estimators.items():
             poses = estimator(noisy)
             e = pose_errors(poses, _Pose(r[s], t[s]))
             claimed = poses.covariance.diagonal(dim1=-2, dim2=-1)
-            parts[m].append((poses.status, e.translation, e.rotation, e.nees, claimed))
+            parts[key].append((poses.status, e.translation, e.rotation, e.nees, claimed))
         if sys.stderr.isatty():
             print(f"\r{name}: {a + len(clean)} of {frames}", end="", file=sys.stderr)
     bound = torch.cat(bounds).diagonal(dim1=-2, dim2=-1)
     limit = chi2.ppf(0.99, 6)
     rows = []
-    for m in methods:
-        status, translation, rotation, nees, claimed = (torch.cat(x) for x in zip(*parts[m], strict=True))
+    for (m, file), part in parts.items():
+        status, translation, rotation, nees, claimed = (torch.cat(x) for x in zip(*part, strict=True))
         ok = status == tp.Status.OK
         e2, b2 = torch.cat([translation, rotation], -1)[ok].square().mean(0), bound[ok].mean(0)
         ratio = [math.sqrt(e2[i].sum() / b2[i].sum()) for i in (slice(0, 2), slice(2, 3), slice(3, 6))]
         rows.append({
             "case": name,
             "method": m,
+            "file": file,
             "frames": frames,
             "ok": int(ok.sum()),
             "lateral_ratio": ratio[0],
@@ -238,6 +345,8 @@ def run(name: str, case: Case, methods: list[Method], frames: int, seed: int) ->
             "claimed_ratio": math.sqrt(claimed[ok][:, :2].mean(0).sum() / b2[:2].sum()),
             "lateral_um": 1e3 * math.sqrt(e2[:2].sum()),
             "depth_um": 1e3 * math.sqrt(e2[2]),
+            "claimed_lateral_um": 1e3 * math.sqrt(claimed[ok][:, :2].mean(0).sum()),
+            "claimed_depth_um": 1e3 * math.sqrt(claimed[ok][:, 2].mean()),
             "rotation_mdeg": math.degrees(1e3 * math.sqrt(e2[3:].sum())),
             "nees": float(nees[ok].mean()),
             "nees_median": float(nees[ok].median()),
@@ -254,16 +363,17 @@ class _Pose:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--case", nargs="+", default=["tilt"], choices=[*CASES, "all"])
+    parser.add_argument("--case", nargs="+", default=["tilt"], choices=[*CASES, *FAULTS, "all", "faults"])
     parser.add_argument("--method", nargs="+", default=["photometric"], choices=get_args(Method))
     parser.add_argument("--frames", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, help="CSV file of the rows")
     options = parser.parse_args()
-    names = list(CASES) if "all" in options.case else options.case
+    families = {"all": list(CASES), "faults": list(FAULTS)}
+    names = [name for case in options.case for name in families.get(case, [case])]
     rows: list[dict[str, Any]] = []
     for name in names:
-        for row in run(name, CASES[name], options.method, options.frames, options.seed):
+        for row in run(name, (CASES | FAULTS)[name], options.method, options.frames, options.seed):
             rows.append(row)
             print("  ".join(f"{k} {v:.3g}" if isinstance(v, float) else str(v) for k, v in row.items()), flush=True)
     if options.out:

@@ -7,8 +7,8 @@ import inspect
 import torchpose as tp
 
 PUBLIC = [
-    "Camera", "ConfigError", "Detections", "FrameError", "HandEye", "PoseEstimator", "Poses", "Reason", "Status",
-    "Target", "TorchposeError", "ellipse", "pnp",
+    "Camera", "ConfigError", "Detections", "FrameError", "HandEye", "Misfit", "Motions", "PoseEstimator", "Poses",
+    "Reason", "Status", "Target", "TorchposeError", "ellipse", "pnp",
 ]  # fmt: skip
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import pytest
@@ -42,6 +42,8 @@ def poses() -> Poses:
         covariance=root @ root.mT,
         noise=0.25 * root @ root.mT,
         systematic=0.75**0.5 * root,
+        place=torch.zeros(4, 4, 4, dtype=torch.float64),
+        misfit=torch.zeros(4, dtype=torch.int64),
         rms=floats().abs(),
         status=status,
         reason=torch.zeros(4, dtype=torch.int64),
@@ -143,3 +145,81 @@ def test_to_reaches_everything(poses: Poses, target: str | torch.dtype) -> None:
     if target == torch.float32:
         # ids beyond the 24 bits of a float32 survive
         assert torch.equal(moved.detections.marker, poses.detections.marker)
+
+
+def drawn(rows: int, numbers: int, of_camera: int, seed: int = 4) -> tuple[Poses, torch.Tensor, torch.Tensor]:
+    """True poses, and how they err with noise of their own and numbers that they share."""
+    g = torch.Generator().manual_seed(seed)
+
+    def floats(*shape: int) -> torch.Tensor:
+        return torch.randn(rows, *shape, generator=g, dtype=torch.float64)
+
+    noise, systematic = 1e-4 * floats(6, 6), 1e-3 * floats(6, numbers)
+    noise = noise @ noise.mT
+    none = floats() * torch.nan
+    whole = torch.zeros(rows, dtype=torch.int64)
+    poses = Poses(
+        frame=torch.arange(rows),
+        target=torch.arange(rows) % 2,
+        instance=whole,
+        copies=whole + 1,
+        R=rotations.exp(floats(3)),
+        t=floats(3),
+        covariance=noise + systematic @ systematic.mT,
+        noise=noise,
+        systematic=systematic,
+        place=torch.zeros(rows, 4, 4, dtype=torch.float64),
+        misfit=whole,
+        rms=none,
+        status=whole,
+        reason=whole,
+        markers=whole + 4,
+        chi2=none,
+        R_alt=none[:, None, None].expand(-1, 3, 3),
+        t_alt=none[:, None].expand(-1, 3),
+        rms_alt=none,
+        chi2_alt=none,
+        detections=detections(),
+        of_camera=of_camera,
+    )
+    return poses, noise, systematic
+
+
+@pytest.mark.parametrize(("i", "j"), [(0, 2), (0, 1)])
+def test_motions_have_the_covariance_of_their_scatter(i: int, j: int) -> None:
+    """20,000 draws: of one target all its numbers cancel as far as they do, of two targets the camera's alone."""
+    poses, noise, systematic = drawn(4, 5, 2)
+    motion, draws, g = poses.between(i, j), 20000, torch.Generator().manual_seed(9)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=g, dtype=torch.float64)
+
+    lens, prints = normal(draws, 2), normal(2, draws, 3)
+    seen = []
+    for row, of in ((i, 0), (j, 0 if i % 2 == j % 2 else 1)):
+        error = normal(draws, 6) @ torch.linalg.cholesky(noise[row]).T
+        error = error + torch.cat([lens, prints[of]], -1) @ systematic[row].T
+        seen.append((rotations.exp(error[:, 3:]) @ poses.R[row], poses.t[row] + error[:, :3]))
+    (r_i, t_i), (r_j, t_j) = seen
+    r, t = r_i.mT @ r_j, (r_i.mT @ (t_j - t_i)[..., None])[..., 0]
+    error = torch.cat([t - motion.t, rotations.log(r @ motion.R.mT)], -1)
+    scatter = error.T @ error / draws
+    root = torch.linalg.cholesky(motion.covariance[0])
+    whitened = torch.linalg.solve_triangular(
+        root, torch.linalg.solve_triangular(root, scatter, upper=False).T, upper=False
+    )
+    torch.testing.assert_close(whitened, torch.eye(6, dtype=torch.float64), rtol=0, atol=0.06)
+    torch.testing.assert_close(poses.R[j], poses.R[i] @ motion.R[0], rtol=0, atol=1e-12)
+
+
+def test_one_part_in_the_frame_of_another() -> None:
+    poses, _, _ = drawn(4, 5, 2)
+    poses = replace(poses, frame=torch.tensor([0, 0, 1, 1]))
+    poses.status[2] = Status.AMBIGUOUS
+    inside = poses.relative_to(0)
+    assert inside.target.tolist() == [1, 1]
+    assert inside.frame.tolist() == [0, 1]
+    assert inside.status.tolist() == [Status.OK, Status.AMBIGUOUS]
+    expected = poses.between(torch.tensor([0, 2]), torch.tensor([1, 3]))
+    torch.testing.assert_close(inside.t, expected.t)
+    torch.testing.assert_close(inside.covariance, expected.covariance)

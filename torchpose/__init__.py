@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from torchpose.errors import ConfigError, FrameError, TorchposeError
     from torchpose.handeye import HandEye
     from torchpose.pipeline import PoseEstimator
-    from torchpose.results import Detections, Poses, Reason, Status
+    from torchpose.results import Detections, Misfit, Motions, Poses, Reason, Status
     from torchpose.target import Target
 
 __all__ = [
@@ -20,6 +20,8 @@ __all__ = [
     "Detections",
     "FrameError",
     "HandEye",
+    "Misfit",
+    "Motions",
     "PoseEstimator",
     "Poses",
     "Reason",
@@ -38,6 +40,8 @@ _HOME = {
     "FrameError": "errors",
     "HandEye": "handeye",
     "PoseEstimator": "pipeline",
+    "Misfit": "results",
+    "Motions": "results",
     "Poses": "results",
     "Reason": "results",
     "Status": "results",

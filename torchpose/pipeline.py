@@ -240,8 +240,10 @@ class PoseEstimator(nn.Module):
 
     def _solved(self, scene: Scene, rings: Rings, identified: Identified) -> Found:
         """The evidence of every row, and the solutions of those rows that have enough of it."""
-        markers = scene.table[scene.target]
+        gain = scene.stated_gain(identified.gain)
+        markers = replace(scene.table[scene.target], radii=scene.printed_radii(gain))
         evidence = gather_evidence(rings, identified.ring, markers, scene.camera, self._recipe.locate)
+        evidence = replace(evidence, gain=gain)
         solvable = (evidence.mask.sum(-1) >= MIN_MARKERS).nonzero()[:, 0]
         rough = identified.R[solvable], identified.t[solvable]
         return Found(

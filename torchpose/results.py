@@ -42,6 +42,15 @@ class Reason(IntEnum):
     TWO_SOLUTIONS = 6  # with Status.AMBIGUOUS
 
 
+class Misfit(IntEnum):
+    """What the residuals of a row show beyond noise and the stated uncertainties; its covariance is widened by that."""
+
+    NONE = 0
+    PRINT = 1  # markers sit beside their places, or edges do
+    CAMERA = 2  # focal length, principal point or distortion are off, as far as one frame can tell
+    SCATTER = 3  # neither: something else in the frame
+
+
 @dataclass(frozen=True, eq=False)
 class Detections(Rows):
     """The K markers found in a batch, flat. Pixels are those of the raw (distorted) frame, OpenCV convention.
@@ -67,6 +76,27 @@ class Detections(Rows):
 
 
 @dataclass(frozen=True, eq=False)
+class Motions(Rows):
+    """Poses of one row's target in the frame of another's: X_i = R X_j + t.
+
+    Attributes:
+        R, t: t in mm.
+        covariance: translation (mm) first, then rotation (rad, about the axes of frame i), of everything.
+        noise: the part of it that is the noise of the two frames.
+    """
+
+    R: Float[Tensor, "N 3 3"]
+    t: Float[Tensor, "N 3"]
+    covariance: Float[Tensor, "N 6 6"]
+    noise: Float[Tensor, "N 6 6"]
+
+    @property
+    def std(self) -> Float[Tensor, "N 6"]:
+        """Standard deviations of t (mm) and of the rotation (rad)."""
+        return self.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+
+
+@dataclass(frozen=True, eq=False)
 class Poses(Rows):
     """Poses of T targets in B frames, frame-major.
 
@@ -89,6 +119,9 @@ class Poses(Rows):
         noise: the part of it that is the frame's own: how far the pose would scatter if the frame were taken again.
         systematic: how the pose errs with each of L numbers of unit variance that are the same in all frames: the
             uncertain parameters of the camera, the first ``of_camera``, and what is uncertain of the target.
+        place: where the fit found the M markers beside their places, target frame, mm, and their edges outwards, mm,
+            as far as the file or the residuals leave it open; NaN for markers that were not used.
+        misfit: `Misfit`.
         rms: reprojection RMS of the compensated marker centres, px.
         status, reason: `Status` and `Reason`.
         markers: number of markers used.
@@ -108,6 +141,8 @@ class Poses(Rows):
     covariance: Float[Tensor, "N 6 6"]
     noise: Float[Tensor, "N 6 6"]
     systematic: Float[Tensor, "N 6 L"]
+    place: Float[Tensor, "N M 4"]
+    misfit: Int[Tensor, " N"]
     rms: Float[Tensor, " N"]
     status: Int[Tensor, " N"]
     reason: Int[Tensor, " N"]
@@ -155,6 +190,70 @@ class Poses(Rows):
     def noise_std(self) -> Float[Tensor, "N 6"]:
         """The same of the noise of the frame alone: repeatability."""
         return self.noise.diagonal(dim1=-2, dim2=-1).sqrt()
+
+    def between(self, i: int | Tensor, j: int | Tensor) -> Motions:
+        """The poses of rows j in the frames of rows i: how a target moved, or where one part is in another.
+
+        What camera and target do to both rows alike cancels in the covariance as far as it does: the numbers of
+        `systematic` are the same in all frames, those of the target where both rows are of one target.
+
+        Args:
+            i: number of a row, or (N,) numbers.
+            j: the same; N motions, or one.
+        """
+        i, j = (torch.as_tensor(k, device=self.t.device).reshape(-1) for k in (i, j))
+        one, two = self[i], self[j]
+        back = one.R.mT
+        arm = (two.t - one.t)[..., None]
+        by_two = torch.zeros_like(two.covariance)
+        by_two[:, :3, :3] = by_two[:, 3:, 3:] = back
+        by_one = -by_two
+        by_one[:, :3, 3:] = back @ rotations.skew(arm[..., 0])
+        own, noise = self._own, self.noise
+        common = by_one @ one.systematic + by_two @ two.systematic
+        apart = torch.cat([by_one @ one.systematic, by_two @ two.systematic], -1)
+        # numbers of two targets are others
+        same = (one.target == two.target)[:, None, None]
+        lens, prints = common[..., : self.of_camera], apart.unflatten(-1, (2, -1))[..., self.of_camera :].flatten(2)
+        shared_by_both = torch.where(same, common @ common.mT, lens @ lens.mT + prints @ prints.mT)
+        whole = by_one @ own[i] @ by_one.mT + by_two @ own[j] @ by_two.mT + shared_by_both
+        alone = by_one @ noise[i] @ by_one.mT + by_two @ noise[j] @ by_two.mT
+        return Motions(back @ two.R, (back @ arm)[..., 0], whole, alone)
+
+    def relative_to(self, target: int) -> Poses:
+        """Poses of the other targets in the frame of number ``target``: where one part is in another.
+
+        One row a frame and target each, as `between` has them; their covariance is about that frame's axes. Where the
+        reference has no pose, or is not sure, a row has its status and reason.
+        """
+        index = (self.target != target).nonzero()[:, 0]
+        at = (self.target == target).nonzero()[:, 0]
+        row = torch.full((int(self.frame.max()) + 1 if len(self) else 0,), -1, device=at.device)
+        reference = row.index_copy(0, self.frame[at], at)[self.frame[index]]
+        other, base = self[index], self[reference]
+        motion = self.between(reference, index)
+        worse = (other.ok & ~base.ok)[:, None]
+        codes = torch.stack([other.status, other.reason], -1)
+        status, reason = torch.where(worse, torch.stack([base.status, base.reason], -1), codes).unbind(-1)
+        nothing = {name: torch.full_like(getattr(other, name), torch.nan) for name in ("R_alt", "t_alt", "rms_alt")}
+        return replace(
+            other,
+            R=motion.R,
+            t=motion.t,
+            covariance=motion.covariance,
+            noise=motion.noise,
+            systematic=torch.full_like(other.systematic, torch.nan)[..., :0],
+            status=status,
+            reason=reason,
+            chi2_alt=torch.full_like(other.chi2_alt, torch.nan),
+            of_camera=0,
+            **nothing,
+        )
+
+    @property
+    def _own(self) -> Tensor:
+        """Covariance (N, 6, 6) without what is common to all frames."""
+        return self.covariance - self.systematic @ self.systematic.mT
 
     def se3(self) -> Se3:
         """The N poses as kornia's `Se3`, camera from target, mm; back by ``pose.so3.matrix(), pose.t``."""

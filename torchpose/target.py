@@ -308,9 +308,10 @@ class Target:
             lines.append(f"edge_gain: {format_number(self.edge_gain)}")
         if self.covariance is not None:
             places, gain = self.covariance[:-1, :-1], float(self.covariance[-1, -1])
-            data = format_list(places.flatten().tolist())
             lines.append(f"edge_gain_sigma: {format_number(gain**0.5)}")
-            lines.append(f"centers_covariance: {{rows: {len(places)}, cols: {len(places)}, data: {data}}}")
+            if bool(places.any()):
+                data = format_list(places.flatten().tolist())
+                lines.append(f"centers_covariance: {{rows: {len(places)}, cols: {len(places)}, data: {data}}}")
         if self.adjustment is not None:
             lines.append(f'adjustment: "{self.adjustment}"')
         if self.cross_covariance is not None:

@@ -108,7 +108,7 @@ def test_poses_and_truth_are_what_is_compared() -> None:
     """The result type of the pipeline and the truth file fit the two arguments."""
     rows = 2
     zeros = {name: torch.zeros(rows, dtype=torch.float64) for name in ("rms", "chi2", "rms_alt", "chi2_alt")}
-    names = ("frame", "target", "instance", "copies", "status", "reason", "markers")
+    names = ("frame", "target", "instance", "copies", "status", "reason", "markers", "misfit")
     whole = {n: torch.zeros(rows, dtype=torch.int64) for n in names}
     eye = torch.eye(3, dtype=torch.float64).repeat(rows, 1, 1)
     t = torch.ones(rows, 3, dtype=torch.float64)
@@ -118,7 +118,12 @@ def test_poses_and_truth_are_what_is_compared() -> None:
         **{name: torch.zeros(0, size) for name, size in (("center", 2), ("outer", 5), ("inner", 5))},
         center_cov=torch.zeros(0, 2, 2),
     )
-    parts = {"covariance": covariance, "noise": covariance, "systematic": covariance[..., :0]}
+    parts = {
+        "covariance": covariance,
+        "noise": covariance,
+        "systematic": covariance[..., :0],
+        "place": covariance[:, :4, :4],
+    }
     poses = Poses(R=eye, t=t, R_alt=eye, t_alt=t, detections=none, **parts, **zeros, **whole)
     truth = Truth(["a", "b"], ["x", "x"], torch.zeros_like(t), torch.zeros_like(t))
     assert pose_errors(poses, truth).nees.tolist() == [3.0, 3.0]

@@ -120,7 +120,7 @@ def test_the_precision_of_an_existing_target(run: Callable[..., Any], tmp_path: 
         (["--camera", "camera.yaml", *GOOD, "--name", "a/b"], "name: has the character '/'"),
         (["--target", "quad41"], "quad41: target: is neither a file nor built in"),
         (["--target", "quad40", "--plate", "20x70"], "does not hold the rings of quad40"),
-        (["--target", "quad40", "--name", "x"], "leave --name and --markers out"),
+        (["--target", "quad40", "--name", "x"], "leave --name, --markers and --print-gain out"),
         (["--target", "quad40", "--distance", "100"], "--camera: is missing"),
         (["--target", "quad40", "--camera", "camera.yaml", "--distance", "60"], "leave the frame"),
     ],

@@ -58,6 +58,9 @@ def test_filter_width_has_the_variance() -> None:
         ("imaging.plate", "plate: [70, 70], ", ""),
         ("imaging.clutter", "plate:", "clutter: 3, plate:"),
         ("imaging.motion_mm", "plate:", "motion_mm: 0.1, plate:"),
+        ("print.each", "sensor:", "print: {each: frame}\nsensor:"),
+        ("print.center_sigma", "sensor:", "print: {center_sigma: 0.02}\nsensor:"),
+        ("print.dpi", "sensor:", "print: {dpi: 600}\nsensor:"),
     ],
 )
 def test_what_is_not_modelled_is_an_error(plan: Plan, field: str, old: str, new: str) -> None:
@@ -67,6 +70,29 @@ def test_what_is_not_modelled_is_an_error(plan: Plan, field: str, old: str, new:
     path.write_text(path.read_text().replace(old, new))
     with pytest.raises(ConfigError, match=field):
         blender(load_plan(path))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("shape", ["dome", "cylinder", "twist"])
+def test_agrees_on_a_print(plan: Plan, shape: str) -> None:
+    pytest.importorskip("bpy")
+    from torchpose.datasets.blender import blender
+
+    made = f"{{center_sigma: [0.05, 0.05, 0], gain: 0.06, warp: 0.8, warp_shape: {shape}, warp_deg: 25}}"
+    plan.path.write_text(plan.path.read_text().replace("sensor:", f"print: {made}\nsensor:"))
+    printed = load_plan(plan.path)
+    which = torch.arange(2)
+    seen, expected, nominal = (f(which) for f in (blender(printed), analytic(printed), analytic(plan)))
+    # both know the print: what is left is sampling noise and the shape of the pixel filter
+    inks = ink(printed, seen), ink(printed, expected), ink(plan, nominal)
+    off, moved = (inks[i][..., :2] - inks[1][..., :2] for i in (0, 2))
+    grown = [float(inks[i][..., 2].sum() / inks[2][..., 2].sum()) - 1 for i in (0, 1)]
+    print(f"{shape}: {off.norm(dim=-1).max():.4f} of {moved.norm(dim=-1).mean():.3f} px, area by {grown}")
+    assert off.norm(dim=-1).max() < 0.005
+    assert moved.norm(dim=-1).mean() > 0.2
+    assert grown[0] == pytest.approx(grown[1], abs=3e-4)
+    assert grown[1] > 0.02
 
 
 @pytest.mark.slow
@@ -99,6 +125,11 @@ def test_agrees_with_the_analytic_renderer(plan: Plan) -> None:
 
 def ink_centroids(plan: Plan, frames: torch.Tensor) -> torch.Tensor:
     """(B, M, 2) centroids of the dark mass within 1.2 outer radii of each marker."""
+    return ink(plan, frames)[..., :2]
+
+
+def ink(plan: Plan, frames: torch.Tensor) -> torch.Tensor:
+    """(B, M, 3) centroids of the dark mass within 1.2 outer radii of each marker, and that mass in px."""
     c = plan.conditions
     camera, target = plan.camera, plan.target
     out = []
@@ -111,5 +142,6 @@ def ink_centroids(plan: Plan, frames: torch.Tensor) -> torch.Tensor:
         dark = (c.light[i] - frame) / (c.light[i] - c.dark[i])
         for center, radius in zip(target.centers, target.radii[:, 0], strict=True):
             mass = dark * ((plane - center[:2]).norm(dim=-1) < 1.2 * radius)
-            out.append(torch.stack([(mass * u).sum(), (mass * v).sum()]) / mass.sum())
-    return torch.stack(out).view(len(frames), len(target), 2)
+            total = mass.sum()
+            out.append(torch.stack([(mass * u).sum() / total, (mass * v).sum() / total, total]))
+    return torch.stack(out).view(len(frames), len(target), 3)

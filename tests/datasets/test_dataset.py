@@ -10,10 +10,13 @@ import torch
 import yaml
 
 from torchpose.camera import Camera
-from torchpose.datasets.dataset import analytic, bounds, plan_truth, write_bop, write_dataset
+from torchpose.datasets.dataset import analytic, bounds, plan_truth, simulated_frames, write_bop, write_dataset
 from torchpose.datasets.plan import Plan, load_plan
 from torchpose.errors import ConfigError
+from torchpose.io.truth import read_truth
+from torchpose.io.writers import read_table
 from torchpose.sim import render
+from torchpose.target import Target
 
 F64 = torch.float64
 
@@ -70,6 +73,165 @@ def test_blur_with_a_direction_is_drawn_and_recorded(plan: Plan) -> None:
     torch.testing.assert_close(analytic(other)(every), drawn, rtol=0, atol=1e-3)
     # the bound knows that blur: 4 px of smear leave less of edges in their direction
     assert (bounds(other, every) > bounds(plan, every)).all()
+
+
+def with_keys(plan: Plan, name: str, **keys: object) -> Plan:
+    """The plan with other sections, from a file of its own."""
+    text = yaml.safe_load(plan.path.read_text()) | keys
+    path = plan.path.with_name(name)
+    path.write_text(yaml.safe_dump(text))
+    return load_plan(path)
+
+
+def test_one_print_is_that_of_all_frames(plan: Plan, tmp_path: Path) -> None:
+    wanted = {
+        "seed": 4,
+        "center_sigma": [0.1, 0.1, 0.2],
+        "gain": [0.1, 0.2],
+        "scale": 0.01,
+        "warp": 0.1,
+        "warp_deg": 30,
+    }
+    other = with_keys(plan, "print.yaml", print=wanted)
+    assert torch.equal(other.R, plan.R)
+    assert torch.equal(other.motion, plan.motion)
+    # a plan of another seed and other frames shows the same print
+    again = with_keys(plan, "again.yaml", print=wanted, seed=9)
+    assert other.prints is not None
+    assert again.prints is not None
+    assert not torch.equal(again.R, other.R)
+    assert torch.equal(again.prints.centers, other.prints.centers)
+    out = tmp_path / "set"
+    write_dataset(other, out)
+    made, meant = Target.load(out / "print.yaml"), Target.load(out / "target.yaml")
+    gain = read_truth(out / "truth.csv").extra["edge_gain"]
+    assert (gain == gain[0]).all()
+    assert 0.1 <= gain[0] <= 0.2
+    assert made.edge_gain == gain[0]
+    torch.testing.assert_close(made.printed_radii[:, 0], 1.01 * meant.radii[:, 0] + gain[0])
+    torch.testing.assert_close(made.printed_radii[:, 1], 1.01 * meant.radii[:, 1] - gain[0])
+    assert 0.05 < float((made.centers - 1.01 * meant.centers).square().mean().sqrt()) < 0.4
+    rows = read_table(out / "prints.csv")
+    assert [(row["frame"], int(str(row["id"]))) for row in rows[3:5]] == [("0000.png", 3), ("0001.png", 0)]
+    for number, row in enumerate(rows):
+        assert [float(str(row[name])) for name in "xyz"] == made.centers[number % 4].tolist()
+        assert float(str(row["inner_radius"])) == pytest.approx(float(made.printed_radii[number % 4, 1]), rel=1e-12)
+    # the frames show it: bent rings and all
+    frames = analytic(other)(torch.arange(4))
+    look = plan_truth(other).extra
+    shown = render(
+        other.camera, made, other.R, other.t, psf_sigma=look["psf_sigma"], dark=look["dark"], light=look["light"],
+        plate=(70, 70), motion=other.motion,
+    )  # fmt: skip
+    assert float((frames - shown).abs().mean()) < 0.05 * float((frames - analytic(plan)(torch.arange(4))).abs().mean())
+
+
+def test_every_frame_may_have_a_print(plan: Plan, tmp_path: Path) -> None:
+    other = with_keys(plan, "prints.yaml", print={"each": "frame", "center_sigma": 0.05, "gain": [-0.1, 0.1]})
+    assert other.prints is not None
+    assert len(other.prints.gain.unique()) == 4
+    write_dataset(other, tmp_path / "set")
+    assert not (tmp_path / "set" / "print.yaml").exists()
+    rows = read_table(tmp_path / "set" / "prints.csv")
+    assert [float(str(row["x"])) for row in rows] == other.prints.centers[..., 0].flatten().tolist()
+    part = other[torch.tensor([2])]
+    torch.testing.assert_close(analytic(part)(torch.tensor([0])), analytic(other)(torch.tensor([2])), rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "words"),
+    [
+        ({"center_sigma": -0.1}, r"print\.center_sigma"),
+        ({"center_sigma": [0.1, 0.1]}, r"print\.center_sigma: has 2 entries; give a number or"),
+        ({"warp": [-0.1, 0.1]}, r"print\.warp: is -0.1; give half of the plate's height"),
+        ({"warp_shape": "bowl"}, r"print\.warp_shape"),
+        ({"center_sigma": [20.0, 20.0, 0.0], "seed": 14}, r"print\.markers.*overlap"),
+        ({"gain": -3.0}, r"print\.gain: leaves nothing of a ring"),
+        ({"bow": 1}, r"print\.bow"),
+    ],
+)
+def test_a_wrong_print_is_one_clear_line(plan: Plan, wanted: dict[str, object], words: str) -> None:
+    with pytest.raises(ConfigError, match=words) as caught:
+        with_keys(plan, "wrong.yaml", print=wanted)
+    assert "\n" not in str(caught.value)
+
+
+FAULTS: dict[str, dict[str, object]] = {
+    "coma": {"imaging": {"coma_px": 2.0}},
+    "haze": {"imaging": {"haze_px": 0.3, "haze_length": 20}},
+    "ghost": {"imaging": {"ghost": [10, 20]}},
+    "speckle": {"imaging": {"speckle": 0.05}},
+    "flicker": {"imaging": {"flicker": [0.03, 0.05], "flicker_px": 30}},
+    "texture": {"print": {"texture": {"share": 0.05, "length": 1.0}}},
+    "prnu": {"sensor": {"prnu": 0.02}},
+    "columns": {"sensor": {"column_noise": 3}},
+    "jitter": {"sensor": {"line_jitter": 0.3}},
+    "srgb": {"sensor": {"gamma": "srgb"}},
+    "bayer": {"processing": {"bayer": True}},
+    "denoise": {"processing": {"denoise": 10}},
+    "sharpen": {"processing": {"sharpen": 1.0}},
+    "jpeg": {"processing": {"jpeg": 60}},
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_is_in_the_frames_in_any_batch(plan: Plan, name: str) -> None:
+    other = with_keys(plan, f"{name}.yaml", **FAULTS[name])
+    clean = with_keys(plan, "clean.yaml", **{section: {} for section in FAULTS[name]})
+    whole = simulated_frames(other, analytic(other), torch.arange(4))
+    assert whole.dtype == torch.uint8
+    without = simulated_frames(clean, analytic(clean), torch.arange(4))
+    assert (whole.float() - without.float()).abs().flatten(1).amax(1).min() > 4
+    some = torch.tensor([3, 1])
+    # to rounding: a grey value in ten thousand lies on its edge
+    again = simulated_frames(other, analytic(other), some).float() - whole[some].float()
+    assert again.abs().max() <= (1 if name != "jpeg" else 12)
+    assert float((again != 0).double().mean()) < 1e-3
+
+
+def test_a_sensor_keeps_its_pattern(plan: Plan) -> None:
+    look = {"imaging": {"dark": 100, "light": 100, "plate": None}, "bounds": False}
+    flat = [
+        with_keys(plan, f"{n}.yaml", seed=n, sensor={"prnu": 0.05, "noise": 0, "seed": sensor}, **look)
+        for n, sensor in ((1, 8), (2, 8), (3, 9))
+    ]
+    frames = [simulated_frames(each, analytic(each), torch.arange(1))[0] for each in flat]
+    assert torch.equal(frames[0], frames[1])
+    assert not torch.equal(frames[0], frames[2])
+
+
+def test_faults_are_in_the_truth(plan: Plan) -> None:
+    other = with_keys(plan, "f.yaml", imaging={"haze_px": [0.1, 0.2], "coma_px": 1.5, "coma_deg": 40})
+    extra = plan_truth(other).extra
+    assert ((extra["haze_px"] >= 0.1) & (extra["haze_px"] <= 0.2)).all()
+    assert len(extra["haze_px"].unique()) == 4
+    assert (extra["coma_px"] == 1.5).all()
+    assert (extra["coma_deg"] == 40).all()
+    assert (extra["ghost"] == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("section", "wanted", "words"),
+    [
+        ("imaging", {"haze_px": -0.1}, r"imaging\.haze_px: is -0.1; give px, 0 or more"),
+        ("imaging", {"speckle": [0.1, 1.5]}, r"imaging\.speckle: is 1.5; the contrast"),
+        ("imaging", {"haze_length": 0.5}, r"imaging\.haze_length"),
+        ("print", {"texture": {"share": 0.02}}, r"print\.texture\.length"),
+        ("sensor", {"prnu": -1}, r"sensor\.prnu"),
+        ("sensor", {"gamma": "sRGB"}, r"sensor\.gamma"),
+        ("processing", {"jpeg": 0}, r"processing\.jpeg"),
+        ("processing", {"jpg": 80}, r"processing\.jpg"),
+    ],
+)
+def test_a_wrong_fault_is_one_clear_line(plan: Plan, section: str, wanted: dict[str, object], words: str) -> None:
+    with pytest.raises(ConfigError, match=words) as caught:
+        with_keys(plan, "wrong.yaml", **{section: wanted})
+    assert "\n" not in str(caught.value)
+
+
+def test_jpeg_of_twelve_bits_is_refused(plan: Plan) -> None:
+    with pytest.raises(ConfigError, match=r"processing\.jpeg: holds 8 bits and sensor\.bits is 12"):
+        with_keys(plan, "wrong.yaml", processing={"jpeg": 80}, sensor={"bits": 12})
 
 
 def test_bop_is_that_of_the_folder(plan: Plan, tmp_path: Path) -> None:

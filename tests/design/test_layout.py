@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -90,3 +91,25 @@ def test_codes_differ_under_every_symmetry(count: int, plate: tuple[float, float
         assert len(moved) >= count // 2  # rings on the axis of a mirror stay
         assert sum(moved) / count > (0.99 if count == 4 else 1.2) * gap
     assert symmetries >= 3
+
+
+@settings(max_examples=60, deadline=None)
+@given(counts, st.floats(2.0, 60.0), st.floats(0.01, 0.4), st.sampled_from([-1.0, 1.0]))
+def test_codes_of_a_print_with_gain_are_nearest_to_their_own(
+    count: int, radius: float, most: float, way: float
+) -> None:
+    limits = replace(LIMITS, gain=most)
+    ratios = limits.ratios(count, radius)
+    if ratios is None:
+        return
+    assert LIMITS.ratios(count, radius) is not None  # with gain less fits, not more
+    gain = way * most
+    outer, inner = radius + gain, radius * ratios - gain
+    # the limits hold for the ring as printed
+    assert outer * limits.scale >= limits.outer - 1e-9
+    assert float(inner.min()) * limits.scale >= limits.inner - 1e-9
+    assert float((outer - inner).min()) * limits.scale >= limits.width - 1e-9
+    # read as far off as the tolerance allows, by the side to which the gain draws them
+    read = inner / outer - way * ratio_tolerance(radius * limits.scale)
+    off = (read[:, None] - ratios).abs()
+    assert (off.diagonal() <= off.min(1).values + 1e-9).all()

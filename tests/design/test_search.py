@@ -80,6 +80,24 @@ def test_more_rings_where_four_do_not_reach_it() -> None:
     assert len(design_target(camera(), volume, plate, Need(between, 9.0), IMAGING).target) > 4
 
 
+def test_room_for_dot_gain_is_left_and_stated(tmp_path: Path) -> None:
+    plain = design_target(camera(), VOLUME, (50.0, 50.0), Need(2.0, 9.0), IMAGING, markers=4)
+    made = design_target(camera(), VOLUME, (50.0, 50.0), Need(2.0, 9.0), IMAGING, markers=4, print_gain=0.1)
+    assert made.code_gap >= 2
+    assert made.target.radii[:, 1].min() * made.limits.scale >= made.limits.inner + 0.1 * made.limits.scale - 0.05
+    made.target.save(tmp_path / "target.yaml")
+    assert "centers_covariance" not in (tmp_path / "target.yaml").read_text()
+    again = tp.Target.load(tmp_path / "target.yaml")
+    assert plain.target.covariance is None
+    assert again.covariance is not None
+    assert float(again.covariance[-1, -1].sqrt()) == pytest.approx(0.1 / 3)
+    assert not again.covariance[:-1, :-1].any()
+    with pytest.raises(ConfigError, match=r"print_gain: -0\.1 mm"):
+        design_target(camera(), VOLUME, (50.0, 50.0), Need(2.0, 9.0), IMAGING, print_gain=-0.1)
+    with pytest.raises(ConfigError, match="4 codes need"):
+        design_target(camera(), VOLUME, (50.0, 50.0), Need(2.0, 9.0), IMAGING, markers=4, print_gain=2.0)
+
+
 def test_dark_background_and_name() -> None:
     found = design_target(
         camera(), VOLUME, (60.0, 40.0), Need(2.0, 9.0, 0.02), IMAGING, name="left", background="dark", markers=6

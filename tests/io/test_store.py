@@ -30,7 +30,10 @@ from torchpose.io.store import ResultStore
 from torchpose.io.writers import read_rows, read_table, write_rows
 from torchpose.results import Detections, Poses, Reason, Status
 
-CONTRACT = "frame,target,status,tx,ty,tz,rx,ry,rz,sx,sy,sz,srx,sry,srz,rms_px,markers,reason,instance,copies"
+CONTRACT = (
+    "frame,target,status,tx,ty,tz,rx,ry,rz,sx,sy,sz,srx,sry,srz,rms_px,markers,nx,ny,nz,nrx,nry,nrz,"
+    "reason,instance,copies,misfit"
+)
 DETECTION_CONTRACT = "frame,target,marker,u,v,su,sv,outer_a,outer_b,outer_theta,inner_a,inner_b,inner_theta,instance"
 NAN = float("nan")
 
@@ -67,6 +70,8 @@ def some_poses(frames: int = 3, targets: int = 2, seed: int = 0) -> Poses:
         covariance=torch.where(gone[:, None, None], NAN, root @ root.mT),
         noise=torch.where(gone[:, None, None], NAN, 0.5 * root @ root.mT),
         systematic=torch.where(gone[:, None, None], NAN, 0.5**0.5 * root),
+        place=torch.zeros(n, 4, 4, dtype=torch.float64),
+        misfit=torch.zeros(n, dtype=torch.int64),
         rms=torch.where(gone, NAN, normal(n).square()),
         status=torch.where(gone, Status.REJECTED, torch.where(second, Status.AMBIGUOUS, Status.OK)),
         reason=torch.where(gone, Reason.RING_SHAPE, torch.where(second, Reason.TWO_SOLUTIONS, Reason.NONE)),

@@ -58,7 +58,8 @@ def solutions(r: Tensor, t: Tensor, r_alt: Tensor, t_alt: Tensor, status: Status
     mask = torch.ones(len(r), len(QUAD), dtype=torch.bool)
     covariance = torch.eye(6, dtype=F64).repeat(len(r), 1, 1)
     parts = (covariance, covariance, covariance[..., :0])
-    return Solutions(r, t, *parts, one, 10 * one, r_alt, t_alt, 2 * one, 20 * one, codes, reasons, mask)
+    rest = (torch.zeros(*mask.shape, 4, dtype=F64), torch.zeros_like(codes))
+    return Solutions(r, t, *parts, one, 10 * one, r_alt, t_alt, 2 * one, 20 * one, codes, reasons, mask, *rest)
 
 
 def decided(s: Solutions, frames: Tensor, r: Tensor, t: Tensor) -> Solutions:

@@ -56,6 +56,8 @@ def one_pose(
         covariance=1e-6 * torch.eye(6, dtype=torch.float64)[None],
         noise=1e-6 * torch.eye(6, dtype=torch.float64)[None],
         systematic=torch.zeros(1, 6, 0, dtype=torch.float64),
+        place=torch.zeros(1, 4, 4, dtype=torch.float64),
+        misfit=torch.zeros(1, dtype=torch.int64),
         rms=torch.full((1,), 0.01, dtype=torch.float64),
         status=zero[:1] + status,
         reason=zero[:1] + reason,

@@ -27,6 +27,7 @@ _TILT = "Largest tilt against the optical axis, in any direction, degrees."
 _OFFSET = "Largest distance off the optical axis, mm."
 _ANGLE = "Standard deviation needed about every axis, degrees."
 _MARKERS = "Number of rings: 4, 6, 8, 9, 10 or 12; by default the fewest that do."
+_GAIN = "Most dot gain of the print, either way, um: room for it is left between codes (office printers: 60 to 100)."
 _LEVELS = "Grey levels of print and paper."
 _APERTURE = "Aperture: counts the blur out of focus and notes the depth of field."
 _TONE = "Tone around the rings: dark rings on light, or the reverse."
@@ -45,6 +46,7 @@ def design(
     accuracy_um: _Need = None,
     accuracy_deg: Annotated[float | None, typer.Option(help=_ANGLE)] = None,
     markers: Annotated[int | None, typer.Option(help=_MARKERS)] = None,
+    print_gain: Annotated[float, typer.Option(metavar="UM", help=_GAIN)] = 0.0,
     blur: Annotated[float, typer.Option(help="Standard deviation of the lens's blur in focus, px.")] = 0.7,
     noise: Annotated[float, typer.Option(help="Standard deviation of the noise, grey levels of 255.")] = 2.0,
     levels: Annotated[tuple[float, float], typer.Option(metavar="DARK LIGHT", help=_LEVELS)] = (30.0, 220.0),
@@ -67,8 +69,8 @@ def design(
         for option, value in (("--plate", plate), ("--accuracy-um", accuracy_um)):
             if value is None:
                 raise ConfigError(f"{option}: is missing; a design needs it (--target draws an existing target alone)")
-    elif name is not None or markers is not None:
-        raise ConfigError("--target: is there already; leave --name and --markers out")
+    elif name is not None or markers is not None or print_gain != 0:
+        raise ConfigError("--target: is there already; leave --name, --markers and --print-gain out")
     existing = None if target is None else Target.load(target)
     scene = None
     if existing is None or camera is not None or distance is not None or distance_range is not None:
@@ -80,7 +82,7 @@ def design(
         assert scene is not None
         assert need is not None
         assert sides is not None
-        chosen, precision, written = _new_target(scene, sides, need, out, name, background, markers)
+        chosen, precision, written = _new_target(scene, sides, need, out, (name, background, markers, print_gain / 1e3))
     else:
         chosen, written = existing, []
         if scene is not None:
@@ -152,16 +154,13 @@ def _new_target(
     plate: tuple[float, float],
     need: Need,
     out: Path,
-    name: str | None,
-    background: str,
-    markers: int | None,
+    choice: tuple[str | None, str, int | None, float],
 ) -> tuple[Target, Precision, list[Path]]:
     """The designed target, its precision and its file; its rings are told."""
     from torchpose.design import design_target
 
-    made = design_target(
-        scene.camera, scene.volume, plate, need, scene.imaging, name=name, background=background, markers=markers
-    )
+    named = dict(zip(("name", "background", "markers", "print_gain"), choice, strict=True))
+    made = design_target(scene.camera, scene.volume, plate, need, scene.imaging, **named)
     ratios = ", ".join(f"{ratio:.2f}" for ratio in sorted(made.target.codes.sqrt().tolist()))
     typer.echo(
         f"{len(made.target)} rings of {2 * made.radius:g} mm, semi-minor axis at least {made.semi_minor:.0f} px; "

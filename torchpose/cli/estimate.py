@@ -25,6 +25,7 @@ if TYPE_CHECKING:  # imported where they are used: torch takes more than a secon
     from torchpose.camera import Camera
     from torchpose.handeye import HandEye
     from torchpose.io import reader
+    from torchpose.io.misfits import Misfits
     from torchpose.io.rows import Row
     from torchpose.io.sources import Source
     from torchpose.pipeline import PoseEstimator
@@ -45,6 +46,7 @@ _METHOD = "Last stage: grey values, edge points, ring centres, or the paper's ow
 _HAND_EYE = "Calibrated camera-to-base or camera-to-tool transform; adds the poses in the robot base."
 _RESUME = "Keep the frames that an earlier run finished and do the rest."
 _INSTANCES = "Most copies of a target in a frame (a tray of equal parts): up to as many rows, column instance."
+_RELATIVE = "Name of a target: give the poses of the others (of their parts) in its frame (that of its part)."
 _DETECTIONS = "Table of the markers found: .csv, .jsonl or .parquet."
 
 
@@ -58,6 +60,7 @@ def estimate(
     instances: Annotated[int, typer.Option(min=1, metavar="K", help=_INSTANCES)] = 1,
     resume: Annotated[bool, typer.Option("--resume", help=_RESUME)] = False,
     hand_eye: Annotated[Path | None, typer.Option(help=_HAND_EYE)] = None,
+    relative_to: Annotated[str | None, typer.Option(metavar="NAME", help=_RELATIVE)] = None,
     method: Annotated[str, typer.Option(metavar=_METHODS, help=_METHOD)] = "photometric",
     srgb: Annotated[bool, typer.Option("--srgb", help="The frames are sRGB-encoded: linearise them first.")] = False,
     batch: Batch = None,
@@ -79,7 +82,8 @@ def estimate(
         if path is not None:
             check_table_path(path, option)
     lens, targets, sources = Camera.load(camera), [Target.load(name) for name in target], find_sources(inputs)
-    work = _Work(lens, targets, sources, _load_hand_eye(hand_eye, sources), method, srgb, instances)
+    _check_relative(relative_to, targets, hand_eye, instances)
+    work = _Work(lens, targets, sources, _load_hand_eye(hand_eye, sources), method, srgb, instances, relative_to)
     check_outputs(inputs, sources, [p for p in (out, detections) if p is not None], overlay)
     with native_stderr_silenced():
         return _run(work, out, detections, overlay, resume=resume, batch=batch, threads=threads or cores(), quiet=quiet)
@@ -96,6 +100,12 @@ class _Work:
     method: str
     srgb: bool
     instances: int
+    relative_to: str | None
+
+    @property
+    def rows_of(self) -> list[Target]:
+        """Targets that have rows."""
+        return [target for target in self.targets if target.name != self.relative_to]
 
     def origin(self, detections: bool) -> dict[str, Any]:
         """The same for `ResultStore`. Names are those that its error messages shall say."""
@@ -109,6 +119,7 @@ class _Work:
             "--method": self.method,
             "--srgb": self.srgb,
             "--instances": self.instances,
+            "--relative-to": self.relative_to,
             "--detections": detections,
             "INPUT": sorted({str(source.root) for source in self.sources}),
         }
@@ -146,7 +157,7 @@ def _run(
     painter = None if overlay is None else Overlay(camera, targets, overlay, threads=threads)
     schema = POSE_SCHEMA | (BASE_SCHEMA if work.hand_eye else {})
     origin = work.origin(detections is not None)
-    store = ResultStore(out, detections, schema=schema, targets=len(targets), origin=origin, resume=resume)
+    store = ResultStore(out, detections, schema=schema, targets=len(work.rows_of), origin=origin, resume=resume)
     # a resumed run works on the same batches as one that was not interrupted, so that rows agree to the last bit
     batches = in_batches(sources, batch or default_batch(camera.width, camera.height))
     pending = [one for one in batches if any(source.name not in store for source in one)]
@@ -166,6 +177,7 @@ def _run(
     progress.summary(store.counts, out)
     if not quiet:
         _tell_crowded(store.crowded, store.most, work)
+        _tell_misfits(store.misfits, work)
     return ended(store.unreadable)
 
 
@@ -183,6 +195,23 @@ def _tell_crowded(frames: set[str], most: dict[str, int], work: _Work) -> None:
     )
 
 
+def _tell_misfits(misfits: dict[str, Misfits], work: _Work) -> None:
+    """Tells, on stderr, what the files leave out that the standard deviations then cannot count."""
+    silent = [t.name for t in work.rows_of if t.covariance is None and t.name in misfits and misfits[t.name].frames]
+    files = [f"target {', '.join(silent)} (center_sigma, edge_gain_sigma)"] if silent else []
+    if work.camera.covariance is None and any(m.frames for m in misfits.values()):
+        files.append("camera (intrinsics_covariance)")
+    if files:
+        typer.echo(
+            f"torchpose: no uncertainty is stated of {' and '.join(files)}: s* counts the noise of the frames alone, "
+            "and what residuals show beyond it",
+            err=True,
+        )
+    for target in work.rows_of:
+        for line in misfits[target.name].lines(target.name, target.ids.tolist()) if target.name in misfits else ():
+            typer.echo(f"torchpose: {line}", err=True)
+
+
 def _records(batch: reader.Batch, estimator: PoseEstimator, work: _Work, painter: pictures.Overlay | None) -> list[Row]:
     """Rows and detections of every frame of a batch, see `ResultStore.append`."""
     from torchpose.io.rows import detection_rows, fault_row, pose_rows
@@ -191,7 +220,7 @@ def _records(batch: reader.Batch, estimator: PoseEstimator, work: _Work, painter
     records: dict[str, Row] = {s.name: {"frame": s.name, "rows": [], "detections": []} for s in batch.sources}
     for position, fault in batch.faults.items():
         frame = batch.sources[position].name
-        records[frame]["rows"] = [fault_row(frame, name, fault.status, fault.reason) for name in names]
+        records[frame]["rows"] = [fault_row(frame, t.name, fault.status, fault.reason) for t in work.rows_of]
     for positions, frames in batch.groups:
         sources = [batch.sources[position] for position in positions]
         frame_names = [source.name for source in sources]
@@ -199,6 +228,8 @@ def _records(batch: reader.Batch, estimator: PoseEstimator, work: _Work, painter
         if painter is not None:
             painter.write(frames, poses, frame_names)
         given = _of_parts(poses, work.targets)
+        if work.relative_to is not None:
+            given = given.relative_to(names.index(work.relative_to))
         rows = pose_rows(given, frame_names, names)
         if work.hand_eye is not None:
             _add_base_cells(rows, given, sources, work.hand_eye)
@@ -250,6 +281,22 @@ def _load_hand_eye(path: Path | None, sources: Sequence[Source]) -> HandEye | No
     if hand_eye.mount == "tool":
         check_robot_poses(sources, f", but the camera of {path} is on the tool")
     return hand_eye
+
+
+def _check_relative(name: str | None, targets: Sequence[Target], hand_eye: Path | None, instances: int) -> None:
+    from torchpose.errors import ConfigError
+
+    if name is None:
+        return
+    names = [target.name for target in targets]
+    if name not in names or len(names) < 2:
+        raise ConfigError(
+            f"--relative-to: {name} needs to be one of two or more targets, but --target gives {', '.join(names)}; "
+            "repeat --target"
+        )
+    if hand_eye is not None or instances > 1:
+        other = "--hand-eye" if hand_eye is not None else "--instances"
+        raise ConfigError(f"--relative-to: cannot be combined with {other}; leave one of them out")
 
 
 def _digest(model: Any) -> str:

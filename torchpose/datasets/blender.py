@@ -2,8 +2,8 @@
 
 The rings are an analytic shader on a square of true geometry: emission is dark where inner <= distance < outer, so
 there is no bitmap and no tessellation of circles. Units are millimetres and the world frame is the target's; only the
-camera moves. The response is linear, the view transform raw, and nothing but emission is traced. Only the plate's
-region is rendered, the rest is the surround.
+camera moves. A bent plate is a mesh whose vertices have its height. The response is linear, the view transform raw, and
+nothing but emission is traced. Only the plate's region is rendered, the rest is the surround.
 
 Cycles samples a pixel filter, which stands for the optical blur and the pixel's area together: a Blackman-Harris window
 of the same variance as the plan's Gaussian and the unit square. Its name in the settings says half of its support.
@@ -28,6 +28,7 @@ from torchpose.errors import ConfigError
 SAMPLES = 1024  # paths a pixel on edges; even regions stop at the least number
 _LEAST_SAMPLES = 32
 _SENSOR_MM = 36.0
+_MESH = 96  # squares of a bent plate along each side: flat pieces leave (70 mm / 96)^2 / 8 of its curvature
 _MARGIN = 8  # px of surround around the plate that are rendered with it
 
 
@@ -77,9 +78,17 @@ def _check(plan: Plan) -> None:
         "covered": image.covered > 0,
         "background": image.background is not None,
     }
+    unknown = {f"imaging.{name}": wanted for name, wanted in unknown.items()}
+    if (made := plan.file.print) is not None:
+        unknown |= {
+            "print.each": made.each == "frame",
+            "print.center_sigma": made.center_sigma[2] > 0,  # along z: markers off the plate
+            "print.texture": made.texture is not None,
+            "print.dpi": made.dpi is not None,
+        }
     for field in (name for name, wanted in unknown.items() if wanted):
         raise ConfigError(
-            f"{plan.path}: imaging.{field}: is not modelled by the Blender backend; remove it or use the analytic one"
+            f"{plan.path}: {field}: is not modelled by the Blender backend; remove it or use the analytic one"
         )
     if image.plate is None:
         raise ConfigError(f"{plan.path}: imaging.plate: is missing, the Blender backend needs it; add [width, height]")
@@ -99,9 +108,8 @@ def _build(bpy: Any, plan: Plan, samples: int, threads: int) -> tuple[Any, dict[
     scene = bpy.context.scene
     camera = plan.camera
     material, levels = _ring_material(bpy, plan)
-    w, h = (side / 2 for side in plan.file.imaging.plate or ())
     mesh = bpy.data.meshes.new("plate")
-    mesh.from_pydata([(-w, -h, 0), (w, -h, 0), (w, h, 0), (-w, h, 0)], [], [(0, 1, 2, 3)])
+    mesh.from_pydata(*_plate_mesh(plan))
     mesh.materials.append(material)
     scene.collection.objects.link(bpy.data.objects.new("plate", mesh))
 
@@ -137,6 +145,18 @@ def _build(bpy: Any, plan: Plan, samples: int, threads: int) -> tuple[Any, dict[
     return scene, levels
 
 
+def _plate_mesh(plan: Plan) -> tuple[list[list[float]], list[Any], list[tuple[int, ...]]]:
+    """Vertices, no edges and faces of the plate: a rectangle, or squares between vertices of its height."""
+    w, h = (side / 2 for side in plan.file.imaging.plate or ())
+    cells = 1 if plan.prints is None or not bool(plan.prints.curvature.any()) else _MESH
+    x, y = (torch.linspace(-side, side, cells + 1, dtype=torch.float64) for side in (w, h))
+    place = torch.cartesian_prod(x, y)
+    height = torch.zeros_like(place[:, 0]) if plan.prints is None else plan.prints[:1].height(place)[0]
+    vertices = torch.cat([place, height[:, None]], 1).tolist()
+    first = [a * (cells + 1) + b for a in range(cells) for b in range(cells)]
+    return vertices, [], [(k, k + cells + 1, k + cells + 2, k + 1) for k in first]
+
+
 def _set(settings: Any, **values: Any) -> None:
     for name, value in values.items():
         setattr(settings, name, value)
@@ -163,7 +183,8 @@ def _ring_material(bpy: Any, plan: Plan) -> tuple[Any, dict[str, Any]]:
         return node.outputs[0]
 
     ink: Any = 0.0
-    for center, (outer, inner) in zip(plan.target.centers.tolist(), plan.target.printed_radii.tolist(), strict=True):
+    shown = plan.target if plan.prints is None else plan.prints.as_target()
+    for center, (outer, inner) in zip(shown.centers.tolist(), shown.printed_radii.tolist(), strict=True):
         distance = new("ShaderNodeVectorMath")
         distance.operation = "DISTANCE"
         link(place, distance.inputs[0])

@@ -5,6 +5,7 @@ A data set is a folder:
     frames/0000.png ...      8 or 16 bit grey, lossless
     camera.yaml target.yaml  the models of the frames
     truth.csv                one row a frame, see `torchpose.io.truth`
+    prints.csv print.yaml    where the plan has a print: one row a frame and marker; a target file, of one print for all
     plan.json                what the frames were made from
     bop/                     the same in the layout of the BOP challenge, where asked for
 """
@@ -17,7 +18,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -33,8 +34,8 @@ from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.io.images import UnreadableImageError, decode
 from torchpose.io.truth import Truth, read_truth, write_truth
-from torchpose.io.writers import atomic_path
-from torchpose.sim import faults_of, with_faults
+from torchpose.io.writers import atomic_path, write_rows
+from torchpose.sim import Processing, SensorPattern, disturbed, faults_of, processed, read_out, with_faults
 from torchpose.sim.clutter import random_clutter, random_covers
 from torchpose.sim.renderer import Defocus, render
 from torchpose.sim.sensor import Lighting, add_noise
@@ -44,6 +45,7 @@ Renderer = Callable[[Int[Tensor, " B"]], Float[Tensor, "B H W"]]
 """Noise-free frames, float32, of the frames numbered."""
 
 BLUR = ("psf_sigma", "psf_ratio", "psf_deg", "smear_px", "smear_deg", "disc_px")
+DISTURBANCES = ("coma_px", "coma_deg", "haze_px", "ghost", "speckle", "flicker")
 BOUND = ("sx", "sy", "sz", "srx", "sry", "srz")
 _BATCH_PIXELS = 7_000_000  # larger buffers go back to the system and are cleared anew each time
 
@@ -53,9 +55,10 @@ def plan_truth(plan: Plan) -> Truth:
 
     Columns besides the pose: tilt_deg, psf_sigma, psf_ratio, psf_deg, smear_px, smear_deg, disc_px, see
     `torchpose.datasets.plan.Conditions`; noise_sigma (read noise), dark, light, motion_mm, motion_deg;
-    markers_in_view, markers that lie in the frame as a whole; in_depth_range, 0 where the plan's range is left.
+    markers_in_view, markers that lie in the frame as a whole; in_depth_range, 0 where the plan's range is left;
+    those of `torchpose.sim.Disturbances`; edge_gain, the dot gain of the print.
     """
-    taken = plan.conditions
+    taken, prints = plan.conditions, plan.prints
     return Truth(
         frame=plan.names,
         target=[plan.target.name] * len(plan),
@@ -71,6 +74,8 @@ def plan_truth(plan: Plan) -> Truth:
             "motion_deg": plan.motion[:, 3:].norm(dim=1).rad2deg(),
             "markers_in_view": plan.seen.double(),
             "in_depth_range": plan.in_depth_range.double(),
+            **{name: getattr(plan.disturbances, name) for name in DISTURBANCES},
+            "edge_gain": torch.zeros(len(plan), dtype=torch.float64) if prints is None else prints.gain,
         },
     )
 
@@ -113,7 +118,7 @@ def analytic(plan: Plan) -> Renderer:
         part, numbers = plan[which], which.tolist()
         return render(
             plan.camera,
-            plan.target,
+            plan.target if part.prints is None else part.prints,
             part.R,
             part.t,
             **part.conditions.blur,
@@ -125,6 +130,7 @@ def analytic(plan: Plan) -> Renderer:
             motion=part.motion if bool(part.motion.any()) else None,
             lighting=lighting,
             clutter=random_clutter(plan.target, image.clutter, seed, numbers) if image.clutter else None,
+            texture=part.texture,
             covers=random_covers(plan.target, image.covered, seed, numbers) if image.covered else None,
         )
 
@@ -133,10 +139,18 @@ def analytic(plan: Plan) -> Renderer:
 
 def simulated_frames(plan: Plan, renderer: Renderer, which: Int[Tensor, " B"]) -> Shaped[Tensor, "B H W"]:
     """The frames numbered ``which``, uint8 or uint16, as the plan's sensor delivers them."""
-    sensor, frames = plan.file.sensor.model_dump(exclude={"noise"}), renderer(which)
+    sensor, seed = plan.file.sensor, plan.file.seed
+    frames = disturbed(renderer(which), plan.disturbances[which], which)
     if plan.file.faults:
-        frames = with_faults(frames, faults_of(plan.file.faults), plan.file.seed, index=which)
-    return add_noise(frames, plan.conditions.noise[which], plan.file.seed, index=which, **sensor)
+        frames = with_faults(frames, faults_of(plan.file.faults), seed, index=which)
+    own = seed if sensor.seed is None else sensor.seed
+    frames = read_out(frames, SensorPattern(sensor.prnu, sensor.column_noise, sensor.line_jitter, own), seed, which)
+    noise, steps = plan.conditions.noise[which], Processing(**plan.file.processing.model_dump())
+    if not steps.wanted:
+        look: dict[str, Any] = {"full_well": sensor.full_well, "bits": sensor.bits, "gamma": sensor.gamma}
+        return add_noise(frames, noise, seed, index=which, **look)
+    raw = add_noise(frames, noise, seed, index=which, bits=16, full_well=sensor.full_well)
+    return processed(raw.float() * (255.0 / 65535), steps, sensor.bits, sensor.gamma)
 
 
 def write_dataset(
@@ -192,7 +206,24 @@ def write_dataset(
         std = torch.cat([bounds(plan, which) for which in torch.split(torch.arange(len(plan)), 64)])
         truth.extra.update(zip(BOUND, std.unbind(1), strict=True))
     write_truth(out / "truth.csv", truth)
+    _write_prints(plan, out)
     return len(pending)
+
+
+def _write_prints(plan: Plan, out: Path) -> None:
+    """What was printed, where that differs from the target."""
+    if (prints := plan.prints) is None:
+        return
+    names = ("x", "y", "z", "nx", "ny", "nz", "outer_radius", "inner_radius")
+    values = torch.cat([prints.centers, prints.normals, prints.radii], -1).tolist()
+    rows: list[dict[str, object]] = [
+        {"frame": frame, "id": marker, **dict(zip(names, row, strict=True))}
+        for frame, markers in zip(plan.names, values, strict=True)
+        for marker, row in zip(plan.target.ids.tolist(), markers, strict=True)
+    ]
+    write_rows(out / "prints.csv", rows, {"frame": str, "id": int} | dict.fromkeys(names, float))
+    if plan.file.print is not None and plan.file.print.each == "set":
+        replace(prints.as_target(), part_rotation=None, part_translation=None).save(out / "print.yaml")
 
 
 def write_bop(out: Path) -> None:

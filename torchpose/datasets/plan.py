@@ -32,7 +32,9 @@ from torchpose.geometry.rotations import plane_axes
 from torchpose.geometry.rows import Rows, shared
 from torchpose.io.sources import find_sources
 from torchpose.io.truth import read_truth
-from torchpose.sim import faults_of
+from torchpose.sim import Disturbances, PrintErrors, Prints, Texture, faults_of, printed
+from torchpose.sim.fields import keys_of
+from torchpose.sim.prints import Warp
 from torchpose.target import Target
 
 _HALTON_BASES = (2, 3, 5, 7, 11, 13)
@@ -70,9 +72,14 @@ Range = Annotated[list[FiniteFloat], BeforeValidator(_range)]
 Blur = Annotated[Range, _from(lambda s: s > 0, "the blur must be above 0 px, such as 0.3 for a very sharp lens")]
 Move = Annotated[Range, _from(lambda s: s >= 0, "give the length of the move during the exposure, 0 or more")]
 Ratio = Annotated[Range, _from(lambda s: s >= 1, "give the larger standard deviation over the smaller, 1 or more")]
+Share = Annotated[Range, _from(lambda s: s >= 0, "give a share of the mean, 0 or more, such as 0.02")]
+Grey = Annotated[Range, _from(lambda s: s >= 0, "give grey levels of 0..255, 0 or more")]
 Extent = Annotated[Range, _from(lambda s: s >= 0, "give px, 0 or more")]
+Height = Annotated[Range, _from(lambda s: s >= 0, "give half of the plate's height in mm, 0 or more")]
+Scale = Annotated[Range, _from(lambda s: s > -1, "give the relative error of lengths, such as 0.001")]
 Noise = Annotated[Range, _from(lambda s: s >= 0, "give the standard deviation in grey levels, 0 or more")]
 Positive = Annotated[FiniteFloat, Field(gt=0)]
+NotNegative = Annotated[FiniteFloat, Field(ge=0)]
 
 
 class _Section(BaseModel):
@@ -164,6 +171,15 @@ class Imaging(_Section):
     covered: Annotated[FiniteFloat, Field(ge=0, le=1)] = 0.0
     defocus: Lens | None = None
     lighting: Light | None = None
+    coma_px: Extent = [0.0, 0.0]
+    coma_deg: Range = [0.0, 360.0]
+    haze_px: Extent = [0.0, 0.0]
+    haze_length: Annotated[FiniteFloat, Field(ge=1.5)] = 40.0
+    ghost: Grey = [0.0, 0.0]
+    speckle: Share = [0.0, 0.0]
+    speckle_px: Annotated[FiniteFloat, Field(ge=1.5)] = 3.0
+    flicker: Share = [0.0, 0.0]
+    flicker_px: Positive = 90.0
 
     @field_validator("plate")
     @classmethod
@@ -178,6 +194,13 @@ class Imaging(_Section):
             raise ValueError("has both defocus and disc_px; give one of them")
         return self
 
+    @field_validator("speckle")
+    @classmethod
+    def _contrast(cls, value: list[float]) -> list[float]:
+        if value[1] > 1:
+            raise ValueError(f"is {value[1]:g}; the contrast of speckle is 1 at the most")
+        return value
+
     @model_validator(mode="after")
     def _behind(self) -> Imaging:
         if self.background is not None and self.plate is None:
@@ -185,13 +208,60 @@ class Imaging(_Section):
         return self
 
 
+def _three(value: Any) -> Any:
+    return [value] * 3 if isinstance(value, int | float) and not isinstance(value, bool) else value
+
+
+class Paper(_Section):
+    """See `torchpose.sim.Texture`."""
+
+    share: NotNegative
+    length: Positive
+
+
+class Print(_Section):
+    """How the print differs from the target file, see `torchpose.sim.PrintErrors`."""
+
+    each: Literal["set", "frame"] = "set"
+    seed: int | None = None
+    center_sigma: Annotated[list[Annotated[FiniteFloat, Field(ge=0)]], BeforeValidator(_three)] = [0.0, 0.0, 0.0]
+    gain: Range = [0.0, 0.0]
+    scale: Scale = [0.0, 0.0]
+    warp: Height = [0.0, 0.0]
+    warp_shape: Warp = "twist"
+    warp_deg: Range = [0.0, 180.0]
+    texture: Paper | None = None
+    dpi: Positive | None = None
+
+    @field_validator("center_sigma")
+    @classmethod
+    def _axes(cls, value: list[float]) -> list[float]:
+        if len(value) != 3:
+            raise ValueError(f"has {len(value)} entries; give a number or [x, y, z] in mm")
+        return value
+
+
 class Sensor(_Section):
-    """Noise after EMVA 1288 and the stored depth."""
+    """Noise after EMVA 1288 and the stored depth; patterns as `torchpose.sim.SensorPattern`."""
 
     noise: Noise = [1.0, 1.0]
     full_well: Positive | None = None
     bits: Literal[8, 10, 12, 16] = 8
-    gamma: Positive = 1.0
+    gamma: Positive | Literal["srgb"] = 1.0
+    prnu: NotNegative = 0.0
+    column_noise: NotNegative = 0.0
+    line_jitter: NotNegative = 0.0
+    seed: int | None = None
+
+
+class Processing(_Section):
+    """See `torchpose.sim.Processing`."""
+
+    bayer: bool = False
+    denoise: NotNegative = 0.0
+    sharpen: NotNegative = 0.0
+    sharpen_px: Positive = 1.5
+    jpeg: Annotated[int, Field(ge=1, le=100)] | None = None
 
 
 class PlanFile(_Section):
@@ -201,8 +271,10 @@ class PlanFile(_Section):
     target: str
     seed: int = 0
     poses: Poses
+    print: Print | None = None
     imaging: Imaging = Imaging()
     sensor: Sensor = Sensor()
+    processing: Processing = Processing()
     faults: dict[str, dict[str, Any]] = {}
     depth_range: Pair | None = None
     out_of_view: Literal["error", "mark"] = "error"
@@ -254,6 +326,9 @@ class Plan(Rows):
         conditions: blur, levels and noise.
         motion: mm and rad during the exposure.
         seen: markers that lie in the frame as a whole.
+        disturbances: of lens, air and lamp.
+        prints: what was printed, where the plan says that it differs from the target.
+        texture: of the paper, where it has one.
         file: what the plan file ``path`` says, with the ``camera`` and the ``target`` that it names.
         backgrounds: pictures, in natural order; frame i takes the one of the number i modulo their count.
     """
@@ -263,6 +338,9 @@ class Plan(Rows):
     conditions: Conditions
     motion: Float[Tensor, "N 6"]
     seen: Int[Tensor, " N"]
+    disturbances: Disturbances
+    prints: Prints | None
+    texture: Texture | None
     file: PlanFile = shared()
     path: Path = shared()
     camera: Camera = shared()
@@ -296,6 +374,8 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
     if file.faults:
         with within(f"{path}: "):
             faults_of(file.faults)
+    if file.processing.jpeg is not None and (bits := file.sensor.bits) != 8:
+        raise ConfigError(f"{path}: processing.jpeg: holds 8 bits and sensor.bits is {bits}; leave one of them out")
     if file.depth_range is not None and not 0 < file.depth_range[0] < file.depth_range[1]:
         raise ConfigError(f"{path}: depth_range: {file.depth_range} is not 0 < near < far; correct it")
     R, t = _poses(path, file, camera, target)
@@ -315,11 +395,59 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
     # last, so that what came before them draws as it always did
     directed = (image.psf_ratio, image.psf_deg, image.smear_px, image.smear_deg, image.disc_px)
     conditions = Conditions(*levels, *map(draw, directed))
+    rows = (image.coma_px, image.coma_deg, image.haze_px, image.ghost, image.speckle, image.flicker)
+    each: list[Any] = [*map(draw, rows), image.haze_length, image.speckle_px, image.flicker_px, file.seed]
+    disturbances = Disturbances(*each)
     seen = markers_in_view(camera, target, R, t)
-    plan = Plan(R, t, conditions, motion, seen, file, path, camera, target, _backgrounds(path, image.background))
+    with within(f"{path}: print."):
+        printed_ = _prints(file, target, len(t))
+    plan = Plan(
+        R,
+        t,
+        conditions,
+        motion,
+        seen,
+        disturbances,
+        *printed_,
+        file,
+        path,
+        camera,
+        target,
+        _backgrounds(path, image.background),
+    )
     if file.out_of_view == "error":
         _check_view(plan)
     return plan
+
+
+def _prints(file: PlanFile, target: Target, frames: int) -> tuple[Prints | None, Texture | None]:
+    """What is printed in each frame, and on what; its chance is its own, so that plans of one print may differ else."""
+    if (wanted := file.print) is None:
+        return None, None
+    seed = file.seed if wanted.seed is None else wanted.seed
+    generator = torch.Generator().manual_seed(seed % 2**63)
+    count = 1 if wanted.each == "set" else frames
+
+    def draw(value: list[float]) -> Tensor:
+        return _spread(value, torch.rand(count, dtype=torch.float64, generator=generator))
+
+    errors = PrintErrors(
+        wanted.center_sigma,
+        draw(wanted.gain),
+        draw(wanted.scale),
+        draw(wanted.warp),
+        wanted.warp_shape,
+        draw(wanted.warp_deg).deg2rad(),
+        wanted.dpi,
+    )
+    prints, texture = printed(target, errors, count, generator), None
+    if (paper := wanted.texture) is not None:
+        texture = Texture(keys_of(count, seed, "paper"), paper.share, paper.length)
+    if wanted.each == "set":
+        prints.as_target()  # is written beside the frames as a target file
+        once = torch.zeros(frames, dtype=torch.int64)
+        prints, texture = prints[once], None if texture is None else texture[once]
+    return prints, texture
 
 
 def markers_in_view(

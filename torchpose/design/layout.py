@@ -45,12 +45,13 @@ class Limits:
     inner: float  # the same of the inner circle
     width: float  # least difference of both
     scale: float  # px a mm in the worst view
+    gain: float = 0.0  # most dot gain of the print either way, mm
 
     @classmethod
-    def of(cls, camera: Camera, scale: float) -> Limits:
+    def of(cls, camera: Camera, scale: float, gain: float = 0.0) -> Limits:
         factor = reduction_factor(camera.height, camera.width)
         outer, inner = (max(px, reduced * factor) for px, reduced in (_LEAST_OUTER, _LEAST_INNER))
-        return cls(outer, inner, _LEAST_WIDTH_PX, scale)
+        return cls(outer, inner, _LEAST_WIDTH_PX, scale, gain)
 
     def quiet(self, radius: float) -> float:
         """Width in mm of the zone around a ring of ``radius`` mm that stays free."""
@@ -59,16 +60,18 @@ class Limits:
     def ratios(self, count: int, radius: float) -> Float[Tensor, " count"] | None:
         """Inner/outer ratios, rising, as far apart as the ring allows; None where it cannot hold so many.
 
-        Neighbours differ by at least twice the tolerance of `torchpose.identify.markers`, so that a reading within the
-        tolerance of one code is outside that of every other.
+        Neighbours differ by at least twice the tolerance of `torchpose.identify.markers` and twice what the dot gain
+        makes of a code, so that a reading within the tolerance of one code is outside that of every other. The limits
+        hold for the ring as it is printed, whatever the gain is.
         """
-        semi_minor = radius * self.scale
-        if semi_minor < self.outer:
+        semi_minor, gain = radius * self.scale, self.gain * self.scale
+        if semi_minor - gain < self.outer:
             return None
-        low = max(_RATIO_RANGE[0], self.inner / semi_minor)
-        high = min(_RATIO_RANGE[1], 1 - self.width / semi_minor)
+        low = max(_RATIO_RANGE[0], (self.inner + gain) / semi_minor)
+        high = min(_RATIO_RANGE[1], 1 - (self.width + 2 * gain) / semi_minor)
         gap = (high - low) / (count - 1)
-        if gap < max(MIN_RATIO_GAP, 2 * ratio_tolerance(semi_minor)):
+        moved = gain * (1 + high) / (semi_minor - gain)  # of a ratio q, by radii r - g and q r + g
+        if gap < max(MIN_RATIO_GAP, 2 * (ratio_tolerance(semi_minor) + moved)):
             return None
         return torch.linspace(low, high, count, dtype=torch.float64, device="cpu")
 

@@ -15,6 +15,7 @@ from torchpose.design.predict import Imaging, deviations, edge_covariance, in_vi
 from torchpose.design.volume import WorkingVolume
 from torchpose.errors import ConfigError
 from torchpose.identify.markers import ratio_tolerance
+from torchpose.identify.scene import MOST_GAIN
 from torchpose.target import Target
 
 _RADII = 10  # outer radii tried for every number of rings
@@ -54,6 +55,7 @@ class Choice:
     name: str | None = None  # by default number of rings and size
     background: str = "light"  # or dark
     markers: int | None = None  # number of rings; by default the fewest that do
+    print_gain: float = 0.0  # most dot gain of the print either way, mm: room for it is left between codes
 
 
 def design_target(
@@ -67,7 +69,7 @@ def design_target(
 
     Args:
         plate: width and height, mm.
-        choice: fields of `Choice`: ``name``, ``background``, ``markers``.
+        choice: fields of `Choice`: ``name``, ``background``, ``markers``, ``print_gain``.
 
     Raises:
         ConfigError: the rings are out of view or too small, or the accuracy is out of reach; with the figure that can
@@ -79,7 +81,9 @@ def design_target(
     markers, background = chosen.markers, chosen.background
     if markers is not None and markers not in ARRANGEMENTS:
         raise ConfigError(f"markers: {markers}; there are layouts of {', '.join(map(str, ARRANGEMENTS))} rings")
-    limits = Limits.of(camera, volume.least_scale(camera, (plate[0] / 2, plate[1] / 2)))
+    if not 0 <= chosen.print_gain < math.inf:
+        raise ConfigError(f"print_gain: {chosen.print_gain:g} mm; give a length from 0")
+    limits = Limits.of(camera, volume.least_scale(camera, (plate[0] / 2, plate[1] / 2)), chosen.print_gain)
     best: tuple[float, Design] | None = None
     counts = list(ARRANGEMENTS) if markers is None else [markers]
     for count in counts:
@@ -87,7 +91,7 @@ def design_target(
         if target is None:
             continue
         name = chosen.name or f"rings{count}_{plate[0]:g}x{plate[1]:g}"
-        target = replace(target, name=name, background=background)  # type: ignore[arg-type]  # it checks
+        target = replace(_stating(target, chosen.print_gain), name=name, background=background)  # type: ignore[arg-type]  # it checks
         precision = predict_volume(camera, target, volume, imaging)
         excess = float(need.excess(precision.worst).nan_to_num(nan=math.inf))
         if best is None or excess < best[0]:
@@ -134,6 +138,15 @@ def _targets(limits: Limits, count: int, plate: Size, device: torch.device) -> I
             normals=centers.new_tensor([0.0, 0.0, 1.0]).repeat(count, 1),
             radii=_rounded(torch.stack([torch.full_like(ordered, radius), radius * ordered], 1)),
         )
+
+
+def _stating(target: Target, gain: float) -> Target:
+    """The target with the standard deviation of its edge gain, so that codes are read up to ``gain`` mm."""
+    if gain == 0:
+        return target
+    covariance = target.centers.new_zeros(3 * len(target) + 1, 3 * len(target) + 1)
+    covariance[-1, -1] = (gain / MOST_GAIN) ** 2
+    return replace(target, covariance=covariance)
 
 
 def _rounded(length: Tensor) -> Tensor:

@@ -39,6 +39,7 @@ class Rivals(NamedTuple):
         score: (H,) number of markers it explains, less a fraction for what they miss by.
         explained: (H,) number of markers of that.
         place: (H,) `rank` of the score.
+        gain: (H,) mm, likeliest edge gain of the plate.
         claims: the rings that the poses explain.
         near: the rings near enough to a predicted place to be that marker of the same copy.
         size: number of rows, of rings as they are numbered, and of markers.
@@ -48,6 +49,7 @@ class Rivals(NamedTuple):
     score: Tensor
     explained: Tensor
     place: Tensor
+    gain: Tensor
     claims: Claims
     near: Claims
     size: tuple[int, int, int]
@@ -74,7 +76,7 @@ def share_out(rivals: Rivals) -> Tensor:
     that nobody else claims. So disputed claims count less, and a pose of nothing else waits while its frame has others:
     the tray is cleared from its edge.
     """
-    row, score, count, _, claims, _, (rows, rings, markers) = rivals
+    row, score, count, _, _, claims, _, (rows, rings, markers) = rivals
     open_ones = _different_ones(rivals)
     claims = claims.where(open_ones[claims.pose])
     claim, by = _disputes(claims, len(row))

@@ -14,11 +14,11 @@ from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.geometry.rows import Rows, shared
-from torchpose.geometry.segments import marked, pairs_in_group
-from torchpose.identify.assignments import Assignments, propose, ratio_tolerance
+from torchpose.geometry.segments import marked, pairs_in_group, segment_sum
+from torchpose.identify.assignments import Assignments, Codes, propose, ratio_tolerance
 from torchpose.identify.copies import MIN_MARKERS, Claims, Rivals, rank, share_out
 from torchpose.identify.hypotheses import Hypotheses, hypotheses
-from torchpose.identify.scene import MarkerTable
+from torchpose.identify.scene import MOST_GAIN, MarkerTable
 from torchpose.rings import Rings
 
 # of the tolerances, mean over the markers: a false code of rings of 13 px misses by 0.2 more (derived), a right one by
@@ -40,6 +40,7 @@ class Identified(Rows):
         R: the rough pose that the rings were assigned under; NaN without one.
         t: the same, mm.
         copies: how many copies the rings of the row's frame show, each by three markers or more.
+        gain: mm, the edge gain of the plate as the codes tell it and the target's file allows; 0 where nothing tells.
         proposal: group, marker and ring of every ring with the code of a marker, whether or not it fits.
     """
 
@@ -48,6 +49,7 @@ class Identified(Rows):
     R: Float[Tensor, "N 3 3"]
     t: Float[Tensor, "N 3"]
     copies: Int[Tensor, " N"]
+    gain: Float[Tensor, " N"]
     proposal: Int[Tensor, "A 3"] = shared()
 
     def proposed(self, unclaimed: Bool[Tensor, " K"]) -> Tensor:
@@ -85,7 +87,8 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int, inst
     if instances is not None:
         number = torch.arange(len(kept), device=device) - torch.searchsorted(row[kept], row[kept])
         kept = kept[number < instances]
-    kept = kept[~_contested(rivals, kept, rings.clipped)]
+    if len(one.number.unique()) < len(one):  # rings with several codes
+        kept = kept[~_contested(rivals, kept)]
     group, at = row[kept], torch.arange(len(kept), device=device)
     without = (~marked(group, rows)).nonzero()[:, 0]
     if without.numel():
@@ -96,22 +99,36 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int, inst
     to = torch.full_like(row, -1).index_copy_(0, kept, at)[claims.pose]
     chosen = (to >= 0).nonzero()[:, 0]
     result.ring[to[chosen], claims.marker[chosen]] = claims.ring[chosen] % len(rings)
+    result.gain[at] = rivals.gain[kept]
     if without.numel():
         # no pair, no pose: the code is all there is, where it is not clipped
-        alone = (marked(without, rows)[one.row] & one.clipping.isnan()).nonzero()[:, 0]
+        plain = ~one.clipped & (one.codes_of().under(torch.zeros_like(one.likely)) < 1)
+        alone = (marked(without, rows)[one.row] & plain).nonzero()[:, 0]
         result.ring[torch.searchsorted(group, one.row[alone]), one.marker[alone]] = one.ring[alone]
     return result
 
 
-def _contested(rivals: Rivals, kept: Tensor, clipped: Tensor) -> Tensor:
-    """Poses ``kept`` (P,) bool that another one explains as well by other codes of the same rings (K,) ``clipped``.
+def _gain(codes: Codes, told: Tensor, pose: Tensor, scale: Tensor) -> Tensor:
+    """The likeliest edge gain (H,) under every pose, mm, by the codes of its rings.
+
+    Args:
+        codes: (S,), of rings taken for markers.
+        told: (S,) bool, which of them count.
+        pose: (S,), of each.
+        scale: (H,) mm, standard deviation of the gain.
+    """
+    weight = torch.where(told, (MOST_GAIN * codes.per_unit).square(), 0.0)
+    known, sums = (segment_sum(value, pose, len(scale)) for value in (weight, weight * codes.moved))
+    return sums / (known + scale.pow(-2))
+
+
+def _contested(rivals: Rivals, kept: Tensor) -> Tensor:
+    """Poses ``kept`` (P,) bool that another one explains as well by other codes of the same rings.
 
     Codes read up to a displacement let a small target turn, by a code and a corner. What it costs is that the rings'
     size, moved with their edges, no longer suits their distances.
     """
-    if not bool(clipped.any()):
-        return torch.zeros_like(kept, dtype=torch.bool)
-    claims = rivals.claims.where(clipped[rivals.claims.ring % len(clipped)])
+    claims = rivals.claims
     number = torch.full_like(rivals.row, -1).index_copy_(0, kept, torch.arange(len(kept), device=kept.device))
     own = claims.where(number[claims.pose] >= 0)
     ring, order = claims.ring.sort()
@@ -128,7 +145,7 @@ def _tried(
 ) -> tuple[Hypotheses, Rivals]:
     """Poses of targets seen from their printed side; from behind too where these explain too few rings."""
     tried = hypotheses(one, table, matrix, 1.0)
-    rivals = _weighed(tried, one, size)
+    rivals = _weighed(tried, one, table, size)
     lacking = ~marked(rivals.row[rivals.explained >= MIN_MARKERS], size[0])[one.row]
     if not bool(lacking.any()):
         return tried, rivals
@@ -137,7 +154,7 @@ def _tried(
     if behind.numel() == 0:
         return tried, rivals
     tried = tried.and_of(hypotheses(one[behind], table, matrix, -1.0), behind)
-    return tried, _weighed(tried, one, size)
+    return tried, _weighed(tried, one, table, size)
 
 
 def _different(row: Tensor, marker: Tensor, size: tuple[int, int]) -> Tensor:
@@ -145,24 +162,26 @@ def _different(row: Tensor, marker: Tensor, size: tuple[int, int]) -> Tensor:
     return marked(row * size[1] + marker, size[0] * size[1]).view(size).sum(-1)
 
 
-def _weighed(tried: Hypotheses, one: Assignments, size: tuple[int, int, int]) -> Rivals:
+def _weighed(tried: Hypotheses, one: Assignments, table: MarkerTable, size: tuple[int, int, int]) -> Rivals:
     """The poses with the nearest ring of each of their markers; ``size`` as in `Rivals`."""
     member, pose, markers = tried.member, tried.pose, size[2]
     every = Claims(pose, one.number[member], one.marker[member])
     # the code has its say, too: markers of neighbouring codes must not change places
-    # and clipping moves the edges of all rings as far as those of the one that the pose comes from
-    off = one[member].mismatch_under(one.clipping[tried.origin[pose]])
+    # and gain or clipping move the edges of all rings as far as those of the one that the pose comes from
+    codes = one.codes_of(member)
+    off = codes.under(one.common(tried.origin[pose], member))
     cost = torch.where((tried.miss < 1) & (off < 1), 0.5 * (tried.miss + off), torch.inf)
     slot = pose * markers + every.marker
     per_marker = torch.full((len(tried.R) * markers,), torch.inf, dtype=cost.dtype, device=cost.device)
     per_marker.scatter_reduce_(0, slot, cost, "amin")
     chosen = (cost == per_marker[slot]) & cost.isfinite()
+    gain = _gain(codes, chosen & ~one.clipped[member], pose, table.gain_scale[one.target[tried.origin]])
     per_marker = per_marker.view(-1, markers)
     found = per_marker.isfinite()
     count = found.sum(-1)
     score = count - torch.where(found, per_marker, 0.0).sum(-1) / (2 * markers)
     row = one.row[tried.origin]
-    return Rivals(row, score, count, rank(row, score, size[0]), every.where(chosen), every, size)
+    return Rivals(row, score, count, rank(row, score, size[0]), gain, every.where(chosen), every, size)
 
 
 def _empty(group: Tensor, markers: int, copies: Tensor, proposal: Tensor) -> Identified:
@@ -174,6 +193,7 @@ def _empty(group: Tensor, markers: int, copies: Tensor, proposal: Tensor) -> Ide
         nowhere.repeat(count, 3, 3),
         nowhere.repeat(count, 3),
         copies,
+        torch.zeros(count, dtype=torch.float64, device=group.device),
         proposal,
     )
 

@@ -14,6 +14,9 @@ from torchpose.geometry.rows import Rows
 from torchpose.target import Target
 
 _SAME_CODE = 1e-3  # of the ratio of radii: what differs by less is one code
+MOST_GAIN = 3.0  # deviations of the edge gain that a file states, up to which codes are read (a convention)
+# mm, of prints of which nothing is said: laser printers and copiers spread ink by 60 to 100 um
+_OFFICE_GAIN = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +31,10 @@ class MarkerTable(Rows):
         valid: False where padded.
         polarity: +1 dark rings, -1 light ones.
         coplanar: whether all markers lie in one plane.
+        gain_sigma: of the edge gain, mm; 0 where the file states none.
+        gain_scale: the same, or that of a plausible print where the file states none.
+        half_gap: half of the least difference between two codes of each target, as ratios of radii; inf where there is
+            one.
         by_print: how place (mm) and edge gain (mm) of the markers vary with each of Q numbers of unit variance, as
             `Target.covariance` says.
     """
@@ -39,6 +46,9 @@ class MarkerTable(Rows):
     valid: Bool[Tensor, "T M"]
     polarity: Float[Tensor, " T"]
     coplanar: Bool[Tensor, " T"]
+    gain_sigma: Float[Tensor, " T"]
+    gain_scale: Float[Tensor, " T"]
+    half_gap: Float[Tensor, " T"]
     by_print: Float[Tensor, "T M 4 Q"]
 
     @classmethod
@@ -54,16 +64,38 @@ class MarkerTable(Rows):
             padded([torch.ones(len(t), dtype=torch.bool) for t in targets], False),
             torch.tensor([1.0 if t.background == "light" else -1.0 for t in targets], dtype=torch.float64),
             torch.tensor([t.coplanar for t in targets]),
+            torch.stack([_gain_sigma(t) for t in targets]),
+            torch.stack([_gain_scale(t) for t in targets]),
+            torch.stack([_half_gap(t.printed_radii) for t in targets]),
             _by_print(targets),
         )
 
-    @property
-    def half_gap(self) -> Float[Tensor, " T"]:
-        """Half of the least difference between two codes of each target, as ratios of radii; inf where there is one."""
-        ratio = self.radii[..., 1] / self.radii[..., 0]
-        apart = (ratio[:, :, None] - ratio[:, None]).abs()
-        both = self.valid[:, :, None] & self.valid[:, None] & (apart > _SAME_CODE)
-        return 0.5 * torch.where(both, apart, torch.inf).flatten(1).amin(1)
+
+def _gain_sigma(target: Target) -> Tensor:
+    """Standard deviation of the edge gain as the target's file states it, mm; 0 where it does not."""
+    if target.covariance is None:
+        return target.radii.new_zeros(())
+    return target.covariance[-1, -1].clamp_min(0).sqrt()
+
+
+def _gain_scale(target: Target) -> Tensor:
+    """Standard deviation of the edge gain, mm: the one that is stated, or that of a plausible print.
+
+    A print of which nothing is said is read with a gain of less than half of the way from a code to the next.
+    """
+    radii = target.printed_radii
+    by_half = (_half_gap(radii) * radii[:, 0].square() / radii.sum(-1)).amin()
+    stated = _gain_sigma(target)
+    room = torch.minimum(radii[:, 1], 0.5 * (radii[:, 0] - radii[:, 1])).amin()  # or neither hole nor ring is left
+    most = torch.where(stated > 0, (MOST_GAIN * stated).minimum(0.9 * room), by_half.clamp_max(_OFFICE_GAIN))
+    return most / MOST_GAIN
+
+
+def _half_gap(radii: Tensor) -> Tensor:
+    """Half of the least difference between two ratios of radii (M, 2); inf where there is one."""
+    ratio = radii[:, 1] / radii[:, 0]
+    apart = (ratio[:, None] - ratio).abs()
+    return 0.5 * torch.where(apart > _SAME_CODE, apart, torch.inf).amin()
 
 
 def _by_print(targets: Sequence[Target]) -> Tensor:
@@ -100,6 +132,15 @@ class Scene(NamedTuple):
     def of_rows(self, group: Tensor) -> Self:
         """The same with other rows, of the frames and targets ``group`` (N,): frame times T plus target."""
         return self._replace(frame=group // len(self.table), target=group % len(self.table))
+
+    def stated_gain(self, gain: Tensor) -> Tensor:
+        """The gains (N,) of rows whose targets' files state how uncertain the edge gain is, 0 of the others."""
+        return torch.where(self.table.gain_sigma[self.target] > 0, gain, 0.0)
+
+    def printed_radii(self, gain: Tensor) -> Tensor:
+        """(N, M, 2) mm, of the markers of every row printed with an edge gain (N,) beyond that of the file."""
+        radii = self.table.radii[self.target]
+        return radii + (self.table.polarity[self.target] * gain)[:, None, None] * radii.new_tensor([1.0, -1.0])
 
     @property
     def groups(self) -> int:

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.detect import Candidates, Verdict
 from torchpose.geometry import conics
-from torchpose.identify.assignments import Codes
+from torchpose.identify.assignments import Codes, Marks
 from torchpose.identify.markers import Identified
 from torchpose.identify.scene import MarkerTable, Scene
 from torchpose.rings import Rings, mapped, measure_predicted
@@ -41,7 +41,8 @@ def look_again(
     row, option, marker = (wanted[:, None] & R.isfinite().all(-1).all(-1)[..., None]).nonzero().unbind(-1)
     if row.numel() == 0:
         return rings, identified
-    ideal, raw, depth = _predicted(markers, camera, R[row, option], t[row, option], (row, marker))
+    printed = replace(markers, radii=scene.printed_radii(scene.stated_gain(identified.gain)))
+    ideal, raw, depth = _predicted(printed, camera, R[row, option], t[row, option], (row, marker))
     outer, limit = raw[:, 0], torch.tensor([camera.width - 1, camera.height - 1], device=R.device)
     # a circle that reaches behind the camera, or a plane seen edge-on, has no ellipse
     in_view = ((outer[:, :2] > 0) & (outer[:, :2] < limit)).all(-1) & (outer[:, 2] < limit.amin()) & (depth > 0)
@@ -54,10 +55,9 @@ def look_again(
     row, marker, ideal = row[kept[which]], marker[kept[which]], ideal[kept[which], 0]
     measured = found.outer.params
     miss = torch.linalg.vector_norm(measured[:, :2] - ideal[:, :2], dim=-1)
-    expected = markers.radii[..., 1] / markers.radii[..., 0]
-    half_gap = scene.table.half_gap[scene.target]
-    clipping = _clipping(rings, identified.ring, expected, half_gap)[row]
-    off = Codes.of(found, expected[row, marker], half_gap[row]).under(clipping)
+    clipping = _clipping(rings, identified.ring, scene)[row]
+    codes = Codes.of(found, Marks.of(scene.table, scene.target[row], marker))
+    off = codes.under(torch.where(found.clipped, clipping, identified.gain[row]))
     px, of_size = _PLACE_TOLERANCE
     good = (miss < px + of_size * measured[:, 2]) & (off < 1)
     # of several poses of a row, the one that was nearest
@@ -72,18 +72,20 @@ def look_again(
     return Rings.cat([rings, found[index]]), more
 
 
-def _clipping(rings: Rings, ring: Tensor, expected: Tensor, half_gap: Tensor) -> Tensor:
+def _clipping(rings: Rings, ring: Tensor, scene: Scene) -> Tensor:
     """By how far clipping has moved the edges of each row's rings (N, M), -1 where not seen: (N,) px, NaN if unknown.
 
     Args:
         rings: of all frames.
         ring: index into them.
-        expected: ratios (N, M) of the markers. half_gap: (N,), as for `Codes.of`.
+        scene: whose each row is.
     """
-    some = rings[ring.flatten().clamp_min(0)]
-    apart = half_gap[:, None].expand_as(expected).flatten()
-    each = Codes.of(some, expected.flatten(), apart).clipping.view_as(expected)
-    return torch.where(ring >= 0, each, torch.nan).nanmedian(1).values
+    row, marker = (ring >= 0).nonzero().unbind(-1)
+    some = rings[ring[row, marker]]
+    codes = Codes.of(some, Marks.of(scene.table, scene.target[row], marker))
+    each = torch.full(ring.shape, torch.nan, dtype=torch.float64, device=ring.device)
+    each = each.index_put((row, marker), torch.where(some.clipped, codes.likely, torch.nan))
+    return each.nanmedian(1).values
 
 
 def _predicted(

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchpose.geometry import rotations
-from torchpose.results import Detections, Poses, Reason, Status
+from torchpose.results import Detections, Misfit, Poses, Reason, Status
 
 Row = dict[str, Any]
 Schema = dict[str, type]
@@ -16,6 +16,7 @@ Schema = dict[str, type]
 
 _POSE = ("tx", "ty", "tz", "rx", "ry", "rz")
 _STD = ("sx", "sy", "sz", "srx", "sry", "srz")
+_NOISE = ("nx", "ny", "nz", "nrx", "nry", "nrz")
 
 POSE_SCHEMA: Schema = {
     "frame": str,
@@ -23,16 +24,25 @@ POSE_SCHEMA: Schema = {
     "status": str,
     **dict.fromkeys((*_POSE, *_STD, "rms_px"), float),
     "markers": int,
+    **dict.fromkeys(_NOISE, float),
     "reason": str,
     "instance": int,
     "copies": int,
+    "misfit": str,
     "covariance": list,
+    "noise_covariance": list,
+    "systematic": list,
+    "place": list,
     "quaternion": list,
     "solutions": list,
 }
-"""Columns of a row: t in mm, rotation vector r in rad, standard deviations s* of t and of the rotation about the camera
-axes; instance counts the copies of a target in its frame from the left, copies says how many it shows, if any;
-covariance 6x6 (t, then rotation), quaternion w, x, y, z, and the one or two solutions, the row's own first."""
+"""Columns of a row.
+
+t in mm, rotation vector r in rad, standard deviations s* of t and of the rotation about the camera axes, of everything,
+and n* of the noise of the frame alone; instance counts the copies of a target in its frame from the left, copies says
+how many it shows, if any; misfit is `Misfit` where the residuals show any; covariance and noise_covariance 6x6 (t, then
+rotation), systematic and place as in `Poses`, quaternion w, x, y, z, and the one or two solutions, the row's own first.
+"""
 
 BASE_SCHEMA: Schema = {
     **dict.fromkeys(tuple(f"base_{c}" for c in (*_POSE, *_STD)), float),
@@ -51,8 +61,8 @@ DETECTION_SCHEMA: Schema = {
 }
 """One row a marker: compensated centre with standard deviation, semi-axes and direction of both ellipses (px, rad)."""
 
-SINCE_INSTANCES: Row = {"instance": 0, "copies": None}
-"""Cells of rows that were written before a frame could have several copies of a target."""
+NEWER: Row = {"instance": 0} | dict.fromkeys(("copies", "misfit", *_NOISE, "noise_covariance", "systematic", "place"))
+"""Cells of rows that were written before a frame could have several copies of a target, or two covariances."""
 
 
 def pose_rows(poses: Poses, frames: Sequence[str], targets: Sequence[str]) -> list[Row]:
@@ -75,6 +85,8 @@ def pose_rows(poses: Poses, frames: Sequence[str], targets: Sequence[str]) -> li
         reason=[Reason(reason).name.lower() if reason else None for reason in poses.reason.tolist()],
         instance=poses.instance.tolist(),
         copies=[count or None for count in poses.copies.tolist()],
+        misfit=[Misfit(misfit).name.lower() if misfit else None for misfit in poses.misfit.tolist()],
+        **_noise_cells(poses),
         quaternion=[pose and pose["quaternion"] for pose in own],
         solutions=[a and [a, *([b] if b else [])] for a, b in zip(own, other, strict=True)],
     )
@@ -124,6 +136,16 @@ def _pose_cells(poses: Poses, prefix: str) -> list[Row]:
     whole = poses.covariance.isfinite().flatten(1).all(1).tolist()
     covariance = [c if ok else None for c, ok in zip(poses.covariance.tolist(), whole, strict=True)]
     return table(**columns, **{f"{prefix}covariance": covariance})
+
+
+def _noise_cells(poses: Poses) -> dict[str, list[Any]]:
+    """Columns of the parts of the covariance."""
+    there = poses.noise.isfinite().flatten(1).all(1).tolist()
+    lists = {"noise_covariance": poses.noise.tolist(), "systematic": poses.systematic.tolist()}
+    parts = {name: [v if ok else None for v, ok in zip(values, there, strict=True)] for name, values in lists.items()}
+    places = [[None if p[0] != p[0] else p for p in of_row] for of_row in poses.place.tolist()]
+    parts["place"] = [p if ok else None for p, ok in zip(places, there, strict=True)]
+    return dict(zip(_NOISE, _columns(poses.noise_std), strict=True)) | parts
 
 
 def _columns(numbers: Tensor) -> list[list[float | None]]:

@@ -22,7 +22,8 @@ from filelock import lock_descriptor
 from pydantic import BaseModel, Field, ValidationError
 
 from torchpose.errors import ConfigError
-from torchpose.io.rows import DETECTION_SCHEMA, SINCE_INSTANCES, Row, Schema
+from torchpose.io.misfits import Misfits
+from torchpose.io.rows import DETECTION_SCHEMA, NEWER, Row, Schema
 from torchpose.io.writers import atomic_path, check_table_path, read_rows, write_rows
 
 _UNSAID = {"--instances": 1}  # in what older runs were made from
@@ -54,6 +55,7 @@ class ResultStore:
         unreadable: frames that could not be read, with their reason.
         crowded: frames that show more copies of a target than they have rows.
         most: by target, the most copies of it that one of these frames shows.
+        misfits: by target, what its rows say together of target and camera file.
 
     Raises:
         ConfigError: a place cannot be written, another run is writing there, or there is an earlier run that cannot be
@@ -72,6 +74,7 @@ class ResultStore:
         self.unreadable: dict[str, str] = {}
         self.crowded: set[str] = set()
         self.most: dict[str, int] = {}
+        self.misfits: dict[str, Misfits] = {}
         self._out, self._detections = out, detections
         self._schema, self._targets = schema, targets
         self._origin = json.loads(json.dumps(origin))
@@ -176,6 +179,7 @@ class ResultStore:
             self.unreadable[record["frame"]] = record["rows"][0]["reason"]
         rows = Counter(row["target"] for row in record["rows"])
         for row in record["rows"]:
+            self.misfits.setdefault(row["target"], Misfits()).add(row)
             if (row.get("copies") or 0) > rows[row["target"]]:
                 self.crowded.add(record["frame"])
                 self.most[row["target"]] = max(self.most.get(row["target"], 0), row["copies"])
@@ -208,8 +212,9 @@ class ResultStore:
                 offset, length = self._places[frame]
                 journal.seek(offset)
                 record = json.loads(journal.read(length))
-                for part in ("rows", "detections"):
-                    record[part] = [SINCE_INSTANCES | row for row in record[part]]
+                for part, schema in (("rows", self._schema), ("detections", DETECTION_SCHEMA)):
+                    newer = {column: cell for column, cell in NEWER.items() if column in schema}
+                    record[part] = [newer | row for row in record[part]]
                 yield record
 
     def _finished(self) -> Iterator[Row]:

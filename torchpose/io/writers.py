@@ -9,7 +9,7 @@ from itertools import islice
 from pathlib import Path
 
 from torchpose.errors import ConfigError
-from torchpose.io.rows import SINCE_INSTANCES, Row, Schema
+from torchpose.io.rows import NEWER, Row, Schema
 
 TABLE_SUFFIXES = (".csv", ".jsonl", ".parquet")
 _ROW_GROUP = 4096
@@ -44,18 +44,17 @@ def write_rows(path: Path, rows: Iterable[Row], schema: Schema) -> None:
 
 
 def read_rows(path: Path, schema: Schema) -> Iterator[Row]:
-    """Rows of a table that `write_rows` wrote, before there were instances too.
+    """Rows of a table that `write_rows` wrote, before there were the columns of `NEWER` too.
 
     Raises:
         ConfigError: the file is not such a table.
     """
     columns = _cells(schema) if path.suffix.lower() == ".csv" else list(schema)
-    older = [column for column in columns if column not in SINCE_INSTANCES]
     try:
         for row in _READERS[path.suffix.lower()](path):
-            if list(row) not in (columns, older):
+            if list(row) != [column for column in columns if column in row or column not in NEWER]:
                 raise ValueError("columns")
-            cells = {column: row[column] if column in row else SINCE_INSTANCES[column] for column in columns}
+            cells = {column: row[column] if column in row else NEWER[column] for column in columns}
             yield {column: None if cell is None else schema[column](cell) for column, cell in cells.items()}
     except (ValueError, KeyError, TypeError, OSError, csv.Error):
         raise ConfigError(
@@ -146,9 +145,8 @@ def _write_parquet(path: Path, rows: Iterable[Row], schema: Schema) -> None:
 
     number = pa.float64()
     parts = {"translation": pa.list_(number, 3), "rotation": pa.list_(number, 3), "quaternion": pa.list_(number, 4)}
-    nested = {
-        "covariance": pa.list_(pa.list_(number)),
-        "base_covariance": pa.list_(pa.list_(number)),
+    matrices = ("covariance", "noise_covariance", "systematic", "place", "base_covariance")
+    nested = dict.fromkeys(matrices, pa.list_(pa.list_(number))) | {
         "quaternion": pa.list_(number),
         "solutions": pa.list_(pa.struct(parts | {"rms_px": number, "chi2": number})),
     }

@@ -40,8 +40,10 @@ class Evidence(Rows):
         coplanar: whether all markers of the target lie in one plane.
         polarity: of the target, as `MarkerTable.polarity`.
         placed: covariance that uncertain places on the print add to the centres, at most, ideal px^2.
-        by_target: `MarkerTable.by_print`, after as many zeros as the camera has uncertain parameters.
+        by_target: `MarkerTable.by_print`.
         matrix: of the camera.
+        of_camera: how many independent numbers are uncertain of it.
+        gain: mm, edge gain of each plate that ``radii`` hold beyond those of the target's file; None for none.
     """
 
     points: Float[Tensor, "N M 3"]
@@ -58,6 +60,13 @@ class Evidence(Rows):
     placed: Float[Tensor, "N M 2 2"]
     by_target: Float[Tensor, "N M 4 L"]
     matrix: Float[Tensor, "3 3"] = shared()
+    of_camera: int = shared(0)
+    gain: Float[Tensor, " N"] | None = None
+
+    @property
+    def numbers(self) -> int:
+        """How many independent numbers are uncertain of camera and targets."""
+        return self.of_camera + self.by_target.shape[-1]
 
     def without(self, marker: Tensor) -> Evidence:
         """The same rows with one marker each, (N,) int64, taken as not seen."""
@@ -79,7 +88,7 @@ def gather_evidence(
         rings: of all frames.
         ring: which one each marker is, -1 where not seen.
         markers: of the target of each row.
-        camera: for its matrix, and how many of its parameters are uncertain.
+        camera: for its matrix and covariance.
         locate: centres from both ellipses of a ring, as `centers.common_center`.
     """
     mask = ring >= 0
@@ -95,7 +104,6 @@ def gather_evidence(
     # a circle of the radius r has the shape matrix r A, A from the plane to the image
     variance = markers.by_print[:, :, :3].square().sum(-1).amax(-1) / markers.radii[..., 0].square()
     shape = conics.shape_matrix(ellipses[:, :, 0])
-    uncertain = 0 if camera.covariance is None else covariance_factor(camera.covariance).shape[1]
     return Evidence(
         markers.centers,
         markers.normals,
@@ -109,21 +117,36 @@ def gather_evidence(
         markers.coplanar,
         markers.polarity,
         variance[..., None, None] * shape @ shape,
-        torch.nn.functional.pad(markers.by_print, (uncertain, 0)),
+        markers.by_print,
         camera.matrix,
+        0 if camera.covariance is None else covariance_factor(camera.covariance).shape[1],
     )
 
 
-def shape_chi2(evidence: Evidence, R: Tensor, t: Tensor) -> Tensor:
-    """Chi-squared (N, S) of the rings' shapes: elongation and its direction, which blur and threshold hardly touch."""
+def predicted_circles(evidence: Evidence, R: Tensor, t: Tensor) -> Tensor:
+    """Ellipses (N, S, M, 2, 5), ideal px, of every marker's circles under S poses R (N, S, 3, 3), t (N, S, 3)."""
     x = (R[:, :, None] @ evidence.points[:, None, ..., None]).squeeze(-1) + t[:, :, None]  # (N, S, M, 3)
-    predicted = conics.circle_ellipse(
+    return conics.circle_ellipse(
         evidence.matrix,
         R[:, :, None, None],
         x[..., None, :],
         evidence.normals[:, None, :, None],
         evidence.radii[:, None],
-    )  # (N, S, M, 2, 5)
+    )
+
+
+def shape_chi2(evidence: Evidence, R: Tensor, t: Tensor) -> Tensor:
+    """`misfit_of_shapes` (N, S) under S poses."""
+    return misfit_of_shapes(evidence, predicted_circles(evidence, R, t))
+
+
+def misfit_of_shapes(evidence: Evidence, predicted: Tensor) -> Tensor:
+    """Chi-squared (N, S) of the rings' shapes: elongation and its direction, which blur and threshold hardly touch.
+
+    Args:
+        evidence: N rows.
+        predicted: as `predicted_circles`.
+    """
     difference = conics.shape_matrix(evidence.shape)[:, None] - conics.shape_matrix(predicted)
     theta = evidence.shape[..., 4]
     cos, sin = theta.cos(), theta.sin()

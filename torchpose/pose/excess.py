@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.geometry.robust import of_chance
@@ -37,11 +37,13 @@ class Excess(Rows):
         deviation: standard deviations of the further unknowns: places (3 by marker, mm), gain (mm), camera (px); 0
             where they need not be off.
         factor: of the variance of all noise, 1 where it suffices.
+        misfit: `Misfit`, what is behind it.
         explained: whether the residuals then agree with all that.
     """
 
     deviation: Float[Tensor, "N E"]
     factor: Float[Tensor, " N"]
+    misfit: Int[Tensor, " N"]
     explained: Bool[Tensor, " N"]
 
 
@@ -71,20 +73,22 @@ def excess_of(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) 
     chi2, freedom = modes.residual.square().sum(-1), modes.there.sum(-1).clamp_min(1)
     most = freedom * of_chance(freedom)
     explained = chi2 < most
-    none = Excess(torch.zeros_like(right), torch.ones_like(chi2), explained)
+    none = Excess(torch.zeros_like(right), torch.ones_like(chi2), torch.zeros_like(freedom), explained)
     row = (~explained).nonzero()[:, 0]
     if row.numel() == 0:
         return none
     some = _Modes(*(x[row] for x in modes))
-    families = (_print(some), _camera(some), _scatter(some))
+    families = (_print(some), _camera(some), _scatter(some))  # in the order of `Misfit`
     best = torch.stack([f.evidence for f in families], -1).argmax(-1)
     at = torch.arange(len(row), device=row.device)
     deviation, factor, chi2 = (torch.stack([f[k] for f in families], 1)[at, best] for k in (1, 2, 3))
-    return none.replaced(row, Excess(deviation, factor, chi2 < most[row]))
+    return none.replaced(row, Excess(deviation, factor, best + 1, chi2 < most[row]))
 
 
 def _modes(information: Tensor, right: Tensor) -> _Modes:
-    values, vectors = torch.linalg.eigh(information)
+    finite = (information.isfinite().all(-1) & right.isfinite()).all(-1, keepdim=True)
+    right = torch.where(finite, right, 0.0)
+    values, vectors = torch.linalg.eigh(torch.where(finite[..., None], information, 0.0))
     there = values > _LEAST_MODE * values[:, -1:].clamp_min(torch.finfo(values.dtype).tiny)
     root = torch.where(there, values, 0.0).sqrt()
     residual = torch.where(there, (vectors.mT @ right[..., None])[..., 0] / root.clamp_min(1e-300), 0.0)

@@ -49,7 +49,20 @@ def outcome(scene: Scene, found: Found) -> Poses:
         kept = awarded.view(-1, *[1] * (values.ndim - 1))
         return torch.where(kept, out.index_copy(0, solvable, values), torch.nan)
 
-    names = ("R", "t", "covariance", "noise", "systematic", "rms", "chi2", "R_alt", "t_alt", "rms_alt", "chi2_alt")
+    names = (
+        "R",
+        "t",
+        "covariance",
+        "noise",
+        "systematic",
+        "place",
+        "rms",
+        "chi2",
+        "R_alt",
+        "t_alt",
+        "rms_alt",
+        "chi2_alt",
+    )
     every = Poses(
         frame=scene.frame,
         target=scene.target,
@@ -60,8 +73,9 @@ def outcome(scene: Scene, found: Found) -> Poses:
         status=torch.where(few, few_status, status),
         reason=torch.where(few, int(Reason.NONE), reason),
         markers=torch.where(few, proposed, mask.sum(-1)),
+        misfit=torch.zeros_like(status).index_copy(0, solvable, solutions.misfit) * awarded,
         detections=_detections(scene, found, mask),
-        of_camera=found.evidence.by_target.shape[-1] - scene.table.by_print.shape[-1],
+        of_camera=found.evidence.of_camera,
         **{name: spread(getattr(solutions, name)) for name in names},
     )
     return every if rows == scene.groups else _numbered(scene, every, awarded)

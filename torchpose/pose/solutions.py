@@ -32,6 +32,8 @@ class Solutions(Rows):
     status: Int[Tensor, " N"]
     reason: Int[Tensor, " N"]
     mask: Bool[Tensor, "N M"]
+    place: Float[Tensor, "N M 4"]
+    misfit: Int[Tensor, " N"]
 
     @property
     def solved(self) -> Tensor:

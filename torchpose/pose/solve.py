@@ -11,13 +11,15 @@ from torch import Tensor
 
 from torchpose import pnp
 from torchpose.pose.covariance import pose_covariance
-from torchpose.pose.evidence import Evidence, shape_chi2, visible
+from torchpose.pose.evidence import Evidence, misfit_of_shapes, predicted_circles, visible
+from torchpose.pose.sizes import code_shift
 from torchpose.pose.solutions import AMBIGUOUS_CHI2, Solutions
 from torchpose.results import Reason, Status
 
 _SHAPE_LIMIT = 16.0  # mean chi-squared a shape component above which the rings contradict the pose
 _CENTER_LIMIT = (30.0, 10.0)  # chi-squared, and per degree of freedom, above which the centres contradict each other
 _ITERATIONS = (16, 60)  # of the solver: for most rows, and for those that need more
+_CODE_SHIFT = 0.5  # of the way to the next code, from which on the markers may as well be their neighbours in code
 _CENTER_RMS = 0.3  # px, below which they do not: small errors of calibration or print are no mix-up
 
 
@@ -66,10 +68,12 @@ def _solve(evidence: Evidence, rough: tuple[Tensor, Tensor], iterations: int, co
     # both minima of the centres, weighed again with the rings' shapes
     R, t = torch.stack([result.R, result.R_alt], 1), torch.stack([result.t, result.t_alt], 1)
     rms, of_centers = torch.stack([result.rms, result.rms_alt], 1), torch.stack([result.chi2, result.chi2_alt], 1)
-    of_shapes = shape_chi2(evidence, R, t)
+    circles = predicted_circles(evidence, R, t)
+    of_shapes = misfit_of_shapes(evidence, circles)
     chi2, best = (of_centers + of_shapes).nan_to_num(nan=torch.inf).sort(1)  # NaN: no such minimum
     row = torch.arange(len(best), device=best.device)[:, None]
     R, t, rms, of_centers, of_shapes = (x[row, best] for x in (R, t, rms, of_centers, of_shapes))
+    shift = code_shift(evidence, circles[row[:, 0], best[:, 0]])
     covariance, determined = pose_covariance(evidence, R[:, 0], t[:, 0])
     chi2_alt = torch.where(chi2[:, 1].isfinite(), chi2[:, 1], torch.nan)
     seen = evidence.mask.sum(-1)
@@ -79,7 +83,7 @@ def _solve(evidence: Evidence, rough: tuple[Tensor, Tensor], iterations: int, co
     for condition, why in (
         (chi2_alt - chi2[:, 0] < AMBIGUOUS_CHI2, Reason.TWO_SOLUTIONS),
         (of_shapes[:, 0] > 4 * _SHAPE_LIMIT * seen, Reason.RING_SHAPE),
-        (contradicts, Reason.RESIDUAL),
+        (contradicts | (shift > _CODE_SHIFT), Reason.RESIDUAL),
         (~solvable, Reason.NOT_CONVERGED),
         (result.code == pnp.PnPCode.BEHIND_CAMERA, Reason.BEHIND_CAMERA),
         ((result.code == pnp.PnPCode.DEGENERATE) | (solvable & ~determined), Reason.DEGENERATE),
@@ -88,16 +92,18 @@ def _solve(evidence: Evidence, rough: tuple[Tensor, Tensor], iterations: int, co
     status = torch.where(reason == Reason.NONE, int(Status.OK), int(Status.REJECTED))
     status = torch.where(reason == Reason.TWO_SOLUTIONS, int(Status.AMBIGUOUS), status)
     one, two = ((R[:, k], t[:, k], rms[:, k]) for k in range(2))
-    alone = covariance.new_zeros(*evidence.mask.shape[:1], 6, evidence.by_target.shape[-1])
+    alone = covariance.new_zeros(len(covariance), 6, evidence.numbers)
     parts = (covariance, covariance, alone)
-    return Solutions(one[0], one[1], *parts, one[2], chi2[:, 0], *two, chi2_alt, status, reason, evidence.mask)
+    rest = (evidence.mask, one[1].new_zeros(*evidence.mask.shape, 4), torch.zeros_like(status))
+    return Solutions(one[0], one[1], *parts, one[2], chi2[:, 0], *two, chi2_alt, status, reason, *rest)
 
 
 def _no_solutions(evidence: Evidence, R: Tensor, t: Tensor) -> Solutions:
     """Of no rows: frames without a target cost nothing here."""
     one, code = t.new_empty(0), evidence.mask.new_empty(0, dtype=torch.int64)
-    parts = (t.new_empty(0, 6, 6), t.new_empty(0, 6, 6), t.new_empty(0, 6, evidence.by_target.shape[-1]))
-    return Solutions(R, t, *parts, one, one, R, t, one, one, code, code, evidence.mask)
+    parts = (t.new_empty(0, 6, 6), t.new_empty(0, 6, 6), t.new_empty(0, 6, evidence.numbers))
+    rest = (evidence.mask, t.new_empty(*evidence.mask.shape, 4), code)
+    return Solutions(R, t, *parts, one, one, R, t, one, one, code, code, *rest)
 
 
 def _starts(evidence: Evidence, rough: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:

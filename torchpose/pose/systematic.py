@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.camera import Camera
@@ -85,7 +85,8 @@ class OnPrint(Rows):
         noise: the part of it that is the frame's own.
         systematic: how the pose errs with each of the L numbers, one deviation of them; the same in all frames.
         place: where the markers sit beside their places, target frame, mm, and the edge gain, all as estimated.
-        explained: whether the residuals agree with print, camera and what a print may have besides.
+        misfit: `Misfit`, what the residuals show beyond noise and stated uncertainties; it is in the covariance.
+        explained: whether the residuals agree with all that.
         known: whether the pose is determined.
     """
 
@@ -94,6 +95,7 @@ class OnPrint(Rows):
     noise: Float[Tensor, "N 6 6"]
     systematic: Float[Tensor, "N 6 L"]
     place: Float[Tensor, "N M 4"]
+    misfit: Int[Tensor, " N"]
     explained: Bool[Tensor, " N"]
     known: Bool[Tensor, " N"]
 
@@ -122,60 +124,69 @@ def on_print(
     right = normals.right + (normals.information @ _among(back[..., None], n))[..., 0]
     normals = MarkerNormals(normals.information, right)
     own = torch.eye(n, dtype=right.dtype, device=right.device)[:, :-1].expand(*right.shape[:2], n, n - 1)
-    shifts = _shifts(setting)
-    known, count = torch.cat([own, _among(shifts, n)], -1), shifts.shape[-1]
-    excess, further = _excess(normals, known, count, setting)
-    normals = normals.over(excess.factor)
-    every = shifts
-    if bool((excess.deviation > 0).any()):
-        every = torch.cat([shifts, further * excess.deviation[:, None, None]], -1)
-    joint = _Joint.of(normals, own, _among(every, n), estimate)
-    place = torch.cat([R.mT[:, None] @ every[:, :, :3], every[:, :, POSE:]], 2)
+    by_camera, by_target = _by_camera(setting), _by_target(setting)
+    stated = torch.cat([by_camera, by_target], -1)
+    excess, further = _excess(normals, torch.cat([own, _among(stated, n)], -1), stated.shape[-1], setting)
+    beside = further * excess.deviation[:, None, None]
+    wide = bool((excess.deviation > 0).any())
+    printed = torch.cat([by_target, beside[..., :-CAMERA]], -1) if wide else by_target
+    lens = torch.cat([by_camera, beside[..., -CAMERA:]], -1) if wide else by_camera
+    joint = _Joint.of(normals.over(excess.factor), own, _among(printed, n), _among(lens, n), estimate)
+    place = torch.cat([R.mT[:, None] @ printed[:, :, :3], printed[:, :, POSE:]], 2)
     place = (place @ joint.numbers[:, None, :, None])[..., 0]
     sure = joint.known & (torch.linalg.cholesky_ex(joint.covariance)[1] == 0)
-    common = joint.systematic[..., :count]
-    return OnPrint(joint.step, joint.covariance, joint.noise, common, place, excess.explained, sure)
+    parts = (joint.by_camera[..., : by_camera.shape[-1]], joint.by_print[..., : by_target.shape[-1]])
+    common = torch.cat(parts, -1)
+    return OnPrint(joint.step, joint.covariance, joint.noise, common, place, excess.misfit, excess.explained, sure)
 
 
 class _Joint(NamedTuple):
-    """Solution of N problems of own unknowns and L numbers of unit variance: pose, and ``numbers`` (N, L).
+    """Solution of N problems of own unknowns, and numbers of unit variance of the print and of the camera.
 
-    step (N, 6). covariance, noise (N, 6, 6), systematic (N, 6, L), as in `OnPrint`. known (N,).
+    The print's are unknowns, too. The camera's are not: a frame tells next to nothing of them, and poses that followed
+    what it seems to tell would scatter. They are counted alone.
+
+    step (N, 6). numbers (N, L), of the print. covariance, noise (N, 6, 6), as in `OnPrint`. by_print (N, 6, L) and
+    by_camera (N, 6, C), error of the pose with each number. known (N,).
     """
 
     step: Tensor
     numbers: Tensor
     covariance: Tensor
     noise: Tensor
-    systematic: Tensor
+    by_print: Tensor
+    by_camera: Tensor
     known: Tensor
 
     @classmethod
-    def of(cls, normals: MarkerNormals, own: Tensor, by: Tensor, estimate: bool) -> Self:
-        """With the columns ``own`` and ``by`` of the markers' unknowns.
+    def of(cls, normals: MarkerNormals, own: Tensor, by_print: Tensor, by_camera: Tensor, estimate: bool) -> Self:
+        """With the columns of the markers' unknowns that belong to each.
 
-        By what the data tell of the numbers when the own unknowns are free, S' = V diag(l) V^T: then the numbers have
-        the covariance (I + S')^-1, and every part of the pose's covariance is a sum of squares, whatever is large.
+        By what the data tell of the print's numbers when the own unknowns are free, S = V diag(l) V^T: then they have
+        the covariance (I + S)^-1, and every part of the pose's covariance is a sum of squares, whatever is large.
         """
-        matrix, right = _assembled(normals, torch.cat([own, by], -1))
+        matrix, right = _assembled(normals, torch.cat([own, by_print], -1))
+        columns = torch.cat([own, by_print], -1)
+        by_lens = (columns.mT @ (normals.information @ by_camera)).sum(1)
         k = own.shape[-1]
         alone, known = scaled_inverse(matrix[:, :k, :k])
         shift = alone @ matrix[:, :k, k:]  # of the own unknowns, found without the numbers, by these
-        step = (alone @ right[:, :k, None])[..., 0]
+        both = torch.cat([right[..., None], by_lens], -1)
+        step = alone @ both[:, :k]
         told = matrix[:, k:, k:] - matrix[:, k:, :k] @ shift
-        values, vectors = torch.linalg.eigh(0.5 * (told + told.mT))
-        values = values.clamp_min(0.0)[:, None]
-        turned = shift[:, :POSE] @ vectors
-        if not estimate:
-            more, none = turned @ turned.mT, torch.zeros_like(right[:, k:])
-            noise = alone[:, :POSE, :POSE]
-            return cls(torch.zeros_like(step[:, :POSE]), none, noise + more, noise, shift[:, :POSE], known)
-        held = turned / (1 + values)
-        numbers = right[:, k:] - (matrix[:, k:, :k] @ step[..., None])[..., 0]
-        numbers = (vectors / (1 + values) @ (vectors.mT @ numbers[..., None]))[..., 0]
-        step = step - (shift @ numbers[..., None])[..., 0]
+        finite = told.isfinite().all(-1).all(-1)
+        told = torch.where(finite[:, None, None], 0.5 * (told + told.mT), 0.0)
+        values, vectors = torch.linalg.eigh(told)
+        values = values.clamp_min(0.0)[:, None] if estimate else torch.zeros_like(values)[:, None]
+        held = shift[:, :POSE] @ vectors / (1 + values)
+        numbers = both[:, k:] - matrix[:, k:, :k] @ step
+        numbers = vectors / (1 + values) @ (vectors.mT @ numbers) * float(estimate)
+        step = (step - shift @ numbers)[:, :POSE]
         noise = alone[:, :POSE, :POSE] + (held * values) @ held.mT
-        return cls(step[:, :POSE], numbers, noise + held @ held.mT, noise, held @ vectors.mT, known)
+        lens = step[..., 1:]
+        covariance = noise + held @ held.mT + lens @ lens.mT
+        step = step[..., 0] * float(estimate)
+        return cls(step, numbers[..., 0], covariance, noise, held @ vectors.mT, lens, known & finite)
 
 
 def _excess(normals: MarkerNormals, known: Tensor, count: int, setting: Setting) -> tuple[Excess, Tensor]:
@@ -185,7 +196,7 @@ def _excess(normals: MarkerNormals, known: Tensor, count: int, setting: Setting)
     camera = further.new_zeros(*further.shape[:3], CAMERA)
     every = torch.cat([further, camera], -1)
     excess = excess_of(*_remaining(normals, known, _among(every, n), count))
-    wide = (~excess.explained | (excess.factor > 1) | (excess.deviation > 0).any(-1)).nonzero()[:, 0]
+    wide = (excess.misfit > 0).nonzero()[:, 0]
     if wide.numel() == 0:
         return excess, every
     # only where the print alone would have to explain it, the camera is asked, too
@@ -196,20 +207,24 @@ def _excess(normals: MarkerNormals, known: Tensor, count: int, setting: Setting)
     return excess.replaced(wide, again), every
 
 
-def _shifts(setting: Setting) -> Tensor:
-    """How markers seem moved (N, M, 7, L), each alone, by the numbers of unit variance of camera and target.
+def _by_target(setting: Setting) -> Tensor:
+    """How markers seem moved (N, M, 7, L), each alone, by the numbers of unit variance of the target."""
+    by_target = setting.evidence.by_target
+    aside = setting.R[:, None] @ by_target[:, :, :3]
+    return torch.cat([aside, torch.zeros_like(aside), by_target[:, :, 3:]], 2)
+
+
+def _by_camera(setting: Setting) -> Tensor:
+    """The same (N, M, 7, C) by those of the camera.
 
     A camera's error moves the image of a ring; the motion of the marker that does the same, by its own information, is
     the least-squares solution over its rims, or over its centre.
     """
-    R, by_target = setting.R, setting.evidence.by_target
-    aside = R[:, None] @ by_target[:, :, :3]
-    apart = torch.cat([aside, torch.zeros_like(aside), by_target[:, :, 3:]], 2)
-    if setting.camera.covariance is None:
-        return apart
-    factor = covariance_factor(setting.camera.covariance.to(R))
-    moved = _as_motions(setting, lambda xy: by_intrinsics(setting.camera, xy)[..., : len(factor)] @ factor)
-    return torch.cat([moved, apart[..., factor.shape[1] :]], -1)
+    camera, like = setting.camera, setting.evidence.by_target
+    if camera.covariance is None:
+        return like.new_zeros(*like.shape[:2], POSE + 1, 0)
+    factor = covariance_factor(camera.covariance.to(like))
+    return _as_motions(setting, lambda xy: by_intrinsics(camera, xy)[..., : len(factor)] @ factor)
 
 
 def _camera_shifts(setting: Setting) -> Tensor:

@@ -70,7 +70,7 @@ def on_frames(refine: Callable[..., Refined]) -> Step:
         start, place = _start(rows, seen, sight.camera)
         found, good, active = rows, torch.zeros_like(rows.status, dtype=torch.bool), torch.arange(len(rows)).to(index)
         for number in range(_ROUNDS):
-            some = rows[active], seen[active], sight[active].displaced(place[active])
+            some = rows[active], seen[active], sight[active].displaced(_beyond(place[active], seen[active]))
             # what seems to contradict the model may be a marker beside its place
             now, joint, held, doubt = _refined(
                 partial(refine, thorough=number > 0), *some, start[active], place[active]
@@ -92,12 +92,20 @@ def on_frames(refine: Callable[..., Refined]) -> Step:
 
 def _start(rows: Solutions, seen: Evidence, camera: Camera) -> tuple[Pose, Tensor]:
     """Poses, and places (N, M, 4) of markers and edges beside those of the file, as `OnPrint.place`, by the centres."""
-    start, place = Pose(rows.R, rows.t), rows.t.new_zeros(*seen.mask.shape, 4)
+    start, place = Pose(rows.R, rows.t), -_beyond(rows.t.new_zeros(*seen.mask.shape, 4), seen)
     off = (rows.rms > _ASIDE).nonzero()[:, 0]
     if off.numel() == 0:
         return start, place
     found, joint = _by_centers(rows[off], seen[off], camera)
-    return start.replaced(off, Pose(found.R, found.t)), place.index_copy(0, off, joint.place)
+    beside = torch.cat([joint.place[..., :3], place[off][..., 3:]], -1)  # centres tell of no gain
+    return start.replaced(off, Pose(found.R, found.t)), place.index_copy(0, off, beside)
+
+
+def _beyond(place: Tensor, seen: Evidence) -> Tensor:
+    """Places (N, M, 4) with the gain beyond that of the radii in sight."""
+    if seen.gain is None:
+        return place
+    return torch.cat([place[..., :3], place[..., 3:] - seen.gain[:, None, None]], -1)
 
 
 def _refined(
@@ -139,6 +147,8 @@ def _of_joint(rows: Solutions, seen: Evidence, pose: Pose, joint: OnPrint) -> So
         covariance=joint.covariance,
         noise=joint.noise,
         systematic=joint.systematic,
+        place=torch.where(seen.mask[..., None], joint.place, torch.nan),
+        misfit=joint.misfit,
         rms=center_rms(seen, pose.R, pose.t),
     )
     return better.marked(joint.known & ~joint.explained & better.ok, Status.REJECTED, Reason.RESIDUAL)

@@ -9,7 +9,7 @@ the robot carries. A robot pose that is off counts as an error of the camera her
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,7 @@ from torchpose.rig.poses import to_transform
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 _POSE = ("tx", "ty", "tz", "rx", "ry", "rz")
 _SIGMA = ("sx", "sy", "sz", "srx", "sry", "srz")
+_NOISE = ("nx", "ny", "nz", "nrx", "nry", "nrz")
 _USED = ("ok", "ambiguous")  # status of the rows that have a pose
 _GROUPS = (("static", None), *(("rotation" if k > 2 else "translation", axis) for k, axis in enumerate(AXES)))
 
@@ -114,6 +115,9 @@ class _Frames(Rows):
     R: Float[Tensor, "N 3 3"]
     t: Float[Tensor, "N 3"]
     covariance: Float[Tensor, "N 6 6"]
+    own: Float[Tensor, "N 6 6"]  # the part that other frames do not share
+    noise: Float[Tensor, "N 6 6"]
+    systematic: Float[Tensor, "N 6 L"]
     robot_R: Float[Tensor, "N 3 3"]
     robot_t: Float[Tensor, "N 3"]
 
@@ -125,9 +129,8 @@ def evaluate_experiment(
 
     Args:
         manifest: with waypoints of the kinds static, translation and rotation.
-        poses: .csv, .jsonl or .parquet; a CSV holds no correlations, which count for tilted targets. Estimate with a
-            camera file without ``camera_matrix_covariance``: errors of the camera are common to all frames and cancel
-            in differences.
+        poses: .csv, .jsonl or .parquet. What camera and target do to all frames alike cancels in differences as far as
+            it does, which the latter two tell; a CSV holds no correlations, and its differences count all as their own.
         bound: covariance (N, 6, 6) that poses R (N, 3, 3), t (N, 3) could have at best.
 
     Raises:
@@ -135,14 +138,17 @@ def evaluate_experiment(
             common with the other.
     """
     frames, unused, emulated = _join(manifest, poses)
-    limit = None if bound is None else _evaluate(replace(frames, covariance=bound(frames.R, frames.t)), manifest)
+    limit = None
+    if bound is not None:
+        best, none = bound(frames.R, frames.t), torch.zeros_like(frames.systematic)
+        limit = _evaluate(replace(frames, covariance=best, own=best, noise=best, systematic=none), manifest)
     return replace(_evaluate(frames, manifest), emulated=emulated, unused=unused, bound=limit)
 
 
 def _evaluate(frames: _Frames, manifest: Path) -> Experiment:
     rest, *groups = (frames[frames.group == number] for number in range(len(_GROUPS)))
     values = torch.cat([rest.t, rotations.log(rest.R @ rest.R[:1].mT)], -1)
-    static = Static(values - values.mean(0), rest.covariance.diagonal(dim1=-2, dim2=-1).sqrt())
+    static = Static(values - values.mean(0), rest.noise.diagonal(dim1=-2, dim2=-1).sqrt())
     moves = [_moves(group, axis, manifest) for axis, group in zip(AXES, groups, strict=True) if len(group)]
     return Experiment(static if len(rest) > 2 else None, moves, float(frames.t[:, 2].mean()))
 
@@ -182,16 +188,28 @@ def _join(manifest: Path, poses: Path) -> tuple[_Frames, tuple[str, ...], bool]:
         torch.tensor([label.value for label in labels], dtype=torch.float64),
         torch.tensor([label.origin for label in labels]),
         *to_transform([[float(row[column]) for column in _POSE] for row in rows]),
-        torch.stack([_covariance(row) for row in rows]),
+        *_covariances(rows),
         *to_transform(tool),
     )
     return frames, tuple(unused), emulated
 
 
-def _covariance(row: dict[str, Any]) -> Float[Tensor, "6 6"]:
-    if row.get("covariance") is not None:
-        return torch.tensor([list(map(float, line)) for line in row["covariance"]], dtype=torch.float64)
-    return torch.tensor([float(row[column]) for column in _SIGMA], dtype=torch.float64).square().diag()
+def _covariances(rows: Sequence[dict[str, Any]]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Covariances (N, 6, 6) of all, what other frames do not share, and noise, and the systematic part (N, 6, L)."""
+
+    def matrices(column: str, deviations: tuple[str, ...]) -> Tensor:
+        if all(row.get(column) is not None for row in rows):
+            return torch.tensor([[list(map(float, line)) for line in row[column]] for row in rows], dtype=torch.float64)
+        names = deviations if all(row.get(name) is not None for row in rows for name in deviations) else _SIGMA
+        deviation = torch.tensor([[float(row[name]) for name in names] for row in rows], dtype=torch.float64)
+        return torch.diag_embed(deviation.square())
+
+    whole, noise = matrices("covariance", _SIGMA), matrices("noise_covariance", _NOISE)
+    if any(row.get("systematic") is None for row in rows):
+        return whole, whole, noise, whole[..., :0]
+    systematic = torch.tensor([[list(map(float, line)) for line in row["systematic"]] for row in rows]).double()
+    systematic = systematic.view(len(rows), 6, -1)
+    return whole, whole - systematic @ systematic.mT, noise, systematic
 
 
 def _moves(frames: _Frames, axis: str, manifest: Path) -> Moves:
@@ -208,9 +226,12 @@ def _moves(frames: _Frames, axis: str, manifest: Path) -> Moves:
     sign = value.sign()
     along = torch.nn.functional.normalize(camera, dim=-1) * sign[:, None]
     # every difference has the noise of its own frame and that of the origin, which all share
-    common = along @ start.covariance[0, block, block] @ along.T
-    own = (along[:, None] @ rest.covariance[:, block, block] @ along[..., None]).flatten()
-    return Moves(axis, value, sign * robot.norm(dim=-1), sign * camera.norm(dim=-1), common + own.diag())
+    common = along @ start.own[0, block, block] @ along.T
+    own = (along[:, None] @ rest.own[:, block, block] @ along[..., None]).flatten()
+    # and what the numbers that all share leave of themselves in it
+    left = (along[:, None] @ (rest.systematic - start.systematic)[:, block])[:, 0]
+    covariance = common + own.diag() + left @ left.mT
+    return Moves(axis, value, sign * robot.norm(dim=-1), sign * camera.norm(dim=-1), covariance)
 
 
 def unit(axis: str) -> tuple[str, float]:

@@ -122,7 +122,7 @@ def sample_boundary(
     one-to-one, or where it lies further than ``reach`` px outside of the frame.
     """
     angle = torch.arange(_COARSE_CIRCLE, dtype=t.dtype, device=t.device) * (2 * math.pi / _COARSE_CIRCLE)
-    offset, slope = _on_circle(shapes.circles.axes[:, None], angle)
+    offset, slope = _on_circle(shapes.circles.axes[:, None], shapes.circles.bend[:, None], angle)
     round_ = _posed(camera, R, t, shapes, shapes.circles.of, (shapes.circles.center[:, None] + offset, slope))
     fraction = torch.linspace(0, 1, _COARSE_SIDE, dtype=t.dtype, device=t.device)[:, None]
     first, last = shapes.sides.ends[:, :1], shapes.sides.ends[:, 1:]
@@ -134,7 +134,7 @@ def sample_boundary(
     trapezoidal = t.new_zeros(1), t.new_ones(1)
     use, angle, weight = _quadrature(round_, seen, sigma, 2 * math.pi, 1.0, 24, trapezoidal)
     circles = shapes.circles[use]
-    offset, slope = _on_circle(circles.axes, angle)
+    offset, slope = _on_circle(circles.axes, circles.bend, angle)
     weight = (_sign(round_.area) * shapes.circles.sign)[use] * weight
     arcs = Boundary(shapes.frame[circles.of], circles.of, circles.center + offset, weight[:, None] * slope)
     # sides of polygons, which turn as the whole polygon does
@@ -272,11 +272,19 @@ def _image(camera: Camera, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor, Tenso
     return camera.distort(normalised), tangent, valid
 
 
-def _on_circle(axes: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
-    """Points (..., 3) of circles of radii ``axes`` (..., 2, 3) about the origin, and derivatives by angle (...)."""
+def _on_circle(axes: Tensor, bend: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
+    """Points (..., 3) of circles of radii ``axes`` (..., 2, 3) about the origin, and derivatives by angle (...).
+
+    They leave their plane by ``bend`` (..., 3, 3), see `torchpose.sim.shapes.Circles`.
+    """
     a, b = axes.unbind(-2)
     cos, sin = angle.cos()[..., None], angle.sin()[..., None]
-    return cos * a + sin * b, cos * b - sin * a
+    point, slope = cos * a + sin * b, cos * b - sin * a
+    if not bool(bend.any()):
+        return point, slope
+    across, mixed, along = bend.unbind(-2)
+    point = point + cos.square() * across + cos * sin * mixed + sin.square() * along
+    return point, slope + 2 * cos * sin * (along - across) + (cos.square() - sin.square()) * mixed
 
 
 def _in_view(camera: Camera, shapes: Shapes, curves: Sequence[_Curves], reach: Tensor) -> Tensor:

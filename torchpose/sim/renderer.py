@@ -26,8 +26,10 @@ from torchpose.geometry.segments import ragged_arange
 from torchpose.sim import boundary
 from torchpose.sim.blur import Blur, Level, Pair, blur_of, blurred, start
 from torchpose.sim.boundary import Boundary, Boxes
+from torchpose.sim.prints import Prints
 from torchpose.sim.sensor import Lighting
 from torchpose.sim.shapes import Shapes, rectangle, rings
+from torchpose.sim.texture import Texture
 from torchpose.target import Target
 
 _CHUNK_PIXELS = 1 << 24  # pixels rendered at a time
@@ -82,6 +84,7 @@ class Imaging:
         lighting: uneven light, None for even light.
         clutter: shapes on and beside the plate, below the rings.
         covers: shapes over everything.
+        texture: of the plate, the clutter and the rings on it; None for an even reflectance.
     """
 
     psf_sigma: Level = 0.7
@@ -96,9 +99,12 @@ class Imaging:
     lighting: Lighting | None = None
     clutter: Shapes | None = None
     covers: Shapes | None = None
+    texture: Texture | None = None
 
 
-def render(camera: Camera, target: Target | Shapes, R: Tensor, t: Tensor, **imaging: Any) -> Float[Tensor, "B H W"]:
+def render(
+    camera: Camera, target: Target | Prints | Shapes, R: Tensor, t: Tensor, **imaging: Any
+) -> Float[Tensor, "B H W"]:
     """Noise-free float32 frames of a target, grey values 0..255, differentiable in pose, blur and grey levels.
 
     A shape, the plate too, is drawn from either side, and not at all where it reaches behind the camera or beyond the
@@ -106,7 +112,7 @@ def render(camera: Camera, target: Target | Shapes, R: Tensor, t: Tensor, **imag
 
     Args:
         camera: the camera; its width and height are those of the frames.
-        target: the target, or shapes with levels of their own.
+        target: the target, a print of it for every frame, or shapes with levels of their own.
         R: (B, 3, 3), target to camera.
         t: (B, 3), target to camera, mm.
         imaging: fields of `Imaging`: ``psf_sigma``, ``dark``, ``light``, ``plate``, ``surround`` and so on.
@@ -114,7 +120,7 @@ def render(camera: Camera, target: Target | Shapes, R: Tensor, t: Tensor, **imag
     Raises:
         ConfigError: ``psf_sigma`` is not above 0 or no covariance, ``disc`` is below 0 or stands beside ``defocus``, or
             there are background pictures and no plate.
-        FrameError: shapes of R and t, of blur, ``motion`` or background pictures disagree.
+        FrameError: shapes of R and t, of prints, blur, ``motion`` or background pictures disagree.
     """
     R, t = check_poses(R, t)
     scene = Imaging(**imaging)
@@ -123,8 +129,10 @@ def render(camera: Camera, target: Target | Shapes, R: Tensor, t: Tensor, **imag
         raise ConfigError("disc: a lens has one defocus; give disc or defocus")
     if motion is not None and motion.shape != (len(t), 6):
         raise FrameError(f"motion: shape {tuple(motion.shape)} is not (B, 6) of {len(t)} poses")
+    if isinstance(target, Prints) and len(target) != len(t):
+        raise FrameError(f"target: {len(target)} prints are not one for each of {len(t)} poses")
     ink, paper = per_frame(scene.dark, t), per_frame(scene.light, t)
-    if isinstance(target, Target) and target.background == "dark":
+    if not isinstance(target, Shapes) and _background_of(target) == "dark":
         ink, paper = paper, ink
     ground = _ground(camera, t, paper, scene)
     if len(t) == 0:
@@ -135,13 +143,27 @@ def render(camera: Camera, target: Target | Shapes, R: Tensor, t: Tensor, **imag
         frames = ground[part].float().expand(len(t[part]), camera.height, camera.width).contiguous()
         twist = None if motion is None else motion[part].to(t)
         for shapes in _layers(target, scene, ink[part], paper[part], part.start):
+            if isinstance(shapes, Texture):
+                frames = frames * shapes.gain(camera, R[part], t[part], _size(scene.plate))
+                continue
             boxes, coverage = cover(camera, shapes, R[part], t[part], blur[part], scene.defocus, twist)
             frames = _paint(frames, shapes, boxes, coverage.float())
         out.append(frames if scene.lighting is None else frames * scene.lighting.gain(camera, R[part], t[part]))
     return torch.cat(out) if len(out) > 1 else out[0]
 
 
-def _layers(target: Target | Shapes, scene: Imaging, ink: Tensor, paper: Tensor, first: int) -> list[Shapes]:
+def _background_of(target: Target | Prints) -> str:
+    """Tone around the rings, ``light`` or ``dark``."""
+    return (target.target if isinstance(target, Prints) else target).background
+
+
+def _size(plate: Sequence[float] | None) -> tuple[float, float] | None:
+    return None if plate is None else (plate[0], plate[1])
+
+
+def _layers(
+    target: Target | Prints | Shapes, scene: Imaging, ink: Tensor, paper: Tensor, first: int
+) -> list[Shapes | Texture]:
     """What is drawn one over the other in the frames from the number ``first`` on, with levels ink and paper (B,)."""
 
     def alike(shapes: Shapes, level: Tensor) -> Shapes:
@@ -152,8 +174,12 @@ def _layers(target: Target | Shapes, scene: Imaging, ink: Tensor, paper: Tensor,
         return [] if shapes is None else [shapes.to(ink).of_frames(first, len(ink))]
 
     plate = [] if scene.plate is None else [alike(rectangle((0.0, 0.0), scene.plate[0], scene.plate[1]), paper)]
-    marks = [alike(rings(target), ink)] if isinstance(target, Target) else own(target)
-    return [*plate, *own(scene.clutter), *marks, *own(scene.covers)]
+    if isinstance(target, Prints):
+        marks = [target.to(ink)[first : first + len(ink)].rings(ink)]
+    else:
+        marks = [alike(rings(target), ink)] if isinstance(target, Target) else own(target)
+    texture = [] if scene.texture is None else [scene.texture[first : first + len(ink)]]
+    return [*plate, *own(scene.clutter), *marks, *texture, *own(scene.covers)]
 
 
 def cover(

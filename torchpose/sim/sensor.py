@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -36,17 +37,12 @@ class Lighting:
 
     def gain(self, camera: Camera, R: Tensor, t: Tensor) -> Tensor:
         """(B, H, W) float32 gain of every pixel, for poses (B, 3, 3), (B, 3) in mm."""
-        nodes = [2 + (size - 1) // _GAIN_STEP for size in (camera.width, camera.height)]
-        u, v = (
-            torch.linspace(0, size - 1, n, dtype=t.dtype, device=t.device)
-            for size, n in zip((camera.width, camera.height), nodes, strict=True)
-        )
+        u, v = _coarse_nodes(camera, t)
         across, down = (2 * x / max(size - 1, 1) - 1 for x, size in ((u, camera.width), (v, camera.height)))
         gain = 1 + self.gradient[0] * across + self.gradient[1] * down[:, None]
         gain = gain.expand(len(t), *gain.shape)
         if self.vignetting or self.point is not None:
-            pixel = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
-            ray = torch.nn.functional.pad(camera.undistort_points(pixel).nan_to_num(), (0, 1), value=1.0)
+            ray = coarse_rays(camera, t)
             gain = gain * ray.square().sum(-1) ** (-0.5 * self.vignetting)
         if self.point is not None:
             light = t.new_tensor(self.point)
@@ -55,9 +51,28 @@ class Lighting:
             depth = (origin * normal).sum(-1) / (ray * normal).sum(-1)
             here = _irradiance(depth[..., None] * ray, light, normal)
             gain = gain * here / _irradiance(origin, light, normal)
-        return interpolate(
-            gain[:, None].float(), size=(camera.height, camera.width), mode="bilinear", align_corners=True
-        )[:, 0].clamp_min(0)
+        return enlarged(gain.float(), camera).clamp_min(0)
+
+
+def coarse_rays(camera: Camera, like: Tensor) -> Tensor:
+    """(h, w, 3) rays of depth 1 of every eighth pixel, the last ones included, of the dtype and device of ``like``."""
+    pixel = torch.stack(torch.meshgrid(*_coarse_nodes(camera, like), indexing="xy"), -1)
+    return torch.nn.functional.pad(camera.undistort_points(pixel).nan_to_num(), (0, 1), value=1.0)
+
+
+def enlarged(coarse: Tensor, camera: Camera) -> Tensor:
+    """(B, H, W) of values (B, h, w) at the places of `coarse_rays`, linear between them."""
+    size = (camera.height, camera.width)
+    return interpolate(coarse[:, None], size=size, mode="bilinear", align_corners=True)[:, 0]
+
+
+def _coarse_nodes(camera: Camera, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Columns (w,) and rows (h,) of the pixels of `coarse_rays`."""
+    u, v = (
+        torch.linspace(0, size - 1, 2 + (size - 1) // _GAIN_STEP, dtype=like.dtype, device=like.device)
+        for size in (camera.width, camera.height)
+    )
+    return u, v
 
 
 def _irradiance(x: Tensor, light: Tensor, normal: Tensor) -> Tensor:
@@ -76,7 +91,7 @@ def add_noise(
     index: Tensor | None = None,
     bits: int = 8,
     full_well: float | None = None,
-    gamma: float = 1.0,
+    gamma: float | Literal["srgb"] = 1.0,
 ) -> Tensor:
     """Frames as the sensor delivers them: read noise, shot noise, gamma, rounding to ``bits`` bits, clipping.
 
@@ -94,7 +109,7 @@ def add_noise(
         index: (B,) int64, the frames' numbers; 0 to B - 1 by default.
         bits: 1 to 16; white (255) becomes 2^bits - 1.
         full_well: electrons of a white pixel; None for a sensor without shot noise.
-        gamma: stored = 255 (grey / 255)^(1 / gamma), after the noise.
+        gamma: stored = 255 (grey / 255)^(1 / gamma), after the noise; or the curve of sRGB.
 
     Returns:
         (B, H, W) uint8 for up to 8 bits, else uint16.
@@ -104,7 +119,7 @@ def add_noise(
     """
     if not 1 <= bits <= 16:
         raise ConfigError(f"bits: {bits} is not a bit depth of this camera model; give 1 to 16")
-    for name, value in (("full_well", full_well), ("gamma", gamma)):
+    for name, value in (("full_well", full_well), ("gamma", 1.0 if gamma == "srgb" else gamma)):
         if value is not None and not value > 0:
             raise ConfigError(f"{name}: {value} is not above 0; give a positive number")
     count, height, width = frames.shape
@@ -122,10 +137,20 @@ def add_noise(
             grey = flat[rows, b : b + 2 * _CHUNK].float()
             start = key[rows] + torch.tensor(b // 2, device=key.device) * _GOLDEN
             level = _noisy(grey, _normal(start, steps, grey.shape[1]), amplitude[rows, None], full_well)
-            if gamma != 1:
-                level.div_(GREY_MAX).clamp_min_(0).pow_(1 / gamma).mul_(GREY_MAX)
+            level = toned(level, gamma)
             out[rows, b : b + 2 * _CHUNK] = level.mul_(top / GREY_MAX).round_().clamp_(0, top).to(out.dtype)
     return out.view(count, height, width)
+
+
+def toned(grey: Tensor, gamma: float | Literal["srgb"]) -> Tensor:
+    """Stored grey levels of linear ones, 0..255, by a power law or by the curve of sRGB (IEC 61966-2-1)."""
+    if gamma == 1:
+        return grey
+    share = (grey / GREY_MAX).clamp_min(0)
+    if gamma != "srgb":
+        return share.pow(1 / gamma).mul(GREY_MAX)
+    steep = 1.055 * share.clamp_min(0.0031308).pow(1 / 2.4) - 0.055
+    return torch.where(share <= 0.0031308, 12.92 * share, steep).mul(GREY_MAX)
 
 
 def _noisy(grey: Tensor, deviate: Tensor, sigma: Tensor, full_well: float | None) -> Tensor:
@@ -140,6 +165,11 @@ def frame_keys(count: int, seed: int, index: Tensor | None = None) -> Tensor:
     """(B,) int64 keys of the chance in each frame, from its number ``index`` (B,), 0 to ``count`` - 1 by default."""
     number = torch.arange(count) if index is None else index
     return _mix64(_mix64(torch.full_like(number, seed % 2**62)) + number)
+
+
+def normal_deviates(key: Tensor, count: int) -> Tensor:
+    """(B, count) float32 normal deviates of the keys (B,) of `frame_keys`."""
+    return _normal(key, torch.arange(1, (count + 1) // 2 + 1, device=key.device) * _GOLDEN, count)
 
 
 def _normal(start: Tensor, steps: Tensor, count: int) -> Tensor:

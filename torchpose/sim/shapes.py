@@ -24,12 +24,16 @@ Place = Sequence[float] | np.ndarray
 
 @dataclass(frozen=True, eq=False)
 class Circles(Rows):
-    """Circles that bound shapes: whose they are, centre and two orthogonal radii in mm, 1 or -1 for a hole."""
+    """Circles that bound shapes: whose they are, centre and two orthogonal radii in mm, 1 or -1 for a hole.
+
+    On a plate that is bent they leave their plane by the vectors ``bend`` times (cos^2, cos sin, sin^2), mm.
+    """
 
     of: Int[Tensor, " C"]
     center: Float[Tensor, "C 3"]
     axes: Float[Tensor, "C 2 3"]
     sign: Float[Tensor, " C"]
+    bend: Float[Tensor, "C 3 3"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +114,7 @@ def rings(target: Target) -> Shapes:
         target.centers.repeat_interleave(2, 0),
         axes.flatten(0, 1),
         target.radii.new_tensor([1.0, -1.0]).repeat(len(target)),
+        axes.new_zeros(2 * len(target), 3, 3),
     )
     sides = Sides(marker[:0], axes.new_zeros(0, 2, 3))
     return Shapes(torch.zeros_like(marker), marker, axes.new_zeros(len(target)), target.centers, circles, sides)
@@ -122,7 +127,7 @@ def ring(center: Place, outer: float, inner: float = 0.0, level: float = 30.0, f
     axes = torch.eye(3, dtype=torch.float64)[:2] * radii[:, None, None]
     of = torch.zeros(len(radii), dtype=torch.int64)
     sign = torch.tensor([1.0, -1.0], dtype=torch.float64)[: len(radii)]
-    circles = Circles(of, at.expand(len(radii), 3), axes, sign)
+    circles = Circles(of, at.expand(len(radii), 3), axes, sign, axes.new_zeros(len(radii), 3, 3))
     return _one(level, frame, at, circles, Sides(of[:0], radii.new_zeros(0, 2, 3)))
 
 
@@ -140,7 +145,7 @@ def polygon(loops: Sequence[Any], level: float = 30.0, frame: int = 0) -> Shapes
     ends = torch.cat([none, *(torch.stack([p, p.roll(-1, 0)], 1) for p in points)])
     center = torch.cat(points).mean(0) if points else none.new_zeros(3)
     of = torch.zeros(len(ends), dtype=torch.int64)
-    circles = Circles(of[:0], none[:, 0], none, none[:, 0, 0])
+    circles = Circles(of[:0], none[:, 0], none, none[:, 0, 0], none.new_zeros(0, 3, 3))
     return _one(level, frame, center, circles, Sides(of, ends))
 
 

@@ -51,7 +51,7 @@ def moved(shapes: Shapes, R: Float[Tensor, "3 3"], t: Float[Tensor, " 3"]) -> Sh
     return replace(
         shapes,
         center=shapes.center @ R.T + t,
-        circles=replace(circles, center=circles.center @ R.T + t, axes=circles.axes @ R.T),
+        circles=replace(circles, center=circles.center @ R.T + t, axes=circles.axes @ R.T, bend=circles.bend @ R.T),
         sides=replace(sides, ends=sides.ends @ R.T + t),
     )
 

@@ -1,0 +1,158 @@
+"""Poses of the joint problem of frame, print and camera, and what residuals show beyond."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from torch import Tensor
+
+import torchpose as tp
+from tests.exact import F64, exact_ellipses, pinhole, random_poses, rings_of
+from torchpose.geometry import rotations
+from torchpose.identify import MarkerTable
+from torchpose.pose import Evidence, MarkerNormals, Setting, center_normals, gather_evidence, on_print, solve_poses
+from torchpose.pose.excess import CAMERA, excess_of
+from torchpose.target import Target
+
+CAMERA_FILE = pinhole()
+QUAD = Target.load("quad40")
+
+
+def uncertain(place: float, gain: float) -> Target:
+    deviation = torch.tensor([place] * (3 * len(QUAD)) + [gain], dtype=F64)
+    return dataclasses.replace(QUAD, covariance=torch.diag(deviation.square()))
+
+
+def evidence(
+    target: Target, r: Tensor, t: Tensor, sigma: float, camera: tp.Camera = CAMERA_FILE, printed: Target | None = None
+) -> Evidence:
+    """Noisy measurements of all markers of one print, as the target's file has them."""
+    count, markers = len(r), len(target)
+    ellipses = exact_ellipses(printed or target, camera, r, t)
+    rings = rings_of(ellipses.flatten(0, 1), torch.arange(count).repeat_interleave(markers), sigma)
+    table = MarkerTable.of([target])[torch.zeros(count, dtype=torch.int64)]
+    return gather_evidence(rings, torch.arange(count * markers).view(count, markers), table, camera)
+
+
+def by_hand(normals: MarkerNormals, R: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
+    """Pose step and covariance of one row from the stacked problem of pose, places and their prior, all at once."""
+    markers = normals.right.shape[1]
+    size = 6 + 3 * markers
+    matrix, right = torch.zeros(size, size, dtype=F64), torch.zeros(size, dtype=F64)
+    for m in range(markers):
+        pick = torch.zeros(6, size, dtype=F64)
+        pick[:, :6] = torch.eye(6, dtype=F64)
+        pick[:3, 6 + 3 * m : 9 + 3 * m] = R[0]
+        matrix += pick.T @ normals.information[0, m, :6, :6] @ pick
+        right += pick.T @ normals.right[0, m, :6]
+    matrix[6:, 6:] += torch.linalg.inv(place)
+    covariance = torch.linalg.inv(matrix)
+    return (covariance @ right)[:6], covariance[:6, :6]
+
+
+def test_places_are_unknowns_with_their_prior() -> None:
+    """The same as the dense problem that has every place among its unknowns."""
+    r, t = random_poses(1, 30, (150, 190))
+    target = uncertain(0.02, 0.0)
+    e = evidence(target, r, t, 0.01)
+    normals = center_normals(e, r, t)
+    joint = on_print(normals, Setting(e, r, t, CAMERA_FILE, False), torch.zeros(1, 4, 4, dtype=F64))
+    assert target.covariance is not None
+    step, covariance = by_hand(normals, r, target.covariance[:-1, :-1])
+    torch.testing.assert_close(joint.step[0], step, rtol=1e-6, atol=1e-10)
+    torch.testing.assert_close(joint.covariance[0], covariance, rtol=1e-6, atol=1e-14)
+    torch.testing.assert_close(
+        joint.noise + joint.systematic @ joint.systematic.mT, joint.covariance, rtol=1e-9, atol=1e-16
+    )
+
+
+def test_the_camera_s_part_is_the_pose_s_own_response() -> None:
+    """Column by column: solve again with fx, fy, cx, cy or a coefficient of the lens changed."""
+    r, t = random_poses(4, 30, (150, 190))
+    start = dataclasses.replace(pinhole(), distortion=torch.zeros(4, dtype=F64))
+    e = evidence(QUAD, r, t, 1e-5, start)
+    s = solve_poses(e, (r, t))
+    xy = (e.center - e.matrix[:2, 2]) / e.matrix.diagonal()[:2]
+    for k, step in enumerate([0.05, 0.05, 0.05, 0.05, 1e-4, 1e-4]):
+        matrix, distortion = start.matrix.clone(), start.distortion.clone()
+        if k < 4:
+            matrix[(0, 1, 0, 1)[k], (0, 1, 2, 2)[k]] += step
+        else:
+            distortion[k - 4] += step
+        other = dataclasses.replace(start, matrix=matrix, distortion=distortion)
+        ideal = other.undistort_points(start.distort(xy)) * other.matrix.diagonal()[:2] + other.matrix[:2, 2]
+        moved = solve_poses(dataclasses.replace(e, center=ideal, matrix=other.matrix), (r, t))
+        change = torch.cat([moved.t - s.t, rotations.log(moved.R @ s.R.mT)], -1) / step
+        one = torch.zeros(8, 8, dtype=F64)
+        one[k, k] = 1
+        known = dataclasses.replace(start)
+        object.__setattr__(known, "covariance", one)  # of all parameters
+        setting = Setting(e, s.R, s.t, known, False)
+        joint = on_print(center_normals(e, s.R, s.t), setting, torch.zeros(4, 4, 4, dtype=F64), estimate=False)
+        torch.testing.assert_close(joint.systematic[..., 0].abs(), change.abs(), rtol=0.03, atol=2e-4)
+
+
+@pytest.mark.parametrize("place", [0.003, 0.02])
+def test_prints_of_many_rows_are_covered(place: float) -> None:
+    """NEES of 300 poses, each of a print of its own: 6 with a standard deviation of 0.2."""
+    r, t = random_poses(300, 30, (150, 190))
+    target, g = uncertain(place, 0.0), torch.Generator().manual_seed(3)
+    every = []
+    for k in range(len(r)):
+        shift = place * torch.randn(4, 3, dtype=F64, generator=g)
+        printed = dataclasses.replace(QUAD, centers=QUAD.centers + shift)
+        every.append(exact_ellipses(printed, CAMERA_FILE, r[k : k + 1], t[k : k + 1]))
+    rings = rings_of(torch.cat(every).flatten(0, 1), torch.arange(300).repeat_interleave(4), 0.01)
+    table = MarkerTable.of([target])[torch.zeros(300, dtype=torch.int64)]
+    e = gather_evidence(rings, torch.arange(1200).view(300, 4), table, CAMERA_FILE)
+    s = solve_poses(e, (r, t))
+    joint = on_print(
+        center_normals(e, s.R, s.t), Setting(e, s.R, s.t, CAMERA_FILE, False), torch.zeros(300, 4, 4, dtype=F64)
+    )
+    error = torch.cat([s.t + joint.step[:, :3] - t, rotations.log(rotations.exp(joint.step[:, 3:]) @ s.R @ r.mT)], -1)
+    nees = (error[:, None] @ torch.linalg.solve(joint.covariance, error[..., None]))[:, 0, 0]
+    assert 5.3 < nees.mean() < 6.7
+
+
+def problem(rows: int, seed: int, deviation: Tensor, factor: float = 1.0) -> tuple[Tensor, Tensor]:
+    """Information about 9 places, a gain and a camera, and right sides of true ones of these deviations, with noise."""
+    g = torch.Generator().manual_seed(seed)
+    by = torch.randn(rows, 40, 10 + CAMERA, dtype=F64, generator=g) * 3000
+    by[..., 10:] *= 1e-3
+    true = deviation * torch.randn(rows, 10 + CAMERA, dtype=F64, generator=g)
+    noise = factor**0.5 * torch.randn(rows, 40, dtype=F64, generator=g)
+    measured = (by @ true[..., None])[..., 0] + noise
+    return by.mT @ by, (by.mT @ measured[..., None])[..., 0]
+
+
+def test_noise_alone_is_explained() -> None:
+    found = excess_of(*problem(500, 0, torch.zeros(14, dtype=F64)))
+    assert found.explained.all()
+    widened = (found.factor > 1) | (found.deviation > 0).any(-1)
+    assert widened.double().mean() < 0.02
+
+
+@pytest.mark.parametrize("kind", ["print", "camera", "scatter"])
+def test_what_is_off_is_told_and_measured(kind: str) -> None:
+    """Each explanation where it is the right one, and how large: to a factor of 1.5 in the median."""
+    deviation = torch.zeros(14, dtype=F64)
+    if kind == "print":
+        deviation[:9] = 0.02
+    if kind == "camera":
+        deviation[10:] = 0.5
+    found = excess_of(*problem(200, 1, deviation, 20.0 if kind == "scatter" else 1.0))
+    size = {"print": found.deviation[:, 0], "camera": found.deviation[:, -1], "scatter": found.factor}
+    true = {"print": 0.02, "camera": 0.5, "scatter": 20.0}[kind]
+    told = torch.stack([v > (1 if k == "scatter" else 0) for k, v in size.items()], -1)
+    assert told[:, list(size).index(kind)].double().mean() > 0.95
+    assert told.sum(-1).double().mean() < 1.1
+    assert true / 1.5 < size[kind].median() < 1.5 * true
+    assert found.explained.double().mean() > 0.97
+
+
+def test_what_no_print_may_have_is_not_explained() -> None:
+    deviation = torch.zeros(14, dtype=F64)
+    deviation[:9] = 30.0
+    assert not excess_of(*problem(20, 2, deviation)).explained.any()
