@@ -17,11 +17,12 @@ from torchpose.calibration.bundle import _Problem, moved_camera
 from torchpose.calibration.intrinsics import measure_plate
 from torchpose.calibration.measured import Distance, measured_target, scaled_by_distance, scaled_by_prior
 from torchpose.calibration.plate import free_plate, motions, stated_plate
-from torchpose.calibration.rings import rims_by_camera
+from torchpose.calibration.rings import measure_centers, rims_by_camera
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.geometry.least_squares import Pose, Step, Unknowns, Vector
 from torchpose.geometry.rotations import plane_axes
+from torchpose.sim import add_noise, render
 
 F64 = torch.float64
 OPTIONS = argparse.Namespace(
@@ -221,3 +222,21 @@ def test_places_that_are_stated_only_widen_the_camera() -> None:
             every.append(statistics.nees(statistics.intrinsics(found.camera) - truth, found.covariance))
     assert abs(sum(stated_nees) / 6 - 1) < 4 * math.sqrt(2 / (8 * 6))
     assert sum(exact_nees) > 1.3 * sum(stated_nees)
+
+
+def test_dot_gain_is_told_by_single_rings_and_moves_no_centre() -> None:
+    """Rings rendered 15 um larger, holes smaller: centres and gains of single rings are within their covariance."""
+    camera = scenes.camera(scale=0.35)
+    target = tp.Target.load("quad40")
+    pose = scenes.poses(camera, 4)
+    frames = add_noise(render(camera, replace(target, edge_gain=0.015), *pose), 2.0)
+    views = measure_centers([str(k) for k in range(4)], frames, camera, target, rims=True)
+    assert views.rims is not None
+    true = camera.project((pose[0][views.view] @ views.points[..., None])[..., 0] + pose[1][views.view])
+    error = (views.pixels - true)[..., None]
+    nees = (error.mT @ torch.linalg.solve(views.covariance, error)).flatten()
+    # four deviations of the mean of 16 chi-squares with two degrees
+    assert float(nees.mean()) < 2 + 4 * math.sqrt(2 * 2 / 16)
+    off = (views.rims.gain + views.rims.best[:, 6] - 0.015) / views.rims.covariance[:, 6, 6].sqrt()
+    assert float(views.rims.covariance[:, 6, 6].sqrt().max()) < 2e-3
+    assert float(off.square().mean()) < 1 + 4 * math.sqrt(2 / 16)

@@ -359,7 +359,7 @@ def _check_covariance(covariance: Tensor, coefficients: int) -> None:
     scaled = covariance / (scale[:, None] * scale)
     if bool((scaled - scaled.T).abs().max() > slack):
         raise ConfigError(f"{field}: is not symmetric; {fix}")
-    if bool(torch.linalg.eigvalsh(scaled)[0] < -slack):
+    if bool((covariance.diagonal() < 0).any() | (torch.linalg.eigvalsh(scaled)[0] < -slack)):
         raise ConfigError(f"{field}: has a negative eigenvalue; {fix}")
 
 
