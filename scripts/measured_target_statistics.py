@@ -12,11 +12,11 @@ poses. The estimator knows the nominal file, with what it states of the print, a
 that both of its rims give. --rendered: frames are rendered, and everything is as `torchpose calibrate --measure-target`
 and `torchpose estimate` do it.
 
-NEES: squared errors in units of their covariance over their number, 1 is right: marker places in millimetres (scale
-included), intrinsics, poses of later frames (from their centres). bound: that of the joint problem, all pixels along
-all rims with intrinsics, poses, places, tilts, sizes and edge gain unknown; its information is formed here by finite
-differences. claimed: the deviations that the files state over this bound; by_centers: those that the same adjustment of
-the centres alone, without sizes and tilts of the rings, would state.
+NEES: squared errors in units of their covariance over their number, 1 is right: marker places, intrinsics, poses of
+later frames (from their centres); lengths are in the scale of the nominal places. bound: that of the joint problem, all
+pixels along all rims with intrinsics, poses, places, tilts, sizes and edge gain unknown; its information is formed here
+by finite differences. claimed: the deviations that the files state over this bound; by_centers: those that the same
+adjustment of the centres alone, without sizes and tilts of the rings, would state.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from torch import Tensor
 import torchpose as tp
 from torchpose.calibration import Views, calibrate_intrinsics
 from torchpose.calibration.bundle import adjust, moved_camera
-from torchpose.calibration.measured import measured_target, scaled_by_prior
+from torchpose.calibration.measured import measured_target
 from torchpose.calibration.plate import free_plate, motions
 from torchpose.calibration.rings import rim_derivatives, rims_by_camera
 from torchpose.calibration.session import measure_target
@@ -265,10 +265,10 @@ def print_scale(scene: Scene) -> float:
 
 
 def pose_errors(scene: Scene, R: Tensor, t: Tensor, found: tuple[Tensor, Tensor]) -> Tensor:
-    """(N, 6) of poses of the measured target: translation, then rotation from the left."""
+    """(N, 6) of poses of the measured target: translation, then rotation from the left; in its own scale."""
     _, r0, t0 = true_frame(scene)
     true_r, true_t = R @ r0, (R @ t0[:, None])[..., 0] + t
-    return torch.cat([found[1] - true_t, rotations.log(found[0] @ true_r.mT)], -1)
+    return torch.cat([found[1] - true_t / print_scale(scene), rotations.log(found[0] @ true_r.mT)], -1)
 
 
 def motion_errors(scene: Scene, found: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
@@ -295,8 +295,6 @@ def drawn_set(options: argparse.Namespace, seed: int) -> dict[str, float]:
     plate = free_plate(nominal.ids, nominal.centers, nominal.normals)
     started = time.process_time()
     found = calibrate_intrinsics(views, [scene.start], lens=LENS, plate=plate)
-    assert nominal.covariance is not None
-    found = scaled_by_prior(found, nominal.covariance[:-1, :-1])
     target, camera = measured_target(found, nominal)
     seconds = time.process_time() - started
     places, *_ = true_frame(scene)
@@ -313,7 +311,7 @@ def drawn_set(options: argparse.Namespace, seed: int) -> dict[str, float]:
     shape = error - arm * (arm @ error) / (arm @ arm)
     thin = centers_alone(scene, views)
     row = {
-        "places_nees": nees(error, target.covariance[:-1, :-1]),
+        "places_nees": nees(shape, target.covariance[:-1, :-1]),
         "intrinsics_nees": nees(of_camera, found.covariance),
         "places_by_centers": math.sqrt(float(thin[0] / in_bound.diagonal().sum())),
         "focal_by_centers": math.sqrt(float(thin[1] / bound.diagonal()[:2].sum())),
@@ -396,7 +394,7 @@ def rendered_set(options: argparse.Namespace, seed: int) -> dict[str, float]:
     length, turn = motion_errors(scene, (poses.R, poses.t))
     nominal_length, nominal_turn = motions_without(scene, names, frames, tests)
     return {
-        "places_nees": nees(error, found.target.covariance[:-1, :-1]),
+        "places_nees": nees(shape, found.target.covariance[:-1, :-1]),
         "intrinsics_nees": nees(of_camera, found.calibration.covariance),
         "places_um2": 1e6 * float(shape.square().mean()),
         "focal_px2": float(of_camera[:2].square().mean()),

@@ -15,7 +15,7 @@ from tests.calibration import calibration_scenes as scenes
 from torchpose.calibration import calibrate_intrinsics
 from torchpose.calibration.bundle import _Problem, moved_camera
 from torchpose.calibration.intrinsics import measure_plate
-from torchpose.calibration.measured import Distance, measured_target, scaled_by_distance, scaled_by_prior
+from torchpose.calibration.measured import Distance, measured_target, scaled_by_distance
 from torchpose.calibration.plate import free_plate, motions, stated_plate
 from torchpose.calibration.rings import measure_centers, rims_by_camera
 from torchpose.errors import ConfigError
@@ -140,10 +140,7 @@ def calibrated(distance: Distance | None = None) -> tuple[statistics.Scene, tp.T
     nominal = scene.nominal
     plate = free_plate(nominal.ids, nominal.centers, nominal.normals)
     found = calibrate_intrinsics(views, [scene.start], lens="brown4", plate=plate)
-    assert nominal.covariance is not None
-    if distance is None:
-        found = scaled_by_prior(found, nominal.covariance[:-1, :-1])
-    else:
+    if distance is not None:
         found = scaled_by_distance(found, distance)
     return scene, *measured_target(found, nominal)
 
@@ -167,14 +164,12 @@ def test_a_distance_gives_the_scale() -> None:
         Distance(0, 9, 1.0).check(scene.nominal)
 
 
-def test_scale_by_the_mean_is_as_uncertain_as_the_file_states() -> None:
+def test_scale_by_the_mean_is_that_of_the_nominal_places() -> None:
     scene, target, camera = calibrated()
     assert target.covariance is not None
-    assert scene.nominal.covariance is not None
-    direction = motions(target.centers)[:, 6]
-    direction = direction / direction.norm()
-    stated = float(direction @ scene.nominal.covariance[:-1, :-1] @ direction)
-    assert float(direction @ target.covariance[:-1, :-1] @ direction) == pytest.approx(stated, rel=1e-3)
+    frame = motions(scene.nominal.centers)
+    assert float((frame.mT @ (target.centers - scene.nominal.centers).flatten()).abs().max()) < 1e-9
+    assert float((target.covariance[:-1, :-1] @ frame).abs().max()) < 1e-12
     assert camera.adjustment == target.adjustment is not None
     assert target.cross_covariance is not None
     assert target.cross_covariance.shape == (13, 8)
@@ -192,7 +187,7 @@ def test_a_held_camera_carries_its_covariance_to_the_target() -> None:
     def measured(step: Tensor) -> tuple[Tensor, tp.Target]:
         moved = moved_camera(camera, step)
         assert moved is not None
-        target, _ = measured_target(scaled_by_prior(measure_plate(views, moved, plate), None), nominal)
+        target, _ = measured_target(measure_plate(views, moved, plate), nominal)
         return target.centers.flatten(), target
 
     _, target = measured(torch.zeros(8, dtype=F64))

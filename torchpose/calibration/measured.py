@@ -1,7 +1,7 @@
 """A target measured by a camera: places, edge gain and sizes of its rings, with the covariance of all of it.
 
 The frame of a measured target is the one in which its places fit the nominal ones best. Views tell no scale: it is that
-of the nominal places too, as uncertain as their file says, or a distance between two of them that was measured.
+of the nominal places, too, by definition, or follows from a distance between two of them that was measured.
 """
 
 from __future__ import annotations
@@ -55,14 +55,6 @@ class Distance:
             raise ConfigError("--distance: give two different markers, a length above 0 mm and a deviation from 0 mm")
 
 
-def scaled_by_prior(calibration: Calibration, covariance: Tensor | None) -> Calibration:
-    """The calibration with the scale of the nominal places as uncertain as their covariance (3M, 3M) makes it."""
-    arm = _arms(calibration).flatten()
-    size = arm.square().sum()
-    variance = 0.0 if covariance is None else float(arm @ covariance @ arm / size.square())
-    return _scaled(calibration, 1.0, torch.zeros_like(calibration.joint[0]), variance)
-
-
 def scaled_by_distance(calibration: Calibration, distance: Distance) -> Calibration:
     """The calibration with its places, and poses, scaled so that a distance between two of them is as measured."""
     plate = calibration.plate
@@ -75,12 +67,6 @@ def scaled_by_distance(calibration: Calibration, distance: Distance) -> Calibrat
     row = pad(by_unknown, (len(calibration.joint) - len(plate), 0))
     factor = distance.length / float(length)
     return _scaled(calibration, factor, row, (distance.sigma / distance.length) ** 2)
-
-
-def _arms(calibration: Calibration) -> Float[Tensor, "M 3"]:
-    assert calibration.plate is not None  # what was measured
-    places = calibration.plate.at(calibration.bundle.plate).places
-    return places - places.mean(0)
 
 
 def _scaled(calibration: Calibration, factor: float, row: Float[Tensor, " u"], variance: float) -> Calibration:
@@ -180,7 +166,8 @@ def _poorly_known(calibration: Calibration, target: Target) -> list[str]:
     stated = torch.full_like(sigma, torch.inf)
     if target.covariance is not None:
         stated = target.covariance.diagonal()[:-1].sqrt().view(-1, 3)[target_order(plate, target)]
-    extent = float(_arms(calibration).norm(dim=-1).max())
+    places = plate.at(calibration.bundle.plate).places
+    extent = float((places - places.mean(0)).norm(dim=-1).max())
     worst, axis = divmod(int(sigma.argmax()), 3)
     found = []
     if float(sigma.max()) > _POOR * extent:

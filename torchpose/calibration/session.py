@@ -22,7 +22,6 @@ from torchpose.calibration.measured import (
     doubts,
     measured_target,
     scaled_by_distance,
-    scaled_by_prior,
 )
 from torchpose.calibration.plate import free_plate, stated_plate
 from torchpose.calibration.rings import find_rings, measure_centers
@@ -122,9 +121,6 @@ def measure_target(
             found = calibrate_intrinsics(views, [camera], lens=lens, plate=plate)
         if distance is not None:
             found = scaled_by_distance(found, distance)
-        else:
-            stated = None if target.covariance is None else target.covariance[:-1, :-1]
-            found = scaled_by_prior(found, stated)
         measured, camera_of = measured_target(found, known)
         camera, known = (camera if held else camera_of), measured
     found = replace(found, camera=camera_of, warnings=[*found.warnings, *doubts(found, target)])
