@@ -11,6 +11,7 @@ from torchpose.camera import Camera
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import conics, rotations
 from torchpose.geometry.blur import isotropic
+from torchpose.geometry.sectors import SECTORS
 from torchpose.rings import Rings
 from torchpose.target import Target
 
@@ -61,4 +62,5 @@ def rings_of(ellipses: Tensor, frame: Tensor, sigma: float = 0.005, polarity: fl
 
     outer, inner = fit(ellipses[:, 0]), fit(ellipses[:, 1])
     side, blur = torch.full((count,), polarity, dtype=F64), isotropic(torch.full((count,), 0.8, dtype=F64))
-    return Rings(frame, side, outer.params, inner.params, outer, inner, blur, frame < 0)
+    seen = (frame >= 0)[:, None].expand(-1, SECTORS)
+    return Rings(frame, side, outer.params, inner.params, outer, inner, blur, frame < 0, seen)

@@ -4,7 +4,9 @@ import ast
 import re
 from ast import Module
 from collections.abc import Iterator
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -33,6 +35,7 @@ FLOW = [
 LEVEL = {room: level for level, rooms in enumerate(FLOW) for room in rooms}
 MODULES = sorted(ROOT.rglob("*.py"))
 LOOSE = 8  # files beside __init__.py
+MOST_THRESHOLDS = 85  # named numbers of the stages that decide, see scripts/count_thresholds.py
 LONGEST, MOST_PARAMETERS = 60, 7  # of a function: lines, and parameters outside pnp/ and the command line
 
 
@@ -92,3 +95,30 @@ def test_tensor_rows_share_their_base() -> None:
             assert "__dataclass_fields__" not in path.read_text(), path
     rows = [path for path in MODULES if re.search(r"^class \w+\(Rows\):", path.read_text(), re.M)]
     assert len(rows) >= 12
+
+
+def thresholds() -> ModuleType:
+    """`scripts/count_thresholds.py`."""
+    spec = spec_from_file_location("count_thresholds", ROOT.parent / "scripts" / "count_thresholds.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_thresholds_say_where_they_come_from() -> None:
+    found = [c for c in thresholds().constants(ROOT) if c.decides]
+    assert 60 < len(found) <= MOST_THRESHOLDS, "one may be derived from another, or stand in one place for both"
+    assert not [f"{c.module}:{c.line} {c.name}" for c in found if not c.has_origin]
+    assert thresholds().bare_numbers(ROOT) <= 12, "a number in a comparison wants a name"
+
+
+def test_a_threshold_without_origin_is_found(tmp_path: Path) -> None:
+    (tmp_path / "rings").mkdir()
+    (tmp_path / "rings" / "one.py").write_text(
+        "_MOST = 0.3  # of the width\n_LEAST = 0.7  # of the width (convention)\n_SIZE = 9\n"
+        "def good(x, y):\n    limit = _MOST * y\n    return (x < limit) & (x > _LEAST) & (y.sum(_SIZE) > 0)\n"
+    )
+    found = [(c.name, c.decides, c.has_origin) for c in thresholds().constants(tmp_path)]
+    assert found == [("_MOST", True, False), ("_LEAST", True, True), ("_SIZE", False, False)]

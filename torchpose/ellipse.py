@@ -17,10 +17,10 @@ from torchpose.geometry.least_squares import geman_mcclure
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import Tiles
 
-_SOLVABLE_POINTS = 6  # five parameters and one point to spare
+_SOLVABLE_POINTS = 6  # five parameters and one point to spare (derived)
 _CHUNK = 1 << 15  # points summed at a time: blocks that stay in the processor's cache
-_MOST_PADDING = 4  # places a point: beyond, points are summed one by one
-_FLAT = 1e-12  # squared ratio of the extents of a point set across and along, below which it is a line
+_MOST_PADDING = 4  # places a point: beyond, points are summed one by one (convention: cost alone depends on it)
+_FLAT = 1e-12  # squared ratio of the extents of a point set across and along, below which it is a line (convention)
 
 Method = Literal["halir-flusser", "taubin"]
 Points = Real[Tensor, "E 2"]

@@ -45,7 +45,7 @@ from torchpose.target import Target
 _LEAST_CANDIDATE = (
     3.0  # px of semi-minor axis: rings below 4 are refused (`rings.measure`); candidates of covered ones err
 )
-_LEGIBLE = 1.8  # px, of blur, up to which the mean profile of a ring tells its code
+_LEGIBLE = 1.8  # px, of blur, up to which the mean profile of a ring tells its code (measured: decisions/0059)
 _FRAME_TYPES = (torch.uint8, torch.uint16, torch.float16, torch.bfloat16, torch.float32, torch.float64)
 Method = Literal["photometric", "edges", "centers", "paper"]
 
@@ -319,6 +319,7 @@ def _sight(scene: Scene, found: Found, evidence: Evidence) -> Sight:
         scene.frames,
         scene.camera,
         blur.view(*evidence.mask.shape, 3),
+        seen=ring.seen.view(*evidence.mask.shape, -1),
     )
 
 

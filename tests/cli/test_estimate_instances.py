@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
+from tests.cli.test_estimate import without_note
 from torchpose.camera import Camera
 from torchpose.cli.main import main
 from torchpose.geometry import rotations
@@ -62,7 +63,7 @@ def run(
         options = ["--camera", "camera.yaml", "--target", target, "--out", out, "--threads", "1"]
         with pytest.raises(SystemExit) as exit_:
             main(["estimate", "frames", *words, *options])
-        return exit_.value.code, capfd.readouterr().err
+        return exit_.value.code, without_note(capfd.readouterr().err)
 
     return call
 

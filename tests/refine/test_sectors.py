@@ -9,9 +9,10 @@ from torch import Tensor
 
 from tests.exact import F64, exact_ellipses, pinhole, random_poses
 from torchpose.geometry import rotations
+from torchpose.geometry.sectors import SECTORS
 from torchpose.refine import Refined, Sight, refine_photometric
 from torchpose.refine.photometric.grey_chi2 import grey_chi2
-from torchpose.refine.photometric.sectors import SECTORS, Sectors, away_from_unclear, doubtful, trust
+from torchpose.refine.photometric.sectors import Sectors, away_from_unclear, doubtful, trust
 from torchpose.sim import add_noise, render, shapes
 from torchpose.target import Target
 

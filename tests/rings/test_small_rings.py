@@ -9,6 +9,7 @@ from torch import Tensor
 from tests.exact import exact_ellipses, pinhole, random_poses
 from torchpose.detect import Candidates
 from torchpose.geometry.blur import isotropic
+from torchpose.geometry.sectors import SECTORS
 from torchpose.identify.assignments import ratio_tolerance
 from torchpose.rings.inner_circles import InnerCircles
 from torchpose.rings.small_rings import fit_small_rings
@@ -21,7 +22,7 @@ def begun(frame: Tensor, outer: Tensor, ratio: Tensor) -> tuple[Candidates, Inne
     one = torch.ones_like(ratio)
     candidates = Candidates(frame, outer, one, -one, one, torch.zeros_like(frame))
     inner = torch.cat([outer[:, :2], outer[:, 2:4] * ratio[:, None], outer[:, 4:]], -1)
-    seen = torch.ones(len(frame), 64, dtype=torch.bool)
+    seen = torch.ones(len(frame), SECTORS, dtype=torch.bool)
     return candidates, InnerCircles(ratio, one > 0, inner, seen, isotropic(0.8 * one), one < 0)
 
 

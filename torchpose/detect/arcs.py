@@ -11,17 +11,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose.detect.regions import Gradient, Regions
+from torchpose.detect.regions import AGREE_COS, MOST_A_FRAME, Gradient, Regions
 from torchpose.geometry import conics, segments
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import positions, ragged_arange, segment_mean, segment_sum
 
 _TANGENT_PX = 2.0  # px of position error that weigh as much as a radian of direction error
-_LEAST_TURN = 0.25  # rad from end to end of an arc; less may be straight
-_MOST_ARCS = 200  # of one frame that are chained, the longest
-_RADII = 4.0  # most ratio of the radii of curvature of two arcs of one ellipse
+_LEAST_TURN = 0.25  # rad from end to end of an arc; less may be straight (measured: docs/tried.md, cost)
 _BAND = 2  # px to either side in which an ellipse is followed
-_BAND_COS = 0.9  # of a gradient with the normal of the ellipse: 26 degrees
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,24 +89,18 @@ def chain_pairs(arcs: Arcs, polarity: float = 0.0) -> Int[Tensor, "Q 2"]:
     """
     curved = arcs.turn > _LEAST_TURN
     rank = segments.rank_in_group(arcs.frame, by=torch.where(curved, -arcs.size, 0))
-    index = positions(curved & (rank < _MOST_ARCS) & (arcs.curvature * polarity >= 0))
+    index = positions(curved & (rank < MOST_A_FRAME) & (arcs.curvature * polarity >= 0))
     i, j = segments.pairs_in_group(arcs.frame[index], arcs.frame[index])
     ahead = positions(i < j)
     i, j = index[i[ahead]], index[j[ahead]]
     ki, kj = arcs.curvature[i], arcs.curvature[j]
-    ratio = (ki / kj).abs()
     reach = 1 / torch.minimum(ki.abs(), kj.abs())
     step = arcs.middle[j] - arcs.middle[i]
     distance = torch.linalg.vector_norm(step, dim=-1)
     inward_i, inward_j = -ki.sign()[:, None] * arcs.normal[i], -kj.sign()[:, None] * arcs.normal[j]
     # a chord leaves a convex curve inwards at both ends
     fits = (
-        (ki * kj > 0)
-        & (ratio < _RADII)
-        & (ratio > 1 / _RADII)
-        & (distance < 3 * reach)
-        & ((step * inward_i).sum(-1) > -1.0)
-        & ((step * inward_j).sum(-1) < 1.0)
+        (ki * kj > 0) & (distance < 3 * reach) & ((step * inward_i).sum(-1) > -1.0) & ((step * inward_j).sum(-1) < 1.0)
     )
     return torch.stack([i[fits], j[fits]], -1)
 
@@ -245,6 +236,6 @@ def edge_band(grad: Gradient, frame: Tensor, polarity: Tensor, at: Perimeter, re
     outward = polarity.index_select(0, at.of)[:, None].float()
     rise = (gx * nx).addcmul_(gy, ny).mul_(outward)
     power, least = (gx * gx).addcmul_(gy, gy), (0.5 * grad.threshold[frame]).square()
-    steep = rise.square() > _BAND_COS**2 * power
+    steep = rise.square() > AGREE_COS**2 * power
     good = inside.logical_and_(rise > 0).logical_and_(steep).logical_and_(power > least[at.of, None])
     return Band(at, column + 0.5, row + 0.5, gx, gy, rise.masked_fill_(~good, 0.0))

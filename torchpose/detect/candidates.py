@@ -9,11 +9,24 @@ from torch import Tensor
 
 from torchpose import ellipse
 from torchpose.detect.arcs import chain_pairs, describe_arcs, fit_pairs, follow
-from torchpose.detect.finer import LARGER, SHIFT, SIDE, cut_outs, promising_places
+from torchpose.detect.finer import MIN_ASPECT, MIN_SEMI_MINOR, SHIFT, SIDE, cut_outs, promising_places
 from torchpose.detect.partial import SETTLE, free_of_stumps
 from torchpose.detect.prospects import crests, hints, rings, sorted_out
 from torchpose.detect.reduce import area_reduce, reduction_factor
-from torchpose.detect.regions import Gradient, Regions, gradient, level_line_regions, region_polarity, strong_cells
+from torchpose.detect.regions import (
+    AGREE_COS,
+    BESIDE,
+    MIN_CELLS,
+    ON_EDGE,
+    PHASE,
+    SECTORS,
+    Gradient,
+    Regions,
+    gradient,
+    level_line_regions,
+    region_polarity,
+    strong_cells,
+)
 from torchpose.detect.validation import (
     ANYTHING,
     SAME,
@@ -31,21 +44,15 @@ from torchpose.detect.validation import (
 from torchpose.geometry import conics
 from torchpose.geometry.segments import marked, members, positions, segment_mean
 
-MIN_PIXELS = 10
 _MIN_CRESTS = 7  # of cells that are left where edges are thinned
-_SECTORS = 8  # arcs turn by up to 45 degrees
-_PHASE = 0.5  # sectors centred on the axes and diagonals turn into each other when a frame is mirrored or transposed
-_MIN_SEMI_MINOR = 2.0  # reduced px
-_MIN_ASPECT = 0.12
-_MIN_CELLS = 0.35  # of a region on its ellipse, a pixel of perimeter; an edge is two to three cells wide
+# of a region on its ellipse, a pixel of perimeter: an edge is two to three cells wide, of which one is enough with gaps
+# (convention; without it the same 656 of 658 rings, docs/tried.md)
+_MIN_CELLS = 0.35
+_ARC_ROUNDS = 3  # of following the ellipse of a pair of arcs
 _PART_ROUNDS = 2  # of following the ellipse of a region that is only a part of it
 _RING_SETTLE = 2  # fits of a ring to what agrees: its edges are measured later
-_FOLLOW = ((0.4, 1), (0.5, 2))  # least cover to be followed further, and rounds of it
-_ON_ELLIPSE = 1.5  # reduced px
-_TAPER = 3.0  # reduced px, where the weight of a cell in the second fit has fallen to 0
-_FLANK, _FLANK_COS = 4.0, 0.8  # reduced px, and of the gradient with the normal: a blurred edge of a whole ellipse
-_LENGTH = 1.5  # of a place: semi-major axis over the least semi-minor axis that is wanted
-_ARC_RMS = 1.2  # reduced px, of the cells of an arc, which is a few cells wide
+
+_LENGTH = 1.5  # of a place: semi-major axis over the least semi-minor one wanted (measured: docs/tried.md, cost)
 
 
 def find_candidates(
@@ -119,7 +126,7 @@ def find_finer(
     # where edges fill most of a cut-out, the noise of the whole frame tells more than the median of their gradients
     grad = replace(grad, threshold=torch.minimum(grad.threshold, factor / fine * sharp.threshold[frame]))
     if wanted is not ANYTHING:  # what lies elsewhere in a cut-out is a place of its own
-        reach = SHIFT + LARGER * factor / fine * found.ellipse[place, 2]
+        reach = SHIFT + factor / fine * found.ellipse[place, 2]
         wanted = replace(wanted.reduced(fine), place=Place((middle - corner - 0.5 * (fine - 1)) / fine, SHIFT, reach))
     finer = accepted(find_ellipses(grad, wanted))
     ellipses = conics.rescaled(finer.ellipse, fine)
@@ -137,7 +144,7 @@ def find_ellipses(grad: Gradient, wanted: Wanted = ANYTHING, known: Candidates |
     ``known`` are accepted ellipses of a finer scale in the pixels of this one, which may explain edges better.
     """
     cell = wanted.within_reach(grad, strong_cells(grad))
-    least = MIN_PIXELS
+    least = MIN_CELLS
     if wanted.concentric:
         cell, least = crests(grad, cell), _MIN_CRESTS
     regions = level_line_regions(grad, cell, least)
@@ -147,7 +154,7 @@ def find_ellipses(grad: Gradient, wanted: Wanted = ANYTHING, known: Candidates |
         regions, aside = regions.of(fit), regions.cells_of(arcs)
     whole, explained = fit_regions(grad, regions, wanted)
     rest = torch.cat([regions.cell[~explained], aside]).sort().values
-    pieces = fit_arcs(grad, level_line_regions(grad, rest, least, _SECTORS, _PHASE), wanted)
+    pieces = fit_arcs(grad, level_line_regions(grad, rest, least, SECTORS, PHASE), wanted)
     found = merge_duplicates(Candidates.cat([whole, pieces]), explain=True)
     if known is not None:
         found = without_known(found, known)
@@ -171,8 +178,8 @@ def fit_regions(grad: Gradient, regions: Regions, wanted: Wanted = ANYTHING) -> 
     params = ellipse.fit(xy, regions.region, count, magnitude)
     # once more with what is near the ellipse; weights that fall to 0 smoothly leave it where it is when the threshold,
     # and with it the rim of the region, changes a little
-    r = ellipse.distance(xy, regions.region, params).nan_to_num(nan=_TAPER)
-    params = ellipse.fit(xy, regions.region, count, magnitude * (1 - (r / _TAPER).square()).clamp_min(0).square())
+    r = ellipse.distance(xy, regions.region, params).nan_to_num(nan=BESIDE)
+    params = ellipse.fit(xy, regions.region, count, magnitude * (1 - (r / BESIDE).square()).clamp_min(0).square())
     polarity = region_polarity(regions, params[:, :2], xy).sign()
     follows, along = _on_ellipses(regions, xy, params, polarity, magnitude)
     length, edge = (torch.bincount(regions.region[positions(on)], minlength=count) for on in (follows, along))
@@ -218,8 +225,8 @@ def _on_ellipses(
     gx, gy = regions.gradient.unbind(-1)
     rise = (nx * gx + ny * gy) * outwards
     off = off.abs()
-    follows = off < _ON_ELLIPSE
-    return follows, follows | ((off < _FLANK) & (rise > _FLANK_COS * magnitude))
+    follows = off < ON_EDGE
+    return follows, follows | ((off < BESIDE) & (rise > AGREE_COS * magnitude))
 
 
 def fit_arcs(grad: Gradient, arcs: Regions, wanted: Wanted = ANYTHING) -> Candidates:
@@ -239,14 +246,12 @@ def fit_arcs(grad: Gradient, arcs: Regions, wanted: Wanted = ANYTHING) -> Candid
     weight = torch.linalg.vector_norm(gradient, dim=-1)
     r = ellipse.distance(xy, index, params)
     rms = segment_mean(r.square(), index, len(pair), weight.double()).sqrt()
-    good = positions(rms < _ARC_RMS)
+    good = positions(rms < ON_EDGE)
     frame, polarity = about.frame[pair[good, 0]], about.curvature[pair[good, 0]].sign()
     mine = wanted.admits_ellipses(frame, params[good], polarity)
     found = score(grad, frame[mine], params[good][mine], polarity[mine])
-    found = found[asked_for(grad, found, wanted, found.cover > _FOLLOW[0][0])]
-    for least_cover, rounds in _FOLLOW if len(found) else ():
-        found = merge_duplicates(found[found.cover > least_cover], 2 * SAME)
-        found, _ = _followed(grad, found, rounds)
+    found = found[asked_for(grad, found, wanted, found.cover > 0.5)]
+    found, _ = _followed(grad, merge_duplicates(found, 2 * SAME), _ARC_ROUNDS)
     return accepted(found)
 
 
@@ -263,5 +268,5 @@ def plausible(grad: Gradient, ellipses: Float[Tensor, "M 5"]) -> Int[Tensor, " M
     """Verdict on the size and shape of ellipses; `Verdict.TOO_LARGE` for NaN."""
     a, b = ellipses[:, 2], ellipses[:, 3]
     verdict = torch.where(a <= 0.5 * max(grad.shape[1:]), int(Verdict.ACCEPTED), int(Verdict.TOO_LARGE))
-    verdict = torch.where(b < _MIN_ASPECT * a, int(Verdict.TOO_FLAT), verdict)
-    return torch.where(b < _MIN_SEMI_MINOR, int(Verdict.TOO_SMALL), verdict)
+    verdict = torch.where(b < MIN_ASPECT * a, int(Verdict.TOO_FLAT), verdict)
+    return torch.where(b < MIN_SEMI_MINOR, int(Verdict.TOO_SMALL), verdict)

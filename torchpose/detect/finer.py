@@ -5,16 +5,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.detect.reduce import area_reduce
+from torchpose.detect.regions import BESIDE, MOST_A_FRAME
 from torchpose.geometry.segments import marked, near_pairs, positions, rank_in_group
 
-SIDE = 64  # px of a cut-out
-SHIFT = 16.0  # px of a cut-out: how far from its middle the ellipse that it is made for may have its centre
-LARGER = 1.2  # than the place itself, what it is a part of, beside its shift
-_LARGEST = 10.0  # reduced px of semi-major axis: whatever is larger needs no finer look
-_SMALLEST = 1.2  # reduced px of semi-minor axis
-_LEAST_ASPECT = 0.15
-_SAME_PLACE = 3.0  # reduced px
-_MOST_PLACES = 160  # in a frame, the largest
+SIDE = 64  # px of a cut-out (convention: docs/decisions/0051)
+SHIFT = SIDE / 4  # px: how far from its middle the ellipse that it is made for may have its centre (convention)
+MIN_SEMI_MINOR = 2.0  # px of any scale: the least that the gradient's two pixels leave a hole in (convention)
+MIN_ASPECT = 0.12  # of an ellipse: a tilt of 83 degrees (convention)
+_LARGEST = (SIDE / 2 - SHIFT) / 2  # reduced px of semi-major axis: what a cut-out holds wherever in it (derived)
 
 
 def promising_places(
@@ -26,7 +24,7 @@ def promising_places(
     not asked for.
     """
     a, b = ellipses[:, 2], ellipses[:, 3]
-    place = positions((a < _LARGEST) & (b > _SMALLEST) & (b > _LEAST_ASPECT * a) & ~whole & asked)
+    place = positions((a < _LARGEST) & (b > 0.5 * MIN_SEMI_MINOR) & (b > MIN_ASPECT * a) & ~whole & asked)
     place = place[torch.argsort(a[place], descending=True, stable=True)]
     place = place[torch.argsort(frame[place], stable=True)]
     known = positions(whole)
@@ -34,11 +32,11 @@ def promising_places(
     j, i = near_pairs(center[known], center[place], 0.5 * b[known], (frame[known], frame[place]))
     apart = torch.linalg.vector_norm(ellipses[place[i], :2] - ellipses[known[j], :2], dim=-1)
     place = place[~marked(i[apart < 0.5 * b[known[j]]], len(place))]
-    near = torch.full_like(b[place], _SAME_PLACE)
+    near = torch.full_like(b[place], BESIDE)
     i, j = near_pairs(center[place], center[place], near, (frame[place], frame[place]))
     apart = torch.linalg.vector_norm(center[place[i]] - center[place[j]], dim=-1)
-    place = place[~marked(i[(j < i) & (apart < _SAME_PLACE)], len(place))]
-    return place[rank_in_group(frame[place]) < _MOST_PLACES]
+    place = place[~marked(i[(j < i) & (apart < BESIDE)], len(place))]
+    return place[rank_in_group(frame[place]) < MOST_A_FRAME]
 
 
 def cut_outs(frames: Tensor, frame: Tensor, center: Tensor, factor: int) -> tuple[Tensor, Tensor]:

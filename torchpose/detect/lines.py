@@ -7,17 +7,21 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose.detect.regions import Gradient, Regions, connected_components, level_line_regions
+from torchpose.detect.regions import (
+    BESIDE,
+    MIN_CELLS,
+    ON_EDGE,
+    PHASE,
+    SECTORS,
+    Gradient,
+    Regions,
+    connected_components,
+    level_line_regions,
+)
 from torchpose.detect.validation import edges_at, log10_nfa
 from torchpose.geometry import segments
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import marked, positions, segment_mean, segment_sum
-
-_SECTORS = 8  # directions of one edge stay within 45 degrees
-_MIN_CELLS = 10
-_STRAIGHT = 1.2  # cells, RMS distance of the cells from their line
-_JOIN = 4.0  # cells between the end of one side of a polygon and the start of the next
-_OVERLAP = 2.0  # cells from another segment over most of the length: the same edge
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +60,7 @@ def find_segments(grad: Gradient, cells: Int[Tensor, " P"]) -> Segments:
     Edges are regions whose directions fall into one sector of the circle, for two divisions of the circle, half a
     sector apart, so that none is lost on a border.
     """
-    phases = (level_line_regions(grad, cells, _MIN_CELLS, _SECTORS, phase) for phase in (0.0, 0.5))
+    phases = (level_line_regions(grad, cells, MIN_CELLS, SECTORS, phase) for phase in (0.0, PHASE))
     found = _Lines.cat([_straight(grad, regions) for regions in phases])
     _, height, width = grad.shape
     pixels = math.log10(max(2, height * width))
@@ -96,7 +100,7 @@ def _straight(grad: Gradient, regions: Regions) -> _Lines:
     along = ((xy - middle[index]) * direction[index]).sum(-1)
     low = torch.zeros(count, dtype=along.dtype, device=along.device).scatter_reduce(0, index, along, "amin")
     high = torch.zeros_like(low).scatter_reduce(0, index, along, "amax")
-    good = positions((across.clamp_min(0).sqrt() < _STRAIGHT) & (high - low > 3))
+    good = positions((across.clamp_min(0).sqrt() < ON_EDGE) & (high - low > 3))
     reach, direction, frame = torch.stack([low, high], -1)[good], direction[good], regions.frame[good]
     ends = middle[good, None] + reach[..., None] * direction[:, None]
 
@@ -123,7 +127,7 @@ def _repeated(frame: Tensor, ends: Tensor) -> Tensor:
     across = local[..., 0] * axis[..., 1] - local[..., 1] * axis[..., 0]
     inside = torch.minimum(along.amax(-1), length) - along.amin(-1).clamp_min(0)
     covered = along[:, 1] - along[:, 0]
-    same = (across.abs() < _OVERLAP).all(-1) & (inside > 0.5 * covered) & (covered > 0)
+    same = (across.abs() < ON_EDGE).all(-1) & (inside > 0.5 * covered) & (covered > 0)
     return marked(i[same], len(frame))
 
 
@@ -132,7 +136,7 @@ def _chains(frame: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
     count = frame.numel()
     i, j = segments.pairs_in_group(frame, frame)
     gap = torch.linalg.vector_norm(ends[j, 0] - ends[i, 1], dim=-1)
-    meets = positions((gap < _JOIN) & (i != j))
+    meets = positions((gap < BESIDE) & (i != j))
     i, j, gap = i[meets], j[meets], gap[meets]
     far = torch.full((count,), torch.inf, dtype=gap.dtype, device=gap.device)
     after, before = far.scatter_reduce(0, i, gap, "amin"), far.scatter_reduce(0, j, gap, "amin")

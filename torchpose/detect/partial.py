@@ -14,19 +14,19 @@ from torch import Tensor
 
 from torchpose.detect.arcs import edge_band, fit_scatter, perimeter_samples, scatter_sums
 from torchpose.detect.regions import Gradient
+from torchpose.detect.validation import WHOLE
 from torchpose.geometry import conics
 from torchpose.geometry.rows import Rows, shared
+from torchpose.geometry.sectors import MOST, SECTORS
 from torchpose.geometry.segments import positions, segment_sum
 
-_SECTORS = 16
-_RUN = 9  # sectors of a run: what leaves 65 % of a perimeter in view leaves a run in view, wherever it begins
+_RUNS = 16  # of an ellipse, each a little longer than half of it: few enough to try them all (convention)
+_RUN = round(MOST * SECTORS)  # sectors of a run: 65 % in view leave a run in view, wherever it begins (derived)
 _REACH = 3  # cells to either side in which the ridge of an edge is looked for
 _MOST_SAMPLES = 96  # of an ellipse, a multiple of the sectors
-_WELL = 0.9  # support from which on an ellipse is left as it is
 _ROUNDS = 2
 _TRIALS = 4  # fits of runs that are compared at the frame itself
-SETTLE = 4  # fits to what agrees
-_STILL = 0.01  # cells: less than the edges' own error
+SETTLE = 4  # fits to what agrees (measured: docs/tried.md, rounds of freeing rings of stumps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class Ridge(Rows):
     """Edges beside samples of the perimeters of M ellipses."""
 
     of: Int[Tensor, " S"]  # the ellipse
-    sector: Int[Tensor, " S"]  # which sixteenth of its perimeter
+    sector: Int[Tensor, " S"]  # of its perimeter, see `geometry.sectors`
     xy: Float[Tensor, "S 2"]  # where the gradient across the ellipse peaks, cells
     gradient: Float[Tensor, "S 2"]  # there
     offset: Float[Tensor, " S"]  # cells from the ellipse, positive outside
@@ -53,7 +53,7 @@ def free_of_stumps(
     part = torch.arange(len(ellipses), device=ellipses.device)
     for _ in range(_ROUNDS if len(part) else 0):
         ridge = find_ridge(grad, frame[part], ellipses[part], polarity[part])
-        weak = positions(ridge.support < _WELL)
+        weak = positions(ridge.support < WHOLE)
         part, ridge = part[weak], _ridge_of(ridge, weak)
         if part.numel() == 0:
             break
@@ -98,24 +98,18 @@ def _agreement(ridge: Ridge, fits: Float[Tensor, "M F 5"]) -> Float[Tensor, "M F
 
 
 def _settled(grad: Gradient, frame: Tensor, fits: Tensor, polarity: Tensor, settle: int) -> Float[Tensor, "M 5"]:
-    """Fitted again to all of the perimeter that agrees, until they stay: the borders of the runs leave no trace."""
-    moving = torch.arange(len(fits), device=fits.device)
+    """Fitted again to all of the perimeter that agrees, so often that the borders of the runs leave no trace."""
     for _ in range(settle):
-        now = fits[moving]
-        near = find_ridge(grad, frame[moving], now, polarity[moving])
+        near = find_ridge(grad, frame, fits, polarity)
         on = (near.found & (near.offset.abs() < 1)).double()
-        refit = fit_scatter(scatter_sums(near.xy, near.gradient, near.of, now[:, :2], on), now[:, :2], now[:, 2])
-        refit = torch.where(refit.isfinite().all(-1, keepdim=True), refit, now)
-        fits = fits.index_copy(0, moving, refit)
-        moving = moving[positions(((refit - now)[:, :4].abs() > _STILL).any(-1))]
-        if moving.numel() == 0:
-            break
+        refit = fit_scatter(scatter_sums(near.xy, near.gradient, near.of, fits[:, :2], on), fits[:, :2], fits[:, 2])
+        fits = torch.where(refit.isfinite().all(-1, keepdim=True), refit, fits)
     return fits
 
 
 def find_ridge(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> Ridge:
     """The strongest edge of the right direction beside each sample; arguments as in `free_of_stumps`."""
-    at = perimeter_samples(ellipses, _MOST_SAMPLES, _SECTORS)
+    at = perimeter_samples(ellipses, _MOST_SAMPLES, SECTORS)
     band = edge_band(grad, frame, polarity, at, _REACH)
     peak = band.rise.argmax(-1, keepdim=True)
     beside = torch.cat([(peak - 1).clamp_min(0), peak, (peak + 1).clamp_max(2 * _REACH)], -1)
@@ -129,16 +123,17 @@ def find_ridge(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor
     support = segment_sum(torch.where(found, (1 - offset.square()).clamp_min(0), 0.0), at.of, len(ellipses))
     support = support / torch.bincount(at.of, minlength=len(ellipses)).clamp_min(1)
     gradient = torch.cat([band.gx.gather(-1, peak), band.gy.gather(-1, peak)], -1)
-    sector = (at.turn * _SECTORS).long().clamp_max(_SECTORS - 1)
+    sector = (at.turn * SECTORS).long().clamp_max(SECTORS - 1)
     return Ridge(at.of, sector, at.xy + offset[:, None] * at.normal, gradient, offset, found, support)
 
 
-def _runs(ridge: Ridge, ellipses: Tensor) -> Float[Tensor, "M 16 5"]:
+def _runs(ridge: Ridge, ellipses: Tensor) -> Float[Tensor, "M R 5"]:
     """Ellipses fitted to the ridge of every run of sectors, NaN where it is none."""
     count = len(ellipses)
-    sector = ridge.of * _SECTORS + ridge.sector
-    center, scale = (v.repeat_interleave(_SECTORS, 0) for v in (ellipses[:, :2], ellipses[:, 2]))
-    sums = scatter_sums(ridge.xy, ridge.gradient, sector, center, ridge.found, _MOST_SAMPLES // _SECTORS)
-    sums = sums.view(count, _SECTORS, 6, 6)
-    runs = torch.cat([sums, sums[:, : _RUN - 1]], 1).unfold(1, _RUN, 1).sum(-1)
-    return fit_scatter(runs.flatten(0, 1), center, scale).view(count, _SECTORS, 5)
+    sector = ridge.of * SECTORS + ridge.sector
+    center, scale = (v.repeat_interleave(SECTORS, 0) for v in (ellipses[:, :2], ellipses[:, 2]))
+    sums = scatter_sums(ridge.xy, ridge.gradient, sector, center, ridge.found, _MOST_SAMPLES // SECTORS)
+    sums = sums.view(count, SECTORS, 6, 6)
+    step = SECTORS // _RUNS
+    runs = torch.cat([sums, sums[:, : _RUN - step]], 1).unfold(1, _RUN, step).sum(-1)
+    return fit_scatter(runs.flatten(0, 1), center[::step], scale[::step]).view(count, _RUNS, 5)

@@ -14,18 +14,16 @@ from torchpose.detect.validation import Candidates
 from torchpose.geometry import conics
 from torchpose.geometry.segments import positions, run_sums, values_at
 
-_CREST = 0.5  # of squared gradients: with 0.64 more rings are lost, with 0.36 less is saved (docs/tried.md)
+_CREST = 0.5  # of squared gradients: with 0.64 more rings are lost, with 0.36 less is saved (measured: docs/tried.md)
 # Of true rings of `scripts/clutter_statistics.py`, seeds 41, 42 and 33: regions of outer circles have a mean direction
-# of length 0.64 at most and a roundness of at least 0.27; an ellipse of an axes' ratio of 0.12 has 0.27 as well.
+# of length 0.64 at most and a roundness of at least 0.27; an ellipse of an axes' ratio of 0.12 has 0.27 as well
+# (measured).
 _STRAIGHT = 0.8  # length of the mean direction of a region that turns too little: an arc of 130 degrees has 0.8
-_ROUND = 0.2
-_LINE = 0.985  # an arc of 34 degrees
-_OTHER = -0.5  # roundness of a region of the other polarity
-_WHOLE = 0.3  # length of the mean direction of a region that goes all the way round
-_STEP = 0.2  # of the inner edge, to the outer one: true rings have it in 0.83 of the directions at least
-_SHARE = 0.6  # of the directions in which the outer edge is seen
-_HINT = 0.3  # the place of the one ring of 650 that only the finer look finds has 0.44
-_SEEN = 0.5  # of the frame's threshold: an outer edge that is there
+_ROUND = 0.2  # roundness; and length of the mean direction of what goes all the way round (measured, as above)
+_LINE = 0.985  # an arc of 34 degrees: straighter regions are no arcs (measured: docs/tried.md, cost)
+# of the inner edge, to the outer one: true rings have it in 0.83 of the directions at least (measured: decisions/0057)
+_STEP = 0.2
+_SHARE = 0.6  # of the directions in which the outer edge is seen (measured: decisions/0057)
 _DIRECTIONS = 16
 _RADII = (1.05, 1.0, 0.95, 0.9, 0.85, 0.8, 0.7, 0.6, 0.45, 0.3, 0.15, 0.0)  # close where the other circle may be close
 _OUTSIDE = (1.0, 2.0)  # px beyond the ellipse
@@ -70,8 +68,8 @@ def sorted_out(
     that are not, but may have arcs of the polarity in them."""
     mean, turning = roundness(regions, xy)
     own = turning.abs() if polarity == 0 else polarity * turning
-    fit = ((mean < _STRAIGHT) & (own > _ROUND)) | ((mean < _WHOLE) & (turning.abs() > _ROUND))
-    return fit, ~fit & (mean < _LINE) & (own > _OTHER)
+    fit = ((mean < _STRAIGHT) & (own > _ROUND)) | ((mean < _ROUND) & (turning.abs() > _ROUND))
+    return fit, ~fit & (mean < _LINE) & (own > -_ROUND)
 
 
 def rings(grad: Gradient, found: Candidates) -> Bool[Tensor, " M"]:
@@ -80,8 +78,10 @@ def rings(grad: Gradient, found: Candidates) -> Bool[Tensor, " M"]:
 
 
 def hints(grad: Gradient, found: Candidates) -> Bool[Tensor, " M"]:
-    """Whether it does in some of them: an ellipse of a few cells may be a poor fit to what is there."""
-    return second_edges(grad, found) > _HINT
+    """Whether it does in some of them: an ellipse of a few cells may be a poor fit to what is there.
+
+    Half as many will do: the place of the one ring of 650 that only the finer look finds has 0.44."""
+    return second_edges(grad, found) > 0.5 * _SHARE
 
 
 def second_edges(grad: Gradient, found: Candidates) -> Float[Tensor, " M"]:
@@ -104,6 +104,6 @@ def second_edges(grad: Gradient, found: Candidates) -> Float[Tensor, " M"]:
     inner = grey.flip(-1).cummax(-1).values.flip(-1).gather(-1, first[..., None]).squeeze(-1)
     outer = outside.amax(-1) - low
     inside = ((x == on_x) & (y == on_y))[..., len(_RADII) :].all(-1)
-    seen = inside & (outer > _SEEN * grad.threshold[found.frame, None]) & inner.isfinite()
+    seen = inside & (outer > 0.5 * grad.threshold[found.frame, None]) & inner.isfinite()
     second = seen & (inner - low > _STEP * outer)
     return second.sum(-1) / seen.sum(-1).clamp_min(1)

@@ -8,10 +8,12 @@ import torch
 from jaxtyping import Float, Int, Real, Shaped
 from torch import Tensor
 
-REDUCED_PIXELS = 1_300_000  # upper bound of the reduced frame's size when the factor is chosen automatically
+# upper bound of the reduced frame's size when the factor is chosen automatically: 2 MP are halved (convention)
+REDUCED_PIXELS = 1_300_000
 _MOST_REDUCTION = 4  # of frames that are looked at from farther away: of wider blurs rings are not read
 _PART_PIXELS = 1_000_000  # of the frames that are reduced at a time
-_OPENCV_MOST = 9  # OpenCV forms larger blocks' means in float32, which is too short to round the sums of 16 bits right
+# of larger blocks OpenCV forms means in float32, which is too short to round sums of 16 bits right (derived)
+_OPENCV_MOST = 9
 _OPENCV_LANES = 16  # columns that its widest vectors take at a time
 _Grid = TypeVar("_Grid", np.ndarray, Tensor)
 

@@ -17,14 +17,21 @@ from torch import Tensor
 from torchpose.geometry.rows import Rows, shared
 from torchpose.geometry.segments import positions, segment_sum
 
-# neighbours join within 37 degrees: a circle of 3 px turns 19 to 27 degrees from pixel to pixel. Not 0.8, which whole
-# grey levels reach exactly, as (3, 4) beside (0, 5): rounding would decide.
-_JOIN_COS = 0.8001
+# Gradients agree, with each other or with the normal of a curve, within 37 degrees: a circle of 3 px turns by 19 to 27
+# degrees from pixel to pixel (derived). Not 0.8, which whole levels reach exactly, as (3, 4) beside (0, 5): rounding
+# would decide.
+AGREE_COS = 0.8001
+ON_EDGE = 1.5  # cells from a curve: an edge is two to three cells wide (derived: two of the gradient, one of blur)
+BESIDE = 2 * ON_EDGE  # cells from a curve: farther off is another edge (derived)
+MIN_CELLS = 10  # of a region; the edge of the least circle that is looked for has some 25 (convention)
+SECTORS, PHASE = 8, 0.5  # pieces turn by 45 degrees; sectors about axes and diagonals survive mirroring (derived)
+MOST_A_FRAME = 200  # arcs and small places, the largest: natural pictures have hundreds of both (convention)
 _NOISE_SIGMAS = 3.7  # of the gradient: one pure-noise pixel in a thousand stays
 _RANGE_FRACTION = 0.01  # of the frame's own range of grey, for frames without noise
 _LEAST_LEVEL = 1.5  # grey levels, above the flicker of quantisation
 _NOISE_SAMPLES = 10_000
-_DENSE = 16  # cells of frames for each strong one, below which a table of all is quicker than a search
+# cells of frames for each strong one, below which a table of all is quicker than a search (measured: decisions/0056)
+_DENSE = 16  # cells of frames for each strong one, below which a table of all is quicker than a search (convention)
 _PART_PIXELS = 300_000  # of the frames whose gradients are formed at a time
 
 
@@ -184,7 +191,7 @@ def level_line_regions(
         scale = (gx.square() + gy.square()).rsqrt_()
         x, y = gx * scale, gy * scale
         cos = x.index_select(0, a) * x.index_select(0, b) + y.index_select(0, a) * y.index_select(0, b)
-        agree = cos > _JOIN_COS
+        agree = cos > AGREE_COS
     label = _labels(a, b, agree, cell.numel())
 
     large = torch.bincount(label, minlength=cell.numel()) >= min_pixels

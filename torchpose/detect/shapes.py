@@ -10,14 +10,13 @@ from torchpose import ellipse
 from torchpose.detect.candidates import find_candidates
 from torchpose.detect.lines import Segments, find_segments
 from torchpose.detect.reduce import area_reduce, reduction_factor
-from torchpose.detect.regions import gradient, strong_cells
+from torchpose.detect.regions import ON_EDGE, gradient, strong_cells
 from torchpose.detect.validation import Candidates, Verdict
 from torchpose.geometry import conics
 from torchpose.geometry.segments import marked, pairs_in_group, positions, segment_sum
 
-_NEAR = 2.0  # reduced px between a line and the ellipse that explains it
-_MOSTLY = 0.7  # of the samples of a line, or of the perimeter of an ellipse
-_BULGE = 0.1  # of the semi-minor axis: the sides of a hexagon leave its best circle by 8 %
+_MOSTLY = 0.7  # of the samples of a line, or of the perimeter of an ellipse: between half and all (convention)
+_BULGE = 0.1  # of the semi-minor axis: the sides of a hexagon leave its best circle by 8 % (derived)
 _SAMPLES = 9  # of a line
 
 
@@ -47,7 +46,7 @@ def find_shapes(frames: Shaped[Tensor, "B H W"], factor: int | None = None, *, e
     segments = replace(segments, ends=factor * segments.ends + 0.5 * (factor - 1))
 
     valid = positions(ellipses.verdict == Verdict.ACCEPTED)
-    line, owner = _explained(segments, ellipses[valid], _NEAR * factor)
+    line, owner = _explained(segments, ellipses[valid], ON_EDGE * factor)
     likelihood = torch.where(segments.chain >= 0, segments.chain_log10_nfa, segments.log10_nfa)
     beaten = ellipses.log10_nfa[valid[owner]] > likelihood[line]
     # an ellipse loses to a polygon that goes all along it, not to one side of it

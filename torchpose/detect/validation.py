@@ -14,18 +14,19 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.detect.arcs import cells_at, perimeter_samples
-from torchpose.detect.regions import Gradient
+from torchpose.detect.regions import AGREE_COS, ON_EDGE, Gradient
 from torchpose.geometry import conics
 from torchpose.geometry.rows import Rows
+from torchpose.geometry.sectors import MOST
 from torchpose.geometry.segments import marked, members, near_pairs, positions, segment_sum
 
-WHOLE = 0.9  # cover from which on an ellipse is seen whole
-SAME = 0.08  # of the semi-minor axis, plus a pixel: ellipses nearer than that are one
-LEAST_COVER = 0.58  # a circle in a square is covered by 0.5
-_NEAR = 1.5  # cells between an edge and the ellipse that explains it
-_COS = 0.8  # of the edge's gradient with the normal of that ellipse: 37 degrees
+WHOLE = 0.9  # cover from which on an ellipse is seen whole: a tenth may be lost to noise (convention)
+# of the semi-minor axis, plus a pixel: ellipses nearer than that are one (convention; with 0.1 the same rings are
+# found)
+SAME = 0.08
 _ROUNDS = 4
-_COVER_ERROR = 0.125  # 22.5 degrees in units of pi: a sample with a smaller error belongs to the arc
+# 22.5 degrees in units of pi: a sample with a smaller error is on the arc, in noise one of eight (convention)
+_COVER_ERROR = 0.125
 
 
 class Verdict(IntEnum):
@@ -163,7 +164,7 @@ def score(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> 
     samples = sample_edges(grad, frame, ellipses, polarity)
     nfa, cover = false_alarms(grad, samples.error, samples.of, ellipses.shape[0])
     verdict = torch.where(nfa < 0, int(Verdict.ACCEPTED), int(Verdict.FALSE_ALARM))
-    verdict = torch.where((nfa < 0) & (cover < LEAST_COVER), int(Verdict.FRAGMENT), verdict)
+    verdict = torch.where((nfa < 0) & (cover < MOST), int(Verdict.FRAGMENT), verdict)
     return Candidates(frame, ellipses, polarity, nfa, cover, verdict)
 
 
@@ -244,13 +245,13 @@ def explain_once(grad: Gradient, found: Candidates, known: Candidates | None = N
     for _ in range(_ROUNDS):
         free = ~marked(sample[kept[other]], len(samples))
         nfa, cover = false_alarms(grad, samples.error[free], samples.of[free], part.numel())
-        kept[part] = (nfa < 0) & (cover >= LEAST_COVER)
+        kept[part] = (nfa < 0) & (cover >= MOST)
     return replace(found, verdict=torch.where(kept[: len(found)], found.verdict, int(Verdict.EXPLAINED)))
 
 
 def _overlapping(some: Candidates, others: Candidates) -> tuple[Tensor, Tensor]:
     """Pairs (i, j) of the same frame whose circumscribed circles overlap, or nearly: a few others are among them."""
-    a, b = some.ellipse[:, 2] + _NEAR, others.ellipse[:, 2] + _NEAR
+    a, b = some.ellipse[:, 2] + ON_EDGE, others.ellipse[:, 2] + ON_EDGE
     frames = some.frame, others.frame
     # the centres are nearer than twice the larger of both
     i, j = near_pairs(some.ellipse[:, :2], others.ellipse[:, :2], 2 * a, frames)
@@ -266,7 +267,7 @@ def _explained(samples: Samples, weak: Candidates, every: Candidates) -> tuple[T
     i, j = _overlapping(weak, every[best])
     j = best[j]
     apart = torch.linalg.vector_norm(weak.ellipse[i, :2] - every.ellipse[j, :2], dim=-1)
-    meet = (every.log10_nfa[j] < weak.log10_nfa[i]) & (apart < weak.ellipse[i, 2] + every.ellipse[j, 2] + _NEAR)
+    meet = (every.log10_nfa[j] < weak.log10_nfa[i]) & (apart < weak.ellipse[i, 2] + every.ellipse[j, 2] + ON_EDGE)
     i, j = i[meet], j[meet]
     pair, sample = members(torch.bincount(samples.of, minlength=len(weak)), i)
     other = j[pair]
@@ -274,5 +275,5 @@ def _explained(samples: Samples, weak: Candidates, every: Candidates) -> tuple[T
     off, nx, ny = conics.signed_distance(conic, *samples.xy[sample].unbind(-1))
     gradient = samples.gradient[sample]
     rise = (gradient[:, 0] * nx + gradient[:, 1] * ny) * every.polarity[other]
-    on = (off.abs() < _NEAR) & (rise > _COS * torch.linalg.vector_norm(gradient, dim=-1))
+    on = (off.abs() < ON_EDGE) & (rise > AGREE_COS * torch.linalg.vector_norm(gradient, dim=-1))
     return sample[on], other[on]

@@ -28,6 +28,9 @@ from torchpose.geometry.rows import Rows, shared
 
 Kind = Literal["gauss", "line", "disc"]
 BLUR = 3  # numbers of a blur
+# of a radius of curvature: blurs up to there, and pixels no nearer to the centre, see one edge and not all sides of it
+# (convention; what the second order leaves: tests/geometry/test_blur.py)
+HOLDS = 0.4
 LEAST, MOST = 0.3, 12.0  # px, standard deviations: a pixel alone has 0.289; beyond the widest band nothing is left
 _NODES_A_SIGMA = 1.1  # Gauss-Legendre nodes a half length in narrow Gaussians: an edge to 1e-3
 _MOST_NODES = 40

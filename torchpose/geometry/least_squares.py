@@ -23,10 +23,13 @@ from torchpose.geometry.segments import segment_sum
 
 _RIDGE = 1e-12  # of a unit diagonal
 _LEAST_DIAGONAL = 1e-30  # of unknowns that nothing tells of
-_LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e12  # beyond the latter rounding decides: nowhere lower
-_PROMISED = 1e-12  # chi-squared: a step that promises less is none
-_LEAST_DIRECTION = 1e-9  # of the largest variance of correlations: less is rounding of what a file holds
-_MOST_INFLATION = 1e10  # of a parameter's variance by the others' freedom, beyond which it counts as open
+# beyond the latter rounding decides: nowhere lower (derived: float64 has 16 digits)
+_LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e12
+_PROMISED = 1e-12  # chi-squared: a step that promises less is none (convention: far below any digit that counts)
+# of a parameter's variance by the others' freedom, beyond which it counts as open (derived: the inverse has lost ten of
+# 16 digits)
+_MOST_INFLATION = 1e10
+_LEAST_DIRECTION = 1e-9  # of the largest variance of correlations: less is rounding of what a file holds (convention)
 
 
 class Code(IntEnum):

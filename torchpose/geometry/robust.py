@@ -6,9 +6,10 @@ from torch import Tensor
 
 Value = TypeVar("Value", float, Tensor)
 
-CUT = 4.0  # standard deviations, beyond which a value is no noise: of a ring's thousand pixels noise loses 0.06
-LEAST_KEPT = 0.5  # of the pixels of a ring that must follow its model: with less, what is left may be something else
-RATIO_RANGE = (0.12, 0.93)  # of inner to outer radius: beyond, a plain disc or its rim
+CUT = 4.0  # deviations, beyond which a value is no noise: of a ring's thousand pixels noise loses 0.06 (derived)
+# of the pixels of a ring that must follow its model: with less, what is left may be something else (convention)
+LEAST_KEPT = 0.5
+RATIO_RANGE = (0.12, 0.93)  # of inner to outer radius: beyond, a plain disc or its rim (convention)
 
 
 def of_chance(number: Value) -> Value:

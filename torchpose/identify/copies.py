@@ -7,8 +7,8 @@ from torch import Tensor
 
 from torchpose.geometry.segments import marked, pairs_in_group, segment_sum
 
-MIN_MARKERS = 3  # seen, that a pose needs
-_EQUAL = 1e-6  # difference of scores that rounding may make
+MIN_MARKERS = 3  # seen, that a pose needs (derived: six unknowns)
+_EQUAL = 1e-6  # difference of scores that rounding may make (convention)
 
 
 class Claims(NamedTuple):

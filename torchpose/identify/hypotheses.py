@@ -17,12 +17,18 @@ from torchpose.identify.nearby import Nearby
 from torchpose.identify.scene import MarkerTable
 
 # px, of the ring's semi-major axis, of the distance to the ring the pose comes from
-_PLACE_TOLERANCE = (2.0, 0.3, 0.05)
+# px, of the ring's semi-major axis, of the distance to the ring the pose comes from (convention;
+# `scripts/clutter_statistics.py`)
+PLACE_TOLERANCE = (2.0, 0.3, 0.05)
+# ratio of a ring's semi-major axis to the predicted one: what a rough pose leaves open (convention)
 SIZE_TOLERANCE = 1.25
-_PARTNERS = 4  # of a ring, plane and marker, the nearest to their places: one is right, the others are neighbours'
+# of a ring, plane and marker, the nearest: one is right, the others are neighbours' (convention: decisions/0058)
+_PARTNERS = 4
 _STEEPEST = 0.1  # of a plane's depth: how near to the camera a circle in it is taken to reach at most
 _NEAREST = 1e-3  # mm: what lies behind the camera gets a box that holds nothing of the right place
-SAME_PLACE = 2.0  # times the tolerance of a place: two poses that put a marker so near to one ring are of one copy
+# times the tolerance of a place: two poses that put a marker so near to one ring are of one copy (derived: each may be
+# off by one)
+SAME_PLACE = 2.0
 
 
 class Hypotheses(NamedTuple):
@@ -104,7 +110,7 @@ def _pairs(
     lean = (1 - normal[:, 2].square()).clamp_min(0).sqrt()
     least = torch.maximum(depth - flat * lean, _STEEPEST * depth)
     scale = matrix[0, 0] * torch.linalg.vector_norm(middle, dim=-1) / depth / least
-    px, of_size, of_way = _PLACE_TOLERANCE
+    px, of_size, of_way = PLACE_TOLERANCE
     reach = px + scale * ((1 + of_way) * flat + of_size * SIZE_TOLERANCE * radius)
     center = (middle @ matrix.T)[:, :2] / depth[:, None]
     query, b = near.within(one.row[a] * table.ids.shape[1] + marker, center, reach)
@@ -124,7 +130,7 @@ def _support(
     x, start = x[pose, marker], one.ellipse[origin[pose], :2]
     uv = (x @ matrix.T)[:, :2] / x[:, 2:]
     most = matrix[0, 0] * table.radii[target[pose], marker, 0] * torch.linalg.vector_norm(x, dim=-1) / x[:, 2].square()
-    px, of_size, of_way = _PLACE_TOLERANCE
+    px, of_size, of_way = PLACE_TOLERANCE
     way = torch.linalg.vector_norm(uv - start, dim=-1)
     reach = SAME_PLACE * (px + of_size * SIZE_TOLERANCE * most + of_way * way) / (1 - SAME_PLACE * of_way)
     query, member = near.within(one.row[origin[pose]] * table.ids.shape[1] + marker, uv, reach)
@@ -145,7 +151,7 @@ def _miss(x: Tensor, radius: Tensor, seen: Tensor, away: Tensor, matrix: Tensor)
         matrix: of the camera.
     """
     uv = (x @ matrix.T)[:, :2] / x[:, 2:]
-    px, of_size, of_way = _PLACE_TOLERANCE
+    px, of_size, of_way = PLACE_TOLERANCE
     miss = torch.linalg.vector_norm(uv - seen[:, :2], dim=-1) / (px + of_size * seen[:, 2] + of_way * away)
     # semi-major axes: that of a circle on the optical axis, and the most that the view off axis makes of it
     least = matrix[0, 0] * radius / x[:, 2]

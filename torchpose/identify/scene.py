@@ -11,9 +11,8 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.geometry.least_squares import covariance_factor
 from torchpose.geometry.rows import Rows
-from torchpose.target import Target
+from torchpose.target import MIN_RATIO_GAP, Target
 
-_SAME_CODE = 1e-3  # of the ratio of radii: what differs by less is one code
 MOST_GAIN = 3.0  # deviations of the edge gain that a file states, up to which codes are read (a convention)
 # mm, of prints of which nothing is said: laser printers and copiers spread ink by 60 to 100 um
 _OFFICE_GAIN = 0.1
@@ -95,7 +94,7 @@ def _half_gap(radii: Tensor) -> Tensor:
     """Half of the least difference between two ratios of radii (M, 2); inf where there is one."""
     ratio = radii[:, 1] / radii[:, 0]
     apart = (ratio[:, None] - ratio).abs()
-    return 0.5 * torch.where(apart > _SAME_CODE, apart, torch.inf).amin()
+    return 0.5 * torch.where(apart > 0.5 * MIN_RATIO_GAP, apart, torch.inf).amin()
 
 
 def _by_print(targets: Sequence[Target]) -> Tensor:

@@ -14,12 +14,11 @@ from torchpose.camera import Camera
 from torchpose.detect import Candidates, Verdict
 from torchpose.geometry import conics
 from torchpose.identify.assignments import Codes, Marks
+from torchpose.identify.copies import MIN_MARKERS
+from torchpose.identify.hypotheses import PLACE_TOLERANCE
 from torchpose.identify.markers import Identified
 from torchpose.identify.scene import MarkerTable, Scene
 from torchpose.rings import Rings, mapped, measure_predicted
-
-_LEAST_FOUND = 2  # markers whose rings give a pose
-_PLACE_TOLERANCE = (1.5, 0.15)  # px, and of the semi-major axis
 
 
 def look_again(
@@ -37,7 +36,7 @@ def look_again(
         correct: as for `rings.measure_rings`.
     """
     markers, camera = scene.table[scene.target], scene.camera
-    wanted = markers.valid & ~seen & (seen.sum(-1) >= _LEAST_FOUND)[:, None]
+    wanted = markers.valid & ~seen & (seen.sum(-1) >= MIN_MARKERS - 1)[:, None]
     row, option, marker = (wanted[:, None] & R.isfinite().all(-1).all(-1)[..., None]).nonzero().unbind(-1)
     if row.numel() == 0:
         return rings, identified
@@ -58,8 +57,8 @@ def look_again(
     clipping = _clipping(rings, identified.ring, scene)[row]
     codes = Codes.of(found, Marks.of(scene.table, scene.target[row], marker))
     off = codes.under(torch.where(found.clipped, clipping, identified.gain[row]))
-    px, of_size = _PLACE_TOLERANCE
-    good = (miss < px + of_size * measured[:, 2]) & (off < 1)
+    px, of_size, _ = PLACE_TOLERANCE  # half of it: a pose is known, not guessed
+    good = (miss < 0.5 * (px + of_size * measured[:, 2])) & (off < 1)
     # of several poses of a row, the one that was nearest
     slot = row * identified.ring.shape[1] + marker
     nearest = torch.full((identified.ring.numel(),), torch.inf, dtype=miss.dtype, device=miss.device)

@@ -4,7 +4,7 @@ from torchpose.pose.centers import common_center, compensate, raw_centers
 from torchpose.pose.copies import best_copies
 from torchpose.pose.covariance import pose_covariance
 from torchpose.pose.doubt import crossed_out
-from torchpose.pose.evidence import Evidence, center_rms, gather_evidence, shape_chi2
+from torchpose.pose.evidence import CENTER_RMS, SHAPE_FLOOR, Evidence, center_rms, gather_evidence, shape_chi2
 from torchpose.pose.outcome import Found, outcome
 from torchpose.pose.solutions import AMBIGUOUS_CHI2, Solutions
 from torchpose.pose.solve import solve_poses
@@ -12,6 +12,8 @@ from torchpose.pose.systematic import MarkerNormals, OnPrint, Setting, center_no
 
 __all__ = [
     "AMBIGUOUS_CHI2",
+    "CENTER_RMS",
+    "SHAPE_FLOOR",
     "Evidence",
     "Found",
     "MarkerNormals",

@@ -8,7 +8,7 @@ from torchpose.geometry.segments import marked
 from torchpose.identify import MarkerTable
 from torchpose.rings import Rings
 
-_OVERLAP, _CONCENTRIC = 0.3, 0.4  # of the semi-major axis: two rings so far across each other are not both there
+_ACROSS = 0.3  # of the semi-major axis: rings so far across each other are not both there (convention)
 
 
 def crossed_out(
@@ -40,5 +40,5 @@ def crossed_out(
     outer = rings.outer.params[ring]
     apart = torch.linalg.vector_norm(at[row, marker] - outer[:, :2], dim=-1)
     reach = torch.minimum(size[row, marker], outer[:, 2])
-    across = (apart < outer[:, 3] + _OVERLAP * reach) & (apart > _CONCENTRIC * reach) & (x[row, marker, 2] > 0)
+    across = (apart < outer[:, 3] + _ACROSS * reach) & (apart > _ACROSS * reach) & (x[row, marker, 2] > 0)
     return marked(row[across], len(frame))

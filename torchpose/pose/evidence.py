@@ -20,7 +20,8 @@ from torchpose.rings import Rings
 
 # px, and times the curvature a / b^2 and the blur's variance, of a px at least: what blur and mask do to an ellipse's
 # shape. Blur alone draws an edge inwards by half of the product, more where it is wider.
-_SHAPE_FLOOR = (0.03, 0.5)
+SHAPE_FLOOR = (0.03, 0.5)
+CENTER_RMS = 0.3  # px, of centres: small errors of calibration or print are no mix-up (convention)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +156,7 @@ def misfit_of_shapes(evidence: Evidence, predicted: Tensor) -> Tensor:
     v = torch.stack([change[..., 0, 0] - change[..., 1, 1], 2 * change[..., 0, 1]], -1)
     pick = torch.tensor([[0, 0, 1, 0, -1], [0, 0, 0, 2, 0]], dtype=v.dtype, device=v.device)
     bend = evidence.shape[..., 2] / evidence.shape[..., 3].square()
-    floor = _SHAPE_FLOOR[0] + _SHAPE_FLOOR[1] * bend * evidence.blur[..., None].clamp_min(1.0)
+    floor = SHAPE_FLOOR[0] + SHAPE_FLOOR[1] * bend * evidence.blur[..., None].clamp_min(1.0)
     eye = torch.eye(2, dtype=v.dtype, device=v.device)
     covariance = pick @ evidence.shape_covariance @ pick.T + floor.square()[..., None, None] * eye
     seen = evidence.mask[..., None, None, None]

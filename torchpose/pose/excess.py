@@ -26,7 +26,7 @@ CAMERA = 4  # numbers of a camera that may be off: focal length, principal point
 # px at the corner of the frame, of a camera file that is a mistake beyond; of variances, as a factor
 _PRINT, _CAMERA, _SCALE = (1e-4, 0.15), (1e-3, 3.0), (1.0, 1e3)
 _GRID = 16  # values of each, logarithmic: the closest are a factor of 1.5 apart, which a few residuals do not tell
-_LEAST_MODE = 1e-9  # of the best known direction of the residuals: less is rounding
+_LEAST_MODE = 1e-9  # of the best known direction of the residuals: less is rounding (convention)
 
 
 @dataclass(frozen=True, eq=False)

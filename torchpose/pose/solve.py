@@ -10,17 +10,15 @@ import torch
 from torch import Tensor
 
 from torchpose import pnp
+from torchpose.geometry.robust import CUT
 from torchpose.pose.covariance import pose_covariance
-from torchpose.pose.evidence import Evidence, misfit_of_shapes, predicted_circles, visible
+from torchpose.pose.evidence import CENTER_RMS, Evidence, misfit_of_shapes, predicted_circles, visible
 from torchpose.pose.sizes import code_shift
 from torchpose.pose.solutions import AMBIGUOUS_CHI2, Solutions
 from torchpose.results import Reason, Status
 
-_SHAPE_LIMIT = 16.0  # mean chi-squared a shape component above which the rings contradict the pose
-_CENTER_LIMIT = (30.0, 10.0)  # chi-squared, and per degree of freedom, above which the centres contradict each other
-_ITERATIONS = (16, 60)  # of the solver: for most rows, and for those that need more
-_CODE_SHIFT = 0.5  # of the way to the next code, from which on the markers may as well be their neighbours in code
-_CENTER_RMS = 0.3  # px, below which they do not: small errors of calibration or print are no mix-up
+_CODE_SHIFT = 0.5  # derived: of the way to the next code; beyond, the markers may as well be their neighbours in code
+_ITERATIONS = 60  # of the solver, at most: rows that have converged rest
 
 
 def solve_poses(evidence: Evidence, rough: tuple[Tensor, Tensor], *, compile: bool = False) -> Solutions:
@@ -36,17 +34,12 @@ def solve_poses(evidence: Evidence, rough: tuple[Tensor, Tensor], *, compile: bo
     """
     if len(evidence) == 0:
         return _no_solutions(evidence, *rough)
-    solved = _solve(evidence, rough, _ITERATIONS[0], compile)
-    slow = (solved.reason == Reason.NOT_CONVERGED).nonzero()[:, 0]
-    if slow.numel():
-        solved = solved.replaced(
-            slow, _solve(evidence[slow], (rough[0][slow], rough[1][slow]), _ITERATIONS[1], compile)
-        )
+    solved = _solve(evidence, rough, compile)
     bad = (solved.status == Status.REJECTED) & (evidence.mask.sum(-1) >= 4)
     row, marker = (bad[:, None] & evidence.mask).nonzero().unbind(-1)
     if row.numel() == 0:
         return solved
-    retry = _solve(evidence[row].without(marker), (rough[0][row], rough[1][row]), _ITERATIONS[1], compile)
+    retry = _solve(evidence[row].without(marker), (rough[0][row], rough[1][row]), compile)
     # of the subsets that fit, the one with the least chi-squared
     cost = torch.where(retry.status == Status.REJECTED, torch.inf, retry.chi2.nan_to_num(nan=torch.inf))
     least = torch.full(bad.shape, torch.inf, dtype=cost.dtype, device=cost.device).scatter_reduce(0, row, cost, "amin")
@@ -54,7 +47,7 @@ def solve_poses(evidence: Evidence, rough: tuple[Tensor, Tensor], *, compile: bo
     return solved.replaced(row[winner], retry[winner])
 
 
-def _solve(evidence: Evidence, rough: tuple[Tensor, Tensor], iterations: int, compile: bool) -> Solutions:
+def _solve(evidence: Evidence, rough: tuple[Tensor, Tensor], compile: bool) -> Solutions:
     result = pnp.solve(
         evidence.points,
         torch.where(evidence.mask[..., None], evidence.center, 0.0),
@@ -62,7 +55,7 @@ def _solve(evidence: Evidence, rough: tuple[Tensor, Tensor], iterations: int, co
         covariances=visible(evidence.covariance + evidence.placed, evidence.mask),
         mask=evidence.mask,
         initial=_starts(evidence, rough),
-        max_iterations=iterations,
+        max_iterations=_ITERATIONS,
         compile=compile,
     )
     # both minima of the centres, weighed again with the rings' shapes
@@ -77,12 +70,13 @@ def _solve(evidence: Evidence, rough: tuple[Tensor, Tensor], iterations: int, co
     covariance, determined = pose_covariance(evidence, R[:, 0], t[:, 0])
     chi2_alt = torch.where(chi2[:, 1].isfinite(), chi2[:, 1], torch.nan)
     seen = evidence.mask.sum(-1)
-    contradicts = (of_centers[:, 0] > _CENTER_LIMIT[0] + _CENTER_LIMIT[1] * (2 * seen - 6)) & (rms[:, 0] > _CENTER_RMS)
+    freedom = (2 * seen - 6).clamp_min(1)
+    contradicts = (of_centers[:, 0] > CUT**2 * freedom) & (rms[:, 0] > CENTER_RMS)
     solvable = chi2[:, 0].isfinite()
     reason = torch.full_like(seen, Reason.NONE)
     for condition, why in (
         (chi2_alt - chi2[:, 0] < AMBIGUOUS_CHI2, Reason.TWO_SOLUTIONS),
-        (of_shapes[:, 0] > 4 * _SHAPE_LIMIT * seen, Reason.RING_SHAPE),
+        (of_shapes[:, 0] > CUT**2 * 4 * seen, Reason.RING_SHAPE),
         (contradicts | (shift > _CODE_SHIFT), Reason.RESIDUAL),
         (~solvable, Reason.NOT_CONVERGED),
         (result.code == pnp.PnPCode.BEHIND_CAMERA, Reason.BEHIND_CAMERA),

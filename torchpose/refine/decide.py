@@ -11,16 +11,15 @@ import torch
 from torch import Tensor
 
 from torchpose.geometry import rotations
-from torchpose.pose import AMBIGUOUS_CHI2, Evidence, Solutions, center_rms, pose_covariance, shape_chi2
+from torchpose.geometry.robust import of_chance
+from torchpose.pose import AMBIGUOUS_CHI2, SHAPE_FLOOR, Evidence, Solutions, center_rms, pose_covariance, shape_chi2
 from torchpose.refine.centers import refine_centers
 from torchpose.refine.photometric.fit import refine_photometric
 from torchpose.refine.photometric.grey_chi2 import grey_chi2
 from torchpose.refine.sight import LEAST_KEPT, Refined, Sight
 from torchpose.results import Reason, Status
 
-_FLOOR = 0.03  # px, of a centre: what blur, covers and clutter do to it beyond its covariance
-_CLOSE = 200.0  # difference of chi-squared that small blurred rings were seen to be wrong by 37 of
-_MOST_CHI2 = 5.0  # per degree of freedom, above which the better pose does not explain the centres itself
+_CLOSE = 200.0  # difference of chi-squared: small blurred rings were seen to be wrong by 37 (convention)
 
 
 def decide(solutions: Solutions, evidence: Evidence, sight: Sight | None = None) -> Solutions:
@@ -36,7 +35,7 @@ def decide(solutions: Solutions, evidence: Evidence, sight: Sight | None = None)
         return solutions
     open_ones = solutions[row]
     some = replace(evidence[row], mask=open_ones.mask)
-    floor = torch.diag(torch.tensor([_FLOOR**2] * 2 + [0.0] * 3, dtype=some.shape.dtype, device=row.device))
+    floor = torch.diag(torch.tensor([SHAPE_FLOOR[0] ** 2] * 2 + [0.0] * 3, dtype=some.shape.dtype, device=row.device))
     placed = torch.nn.functional.pad(some.placed, (0, 3, 0, 3))[:, :, None]
     wide = replace(some, shape_covariance=some.shape_covariance + placed + floor)
     both = [refine_centers(wide, R, t) for R, t in _both(open_ones)]
@@ -48,7 +47,7 @@ def decide(solutions: Solutions, evidence: Evidence, sight: Sight | None = None)
     at = torch.arange(len(row), device=row.device)[:, None]
     R, t, covariance, of_centers, good = (x[at, best] for x in (R, t, covariance, of_centers, good))
     freedom = 4 * some.mask.sum(-1) - 6
-    explained = good[:, 0] & (of_centers[:, 0] < _MOST_CHI2 * freedom)
+    explained = good[:, 0] & (of_centers[:, 0] < freedom * of_chance(freedom))
     sure = explained & (chi2[:, 1] - chi2[:, 0] > AMBIGUOUS_CHI2)
     rms = [center_rms(some, R[:, k], t[:, k]) for k in range(2)]
     first = {

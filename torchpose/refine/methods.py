@@ -10,6 +10,7 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.geometry.least_squares import Pose
 from torchpose.pose import (
+    CENTER_RMS,
     Evidence,
     OnPrint,
     Setting,
@@ -27,11 +28,13 @@ from torchpose.refine.photometric.fit import refine_photometric
 from torchpose.refine.sight import LEAST_KEPT, Refined, Sight
 from torchpose.results import Reason, Status
 
-_LEAST_KEPT_NEAR = 0.2  # of the pixels, where the pose stays near: of wires over half of every ring 0.27 (`wires 3`)
-_BESIDE = 0.05  # px, by which a marker may sit beside its place before it is looked at there: edges bend little so far
-_ASIDE = 0.02  # px, RMS of the centres, from where on they tell first how far
+# of the pixels, where the pose stays near: of wires over half of every ring 0.27 (measured: `wires 3` of
+# `scripts/corruption_statistics.py`)
+_LEAST_KEPT_NEAR = 0.2
+# px, by which a marker may sit beside its place before it is looked at there: edges bend little so far (convention)
+_BESIDE = 0.05
+_ASIDE = 0.02  # px, RMS of the centres, from where on they tell first how far (convention)
 _ROUNDS = 3  # of fits with markers where the last one found them; the second one ends nearly always
-_NEAR = 0.3  # px, RMS of the centres about a pose that they do not contradict (`pose.solve`)
 
 Step = Callable[[Solutions, Evidence, Sight], Solutions]
 """From solutions of N rows, what was measured of them, and the rows in their frames, to better solutions."""
@@ -123,7 +126,7 @@ def _refined(
     refined = refine(sight, start.R, start.t)
     joint = on_print(refined.normals, Setting(seen, refined.R, refined.t, sight.camera, True), place)
     found = _of_joint(rows, seen, Pose(refined.R, refined.t), joint)
-    near = found.rms < torch.maximum(rows.rms, torch.full_like(rows.rms, _NEAR))
+    near = found.rms < torch.maximum(rows.rms, torch.full_like(rows.rms, CENTER_RMS))
     kept = (refined.kept > LEAST_KEPT) | (near & (refined.kept > _LEAST_KEPT_NEAR))
     return found, joint, refined.good & joint.known & kept, refined.doubt
 

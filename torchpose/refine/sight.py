@@ -40,6 +40,7 @@ class Sight(Rows):
         frames: grey values, any real dtype.
         camera: with distortion.
         reduction: of the frames, by block means: their rounding counts for less.
+        seen: sectors of every ring in which it was seen so far, see `geometry.sectors`; None where nothing is known.
     """
 
     frame: Int[Tensor, " N"]
@@ -53,6 +54,7 @@ class Sight(Rows):
     camera: Camera = shared()
     blur: Float[Tensor, "N M 3"] | None = None
     reduction: int = shared(1)
+    seen: Bool[Tensor, "N M 48"] | None = None
 
     @classmethod
     def of(cls, frames: Tensor, camera: Camera, target: Target, frame: Tensor, rings: Tensor) -> Self:

@@ -11,15 +11,16 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchpose.detect.regions import AGREE_COS
 from torchpose.geometry import conics
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import positions, ragged_arange, segment_mean, values_at
 from torchpose.rings import zernike
 
-REACH = 4  # px searched to either side of the rough ellipse
+# px searched to either side of the rough ellipse: candidates of covered rings err by two (measured: decisions/0057)
+REACH = 4
 _SAMPLES_PER_PIXEL = 1.1  # of perimeter: a chain of edge pixels has at most one pixel a pixel of length
-_NORMAL_COS = 0.85  # of the edge's normal with the ellipse's: 32 degrees
-_LEAST_STEP = 0.35  # of the mean step of the ring
+STEP_RANGE = (0.4, 2.5)  # of one grey step of a ring to another: light may fall off by 2 across it (convention)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,9 +114,9 @@ def ring_edges(frames: Tensor, frame: Tensor, ellipses: Tensor, outward: Tensor,
     )
     offset, step = both(found.offset, second.offset), both(found.step, second.step)
     nx, ny = _normal(ellipses, ring, *points)
-    aligned = (normal[0] * nx + normal[1] * ny) * outward.index_select(0, ring) > _NORMAL_COS
+    aligned = (normal[0] * nx + normal[1] * ny) * outward.index_select(0, ring) > AGREE_COS
     mean_step = segment_mean(step, ring, ellipses.shape[0], aligned.double())
-    good = positions(aligned & (step > _LEAST_STEP * mean_step.index_select(0, ring)))
+    good = positions(aligned & (step > STEP_RANGE[0] * mean_step.index_select(0, ring)))
     order = good[torch.argsort(ring[good], stable=True)]
     (x, y), (nx, ny) = ([c.index_select(0, order) for c in pair] for pair in (points, normal))
     return RingEdges(ring[order], torch.stack([x, y]).mT, torch.stack([nx, ny]).mT, offset[order], step[order])

@@ -9,22 +9,22 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.detect import Candidates
 from torchpose.geometry import blur as blurs
-from torchpose.geometry import conics
+from torchpose.geometry import conics, sectors
 from torchpose.geometry.blurred_edge import MOST
 from torchpose.geometry.grey import full_scale
 from torchpose.geometry.least_squares import solve_scaled
 from torchpose.geometry.robust import RATIO_RANGE
 from torchpose.geometry.rows import Rows
+from torchpose.geometry.sectors import SECTORS
 from torchpose.geometry.segments import values_at
 
-ANGLES = 64
 _RADII = 72
 _INNERMOST, _OUTERMOST = 0.08, 1.12  # of the outer ellipse, the range of the radial profile
-_LEAST_PEAK = 0.25  # of the outer edge's slope in the mean radial profile
-_LEAST_EDGE = 0.5  # of the median rise at the outer edge over all directions, for a direction that counts
+# of the outer edge's slope in the mean radial profile: a blur of the inner circle's size leaves as much (convention)
+_LEAST_PEAK = 0.25
 _EIGHTHS = 8  # parts of the perimeter in which the blur is looked at
-_MOST_CLIPPED = 0.5  # of the directions, at one radius: from there on the median is no measurement (a convention)
-_PARTED = 0.02  # of the semi-minor axis: from which shift of the centres on perspective smears the profile
+# of the semi-minor axis: from which shift of the centres on perspective smears the profile (convention: a sample of it)
+_PARTED = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +35,7 @@ class InnerCircles(Rows):
         ratio: of the radii.
         found: whether there is a circle.
         ellipse: the inner circle, about.
-        seen: the directions, evenly spaced in eccentric anomaly from +u on the circle that the candidate is the image
-            of, in which its own edge shows.
+        seen: the sectors in which its own edge shows, see `geometry.sectors`.
         blur: of the outer edge, px^2, about; see `geometry.blur`.
         clipped: whether most of the paper, or of a light ring, is at the grey value at which the frame is clipped.
     """
@@ -44,7 +43,7 @@ class InnerCircles(Rows):
     ratio: Float[Tensor, " M"]
     found: Bool[Tensor, " M"]
     ellipse: Float[Tensor, "M 5"]
-    seen: Bool[Tensor, "M A"]
+    seen: Bool[Tensor, "M 48"]
     blur: Float[Tensor, "M 3"]
     clipped: Bool[Tensor, " M"]
 
@@ -64,7 +63,7 @@ def find_inner(frames: Tensor, candidates: Candidates, camera: Camera | None = N
     height, width = frames.shape[-2:]
     device = frames.device
     rho = torch.linspace(_INNERMOST, _OUTERMOST, _RADII, dtype=torch.float64, device=device)
-    angle = torch.arange(ANGLES, dtype=torch.float64, device=device) * (2 * torch.pi / ANGLES)
+    angle = sectors.middles(device)
     circle = torch.stack([angle.cos(), angle.sin()])
     own, apart = _planes(candidates, camera)
     outer = candidates.ellipse[own]
@@ -78,7 +77,7 @@ def find_inner(frames: Tensor, candidates: Candidates, camera: Camera | None = N
     # what covers the outer circle on one side hides the inner one there too: only directions that show the outer count
     far = int((at <= RATIO_RANGE[1]).sum())
     edge = ((grey[:, far + 2 :] - grey[:, far:-2]) * polarity[:, None, None].float()).amax(1)
-    seen = edge > _LEAST_EDGE * edge.nanmedian(-1, keepdim=True).values
+    seen = edge > 0.5 * edge.nanmedian(-1, keepdim=True).values
     profile = _mean_profile(grey, seen, frames.is_floating_point())
     rise = (profile[:, 2:] - profile[:, :-2]) * polarity[:, None]
     outermost = rise.masked_fill(at < RATIO_RANGE[1], -torch.inf).amax(-1)
@@ -109,7 +108,7 @@ def _clipped(grey: Tensor, seen: Tensor, frame: Tensor) -> Tensor:
     if some.numel() == 0:
         return torch.zeros_like(brightest, dtype=torch.bool)
     at_limit = (grey[some] >= limit[some, None, None]) & seen[some, None]
-    most = at_limit.sum(-1).amax(1) > _MOST_CLIPPED * seen[some].sum(-1)
+    most = at_limit.sum(-1).amax(1) > 0.5 * seen[some].sum(-1)
     return torch.zeros_like(brightest, dtype=torch.bool).index_copy_(0, some, most)
 
 
@@ -122,7 +121,7 @@ def _edge_blur(grey: Tensor, seen: Tensor, outer: Tensor, ratio: Tensor, at: Ten
     Args:
         grey: (M, R, A). seen: (M, A). outer: (M, 5). ratio: (M,). at: (R - 2,), radii that have a rise.
     """
-    eighth = (-1, _EIGHTHS, ANGLES // _EIGHTHS)
+    eighth = (-1, _EIGHTHS, SECTORS // _EIGHTHS)
     weight = seen.unflatten(1, eighth[1:]).to(grey)
     mean = (grey.nan_to_num(nan=0.0).unflatten(2, eighth[1:]) * weight[:, None]).sum(-1)
     profile = (mean / weight.sum(-1)[:, None]).double()  # NaN where it is not seen
@@ -162,12 +161,3 @@ def _planes(candidates: Candidates, camera: Camera | None) -> tuple[Tensor, Tens
     far &= apart.isfinite().flatten(1).all(-1)
     own = torch.cat([index[~far], index[far].repeat_interleave(2)])
     return own, torch.cat([none[~far], apart[far].flatten(0, 1)])
-
-
-def clear_directions(seen: Tensor) -> Tensor:
-    """Directions (M, A) bool whose neighbours mostly show the outer edge, too, and neither next one hides it.
-
-    Single ones that noise hides stay clear; next to a cover, its own edge may pass for the circle's.
-    """
-    around = torch.stack([seen.roll(k, 1) for k in range(-2, 3)]).sum(0) > 2
-    return around & around.roll(1, 1) & around.roll(-1, 1)

@@ -16,23 +16,25 @@ from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
 from torchpose.geometry.blurred_edge import LEAST, MOST
 from torchpose.geometry.rows import Rows
-from torchpose.geometry.segments import segment_mean, segment_sum
+from torchpose.geometry.sectors import SECTORS, clear_of_ends, sector_about
+from torchpose.geometry.segments import marked, segment_mean, segment_sum
 from torchpose.rings import zernike
-from torchpose.rings.edges import REACH, RingEdges, ring_edges
-from torchpose.rings.inner_circles import ANGLES, InnerCircles, clear_directions, find_inner
+from torchpose.rings.edges import REACH, STEP_RANGE, RingEdges, ring_edges
+from torchpose.rings.inner_circles import InnerCircles, find_inner
 from torchpose.rings.lens import ideal_pixels, mapped
 from torchpose.rings.small_rings import fit_small_rings
 
-_LEAST_COVER = (0.4, 0.33)  # of the perimeter with edge points, outer and inner circle
-_SMALL = 4.0  # px: circles of a smaller semi-minor axis fill the mask of an edge
-_LEAST_SEMI_MINOR = (4.0, 1.2)  # px, outer and inner circle: smaller ones are letters and specks as well as rings
-_LARGE = 20.0  # px, of the outer semi-minor axis, from which on a fit of all pixels costs too much
-_BLURRED = 1.3  # px: a wider blur is out of the reach of an edge's mask; the frame is looked at in half its size
-_SOFT_ALL_AROUND = 1.0  # px, along the minor axis: what is soft along lines alone may be fields of an interlaced frame
-_LEAST_REDUCED = 5.0  # px, outer semi-minor axis in a reduced frame: of a smaller one too few pixels are left
+# of the perimeter with edge points, outer and inner circle: a third covered and noise beside (convention)
+_LEAST_COVER = (0.4, 0.33)
+# px: circles of a smaller semi-minor axis fill the mask of an edge (derived: half of 7 px, and half of one)
+_SMALL = 4.0
+# px, outer and inner circle: smaller ones are letters and specks as well as rings (measured: decisions/0051)
+_LEAST_SEMI_MINOR = (4.0, 1.2)
+_LARGE = 20.0  # px, of the outer semi-minor axis, from which on a fit of all pixels costs too much (convention)
+# px, along the minor axis: what is soft along lines alone may be fields of an interlaced frame (measured:
+# `scripts/corruption_statistics.py --only interlacing`)
+_SOFT_ALL_AROUND = 1.0
 _ROUGH = 0.5  # px, of a candidate's centre and axes
-_EDGE_APART = 0.8  # ... and so do two edges closer than 5 px
-_STEP_RANGE = (0.4, 2.5)  # inner to outer grey step
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +50,7 @@ class Rings(Rows):
         inner: the same.
         blur: of the ring's edges, px^2, see `geometry.blur`.
         clipped: whether the lighter side of the edges is clipped, which moves them all towards the darker side.
+        seen: sectors in which its edges were measured, see `geometry.sectors`.
     """
 
     frame: Int[Tensor, " K"]
@@ -58,6 +61,7 @@ class Rings(Rows):
     inner: EllipseFit
     blur: Float[Tensor, "K 3"]
     clipped: Bool[Tensor, " K"]
+    seen: Bool[Tensor, "K 48"]
 
     @property
     def ratio(self) -> Tensor:
@@ -97,7 +101,7 @@ def find_circles(frames: Tensor, candidates: Candidates, camera: Camera) -> Circ
     """Those of the candidates that have a circle inside; arguments as for `measure_rings`."""
     if len(candidates) == 0:  # frames without any cost nothing here
         none, found = candidates.ellipse, candidates.frame > 0
-        seen = found.new_empty(0, ANGLES)
+        seen = found.new_empty(0, SECTORS)
         return Circles(candidates, InnerCircles(candidates.polarity, found, none, seen, none[:, :3], found))
     inside = find_inner(frames, candidates, camera)
     return Circles(candidates, inside)[inside.found]
@@ -114,8 +118,9 @@ def rough_rings(circles: Circles, camera: Camera) -> Rings:
     def fit(ellipses: Tensor) -> EllipseFit:
         return EllipseFit(mapped(ellipses, lambda points: ideal_pixels(camera, points)), covariance, _ROUGH * one, one)
 
-    blur, clipped = circles.inside.blur, circles.inside.clipped
-    return Rings(circles.outer.frame, circles.outer.polarity, outer, inner, fit(outer), fit(inner), blur, clipped)
+    inside = circles.inside
+    known = (inside.blur, inside.clipped, inside.seen)
+    return Rings(circles.outer.frame, circles.outer.polarity, outer, inner, fit(outer), fit(inner), *known)
 
 
 def measure_circles(
@@ -131,7 +136,8 @@ def _no_rings(candidates: Candidates) -> Rings:
     """Of no candidates."""
     frame, polarity, none = candidates.frame, candidates.polarity, candidates.ellipse
     fit = EllipseFit(none, none.new_empty(0, 5, 5), polarity, polarity)
-    return Rings(frame, polarity, none, none, fit, fit, none[:, :3], frame > 0)
+    seen = (frame > 0)[:, None].expand(-1, SECTORS)
+    return Rings(frame, polarity, none, none, fit, fit, none[:, :3], frame > 0, seen)
 
 
 def measure_predicted(
@@ -155,8 +161,9 @@ def _measured(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
     A mask or a band of a fixed size sees little of an edge that is wider; in a frame of half the size it is not.
     """
     candidates, inside = circles.outer, circles.inside
-    by_blur = reduction_for(blurs.axes(inside.blur)[1].sqrt(), _BLURRED)
-    factor = by_blur.minimum(reduction_for(candidates.ellipse[:, 3], 2 * _LEAST_REDUCED))
+    by_blur = reduction_for(blurs.axes(inside.blur)[1].sqrt(), zernike.WIDEST)
+    # a ring keeps a pixel more than the least has
+    factor = by_blur.minimum(reduction_for(candidates.ellipse[:, 3], 2 * (_LEAST_SEMI_MINOR[0] + 1)))
     rings, which = [], []
     for value in factor.unique().tolist():
         index = (factor == value).nonzero()[:, 0]
@@ -196,16 +203,17 @@ def _measure(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tup
     """Rings of circles in the frames as they are, and whose they are."""
     outer, inner = circles.outer.ellipse, circles.inside.ellipse
     ratio = (inner[:, 2:4].prod(-1) / outer[:, 2:4].prod(-1)).sqrt()
-    inside = replace(circles.inside, ratio=ratio, seen=clear_directions(circles.inside.seen))
+    inside = replace(circles.inside, ratio=ratio, seen=clear_of_ends(circles.inside.seen))
     circles = replace(circles, inside=inside)
-    narrow = torch.minimum((1 - ratio) * _EDGE_APART, ratio) * outer[:, 3] < _SMALL
+    # ... and so do two edges with less than a pixel beside it
+    narrow = torch.minimum((1 - ratio) * outer[:, 3] - 1, ratio * outer[:, 3]) < _SMALL
     small = narrow & (outer[:, 3] < _LARGE)
     parts, index = [], (~small).nonzero()[:, 0]
     if index.numel():
         rings, of = _by_edges(frames, circles[index], camera, how)
         # a narrow ring may hide its blur from its profile, not from its edges
         least, most = blurs.axes(rings.blur)
-        wide = (least > _SOFT_ALL_AROUND**2) & (most > _BLURRED**2) & (outer[index[of], 3] < _LARGE)
+        wide = (least > _SOFT_ALL_AROUND**2) & (most > zernike.WIDEST**2) & (outer[index[of], 3] < _LARGE)
         parts.append((rings[~wide], index[of[~wide]]))
         small = small.index_fill(0, index[of[wide]], True)
     index = small.nonzero()[:, 0]
@@ -227,7 +235,9 @@ def _by_edges(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
     reach = torch.cat([gap, gap]).clamp(1.0, REACH)
     outward = torch.cat([candidates.polarity, -candidates.polarity])
     edges = ring_edges(frames, frame, rough, outward, reach)
-    edges = edges[clear.repeat(2, 1)[edges.ring, _direction(edges, rough)]]
+    sector = sector_about(*edges.points.unbind(-1), rough, edges.ring)
+    shown = clear.repeat(2, 1)[edges.ring, sector]
+    edges, sector = edges[shown], sector[shown]
 
     raw, keep = ellipse.fit_robust(edges.points, edges.ring, 2 * count, start=rough)
     distance = edges.offset - ellipse.distance(edges.points, edges.ring, raw) * outward[edges.ring]
@@ -255,8 +265,8 @@ def _by_edges(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
         & near.view(2, count).all(0)
         & (cover[:count] > _LEAST_COVER[0])
         & (cover[count:] > _LEAST_COVER[1])
-        & (step_ratio > _STEP_RANGE[0])
-        & (step_ratio < _STEP_RANGE[1])
+        & (step_ratio > STEP_RANGE[0])
+        & (step_ratio < STEP_RANGE[1])
         & (offset < 0.25 * raw[:count, 3])  # concentric but for perspective
         & (raw[count:, 2] < raw[:count, 2])
     )
@@ -264,18 +274,9 @@ def _by_edges(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
     second = index + count
     blur = blurs.limited(blur - blurs.pixel(blur), LEAST**2, MOST**2)[index]  # less that of the mask
     frame, polarity = candidates.frame[index], candidates.polarity[index]
-    return Rings(frame, polarity, raw[index], raw[second], fit[index], fit[second], blur, inside.clipped[index]), index
-
-
-def _direction(edges: RingEdges, ellipses: Tensor) -> Tensor:
-    """Number (E,) of each edge point's direction, see `inner_circles.find_inner`."""
-    inverse = torch.linalg.inv(conics.shape_matrix(ellipses)).flatten(1)
-    each = (*inverse[:, [0, 1, 3]].unbind(-1), *ellipses[:, :2].unbind(-1))
-    i11, i12, i22, cx, cy = (v.contiguous().index_select(0, edges.ring) for v in each)
-    u, v = edges.points.unbind(-1)
-    dx, dy = u - cx, v - cy
-    turn = torch.atan2(i12 * dx + i22 * dy, i11 * dx + i12 * dy)
-    return (turn * (ANGLES / (2 * torch.pi))).round().long() % ANGLES
+    follows = marked((edges.ring * SECTORS + sector)[keep], 2 * count * SECTORS).view(2, count, SECTORS)[0, index]
+    known = (blur, inside.clipped[index], clear[index] & follows)
+    return Rings(frame, polarity, raw[index], raw[second], fit[index], fit[second], *known), index
 
 
 def _as_a_whole(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tuple[Rings, Tensor]:
@@ -300,6 +301,7 @@ def _as_a_whole(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> 
         replace(inner, params=mapped(inner.params, to_ideal)),
         found.blur[index],
         circles.inside.clipped[index],
+        found.seen[index],
     )
     return rings, index
 

@@ -10,11 +10,10 @@ import torch
 from torch import Tensor
 
 from torchpose.geometry import blur as blurs
-from torchpose.geometry.blurred_edge import Spread
+from torchpose.geometry.blurred_edge import HOLDS, Spread
 from torchpose.geometry.blurred_ellipse import blurred_ellipse, nodes_needed
 
 RING = 8  # parameters
-_DEEPEST = 0.4  # of a radius of curvature: nearer to the centre a pixel sees the edge on all sides
 MOST_NODES = 120  # of the exact integral: enough for a semi-major axis of 19 blurs
 
 
@@ -55,7 +54,7 @@ def depth(theta: Tensor, x: Tensor, y: Tensor, inner: bool = False) -> Depth:
     scale = theta[:, 5:6] if inner else 1.0
     distance = (rho - scale) / length
     curvature = 1 / (length.pow(3) * det.square()[:, None] * scale).clamp_min(1e-9)
-    curvature = curvature / (1 + curvature * distance).clamp_min(_DEEPEST)
+    curvature = curvature / (1 + curvature * distance).clamp_min(HOLDS)
     return Depth(distance, gx / length, gy / length, u, v, length, curvature)
 
 

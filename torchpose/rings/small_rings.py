@@ -40,25 +40,26 @@ from torchpose.geometry.least_squares import (
 )
 from torchpose.geometry.robust import CUT, LEAST_KEPT, RATIO_RANGE, of_chance
 from torchpose.geometry.rows import Rows
+from torchpose.geometry.sectors import SECTORS, sector_of
 from torchpose.geometry.segments import values_at
 from torchpose.rings.inner_circles import InnerCircles
 from torchpose.rings.small_ring_model import MOST_NODES, RING, depth, exact, first_order, outer_ellipses
 
 _MARGIN = 3.0  # px around the outer ellipse
 _SOFT = 2.5  # standard deviations, scale of the soft weights
-_SECTORS = 16
 _MISFIT = 0.05  # of the contrast, RMS in a sector: the most that a box for a Gaussian leaves
 _ACROSS = 4.0  # px across an edge, two blurs on either side, that share its misfit: all of them tell as much as one
 _MOST_MOVE = (*[0.7] * 5, 0.1, *[0.7] * 2)  # of an iteration: px, and the ratio
 _START_SIGMA = 0.8  # px, at least
 _OVAL = 0.3  # of a blur's mean variance: what is expected of its lean, which a ring as small as its blur hardly tells
-_BLURRED = 0.33  # blur over inner semi-minor axis above which edges are no edges any more
+# blur over inner semi-minor axis above which edges are no edges any more (measured: decisions/0053 and docs/tried.md)
+_BLURRED = 0.33
 _BLURRED_MARGIN = 2.5  # blurs around the outer ellipse
-_LEAST_EXPLAINED = 0.75  # of the variance of grey around the ring
-_PROMISING = 0.5  # of it, from the first fit, for a second one
+# of the variance of grey around the ring: noise of half of the contrast's deviation remains (convention)
+_LEAST_EXPLAINED = 0.75
 _PART = 400_000  # pixels times nodes at a time
 _UNEVEN = 2.0  # most pixels of a window over the least, of those that are padded to one size
-_RATIO_SIGMA = 0.1  # of the ratio: an inner circle that is not sure is none
+_RATIO_SIGMA = 0.1  # of the ratio: an inner circle that is not sure is none (convention)
 _LEVELS = 4  # paper, its slope 2, contrast
 _LEAST = (*[-math.inf] * 5, 0.05, *[-math.inf] * 2)  # of the ring's parameters, and the most
 _MOST = (*[math.inf] * 5, 0.97, *[math.inf] * 2)
@@ -74,12 +75,14 @@ class SmallRings(Rows):
         inner: the same.
         blur: px^2, see `geometry.blur`.
         good: whether the model explains what is seen.
+        seen: sectors in which it does.
     """
 
     outer: EllipseFit
     inner: EllipseFit
     blur: Float[Tensor, "K 3"]
     good: Bool[Tensor, " K"]
+    seen: Bool[Tensor, "K 48"]
 
 
 class _Stage(NamedTuple):
@@ -162,7 +165,7 @@ class _Start(Rows):
 
     theta: Float[Tensor, "K 8"]
     spread: Spread
-    seen: Bool[Tensor, "K A"]
+    seen: Bool[Tensor, "K 48"]
     parted: Float[Tensor, " K"]
     clipped: Bool[Tensor, " K"]
 
@@ -180,8 +183,8 @@ class _Start(Rows):
 @dataclass(frozen=True, eq=False)
 class _Fit(Rows):
     """K fits: parameters, blur and the covariance of both, contrast, residual variance, number of pixels kept and their
-    share, the share of the grey values' variance that is explained, and whether the window is on the frame and the data
-    determine all parameters."""
+    share, the share of the grey values' variance that is explained, whether the window is on the frame and the data
+    determine all parameters, and the sectors that follow the model."""
 
     theta: Float[Tensor, "K 8"]
     blur: Float[Tensor, "K 3"]
@@ -192,13 +195,14 @@ class _Fit(Rows):
     kept: Float[Tensor, " K"]
     explained: Float[Tensor, " K"]
     sound: Bool[Tensor, " K"]
+    seen: Bool[Tensor, "K 48"]
 
 
 def _no_fit(begun: _Start) -> _Fit:
     """Of rings of which nothing is known yet."""
     none = torch.zeros_like(begun.theta[:, 0])
     covariance = none.new_zeros(len(none), RING + BLUR, RING + BLUR)
-    return _Fit(begun.theta, begun.spread.values, covariance, none, none, none, none, none, none > 0)
+    return _Fit(begun.theta, begun.spread.values, covariance, none, none, none, none, none, none > 0, begun.seen)
 
 
 def _pixels(outer: Tensor, margin: Tensor) -> Tensor:
@@ -224,7 +228,8 @@ def _parts(pixels: Tensor, nodes: int) -> Iterator[Tensor]:
 def _blurred(fit: _Fit, outer: Tensor, polarity: Tensor) -> Tensor:
     """Indices of the fits that may be rings whose blur is wide for their size."""
     blur, inner = blurs.axes(fit.blur)[1].sqrt(), fit.theta[:, 5] * outer[:, 3]
-    promising = fit.sound & (fit.contrast * polarity < 0) & (fit.explained > _PROMISING)
+    # the first fit may leave twice as much
+    promising = fit.sound & (fit.contrast * polarity < 0) & (1 - fit.explained < 2 * (1 - _LEAST_EXPLAINED))
     return (promising & (blur > _BLURRED * inner)).nonzero()[:, 0]
 
 
@@ -257,7 +262,18 @@ def _fitted(window: _Window, begun: _Start, scheme: _Scheme) -> _Fit:
     sound = window.whole & determined & covariance.isfinite().all(-1).all(-1)
     theta, spread = unknowns.values("ring") + middle, cast(Spread, unknowns.own["blur"])
     kept, explained = number / window.valid.sum(-1), 1 - variance / total
-    return _Fit(theta, spread.values, covariance, pixels.levels[:, 3], variance, number, kept, explained, sound)
+    return _Fit(
+        theta,
+        spread.values,
+        covariance,
+        pixels.levels[:, 3],
+        variance,
+        number,
+        kept,
+        explained,
+        sound,
+        pixels.followed(),
+    )
 
 
 class _Pixels:
@@ -265,14 +281,13 @@ class _Pixels:
 
     def __init__(self, window: _Window, theta: Tensor, begun: _Start, scheme: _Scheme) -> None:
         self.window, self.scheme, self.known, self.stage = window, scheme, begun.known, scheme.stages[0]
-        semi_major, seen = outer_ellipses(theta)[0][:, 2, None], begun.seen
+        semi_major = outer_ellipses(theta)[0][:, 2, None]
         one = torch.ones_like(window.x)
         self.plane = torch.stack([one, window.x / semi_major, window.y / semi_major], 1)
-        at, directions = depth(theta, window.x, window.y), seen.shape[1]
-        direction = (torch.atan2(at.v, at.u) * (directions / (2 * math.pi))).round().long() % directions
-        self.clear = self.weight = seen.to(window.grey).gather(1, direction) * window.valid
-        ring = torch.arange(len(theta), device=theta.device)[:, None]
-        self.sector = ring * _SECTORS + direction * _SECTORS // directions
+        at = depth(theta, window.x, window.y)
+        sector = sector_of(at.u, at.v)
+        self.clear = self.weight = begun.seen.to(window.grey).gather(1, sector) * window.valid
+        self.sector = torch.arange(len(theta), device=theta.device)[:, None] * SECTORS + sector
         self.spread = torch.ones_like(theta[:, 0])
         self.steepness = torch.zeros_like(window.x)  # squared slope of the coverage
         self.residual, self.levels = window.grey, theta.new_zeros(len(theta), _LEVELS)
@@ -306,14 +321,22 @@ class _Pixels:
 
         A cover of nearly the grey of the ring leaves residuals that no single pixel betrays, but all of a sector do.
         """
-        count = len(residual) * _SECTORS
-        sums = residual.new_zeros(2, count)
-        sums[0].scatter_add_(0, self.sector.flatten(), (self.clear * residual.square()).flatten())
-        sums[1].scatter_add_(0, self.sector.flatten(), self.clear.flatten())
-        square, number = (sums[0] / sums[1]).view(-1, _SECTORS), sums[1].view(-1, _SECTORS)  # NaN where it is not seen
+        # a sector has a pixel or two: its neighbours speak with it
+        own = (self._by_sector(self.clear * residual.square()), self._by_sector(self.clear))
+        total, number = (sums + sums.roll(1, 1) + sums.roll(-1, 1) for sums in own)
+        square = total / number  # NaN where it is not seen
         allowed = (_MISFIT * self.levels[:, 3:]).square()
         limit = square.nanmedian(-1, keepdim=True).values * of_chance(number) + allowed
         return (square <= limit).flatten()[self.sector].to(residual)
+
+    def _by_sector(self, values: Tensor) -> Tensor:
+        """Sums (K, 48) of values (K, P)."""
+        sums = values.new_zeros(len(values) * SECTORS)
+        return sums.scatter_add_(0, self.sector.flatten(), values.flatten()).view(-1, SECTORS)
+
+    def followed(self) -> Tensor:
+        """Sectors (K, 48) bool most of whose pixels count in the end."""
+        return self._by_sector(self.weight) > LEAST_KEPT * self._by_sector(self.window.valid)
 
 
 def _judged(fit: _Fit, outer: Tensor, polarity: Tensor) -> SmallRings:
@@ -346,7 +369,7 @@ def _judged(fit: _Fit, outer: Tensor, polarity: Tensor) -> SmallRings:
         EllipseFit(p, 2 * j @ covariance @ j.mT, fit.variance.sqrt(), fit.pixels)
         for p, j in ((params, outer_jacobian), (inner, inner_jacobian))
     ]
-    return SmallRings(fits[0], fits[1], fit.blur, good)
+    return SmallRings(fits[0], fits[1], fit.blur, good, fit.seen)
 
 
 class _Window(NamedTuple):

@@ -24,7 +24,8 @@ from torchpose.geometry.segments import segment_sum, values_at
 ORDERS = ((0, 0), (1, 1), (2, 0), (2, 2), (3, 1), (3, 3), (4, 0), (4, 2), (4, 4))
 EDGE_ORDERS = ((1, 1), (2, 0))  # all that the edge position needs
 MASK = 7
-_SUBSAMPLES = 128
+WIDEST = 1.3  # px, of a blur: a wider one is out of the reach of a mask of 7 px (measured: decisions/0065)
+_SUBSAMPLES = 128  # of a pixel along a side (convention: the rim of the disc to 1e-5 of its area)
 _ROUND = (
     0.01  # information about the blur's direction that is taken for there, in that about its size: an arc tells little
 )

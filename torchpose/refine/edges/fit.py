@@ -42,16 +42,15 @@ _REACH = 2.0  # px searched to either side of the fitted ellipses
 _CHAIN = 2 * math.sqrt(2) / math.pi  # edge pixels per px of a circle: mean of max(|cos|, |sin|)
 _START_SPREAD = 0.3  # px
 _SOFT = 3.0  # Geman-McClure scale in standard deviations
-_SOFT_BIAS = 1.17  # of a normal distribution, standard deviation over its RMS under these weights
+_SOFT_BIAS = 1.17  # of a normal distribution, standard deviation over its RMS under these weights (derived)
 _STEPS = 6  # on Zernike edges
 _SOFT_STEPS = 2  # of these, the first, that weigh all points instead of leaving some out
 _FILTER_STEPS = 2  # on matched filters
 _ROOM = 1.2  # of half the ring's width: a filter that sees the other circle takes it for its own
-_WIDEST = 1.3  # px, of a blur's major axis: a wider one is out of the mask's reach
 _MOST_BLUR = 3.0  # px, about what a window of the filter holds
 _MOST_CHANGE = 0.6  # px, of the blur in a step, times the blur itself: of its variance
 _PRODUCTS = 7 * 8  # of derivatives by pose and gain with each other and the error
-_CUT_FLOOR = 0.02  # px, added to the cut: what pixels alias to
+_CUT_FLOOR = 0.02  # px, added to the cut: what pixels alias to (convention)
 
 
 def refine_edges(
@@ -61,7 +60,7 @@ def refine_edges(
 
     There is no second look at what contradicts the model, so ``thorough`` changes nothing.
     """
-    factor = reduction_for(blurs.axes(sight.common_blur)[1].clamp_min(0).sqrt(), _WIDEST)
+    factor = reduction_for(blurs.axes(sight.common_blur)[1].clamp_min(0).sqrt(), zernike.WIDEST)
     return refined_by_blur(_refined_in, sight, Pose(rotation, translation), prior, factor)
 
 

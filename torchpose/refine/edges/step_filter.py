@@ -16,7 +16,8 @@ from torchpose.geometry import blur as blurs
 from torchpose.geometry.blurred_edge import blurred_step, square_cumulant
 
 WINDOW = 9  # px; a wider one tells the levels better, but small circles are no longer simple curves in it
-_BEND_REACH = (0.63, 1.2)  # px along an edge: where the fourth order of an ellipse's end is 0.02 px, and at least
+# px along an edge: where the fourth order of an ellipse's end is 0.02 px, and at least (derived)
+_BEND_REACH = (0.63, 1.2)
 
 
 class StepOffsets(NamedTuple):

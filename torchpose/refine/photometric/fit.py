@@ -59,7 +59,8 @@ from torchpose.refine.photometric.sectors import (
 from torchpose.refine.sight import Refined, Sight, refined_by_blur
 
 _COARSE = 6  # the first steps take one pixel of so many; both are whole numbers of tiles
-_WIDEST = 2.4  # px, of a blur's minor axis, in frames as they are: a pixel twice as wide adds 4 % of its variance
+# px, of a blur's minor axis, in frames as they are: a pixel twice as wide adds 4 % of its variance (derived)
+_WIDEST = 2.4
 _MOST_COARSE = 512  # of a marker whose edges are sharp: the last step, on all pixels, mends what they leave
 
 
@@ -77,10 +78,15 @@ class _Stage(NamedTuple):
 
 
 _KINDS: tuple[Kind, ...] = ("gauss", "line", "disc")
-_LONG = 1.7  # variance along the major axis over the minor one: a motion of 2 px, from which on it may be a line
-_MATTERS = 0.004  # of the contrast, RMS at the edges: that of a disc of 2 px, which costs a tenth in the covariance
-_FEWER = 0.02  # of the pixels that a shape of the blur may keep less than a Gaussian, and still explain them better
-_MOST_GAIN = 0.5  # of what would close the smallest hole, or the thinnest ring
+# variance along the major axis over the minor one: a motion of 2 px, from which on it may be a line (derived)
+_LONG = 1.7
+# of the contrast, RMS at the edges: that of a disc of 2 px, which costs a tenth in the covariance (measured:
+# `scripts/corruption_statistics.py --only defocus`)
+_MATTERS = 0.004
+# of the pixels that a shape of the blur may keep less than a Gaussian, and still explain them better (convention)
+_FEWER = 0.02
+# of what would close the smallest hole, or the thinnest ring (convention)
+_MOST_GAIN = 0.5
 _QUICK = (_Stage(3, coarse=True), _Stage(1))
 _THOROUGH = (_Stage(3, coarse=True, wary=True), _Stage(2, wary=True), _Stage(2, wary=True, tempered=True))
 
@@ -219,7 +225,9 @@ class _Fit:
         columns, slope = columns_of(part, model, levels)
         residual = columns[:, :, -2].flatten(1)
         self.usable, self.weight = inliers(residual, part, model, levels)
-        if not stage.coarse:
+        if stage.coarse:  # the first steps begin with what was seen so far, the others see for themselves
+            self.weight = self.weight * part.seen
+        else:
             self.misshapen = self._stands_out(residual, slope, levels)
             self.sectors = sum_sectors(residual, slope, self.usable, self.weight, part, model)
             factor = self._trusted(noise_spread(residual, part), model_misfit(levels))

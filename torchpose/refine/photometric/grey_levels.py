@@ -16,10 +16,10 @@ from torchpose.refine.photometric.light import LEVELS
 from torchpose.refine.photometric.ring_model import PixelBlocks, RingModel, ring_model
 
 TILE = 256  # pixels summed in float32 at a time; sums of tiles are float64, so padding changes no digit that counts
-_CLEAR_OF_LIMITS = 3.0  # standard deviations between what a pixel should show and where its noise is clipped
+_CLEAR_OF_LIMITS = 3.0  # deviations from where noise is clipped: its mean is off by 0.0004 of one there (derived)
 _MISFIT = 0.02  # of the contrast: what a point-spread function that is not Gaussian leaves at the edges of quiet frames
 _MOST_SPREAD = 1.5  # of a marker's residuals, in those of the best marker of its frame
-_NEAR_PURE = 0.05  # of paper in a pixel, beside the most and the least of its marker
+_NEAR_PURE = 0.05  # of paper in a pixel, beside the most and the least of its marker (convention)
 _FIRST_STEPS = 3  # reweighted fits of the levels before the pose is moved
 
 
@@ -36,7 +36,7 @@ def first_levels(blocks: PixelBlocks, R: Tensor, t: Tensor, spread: Spread) -> T
     for _ in range(_FIRST_STEPS):
         predicted = (levels.float()[:, None, None] @ columns[:, :, :LEVELS]).flatten(1)
         residual = blocks.grey - predicted
-        weight = blocks.valid * geman_mcclure(residual / (2 * noise_spread(residual, blocks)[:, None]))
+        weight = blocks.valid * blocks.seen * geman_mcclure(residual / (2 * noise_spread(residual, blocks)[:, None]))
         sums = sum_products(columns, weight)
         levels = solve_scaled(sums[:, :LEVELS, :LEVELS], sums[:, :LEVELS, LEVELS:]).squeeze(-1)
     return levels

@@ -16,7 +16,8 @@ from torchpose.geometry.least_squares import Eliminated, Normal, solve_scaled
 from torchpose.geometry.segments import segment_mean, segment_sum
 from torchpose.pose import MarkerNormals
 
-POSE, LEVELS = 6 + BLUR, 6  # unknowns of a frame (translation, rotation, blur) and of a marker, at least
+# unknowns of a frame (translation, rotation, blur) and of a marker, at least (derived: they are counted)
+POSE, LEVELS = 6 + BLUR, 6
 _GRADIENTS = (1, 2, 4, 5)  # among the levels
 _CURVATURES = (6, 7, 8, 9, 10, 11)  # where there are any
 _BLUR_KNOWN = 1e-4  # information about each number of a blur, px^-4: a disc has two, so that the third is open

@@ -17,17 +17,19 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchpose.geometry import blur as blurs
-from torchpose.geometry.blurred_edge import Spread
+from torchpose.geometry.blurred_edge import HOLDS, Spread
 from torchpose.geometry.grey import full_scale
+from torchpose.geometry.robust import CUT, LEAST_KEPT
 from torchpose.geometry.rotations import plane_axes
 from torchpose.geometry.rows import Rows, shared
+from torchpose.geometry.sectors import SECTORS, sector_about
 from torchpose.geometry.segments import values_at
 from torchpose.refine.photometric.band import band_pixels
 from torchpose.refine.sight import Sight
 
-_CURVED = 0.2  # blur's variance over the squared radius of curvature: nearer to its centre edges are on all sides
-_BENT = 0.4  # of a distance from an edge: the most that its second-order term may be
-_FAR = 3.5  # standard deviations of the blur from an edge, from where on neither matters
+# blur's variance over the squared radius of curvature: nearer to its centre edges are on all sides (measured: with 0.16
+# a third of the pixels of a covered ring under 2.5 px of blur is lost, tests/refine/test_sectors.py)
+_CURVED = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +44,8 @@ class PixelBlocks(Rows):
         warp: d(ray)/d(pixel), row by row.
         grey: values of the pixels.
         valid: 1 or 0.
+        sector: of the ring, see `geometry.sectors`.
+        seen: 1 or 0, whether the ring was seen there so far; 1 all around where that is less than half of it.
         size: pixels of each marker; what follows in its row repeats the last one and is not valid.
         center: of the marker, target frame.
         normal: the same.
@@ -58,6 +62,8 @@ class PixelBlocks(Rows):
     warp: tuple[Tensor, Tensor, Tensor, Tensor]
     grey: Float[Tensor, "K P"]
     valid: Float[Tensor, "K P"]
+    sector: Int[Tensor, "K P"]
+    seen: Float[Tensor, "K P"]
     size: Int[Tensor, " K"]
     center: Float[Tensor, "K 3"]
     normal: Float[Tensor, "K 3"]
@@ -79,7 +85,7 @@ class PixelBlocks(Rows):
         index = i * self.size.clamp_min(nth * count)[:, None] // count
         inside = index < self.size[:, None]
         index = index.minimum((self.size[:, None] - 1).clamp_min(0))
-        planes = {n: getattr(self, n).gather(1, index) for n in ("ray_x", "ray_y", "grey", "valid")}
+        planes = {n: getattr(self, n).gather(1, index) for n in ("ray_x", "ray_y", "grey", "valid", "sector", "seen")}
         planes["valid"] *= inside
         w00, w01, w10, w11 = (w.gather(1, index) for w in self.warp)
         return replace(self, **planes, warp=(w00, w01, w10, w11))
@@ -142,6 +148,7 @@ def gather_pixels(sight: Sight, band: Tensor, grain: int) -> PixelBlocks:
     x, y = (torch.where(sound, ray - start, aside) for ray, start in ((x, x0), (y, y0)))
     j00, j01, j10, j11 = camera.slopes((x0 + x).float(), (y0 + y).float())
     det = j00 * j11 - j01 * j10
+    sector = sector_about(u, v, both[:, 0], block).index_select(0, index.flatten()).view_as(index)
     return PixelBlocks(
         row,
         origin,
@@ -150,6 +157,8 @@ def gather_pixels(sight: Sight, band: Tensor, grain: int) -> PixelBlocks:
         (padded(j11 / det), padded(-j01 / det), padded(-j10 / det), padded(j00 / det)),
         padded(torch.where(sound, grey, 0.0)),
         padded(sound) * inside,
+        sector,
+        _seen(sight, row, marker).gather(1, sector),
         size,
         sight.centers[row, marker],
         sight.normals[row, marker],
@@ -158,6 +167,14 @@ def gather_pixels(sight: Sight, band: Tensor, grain: int) -> PixelBlocks:
         limits,
         sight.quantisation,
     )
+
+
+def _seen(sight: Sight, row: Tensor, marker: Tensor) -> Tensor:
+    """Sectors (K, 48) of markers, 1 or 0, see `PixelBlocks.seen`."""
+    if sight.seen is None:
+        return torch.ones(len(row), SECTORS, device=row.device)
+    seen = sight.seen[row, marker].float()
+    return torch.where(seen.mean(-1, keepdim=True) < LEAST_KEPT, 1.0, seen)
 
 
 def _clipping(grey: Tensor, row: Tensor, rows: int) -> Tensor:
@@ -269,8 +286,8 @@ def ring_model(blocks: PixelBlocks, R: Tensor, t: Tensor, spread: Spread, *, che
     if check:
         blur = spread.covariance[blocks.row].float()
         most = blurs.axes(blur)[1][:, None]
-        near = (rim.bend.square() * most < _CURVED) & ((rim.second * straight).abs() < _BENT)
-        sound = near | (d_inner.square() > _FAR**2 * blurs.across(blur[:, None], *rim.normal))
+        near = (rim.bend.square() * most < _CURVED) & ((rim.second * straight).abs() < HOLDS)
+        sound = near | (d_inner.square() > CUT**2 * blurs.across(blur[:, None], *rim.normal))
     edge = spread.at(blocks.row, *rim.normal)
     outer, inner = edge(d_outer, rim.bend), edge(d_inner, rim.bend)
     by_blur = tuple(one - other for one, other in zip(outer.by_blur, inner.by_blur, strict=True))

@@ -21,18 +21,17 @@ from torch import Tensor
 from torchpose.geometry.least_squares import solve_scaled
 from torchpose.geometry.robust import CUT, of_chance
 from torchpose.geometry.rows import Rows
+from torchpose.geometry.sectors import MOST, SECTORS
 from torchpose.geometry.segments import segment_sum
+from torchpose.refine.photometric.light import POSE
 from torchpose.refine.photometric.ring_model import PixelBlocks, RingModel
 
-SECTORS = 48  # of a circle
-_KEPT = 0.9  # of a sector's pixels that must follow the model for it to count
-_LEAST_CLEAR = 0.55  # of the sectors of a marker, below which none of them counts
+_KEPT = 0.9  # of a sector's pixels that must follow the model for it to count (convention; decisions/0064)
 _CELL = 4  # sectors over which a misfit is taken for one
-_UNCLEAR = 3  # sectors of an outer circle: more are no chance
-_RESTLESS = 24.3  # chi-squared of seven unknowns, exceeded once in a thousand
+_UNCLEAR = 3  # sectors of an outer circle: more are no chance (measured: decisions/0064)
 _DISPLACED = 0.005  # px, displacement that a camera or print slightly off may cause: no reason for doubt
-_BEYOND = 2.0  # standard deviations of a mean chi-squared: a wrong factor then costs little, and seldom
-_TINY = 1e-12
+_BEYOND = 2.0  # standard deviations of a mean chi-squared: a wrong factor then costs little, and seldom (convention)
+_TINY = 1e-12  # least divisor (convention: below any sum that counts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,10 +69,9 @@ def sum_sectors(
     """Sums of residuals (K, P) with derivatives by the edge ``slope``, and weights, of which ``usable`` is the most."""
     middle = 0.5 * (1 + blocks.radii[:, 1] / blocks.radii[:, 0])
     outer = torch.hypot(model.x, model.y) > middle[:, None].float()
-    turn = (torch.atan2(model.y, model.x) / (2 * math.pi) + 0.5) * SECTORS
     count = len(blocks.row)
     block = torch.arange(count, device=blocks.row.device)[:, None]
-    cell = (2 * block + outer) * SECTORS + turn.long().clamp(0, SECTORS - 1)
+    cell = (2 * block + outer) * SECTORS + blocks.sector
     flat = cell.flatten()
     weighted = weight * residual
     slope = slope.masked_fill(weight == 0, 0.0)  # padded pixels have none
@@ -100,7 +98,7 @@ def clear_sectors(sectors: Sectors, spread: Tensor, misfit: Tensor) -> Tensor:
     clear = (sectors.used > _KEPT * sectors.total) & (sectors.square < sectors.used * limit)
     # where half of a ring is gone, the rest of the marker is not to be trusted either
     seen = (sectors.total > 0).sum(-1, keepdim=True)
-    return clear & (clear.sum(-1, keepdim=True) > _LEAST_CLEAR * seen)
+    return clear & (clear.sum(-1, keepdim=True) > MOST * seen)
 
 
 def away_from_unclear(sectors: Sectors, clear: Tensor) -> Tensor:
@@ -185,4 +183,8 @@ def doubtful(sectors: Sectors, clear: Tensor, variance: Tensor, row: Tensor, ste
     total = segment_sum(chi2.double().sum(-1), row, rows) - step_chi2
     freedom = segment_sum((hold > 0).double().sum(-1), row, rows).clamp_min(1)
     pulled = total > freedom * of_chance(freedom)
-    return pulled | (step_chi2 > _RESTLESS * (more - 1)) | (segment_sum(unclear.double(), row, rows) > 0)
+    return (
+        pulled
+        | (step_chi2 > POSE * of_chance(float(POSE)) * (more - 1))
+        | (segment_sum(unclear.double(), row, rows) > 0)
+    )
