@@ -95,6 +95,11 @@ class PosePrior(Rows):
     information: Float[Tensor, "N k k"]
     pose: Pose
 
+    @property
+    def more(self) -> bool:
+        """Whether it is about more than the pose."""
+        return self.information.shape[-1] > self.pose.size
+
     def at(self, pose: Pose, size: int = 6) -> tuple[Tensor, Tensor]:
         """For `Normal.with_prior`: information (N, size, size) about a pose and more unknowns, and how far it moved."""
         moved = torch.cat([pose.t - self.pose.t, rotations.log(pose.R @ self.pose.R.mT)], -1)

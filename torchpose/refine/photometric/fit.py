@@ -20,7 +20,7 @@ from torch import Tensor
 
 from torchpose.detect.reduce import reduction_for
 from torchpose.geometry import blur as blurs
-from torchpose.geometry.blurred_edge import BLUR, LEAST, MOST, Kind, Spread
+from torchpose.geometry.blurred_edge import LEAST, MOST, Kind, Spread
 from torchpose.geometry.least_squares import (
     Block,
     Eliminated,
@@ -209,7 +209,7 @@ class _Fit:
         self.blocks = gather_pixels(sight, band, TILE * _COARSE)
         self.coarse = self.blocks.every(_COARSE, most_coarse)
         self.prior = prior
-        self.gain = prior is not None and prior.information.shape[-1] > POSE - BLUR
+        self.gain = prior is not None and prior.more
         self.stage = _QUICK[0]
         self.variance = torch.ones_like(band)
         self.least = torch.full_like(band, sight.quantisation)
