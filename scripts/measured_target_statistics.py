@@ -12,6 +12,8 @@ poses. The estimator knows the nominal file, with what it states of the print, a
 that both of its rims give. --rendered: frames are rendered, and everything is as `torchpose calibrate --measure-target`
 and `torchpose estimate` do it.
 
+Motions are between consecutive test frames; missing: share of them without a pose at either end.
+
 NEES: squared errors in units of their covariance over their number, 1 is right: marker places, intrinsics, poses of
 later frames (from their centres); lengths are in the scale of the nominal places. bound: that of the joint problem, all
 pixels along all rims with intrinsics, poses, places, tilts, sizes and edge gain unknown; its information is formed here
@@ -401,10 +403,12 @@ def rendered_set(options: argparse.Namespace, seed: int) -> dict[str, float]:
         "gain_um2": 1e6 * (found.target.edge_gain - scene.printed.edge_gain) ** 2,
         "reduced_chi2": found.calibration.reduced_chi2,
         "seconds": seconds,
-        "distance_um2": 1e6 * float(length.square().mean()),
-        "turn_deg2": float(turn.square().mean()),
-        "nominal_distance_um2": 1e6 * float(nominal_length.square().mean()),
-        "nominal_turn_deg2": float(nominal_turn.square().mean()),
+        "distance_um2": 1e6 * float(length.square().nanmean()),
+        "turn_deg2": float(turn.square().nanmean()),
+        "missing": float(length.isnan().double().mean()),
+        "nominal_missing": float(nominal_length.isnan().double().mean()),
+        "nominal_distance_um2": 1e6 * float(nominal_length.square().nanmean()),
+        "nominal_turn_deg2": float(nominal_turn.square().nanmean()),
     }
 
 
