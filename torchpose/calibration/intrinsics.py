@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -40,6 +41,7 @@ _WIDE_SIGMA = 1e-3  # of a focal length, above which views are called too alike
 _LITTLE_TILT_DEG = 15.0  # between the views' normals, below which they are
 _LARGE_ERROR = 1.0  # px, of all points, above which something else than their noise is wrong
 _LITTLE_COVER = 0.5  # of the frame's width or height, below which distortion is extrapolated
+_DIGITS = 12  # of the name of an adjustment
 _SINGULAR = 1e-12  # least eigenvalue of the information, scaled to a unit diagonal
 
 
@@ -143,7 +145,7 @@ def calibrate_intrinsics(
     joint = _covariance(bundle.information, names)
     covariance = joint[: len(names), : len(names)]
     return Calibration(
-        replace(bundle.camera, covariance=covariance, adjustment=None),
+        replace(bundle.camera, covariance=covariance, adjustment=name_of(joint, bundle.camera.matrix)),
         covariance,
         joint,
         names,
@@ -157,6 +159,12 @@ def calibrate_intrinsics(
         seen,
         _warnings(views, bundle, covariance, common.px),
     )
+
+
+def name_of(*results: Tensor) -> str:
+    """A name of an adjustment that two of different frames do not share."""
+    digest = hashlib.sha256(b"".join(result.detach().double().cpu().numpy().tobytes() for result in results))
+    return f"ba-{digest.hexdigest()[:_DIGITS]}"
 
 
 def locate_views(views: Views, camera: Camera) -> tuple[Views, Bundle]:

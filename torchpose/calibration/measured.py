@@ -6,7 +6,6 @@ of the nominal places, too, by definition, or follows from a distance between tw
 
 from __future__ import annotations
 
-import hashlib
 import math
 from dataclasses import dataclass, replace
 
@@ -17,7 +16,7 @@ from torch.nn.functional import pad
 
 from torchpose import pnp
 from torchpose.calibration.bundle import adjust
-from torchpose.calibration.intrinsics import MIN_POINTS, Calibration, common_sigma, redundancy
+from torchpose.calibration.intrinsics import MIN_POINTS, Calibration, common_sigma, name_of, redundancy
 from torchpose.calibration.plate import Plate, free_plate
 from torchpose.calibration.views import Views
 from torchpose.camera import Camera
@@ -26,7 +25,6 @@ from torchpose.geometry import rotations
 from torchpose.geometry.segments import segment_mean
 from torchpose.target import Target
 
-_DIGITS = 12  # of the name of an adjustment
 _LEAST_VIEWS = 3  # of a marker: two give a place, without anything to check it by
 _POOR = 1e-3  # deviation of a place over the extent of the plate, above which it is called poorly known
 _OFTEN = 0.15  # share of a marker's points left out, from which on chance is no explanation
@@ -129,7 +127,7 @@ def measured_target(calibration: Calibration, target: Target) -> tuple[Target, C
     covariance = rows @ of_plate @ rows.mT
     # files hold the deviation of the gain, not what it shares with the places, which is next to nothing
     covariance[-1, :-1] = covariance[:-1, -1] = 0.0
-    name = _name_of(calibration.joint, layout.places)
+    name = name_of(calibration.joint, layout.places)
     measured = replace(
         target,
         centers=layout.places[order],
@@ -277,9 +275,3 @@ def _bent(calibration: Calibration) -> list[str]:
         f"residuals are {calibration.common_sigma_px:.2g} px beyond noise with all places free{where}: the plate "
         "changes its shape between views, or --model does not describe the lens"
     ]
-
-
-def _name_of(*tensors: Tensor) -> str:
-    """A name that two adjustments of different frames do not share."""
-    digest = hashlib.sha256(b"".join(tensor.double().cpu().numpy().tobytes() for tensor in tensors))
-    return f"ba-{digest.hexdigest()[:_DIGITS]}"

@@ -122,7 +122,10 @@ def measure_target(
         if distance is not None:
             found = scaled_by_distance(found, distance)
         measured, camera_of = measured_target(found, known)
-        camera, known = (camera if held else camera_of), measured
+        if held:  # what both share is of use where the camera's file has a name for it
+            cross = None if start.adjustment is None else measured.cross_covariance
+            measured, camera_of = replace(measured, adjustment=start.adjustment, cross_covariance=cross), start
+        camera, known = camera_of, measured
     found = replace(found, camera=camera_of, warnings=[*found.warnings, *doubts(found, target)])
     return Measurement(found, target, measured, camera_of)
 

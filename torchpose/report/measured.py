@@ -100,8 +100,9 @@ def _whole(found: Measurement) -> tuple[list[str], Tensor]:
     """Names and covariance of the intrinsics, the places and the edge gain together."""
     target, calibration = found.target, found.calibration
     assert target.covariance is not None  # always there after a measurement
-    assert target.cross_covariance is not None
     cross = target.cross_covariance
+    if cross is None:
+        cross = target.covariance.new_zeros(len(target.covariance), len(calibration.covariance))
     whole = torch.cat([torch.cat([calibration.covariance, cross.mT], 1), torch.cat([cross, target.covariance], 1)])
     return [*calibration.names, *(f"{axis}{i}" for i in target.ids.tolist() for axis in "xyz"), "gain"], whole
 
