@@ -188,37 +188,33 @@ def _from_moments(center: Tensor, moments: Tensor, enough: Tensor, *, method: Me
     rows = moments.mT.contiguous()
     square = (rows[0] + rows[2]).reciprocal()
     scale = square.rsqrt()
-    scaled = torch.cat([rows[:3] * square, rows[3:7] * (square / scale), rows[7:] * square.square()]).unbind(0)
-    conic = (_taubin if method == "taubin" else _halir_flusser)(scaled)
+    scaled = torch.cat([rows[:3] * square, rows[3:7] * (square / scale), rows[7:] * square.square()])
+    conic = _taubin(scaled.unbind(0)) if method == "taubin" else _halir_flusser(scaled)
     ellipse = conics.ellipse_from_conic(conic)
-    one = torch.ones_like(scale)
-    ellipse = ellipse * torch.stack([scale, scale, scale, scale, one], -1) + torch.nn.functional.pad(center, (0, 3))
+    scale = scale[:, None]
+    ellipse = torch.cat([ellipse[:, :2] * scale + center, ellipse[:, 2:4] * scale, ellipse[:, 4:]], -1)
     m20, m11, m02 = scaled[:3]  # m20 + m02 = 1, so their determinant is the squared ratio of the extents
     return torch.where((enough & (m20 * m02 - m11 * m11 > _FLAT))[:, None], ellipse, torch.nan)
 
 
-def _halir_flusser(moments: tuple[Tensor, ...]) -> Tensor:
-    """Conics (M, 6) of central moments, as `_moments` orders them; the 3x3 eigenproblem in closed form."""
-    m20, m11, m02, m30, m21, m12, m03, m40, m31, m22, m13, m04 = moments
-    # scatter matrix of (x^2, xy, y^2) after eliminating the linear part (x, y, 1)
-    det = m20 * m02 - m11 * m11
-    i11, i12, i22 = m02 / det, -m11 / det, m20 / det
-    first, second, third = (m30, m21, m20), (m21, m12, m11), (m12, m03, m02)
+def _halir_flusser(moments: Tensor) -> Tensor:
+    """Conics (M, 6) of central moments (12, M), as `_moments` orders them, with m20 + m02 = 1.
 
-    def reduced(moment: Tensor, one: Vector, other: Vector) -> Tensor:
-        (p, q, mean), (u, v, other_mean) = one, other
-        return moment - (p * (i11 * u + i12 * v) + q * (i12 * u + i22 * v)) - mean * other_mean
-
-    s11, s12, s13 = reduced(m40, first, first), reduced(m31, first, second), reduced(m22, first, third)
-    s22, s23, s33 = reduced(m22, second, second), reduced(m13, second, third), reduced(m04, third, third)
+    The 3x3 eigenproblem in closed form. Matrices are (rows, columns, M): planes of numbers, few calls and fast ones.
+    """
+    mean, third, fourth = moments[:3], moments[3:7], moments[7:]
+    # the moments of one order make up a Hankel matrix
+    square, mixed, quartic = mean.unfold(0, 2, 1).mT, third.unfold(0, 2, 1).mT, fourth.unfold(0, 3, 1).mT
+    eye = torch.eye(3, dtype=moments.dtype, device=moments.device)[..., None]
+    # scatter matrix of (x^2, xy, y^2) after eliminating the linear part (x, y, 1); the trace of the square is 1
+    det = mean[0] * mean[2] - mean[1].square()
+    linear = (mixed[:, :, None] * ((eye[:2, :2] - square) / det)).sum(1)
+    scatter = quartic - (linear[:, None] * mixed).sum(2) - mean[:, None] * mean
     # rows of M = C^-1 S with the constraint matrix C of 4AC - B^2
-    a, b, c = _positive_eigenvector(
-        (0.5 * s13, 0.5 * s23, 0.5 * s33), (-s12, -s22, -s23), (0.5 * s11, 0.5 * s12, 0.5 * s13)
-    )
+    quadratic = _positive_eigenvector(torch.stack([0.5 * scatter[2], -scatter[1], 0.5 * scatter[0]]), eye)
     # back-substitute the linear part
-    p, q = a * m30 + b * m21 + c * m12, a * m21 + b * m12 + c * m03
-    d, e = -(i11 * p + i12 * q), -(i12 * p + i22 * q)
-    return torch.stack([a, b, c, d, e, -(a * m20 + b * m11 + c * m02)], -1)
+    rest = torch.cat([linear, mean[:, None]], 1)
+    return torch.cat([quadratic, -(quadratic[:, None] * rest).sum(0)]).mT
 
 
 def _taubin(moments: tuple[Tensor, ...]) -> Tensor:
@@ -255,31 +251,18 @@ def _taubin(moments: tuple[Tensor, ...]) -> Tensor:
     return torch.where(sound[:, 0], conic, torch.nan)
 
 
-def _positive_eigenvector(first: Vector, second: Vector, third: Vector) -> Vector:
-    """Eigenvectors of the one non-negative eigenvalue of C^-1 S, the largest of three real ones; rows of M matrices."""
-    (m11, m12, m13), (m21, m22, m23), (m31, m32, m33) = first, second, third
-    mean = (m11 + m22 + m33) / 3
-    k1, k2, k3 = m11 - mean, m22 - mean, m33 - mean
-    c12, c13, c23 = m12 * m21, m13 * m31, m23 * m32
-    p = ((k1 * k1 + k2 * k2 + k3 * k3) / 2 + c12 + c13 + c23).clamp_min(0) / 3
-    det = k1 * (k2 * k3 - c23) - m12 * (m21 * k3 - m23 * m31) + m13 * (m21 * m32 - k2 * m31)
+def _positive_eigenvector(matrix: Tensor, eye: Tensor) -> Tensor:
+    """Eigenvectors (3, M) of the one non-negative eigenvalue of C^-1 S (3, 3, M), the largest of three real ones."""
+    centered = matrix - matrix.diagonal().mean(-1) * eye
+    p = ((centered * centered.transpose(0, 1)).sum((0, 1)) / 6).clamp_min(0)
+    det = (torch.linalg.cross(centered[0], centered[1], dim=0) * centered[2]).sum(0)
     root = p.sqrt()
     largest = 2 * root * ((det / (2 * p * root)).clamp(-1, 1).acos() / 3).cos()
-    one, two, three = (k1 - largest, m12, m13), (m21, k2 - largest, m23), (m31, m32, k3 - largest)
+    rows = centered - largest * eye
     # the null vector is the cross product of any two independent rows: take the longest of the three
-    best, longest = _cross(one, two)
-    for rows in ((two, three), (three, one)):
-        other, length = _cross(*rows)
-        better = length > longest
-        x, y, z = (torch.where(better, new, old) for new, old in zip(other, best, strict=True))
-        best, longest = (x, y, z), torch.where(better, length, longest)
-    return best
-
-
-def _cross(u: Vector, v: Vector) -> tuple[Vector, Tensor]:
-    """Cross products and their squared lengths."""
-    x, y, z = u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
-    return (x, y, z), x * x + y * y + z * z
+    crosses = torch.linalg.cross(rows, rows.roll(-1, 0), dim=1)
+    longest = crosses.square().sum(1, keepdim=True).argmax(0, keepdim=True)
+    return crosses.gather(0, longest.expand(1, 3, -1)).squeeze(0)
 
 
 def distance(points: Points, index: Index, ellipses: Ellipses) -> Float[Tensor, " E"]:

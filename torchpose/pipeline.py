@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor, nn
 
-from torchpose.camera import Camera
+from torchpose.camera import LINEAR, Camera, Tone
 from torchpose.camera.model import Model
 from torchpose.detect import Candidates, Wanted, find_candidates, find_coarse
 from torchpose.errors import ConfigError, FrameError
@@ -39,7 +39,7 @@ from torchpose.pose import (
 )
 from torchpose.refine import METHODS, Recipe, Sight
 from torchpose.results import Poses, Reason, Status
-from torchpose.rings import Circles, Rings, find_circles, measure_circles, rough_rings
+from torchpose.rings import Circles, Rings, find_circles, measure_circles, measure_exactly, rough_rings
 from torchpose.target import Target
 
 _LEAST_CANDIDATE = (
@@ -62,8 +62,9 @@ class PoseEstimator(nn.Module):
             "centers" stops at the pose of the centres of their ellipses; "paper" is the paper's chain: Zernike edges as
             read, centres by eq. (7), PnP.
         float_range: grey value of white in floating-point frames: 1.0 or 255.0.
-        srgb: the grey values are sRGB-encoded and are taken back to linear ones first. Edges are half-way in linear
-            grey, so encoded frames that are taken as linear ones shift them (docs/precision.md).
+        srgb: the grey values are sRGB-encoded, whatever the camera says of its tone. Frames that are not linear are
+            taken back to linear ones first: edges are half-way in linear grey, so encoded frames that are taken as
+            linear ones shift them (docs/precision.md).
         compile: solve small problems in compiled loops (`torchpose.kernels`), on the CPU; the first call takes seconds.
 
     Raises:
@@ -97,7 +98,7 @@ class PoseEstimator(nn.Module):
         self.instances = instances
         self.method = method
         self.float_range = float_range
-        self.srgb = srgb
+        self.tone = Tone("srgb") if srgb else camera.tone or LINEAR
         self.solves_compiled = compile
         if compile:
             find_compiler()
@@ -182,8 +183,8 @@ class PoseEstimator(nn.Module):
         if tuple(frames.shape[1:]) != size:
             got, need = f"{frames.shape[2]} x {frames.shape[1]}", f"{size[1]} x {size[0]}"
             raise FrameError(f"frames: size {got}, but the camera has {need}; use the camera file of these frames")
-        if self.srgb:
-            frames = _linear(frames, self.float_range)
+        if self.tone != LINEAR:
+            frames = self.tone.linear(frames, self.float_range)
         elif frames.is_floating_point():
             # the detector's least contrast counts in 1/255 of white
             frames = frames.float() * (255.0 / self.float_range)
@@ -220,12 +221,21 @@ class PoseEstimator(nn.Module):
 
         Also how many copies (B T,) were seen.
         """
-        circles, precise = self._circles(scene, candidates), not self._recipe.on_rims
+        # frames with fewer circles than markers are searched at all scales anyway
+        circles = _of_full_frames(self._circles(scene, candidates), int(scene.table.valid.sum()))
+        precise = not self._recipe.on_rims
         # the code of a much blurred ring is not to be read off its profile
         blurred = blurs.axes(circles.inside.blur)[1] > _LEGIBLE**2
         sharp, known = circles[~blurred], self._rings(scene, circles[blurred], precise=precise)
         rough = Rings.cat([rough_rings(sharp, scene.camera), known])
         likely = identify(rough, scene.table, scene.camera, len(scene.frames), instances=1)
+        lacking = _lacking(scene, likely)[known.frame]
+        if not precise and bool(lacking.any()):
+            # of a blurred ring the quicker model reads most codes; the dearer one reads those that are missing
+            again = measure_exactly(scene.frames, known[lacking], scene.camera)
+            known = Rings.cat([known[~lacking], again])
+            rough = Rings.cat([rough[torch.arange(len(sharp), device=again.frame.device)], known])
+            likely = identify(rough, scene.table, scene.camera, len(scene.frames), instances=1)
         named = marked(likely.ring[likely.ring >= 0], len(rough))
         others = self._rings(scene, sharp[named[: len(sharp)]], precise=precise)
         return Rings.cat([others, known[named[len(sharp) :]]]), likely.copies
@@ -269,6 +279,18 @@ class PoseEstimator(nn.Module):
         for step in self._recipe.steps:
             solutions = step(solutions, evidence, sight)
         return solutions
+
+
+def _of_full_frames(circles: Circles, least: int) -> Circles:
+    """Those of frames that have at least so many."""
+    frame = circles.outer.frame
+    return circles[(torch.bincount(frame) >= least)[frame]]
+
+
+def _lacking(scene: Scene, identified: Identified) -> Tensor:
+    """Frames (B,) bool in which a target has a row that lacks a marker."""
+    lacks = (scene.table.valid[identified.group % len(scene.table)] & (identified.ring < 0)).any(1)
+    return marked(identified.group[lacks] // len(scene.table), len(scene.frames))
 
 
 def _settled(scene: Scene, found: Found) -> Tensor:
@@ -327,11 +349,3 @@ def _tensors(owner: Camera | MarkerTable) -> dict[str, Tensor]:
     """The tensors of a dataclass by name."""
     values = {f.name: getattr(owner, f.name) for f in fields(owner)}
     return {name: value for name, value in values.items() if isinstance(value, Tensor)}
-
-
-def _linear(frames: Tensor, white: float) -> Tensor:
-    """sRGB-encoded frames as linear grey, float32 with white at 255 (IEC 61966-2-1)."""
-    if not frames.is_floating_point():
-        white = float(torch.iinfo(frames.dtype).max)
-    x = (frames.float() / white).nan_to_num(nan=0.0)
-    return 255.0 * torch.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055).clamp_min(0).pow(2.4))

@@ -235,7 +235,6 @@ class Poses(Rows):
         worse = (other.ok & ~base.ok)[:, None]
         codes = torch.stack([other.status, other.reason], -1)
         status, reason = torch.where(worse, torch.stack([base.status, base.reason], -1), codes).unbind(-1)
-        nothing = {name: torch.full_like(getattr(other, name), torch.nan) for name in ("R_alt", "t_alt", "rms_alt")}
         return replace(
             other,
             R=motion.R,
@@ -245,9 +244,11 @@ class Poses(Rows):
             systematic=torch.full_like(other.systematic, torch.nan)[..., :0],
             status=status,
             reason=reason,
+            R_alt=torch.full_like(other.R_alt, torch.nan),
+            t_alt=torch.full_like(other.t_alt, torch.nan),
+            rms_alt=torch.full_like(other.rms_alt, torch.nan),
             chi2_alt=torch.full_like(other.chi2_alt, torch.nan),
             of_camera=0,
-            **nothing,
         )
 
     @property
@@ -275,12 +276,12 @@ class Poses(Rows):
         # t' = t + R d with R = exp(w) R_est, so dt'/dw = -[R d]x
         jacobian = torch.eye(6, dtype=self.t.dtype, device=self.t.device).repeat(len(self), 1, 1)
         jacobian[:, :3, 3:] = -rotations.skew(t - self.t)
-        return replace(self, R=r, t=t, R_alt=r_alt, t_alt=t_alt, **self._spread(jacobian))
+        return replace(self._spread(jacobian), R=r, t=t, R_alt=r_alt, t_alt=t_alt)
 
-    def _spread(self, jacobian: Tensor) -> dict[str, Tensor]:
-        """What belongs to the covariance, of errors that are ``jacobian`` (N, 6, 6) times those of these poses."""
+    def _spread(self, jacobian: Tensor) -> Poses:
+        """The same poses with errors that are ``jacobian`` (N, 6, 6) or (6, 6) times those of these."""
         whole, noise = (jacobian @ matrix @ jacobian.mT for matrix in (self.covariance, self.noise))
-        return {"covariance": whole, "noise": noise, "systematic": jacobian @ self.systematic}
+        return replace(self, covariance=whole, noise=noise, systematic=jacobian @ self.systematic)
 
     def seen_from(self, rotation: Tensor, translation: Tensor) -> Poses:
         """Poses in another fixed frame whose coordinates are ``rotation @ X_cam + translation`` (hand-eye).
@@ -294,4 +295,4 @@ class Poses(Rows):
         r_alt, t_alt = rotations.compose(ra, ta, self.R_alt, self.t_alt)
         turn = torch.zeros(*ra.shape[:-2], 6, 6, dtype=ra.dtype, device=ra.device)
         turn[..., :3, :3] = turn[..., 3:, 3:] = ra
-        return replace(self, R=r, t=t, R_alt=r_alt, t_alt=t_alt, **self._spread(turn))
+        return replace(self._spread(turn), R=r, t=t, R_alt=r_alt, t_alt=t_alt)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -107,9 +108,11 @@ def test_rows_without_a_pose_are_nan_and_left_out() -> None:
 def test_poses_and_truth_are_what_is_compared() -> None:
     """The result type of the pipeline and the truth file fit the two arguments."""
     rows = 2
-    zeros = {name: torch.zeros(rows, dtype=torch.float64) for name in ("rms", "chi2", "rms_alt", "chi2_alt")}
+    zeros: dict[str, Any] = {
+        name: torch.zeros(rows, dtype=torch.float64) for name in ("rms", "chi2", "rms_alt", "chi2_alt")
+    }
     names = ("frame", "target", "instance", "copies", "status", "reason", "markers", "misfit")
-    whole = {n: torch.zeros(rows, dtype=torch.int64) for n in names}
+    whole: dict[str, Any] = {n: torch.zeros(rows, dtype=torch.int64) for n in names}
     eye = torch.eye(3, dtype=torch.float64).repeat(rows, 1, 1)
     t = torch.ones(rows, 3, dtype=torch.float64)
     covariance = torch.eye(6, dtype=torch.float64).repeat(rows, 1, 1)
@@ -118,7 +121,7 @@ def test_poses_and_truth_are_what_is_compared() -> None:
         **{name: torch.zeros(0, size) for name, size in (("center", 2), ("outer", 5), ("inner", 5))},
         center_cov=torch.zeros(0, 2, 2),
     )
-    parts = {
+    parts: dict[str, Any] = {
         "covariance": covariance,
         "noise": covariance,
         "systematic": covariance[..., :0],

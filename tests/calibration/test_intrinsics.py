@@ -1,5 +1,6 @@
 """What calibration does with doubtful data: outliers, unknown noise, few views, views that are alike."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -7,11 +8,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import torchpose as tp
 from tests.calibration import calibration_scenes as scenes
-from torchpose.calibration import calibrate_intrinsics
+from torchpose.calibration import Views, calibrate_intrinsics
 from torchpose.calibration.intrinsics import common_sigma, locate_views, start_cameras
 from torchpose.errors import ConfigError
+from torchpose.geometry import rotations
 
+F64 = torch.float64
 CAMERA = scenes.camera()
 STARTS = start_cameras(CAMERA.width, CAMERA.height, "brown4")
 
@@ -85,3 +89,40 @@ def test_unknown_lens_is_named() -> None:
 def test_errors_of_pixels_are_warned_of() -> None:
     views = scenes.views(CAMERA, scenes.poses(CAMERA, 15), scenes.grid(20, 6, 4), sigma=3.0, said=0.01)
     assert any("px off" in w for w in calibrate_intrinsics(views, [CAMERA], lens="brown4").warnings)
+
+
+def _chessboards(distortion: list[float], count: int = 13, noise: float = 0.2) -> tuple[tp.Camera, Views]:
+    """Views of 9 x 6 corners by a camera of 640 x 480 px, all over the frame, covariances unknown."""
+    cam = tp.Camera(640, 480, [[532.0, 0, 342], [0, 532, 233], [0, 0, 1]], distortion)
+    u = torch.rand(count, 3, dtype=F64, generator=torch.Generator().manual_seed(1))
+    azimuth = 2 * math.pi * torch.arange(count, dtype=F64) / count
+    turn = torch.stack([azimuth.cos(), azimuth.sin(), 0.3 * azimuth.sin()], -1)
+    t = torch.stack([(u[:, 0] - 0.5) * 230, (u[:, 1] - 0.5) * 170, 330 + 120 * u[:, 2]], -1)
+    pose = rotations.exp((0.2 + 0.5 * u[:, 2:]) * turn), t
+    return cam, scenes.views(cam, pose, scenes.grid(25.0, 9, 6), sigma=noise, said=0.0)
+
+
+def test_a_start_that_loses_views_is_no_better_for_it() -> None:
+    """Where the model of a start folds back within the frame, views near the border have no pose from it."""
+    cam, views = _chessboards([-0.3, 0.14, 1e-3, 3e-4, 0.0])
+    plain = start_cameras(640, 480, "brown5")[1]
+    folds = replace(plain, distortion=torch.tensor([-0.9, 0, 0, 0, 0], dtype=F64))
+    found = calibrate_intrinsics(views, [folds, plain])
+    assert len(found.views) == len(views)
+    error = scenes.intrinsics(found.camera) - scenes.intrinsics(cam)
+    assert float(error @ torch.linalg.solve(found.covariance, error)) < 34  # 9 degrees of freedom, 1e-4
+
+
+def test_points_that_are_mixed_up_are_no_calibration() -> None:
+    """What a chessboard search makes of a board of rings: every view shows something, no two the same."""
+    _, views = _chessboards([-0.3, 0.14, 1e-3, 3e-4, 0.0])
+    g = torch.Generator().manual_seed(3)
+    moved = 30 * torch.randn(views.pixels.shape, dtype=F64, generator=g)
+    with pytest.raises(tp.ConfigError, match=r"px apart fit to|agree with each other"):
+        calibrate_intrinsics(replace(views, pixels=views.pixels + moved), start_cameras(640, 480, "brown5"))
+
+
+def test_a_rational_lens_whose_coefficients_cancel_is_refused() -> None:
+    _, views = _chessboards([-0.3, 0.14, 1e-3, 3e-4, 0.0])
+    with pytest.raises(tp.ConfigError, match="use brown5"):
+        calibrate_intrinsics(views, start_cameras(640, 480, "rational8"), lens="rational8")

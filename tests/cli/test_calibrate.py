@@ -11,6 +11,8 @@ import pytest
 import torch
 
 import torchpose as tp
+from tests.calibration import board_scenes as boards
+from torchpose.calibration.grids import Grid
 from torchpose.cli.main import main
 from torchpose.geometry import rotations
 from torchpose.handeye import HandEye
@@ -149,3 +151,30 @@ def test_too_few_views_and_unreadable_frames(capture: Path, tmp_path: Path, caps
     broken.write_bytes(b"no image")
     assert run(broken, "--target", "hexa50", "--out", tmp_path / "c.yaml") == 2
     assert "no frame could be read" in capsys.readouterr().err
+
+
+def test_a_board_of_dots_in_frames_that_are_not_linear(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """OpenCV's asymmetric grid, files of gamma 1.8: the camera, its covariance, and the tone in the file."""
+    azimuth = 2 * math.pi * torch.arange(VIEWS, dtype=F64) / VIEWS
+    r = rotations.exp(0.5 * torch.stack([azimuth.cos(), azimuth.sin(), 0.2 * azimuth.cos()], -1))
+    depth = torch.linspace(130, 190, VIEWS, dtype=F64)
+    t = torch.stack([14 * azimuth.sin(), 9 * azimuth.cos(), depth], -1)
+    grid = Grid.parse("acircles:4x11:5mm")
+    assert grid is not None
+    drawn = boards.shapes(grid, 1.8)
+    frames = torch.cat([render(CAMERA, drawn, r[k : k + 1], t[k : k + 1]) for k in range(VIEWS)])
+    for k, frame in enumerate(add_noise(frames, 1.0, gamma=1.8)):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), frame.numpy())
+    file = tmp_path / "camera.yaml"
+    assert run(tmp_path, "--board", "acircles:4x11:5mm", "--out", file, "--model", "brown4") == 0
+    assert "tone gamma: 1.8" in capsys.readouterr().out.replace("1.79", "1.8").replace("1.81", "1.8")
+    camera = tp.Camera.load(file)
+    assert camera.tone is not None
+    assert camera.tone.gamma == pytest.approx(1.8, abs=0.05)
+    assert camera.covariance is not None
+    error = torch.cat([(camera.matrix - CAMERA.matrix).diagonal()[:2], (camera.matrix - CAMERA.matrix)[:2, 2]])
+    # chi-squared with 4 degrees of freedom stays below 23.5 but for once in 10^4
+    assert float(error @ torch.linalg.solve(camera.covariance[:4, :4], error)) < 23.5
+    assert float(error.abs().max()) < 0.5
+    assert run(tmp_path, "--board", "acircles:5x11:5mm", "--out", file) == 2
+    assert "acircles:5x11 is in none of the frames" in capsys.readouterr().err

@@ -16,12 +16,17 @@ from torch import Tensor
 from torchpose.calibration.views import Views
 from torchpose.errors import ConfigError
 
-_EXAMPLES = "chessboard:9x6:5mm (inner corners, square) or charuco:8x5:10mm:7mm:4X4_50 (squares, square, marker)"
+_EXAMPLES = (
+    "chessboard:9x6:5mm (inner corners, square), charuco:8x5:10mm:7mm:4X4_50 (squares, square, marker), "
+    "circles:7x6:20mm, acircles:4x11:20mm (pitch) or rings:10x7:20mm:6mm:3mm (pitch, radii)"
+)
 _LENGTH = r"(\d+\.?\d*|\.\d+)mm"
 _CHESSBOARD = re.compile(rf"chessboard:(\d+)x(\d+):{_LENGTH}")
 _CHARUCO = re.compile(rf"charuco:(\d+)x(\d+):{_LENGTH}:{_LENGTH}:(\w+)")
 _SUBPIX_WINDOW = 0.3  # of the distance between corners, half width
 _SUBPIX_RANGE = (3, 11)  # px
+# of OpenCV's older search: without the quick look for corners first a frame that has no board takes minutes
+_QUICK = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
 _NONE = (np.zeros(0, int), np.zeros((0, 2)))
 
 
@@ -94,9 +99,14 @@ def find_corners(names: Sequence[str], frames: Tensor, board: Board) -> Views:
 
 def _chessboard_corners(grey: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray]:
     flags = cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE
-    found, corners = cv2.findChessboardCornersSB(grey, (board.columns, board.rows), flags=flags)
+    size = (board.columns, board.rows)
+    found, corners = cv2.findChessboardCornersSB(grey, size, flags=flags)
     if not found or len(corners) != board.columns * board.rows:
-        return _NONE
+        # the older search finds boards that lack the white border, or are close to the frame's
+        found, corners = cv2.findChessboardCorners(grey, size, flags=_QUICK)
+        if not found or len(corners) != board.columns * board.rows:
+            return _NONE
+        corners = _settled(grey, np.arange(len(corners)), corners, board)
     return np.arange(len(corners)), corners.reshape(-1, 2).astype(float)
 
 
@@ -105,7 +115,13 @@ def _charuco_corners(grey: np.ndarray, board: Board) -> tuple[np.ndarray, np.nda
     corners, ids, _, _ = cv2.aruco.CharucoDetector(board.charuco).detectBoard(grey)
     if ids is None or len(ids) == 0:
         return _NONE
-    ids, points = ids.ravel(), corners.reshape(-1, 1, 2).astype(np.float32)
+    ids = ids.ravel()
+    return ids.astype(int), _settled(grey, ids, corners, board).reshape(-1, 2).astype(float)
+
+
+def _settled(grey: np.ndarray, ids: np.ndarray, corners: np.ndarray, board: Board) -> np.ndarray:
+    """Corners where the gradients of the squares around them meet."""
+    points = corners.reshape(-1, 1, 2).astype(np.float32)
     grid = np.stack([ids % board.columns, ids // board.columns], -1)
     # a window that does not reach the next corner
     neighbours = np.abs(grid[:, None] - grid).sum(-1) == 1
@@ -113,4 +129,4 @@ def _charuco_corners(grey: np.ndarray, board: Board) -> tuple[np.ndarray, np.nda
     half = int(np.clip(_SUBPIX_WINDOW * apart if np.isfinite(apart) else 0.0, *_SUBPIX_RANGE))
     end = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-4)
     cv2.cornerSubPix(grey, points, (half, half), (-1, -1), end)
-    return ids.astype(int), points.reshape(-1, 2).astype(float)
+    return points

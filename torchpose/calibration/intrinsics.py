@@ -40,6 +40,10 @@ _PLATE_ROUNDS = 1  # more where the plate has unknowns: the first fit of its pla
 _WIDE_SIGMA = 1e-3  # of a focal length, above which views are called too alike
 _LITTLE_TILT_DEG = 15.0  # between the views' normals, below which they are
 _LARGE_ERROR = 1.0  # px, of all points, above which something else than their noise is wrong
+_MOST_RESIDUAL = 0.1  # RMS over the distance between points: from there on points are mixed up, not measured badly
+_LEAST_AGREEING = 0.5  # of the points, of a calibration that more than chance explains (a convention)
+_LEAST_FACTOR = 0.25  # of numerator and denominator of a rational lens: a real one's stay above, what cancels does not
+_OPEN_COEFFICIENT = 1.0  # standard deviation of k4: as much as the coefficient of a real lens
 _LITTLE_COVER = 0.5  # of the frame's width or height, below which distortion is extrapolated
 _DIGITS = 12  # of the name of an adjustment
 _SINGULAR = 1e-12  # least eigenvalue of the information, scaled to a unit diagonal
@@ -135,15 +139,17 @@ def calibrate_intrinsics(
     views = views.of_views(views.counts >= MIN_POINTS)
     _check_count(views, len(names))
     fits = [_first_fit(views, with_lens(start, lens).to(views.pixels)) for start in starts]
-    best = min(filter(None, fits), key=lambda one: float(one[1].chi2.sum()), default=None)
+    best = min(filter(None, fits), key=lambda one: _robust_cost(one[1], len(views.view)), default=None)
     if best is None:
         raise ConfigError("INPUT: no pose explains the views; give --camera to start from and check the target")
     before = len(best[0].view)
     views, bundle, common = _weigh(*best, len(names), plate)
     if not bundle.converged:
         raise ConfigError("INPUT: calibration did not converge; use a simpler --model or more varied views")
+    _check_residuals(views, bundle, before)
     joint = _covariance(bundle.information, names)
     covariance = joint[: len(names), : len(names)]
+    _check_lens(bundle.camera, covariance, names)
     return Calibration(
         replace(bundle.camera, covariance=covariance, adjustment=name_of(joint, bundle.camera.matrix)),
         covariance,
@@ -338,21 +344,31 @@ def _with_common(views: Views, common: Common) -> Views:
 
 def _first_fit(views: Views, camera: Camera, *, free: bool = True) -> tuple[Views, Bundle] | None:
     """Fit with equal weights from one start: poses, everything, poses anew (the other planar solution), everything."""
-    bundle = None
+    found = None
     for _ in range(2):
         points, pixels, mask = views.padded()
         poses = pnp.solve(points, pixels, camera, mask=mask)
-        solved = poses.R.isfinite().all(-1).all(-1) & (poses.t[:, 2] > 0)
+        R, t = poses.R, poses.t
+        solved = R.isfinite().all(-1).all(-1) & (t[:, 2] > 0)
+        if found is not None:  # beyond the image of the lens model's fold pixels have no ray, but the view has a pose
+            R, t = found[1].R.where(~solved[:, None, None], R), found[1].t.where(~solved[:, None], t)
+            solved = torch.ones_like(solved)
         if not bool(solved.any()):
             return None
         views = views.of_views(solved)
         equal = replace(views, covariance=_widened(torch.zeros_like(views.covariance), _START_SIGMA))
         try:
-            bundle = adjust(equal, camera, poses.R[solved], poses.t[solved], free=free)
+            found = views, adjust(equal, camera, R[solved], t[solved], free=free)
         except (ConfigError, torch.linalg.LinAlgError):
-            return None
-        camera = bundle.camera
-    return None if bundle is None else (views, bundle)
+            return found
+        camera = found[1].camera
+    return found
+
+
+def _robust_cost(bundle: Bundle, points: int) -> float:
+    """Of a first fit: no point costs more than one that is left out (Geman-McClure), and one of a lost view as much."""
+    chi2 = bundle.chi2
+    return float((chi2 / (1 + chi2 / _OUTLIER)).sum()) + _OUTLIER * (points - len(chi2))
 
 
 def _degrees(views: Views, unknowns: int) -> int:
@@ -366,6 +382,55 @@ def _check_count(views: Views, unknowns: int) -> None:
         raise ConfigError(
             f"INPUT: {len(views)} views with {len(views.view)} points do not determine {unknowns} intrinsics; "
             "add views, or use a simpler --model"
+        )
+
+
+def _check_residuals(views: Views, bundle: Bundle, before: int) -> None:
+    """
+    Raises:
+        ConfigError: the residuals cannot be those of a calibration.
+    """
+    if len(views.view) < _LEAST_AGREEING * before:
+        raise ConfigError(
+            f"INPUT: only {len(views.view)} of {before} points agree with each other; check that --target or --board "
+            "is what the frames show, and that all frames are of one camera with one focus"
+        )
+    # as far as points apart, on average: the square root of the area that each has
+    pixels = views.padded()[1]
+    seen = views.padded()[2][..., None]
+    reach = torch.where(seen, pixels, -torch.inf).amax(1) - torch.where(seen, pixels, torch.inf).amin(1)
+    apart = float((reach.prod(-1) / views.counts).sqrt().median())
+    rms = float(bundle.residual.square().sum(-1).mean().sqrt())
+    if rms > _MOST_RESIDUAL * apart:
+        raise ConfigError(
+            f"INPUT: points that are {apart:.0f} px apart fit to {rms:.2g} px only, which no lens or print explains; "
+            "check that --target or --board is what they show, and that all frames are of one camera with one focus"
+        )
+
+
+def _check_lens(camera: Camera, covariance: Tensor, names: tuple[str, ...]) -> None:
+    """
+    Raises:
+        ConfigError: numerator and denominator of a rational lens cancel, so that its coefficients mean nothing.
+    """
+    if "k4" not in names or camera.model != "brown_conrady":
+        return
+    k1, k2, _, _, k3, k4, k5, k6 = camera.distortion
+    corners = camera.matrix.new_tensor([[0, 0], [1, 0], [0, 1], [1, 1]]) * camera.matrix.new_tensor(
+        [camera.width - 1, camera.height - 1]
+    )
+    focal, center = camera.matrix.diagonal()[:2], camera.matrix[:2, 2]
+    # no farther than a ray may be for the model; a corner without distortion where there is no ray
+    rays = torch.where((rays := camera.undistort_points(corners)).isfinite(), rays, (corners - center) / focal)
+    r2 = torch.linspace(0, 1, 100).to(rays) * rays.square().sum(-1).max()
+    factors = torch.stack([1 + r2 * (a + r2 * (b + r2 * c)) for a, b, c in ((k1, k2, k3), (k4, k5, k6))])
+    at = names.index("k4")
+    sigma = float(covariance[at, at].sqrt())
+    if float(factors.min()) < _LEAST_FACTOR or sigma > _OPEN_COEFFICIENT:
+        raise ConfigError(
+            f"--model: the views do not tell the coefficients of rational8 apart (k1 {float(k1):.3g}, "
+            f"k4 {float(k4):.3g} +- {sigma:.2g} cancel); use brown5, or kannala_brandt for a wide lens, "
+            "or add views that reach the corners"
         )
 
 

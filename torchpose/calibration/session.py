@@ -3,10 +3,12 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
 from torchpose.calibration.boards import Board, find_corners
 from torchpose.calibration.bundle import Bundle
+from torchpose.calibration.grids import Grid, Marks, find_marks, measure_marks, sizes_of_marks
 from torchpose.calibration.hand_eye import HandEyeFit, Mount, calibrate_hand_eye
 from torchpose.calibration.intrinsics import (
     Calibration,
@@ -25,8 +27,9 @@ from torchpose.calibration.measured import (
 )
 from torchpose.calibration.plate import free_plate, stated_plate
 from torchpose.calibration.rings import find_rings, measure_centers
+from torchpose.calibration.tone import judge_tone, sizes_of_target
 from torchpose.calibration.views import Views
-from torchpose.camera import Camera
+from torchpose.camera import LINEAR, Camera, Tone
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.target import Target
@@ -34,32 +37,63 @@ from torchpose.target import Target
 Frames = Callable[[], Iterable[tuple[Sequence[str], Tensor]]]
 """Gives names and frames (B, H, W) in batches, from the first on each time it is called."""
 
+Shown = Target | Board | Grid
+"""What the frames show."""
+
 _MEASURED = 2  # times that the grey values are fitted: the second changes places by less than their deviation
+_SAMPLE = 16  # frames that the tone is judged by
 _MOST_NOISE = (5.0, 0.05)  # mm, rad: a robot that is farther off was not there when the frames were taken
 
 
-def calibrate_camera(frames: Frames, shown: Target | Board, start: Camera, *, guess: bool, lens: str) -> Calibration:
+def parse_board(text: str) -> Board | Grid:
+    """The board that ``--board`` names.
+
+    Raises:
+        ConfigError: it names none.
+    """
+    return Grid.parse(text) or Board.parse(text)
+
+
+def calibrate_camera(
+    frames: Frames, shown: Shown, start: Camera, *, guess: bool, lens: str, tone: Tone | None = None
+) -> Calibration:
     """Intrinsics from frames of a ring target or a board.
 
-    A ring target is seen in two rounds: rough centres to calibrate the camera, with which `measure_centers` fits the
-    grey values. Its places are unknowns with the covariance that its file states.
+    A ring target, or a grid of discs or rings, is measured in two rounds: rough centres to calibrate the camera, with
+    which `measure_centers` or `measure_marks` fits the grey values.
+    The places of a target are unknowns with the covariance that its file states.
 
     Args:
-        frames: read once for a board, twice for a target.
+        frames: read once for a board of squares, else twice.
         guess: only the size of ``start`` is known; several focal lengths are tried.
         lens: a name of `torchpose.calibration.LENS_MODELS`.
+        tone: of the frames; None: the one that their marks tell (`torchpose.calibration.tone`). The camera of the
+            result has it, but for boards of squares, whose corners hardly depend on it.
 
     Raises:
         ConfigError: nothing in view, or as `calibrate_intrinsics`.
     """
+    stored, frames = frames, linear_frames(frames, tone or LINEAR)
     starts = start_cameras(start.width, start.height, lens) if guess else [with_lens(start, lens)]
     if isinstance(shown, Board):
         return calibrate_intrinsics(_all_corners(frames, shown), starts, lens=lens)
+    if isinstance(shown, Grid):
+        marks = _all_marks(frames, shown, starts[0])
+        camera = calibrate_intrinsics(marks.views(shown), starts, lens=lens).camera
+        tone = tone or frames_tone(stored, shown, camera)
+        frames = linear_frames(stored, tone)
+        if tone != LINEAR:
+            marks = _all_marks(frames, shown, camera)
+        found = calibrate_intrinsics(_all_mark_centers(frames, shown, camera, marks), [camera], lens=lens)
+        return replace(found, camera=replace(found.camera, tone=tone))
     camera = _rough(frames, shown, starts, lens)
+    tone = tone or frames_tone(stored, shown, camera)
     plate = None
     if shown.covariance is not None:
         plate = stated_plate(shown.ids, shown.centers, shown.covariance[:-1, :-1])
-    return calibrate_intrinsics(_all_centers(frames, shown, camera), [camera], lens=lens, plate=plate)
+    seen = _all_centers(linear_frames(stored, tone), shown, camera)
+    found = calibrate_intrinsics(seen, [camera], lens=lens, plate=plate)
+    return replace(found, camera=replace(found.camera, tone=tone))
 
 
 def _rough(frames: Frames, target: Target, starts: Sequence[Camera], lens: str) -> Camera:
@@ -91,6 +125,7 @@ def measure_target(
     guess: bool = False,
     lens: str = "brown5",
     distance: Distance | None = None,
+    tone: Tone | None = None,
 ) -> Measurement:
     """Places, edge gain and sizes of a target's rings, and the camera with them unless it is known.
 
@@ -103,14 +138,20 @@ def measure_target(
         guess: see `calibrate_camera`.
         lens: the same.
         distance: what gives the scale; None: the mean of the nominal distances.
+        tone: see `calibrate_camera`; of a camera that is held, its own.
 
     Raises:
         ConfigError: nothing in view, a marker that is in too few views, or as `calibrate_intrinsics`.
     """
-    camera, known = start, target
+    # frames are taken for linear below: the camera's tone would count twice
+    camera, known, stored = replace(start, tone=None), target, frames
+    tone = start.tone or LINEAR if held else tone
+    frames = linear_frames(stored, tone or LINEAR)
     if not held:
         starts = start_cameras(start.width, start.height, lens) if guess else [with_lens(start, lens)]
         camera = _rough(frames, target, starts, lens)
+        tone = tone or frames_tone(stored, target, camera)
+        frames = linear_frames(stored, tone)
     for _ in range(_MEASURED):
         views = _all_centers(frames, known, camera, rims=True)
         check_seen(views, target)
@@ -125,17 +166,49 @@ def measure_target(
         if held:  # what both share is of use where the camera's file has a name for it
             cross = None if start.adjustment is None else measured.cross_covariance
             measured, camera_of = replace(measured, adjustment=start.adjustment, cross_covariance=cross), start
-        camera, known = camera_of, measured
+        camera, known = replace(camera_of, tone=None), measured
+    camera_of = camera_of if held else replace(camera_of, tone=tone)
     found = replace(found, camera=camera_of, warnings=[*found.warnings, *doubts(found, target)])
     return Measurement(found, target, measured, camera_of)
 
 
-def locate_camera(frames: Frames, shown: Target | Board, camera: Camera) -> tuple[Views, Bundle]:
+def linear_frames(frames: Frames, tone: Tone) -> Frames:
+    """The frames by their light."""
+    return lambda: ((names, tone.linear(part)) for names, part in frames())
+
+
+def frames_tone(frames: Frames, shown: Target | Grid, camera: Camera) -> Tone:
+    """The tone that the marks of some of the frames tell; linear where they do not."""
+    names, some = _sample(frames)
+    camera = replace(camera, tone=None)
+    if isinstance(shown, Grid):
+        grid = shown
+        return judge_tone(lambda tone: sizes_of_marks(tone.linear(some), names, grid, camera))[0] or LINEAR
+    target = shown
+    return judge_tone(lambda tone: sizes_of_target(tone.linear(some), camera, target))[0] or LINEAR
+
+
+def _sample(frames: Frames) -> tuple[list[str], Tensor]:
+    """Frames of one pixel type, evenly from all batches, so that they differ."""
+    some: list[tuple[str, Tensor]] = []
+    for names, part in frames():
+        if not some or part.dtype == some[0][1].dtype:
+            some += list(zip(names, part.clone(), strict=True))
+        some = some[:: len(some) // _SAMPLE + 1] if len(some) > 2 * _SAMPLE else some
+    some = some[:: (len(some) - 1) // _SAMPLE + 1]
+    return [name for name, _ in some], torch.stack([frame for _, frame in some])
+
+
+def locate_camera(frames: Frames, shown: Shown, camera: Camera) -> tuple[Views, Bundle]:
     """Views of a camera that is known, with their poses.
 
     Raises:
         ConfigError: nothing in view.
     """
+    frames = linear_frames(frames, camera.tone or LINEAR)
+    camera = replace(camera, tone=None)
+    if isinstance(shown, Grid):
+        return locate_views(_all_mark_centers(frames, shown, camera, _all_marks(frames, shown, camera)), camera)
     seen = _all_corners(frames, shown) if isinstance(shown, Board) else _all_centers(frames, shown, camera)
     return locate_views(seen, camera)
 
@@ -145,6 +218,21 @@ def _all_corners(frames: Frames, board: Board) -> Views:
     if not len(views.view):
         raise ConfigError("INPUT: the board is in none of the frames; check --board (inner corners) and the frames")
     return views
+
+
+def _all_marks(frames: Frames, grid: Grid, camera: Camera) -> Marks:
+    marks = Marks.cat([find_marks(names, part, grid, camera) for names, part in frames()])
+    if not len(marks):
+        raise ConfigError(
+            f"INPUT: the board {grid.name} is in none of the frames, or so little of it that its marks cannot be told "
+            "apart; check --board (columns x rows) and the frames"
+        )
+    return marks
+
+
+def _all_mark_centers(frames: Frames, grid: Grid, camera: Camera, marks: Marks) -> Views:
+    batches = ((names, part, marks.of_names(names)) for names, part in frames())
+    return Views.cat([measure_marks(names, part, some, grid, camera) for names, part, some in batches])
 
 
 def _all_centers(frames: Frames, target: Target, camera: Camera, *, rims: bool = False) -> Views:

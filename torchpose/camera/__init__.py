@@ -1,5 +1,6 @@
 """Camera models and their files."""
 
 from torchpose.camera.model import Camera
+from torchpose.camera.tone import LINEAR, Tone
 
-__all__ = ["Camera"]
+__all__ = ["LINEAR", "Camera", "Tone"]

@@ -17,6 +17,7 @@ import torch
 from torch.nn.functional import pad
 
 from torchpose.camera.model import Camera, Model
+from torchpose.camera.tone import Tone
 from torchpose.config import format_list, format_number, parse_mapping, read_text, suggest, within, write_text
 from torchpose.errors import ConfigError
 
@@ -96,7 +97,7 @@ def save(camera: Camera, path: str | os.PathLike[str], format: str | None = None
         camera: what to write.
         path: where to.
         format: opencv (also readable by cv2.FileStorage), json, ros (camera_info), kalibr (camchain of one camera) or
-            colmap (cameras.txt with CAMERA_ID 1; it has no place for the covariance, which is left out).
+            colmap (cameras.txt with CAMERA_ID 1; it has no place for covariance and tone, which are left out).
             None: .yaml and .yml are opencv, .json is json, .txt is colmap.
 
     Raises:
@@ -144,7 +145,8 @@ def _native(data: Mapping[str, Any]) -> Camera:
         _numbers(get("distortion_coefficients"), "distortion_coefficients").flatten(),
         _model(data.get("distortion_model", default)),
         _covariance(data),
-        _adjustment(data),
+        tone=_tone(data),
+        adjustment=_adjustment(data),
     )
 
 
@@ -176,7 +178,8 @@ def _kalibr(key: str, entry: Any) -> Camera:
             _numbers(entry["distortion_coeffs"], "distortion_coefficients").flatten(),
             _model(entry["distortion_model"]),
             _covariance(entry),
-            _adjustment(entry),
+            tone=_tone(entry),
+            adjustment=_adjustment(entry),
         )
 
 
@@ -235,6 +238,10 @@ def _adjustment(data: Mapping[str, Any]) -> str | None:
     return None if name is None else str(name)
 
 
+def _tone(data: Mapping[str, Any]) -> Tone | None:
+    return None if data.get("tone") is None else Tone.parse(data["tone"])
+
+
 def _numbers(value: Any, field: str) -> torch.Tensor:
     """Float64 tensor of nested lists or of a mapping with rows, cols and data."""
     shape = None
@@ -276,7 +283,8 @@ def _yaml(entries: Mapping[str, Any], tag: str = "") -> str:
             rows, cols = value.shape if value.ndim == 2 else ((1, len(value)) if len(value) else (0, 0))
             text += f"{name}:{tag}\n   rows: {rows}\n   cols: {cols}{kind}\n   data: {_row(value)}\n"
         elif value is not None:
-            text += f"{name}: {value}\n"
+            # a colon within a word would start a mapping
+            text += f'{name}: "{value}"\n' if ":" in str(value) else f"{name}: {value}\n"
     return text
 
 
@@ -288,6 +296,7 @@ def _entries(camera: Camera) -> dict[str, Any]:
         "distortion_model": camera.model,
         "distortion_coefficients": camera.distortion,
         **_covariances(camera),
+        "tone": None if camera.tone is None else str(camera.tone),
         "adjustment": camera.adjustment,
     }
 
@@ -319,6 +328,7 @@ def _ros_text(camera: Camera) -> str:
     entries, model = _entries(camera), "equidistant"
     coefficients = camera.distortion
     covariances = {name: entries.pop(name) for name in COVARIANCES if name in entries}
+    last = {name: entries.pop(name) for name in ("tone", "adjustment")}
     if camera.model == "brown_conrady":  # plumb_bob has five coefficients, rational_polynomial eight
         model = "rational_polynomial" if len(coefficients) == 8 else "plumb_bob"
         coefficients = pad(coefficients, (0, (8 if len(coefficients) == 8 else 5) - len(coefficients)))
@@ -333,7 +343,7 @@ def _ros_text(camera: Camera) -> str:
     covariances = {
         name: pad(table, (0, added, 0, added)) if len(table) > 4 else table for name, table in covariances.items()
     }
-    return _yaml(entries | covariances)
+    return _yaml(entries | covariances | last)
 
 
 def _focal_center(camera: Camera) -> tuple[float, float, float, float]:
@@ -357,6 +367,8 @@ def _kalibr_text(camera: Camera) -> str:
         text += f"  {name}:\n" + "".join(f"    - {_row(row)}\n" for row in table)
     if camera.adjustment is not None:
         text += f"  adjustment: {camera.adjustment}\n"
+    if camera.tone is not None:
+        text += f'  tone: "{camera.tone}"\n'
     return text
 
 

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchpose.camera.tone import Tone
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -52,6 +53,7 @@ class Camera:
         model: which of the two.
         covariance: float64 of fx, fy, cx, cy in px^2 (4, 4), or of these and all n coefficients of the distortion
             (4 + n, 4 + n), or None.
+        tone: how stored grey values follow light; None where nothing is said, which counts as linear.
         adjustment: name of the adjustment that it comes from: a target measured there is correlated with it
             (`Target.cross_covariance`). None where there is none.
 
@@ -68,6 +70,7 @@ class Camera:
     distortion: Tensor
     model: Model = "brown_conrady"
     covariance: Tensor | None = None
+    tone: Tone | None = None
     adjustment: str | None = None
 
     if TYPE_CHECKING:  # of tensors the fields are made by __post_init__
@@ -80,6 +83,7 @@ class Camera:
             distortion: Tensor | np.ndarray | Sequence[float],
             model: Model = "brown_conrady",
             covariance: Tensor | np.ndarray | Sequence[Sequence[float]] | None = None,
+            tone: Tone | None = None,
             adjustment: str | None = None,
         ) -> None: ...
 

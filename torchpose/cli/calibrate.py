@@ -9,23 +9,33 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchpose.cli.common import Quiet, Threads, check_robot_poses, cores, ended, interrupted
+from torchpose.cli.common import (
+    Quiet,
+    Threads,
+    Tone,
+    check_robot_poses,
+    cores,
+    ended,
+    interrupted,
+    read_tone,
+    with_tone,
+)
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from torchpose import camera as cameras
     from torchpose.calibration import Calibration, HandEyeFit
-    from torchpose.calibration.boards import Board
     from torchpose.calibration.measured import Distance
-    from torchpose.calibration.session import Measurement
+    from torchpose.calibration.session import Measurement, Shown
     from torchpose.camera import Camera
     from torchpose.io.sources import Source
-    from torchpose.target import Target
 
 _BOARD = (
-    "Instead of a target: chessboard:9x6:5mm (inner corners, square) or charuco:8x5:10mm:7mm:4X4_50 (squares, square, "
-    "marker, dictionary)."
+    "Instead of a target: circles:7x6:20mm (columns, rows, pitch), acircles:4x11:20mm (OpenCV's asymmetric grid), "
+    "rings:10x7:20mm:6mm:3mm (equal rings: pitch, radii), chessboard:9x6:5mm (inner corners, square) or "
+    "charuco:8x5:10mm:7mm:4X4_50 (squares, square, marker, dictionary)."
 )
 _HAND_EYE_OUT = (
     "Hand-eye file to write; needs a manifest with robot poses. Which of camera and target is on the tool is found "
@@ -54,12 +64,13 @@ def calibrate(
     target_out: Annotated[Path | None, typer.Option("--measure-target", metavar="FILE", help=_MEASURE_TARGET)] = None,
     distance: Annotated[tuple[int, int, float] | None, typer.Option(metavar="ID ID MM [SIGMA]", help=_DISTANCE)] = None,
     hand_eye_out: Annotated[Path | None, typer.Option(help=_HAND_EYE_OUT)] = None,
+    tone: Tone = None,
     plots: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for residual plots and tables.")] = None,
     threads: Threads = None,
     quiet: Quiet = False,
 ) -> int:
     """Calibrate a camera from views of a target, and where it sits on the robot, each with its covariance."""
-    from torchpose.calibration.boards import Board
+    from torchpose.calibration.session import parse_board
     from torchpose.camera import Camera
     from torchpose.cli.terminal import native_stderr_silenced
     from torchpose.io.sources import find_sources
@@ -72,14 +83,15 @@ def calibrate(
     sources = find_sources(inputs)
     if hand_eye_out is not None:
         check_robot_poses(sources)
-    start = None if camera is None else Camera.load(camera)
-    shown = Target.load(target) if target is not None else Board.parse(board or "")
+    start = None if camera is None else with_tone(Camera.load(camera), tone)
+    said = start.tone if start is not None else read_tone(tone)
+    shown = Target.load(target) if target is not None else parse_board(board or "")
     frames = _Frames(sources, start, threads=threads or cores(), quiet=quiet)
     calibration = fit = measured = None
     try:
         with native_stderr_silenced():
             if target_out is not None:
-                measured = _measured(frames, shown, start, model, between, held=out is None)
+                measured = _measured(frames, shown, start, model, between, said, held=out is None)
                 calibration = measured.calibration
                 _show(calibration, len(sources), held=out is None)
                 _show_target(measured)
@@ -87,7 +99,7 @@ def calibrate(
                 if out is not None:
                     measured.camera.save(out)
             elif out is not None:
-                calibration = _calibrate(frames, shown, start, model)
+                calibration = _calibrate(frames, shown, start, model, said)
                 _show(calibration, len(sources))
                 calibration.camera.save(out)
             if hand_eye_out is not None:
@@ -190,20 +202,23 @@ def _first_size(sources: Sequence[Source]) -> tuple[int, int]:
     raise ConfigError(f"{sources[0].path}: INPUT: no frame could be read; give readable images")
 
 
-def _calibrate(frames: _Frames, shown: Target | Board, start: Camera | None, model: str) -> Calibration:
+def _calibrate(
+    frames: _Frames, shown: Shown, start: Camera | None, model: str, tone: cameras.Tone | None
+) -> Calibration:
     from torchpose.calibration.intrinsics import start_cameras
     from torchpose.calibration.session import calibrate_camera
 
     first = start or start_cameras(frames.width, frames.height, model)[0]
-    return calibrate_camera(frames, shown, first, guess=start is None, lens=model)
+    return calibrate_camera(frames, shown, first, guess=start is None, lens=model, tone=tone)
 
 
 def _measured(
     frames: _Frames,
-    shown: Target | Board,
+    shown: Shown,
     start: Camera | None,
     model: str,
     distance: Distance | None,
+    tone: cameras.Tone | None,
     *,
     held: bool,
 ) -> Measurement:
@@ -213,12 +228,12 @@ def _measured(
 
     assert isinstance(shown, Target)  # checked with the options
     first = start or start_cameras(frames.width, frames.height, model)[0]
-    return measure_target(frames, shown, first, held=held, guess=start is None, lens=model, distance=distance)
+    return measure_target(
+        frames, shown, first, held=held, guess=start is None, lens=model, distance=distance, tone=tone
+    )
 
 
-def _hand_eye(
-    frames: _Frames, shown: Target | Board, calibration: Calibration | None, camera: Camera | None
-) -> HandEyeFit:
+def _hand_eye(frames: _Frames, shown: Shown, calibration: Calibration | None, camera: Camera | None) -> HandEyeFit:
     from torchpose.calibration.session import calibrate_robot, locate_camera
 
     robot = {source.name: source.robot_pose for source in frames.sources if source.robot_pose is not None}
@@ -237,6 +252,8 @@ def _show(found: Calibration, frames: int, *, held: bool = False) -> None:
     typer.echo(f"{len(found.views)} of {frames} views, {points}, residual RMS {found.rms_px:.3g} px")
     if found.common_sigma_px:
         typer.echo(f"{found.common_sigma_px:.3g} px per axis, beyond the noise of the frames, in every point")
+    if found.camera.tone is not None:
+        typer.echo(f"tone {found.camera.tone}")
     for warning in found.warnings:
         typer.echo(f"warning: {warning}", err=True)
 

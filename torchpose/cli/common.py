@@ -12,11 +12,18 @@ import typer
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:
+    from torchpose import camera as cameras
     from torchpose.io.sources import Source
 
 INTERRUPTED = 130  # as shells have it: 128 + SIGINT
 
 Threads = Annotated[int | None, typer.Option(min=1, help="Threads to use; by default one a core.")]
+Tone = Annotated[
+    str | None,
+    typer.Option(
+        metavar="linear|srgb|gamma:G", help="How grey values follow light; goes before `tone` in the camera file."
+    ),
+]
 Batch = Annotated[int | None, typer.Option(min=1, help="Frames at once; by default chosen by their size.")]
 Overlay = Annotated[
     Path | None, typer.Option(metavar="DIR", help="Folder for pictures of what was found, one a frame.")
@@ -48,6 +55,20 @@ def check_outputs(
     frames = {source.path.resolve() for source in sources}
     if any(picture_path(place, source.name) in frames for source in sources):
         raise ConfigError(f"{overlay}: --overlay: its pictures would overwrite the frames; choose another folder")
+
+
+def read_tone(text: str | None) -> cameras.Tone | None:
+    """The tone that --tone names."""
+    from torchpose.camera import Tone
+
+    return None if text is None else Tone.parse(text, "--tone")
+
+
+def with_tone(camera: cameras.Camera, text: str | None) -> cameras.Camera:
+    """The camera with the tone that --tone names, where it is given."""
+    from dataclasses import replace
+
+    return camera if text is None else replace(camera, tone=read_tone(text))
 
 
 def check_robot_poses(sources: Sequence[Source], why: str = "") -> None:

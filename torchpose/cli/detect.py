@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchpose.cli.common import Overlay, Silent, Threads, check_outputs, cores, ended, interrupted
+from torchpose.cli.common import Overlay, Silent, Threads, Tone, check_outputs, cores, ended, interrupted, read_tone
 
 if TYPE_CHECKING:  # imported where they are used: torch takes more than a second, which --help need not wait for
     import numpy as np
 
+    from torchpose import camera as cameras
     from torchpose.io.rows import Row
     from torchpose.io.sources import Source
 
@@ -29,6 +30,7 @@ def detect(
     out: Annotated[Path, typer.Option(help="Table of the shapes: .csv, .jsonl or .parquet.")],
     overlay: Overlay = None,
     explain: Annotated[bool, typer.Option("--explain", help=_EXPLAIN)] = False,
+    tone: Tone = None,
     threads: Threads = None,
     quiet: Silent = False,
 ) -> int:
@@ -57,7 +59,7 @@ def detect(
     show = FrameProgress(len(sources), 0, quiet=quiet)
     try:
         with native_stderr_silenced(), show as progress, torch.inference_mode():
-            for some, frames in _batches(sources, unreadable, threads or cores()):
+            for some, frames in _batches(_decoded(sources, threads or cores(), read_tone(tone)), unreadable):
                 found = _rows(some, frames, explain)
                 if overlay is not None:
                     _draw(overlay, some, frames, found)
@@ -73,14 +75,14 @@ def detect(
 
 
 def _batches(
-    sources: Sequence[Source], unreadable: dict[str, str], threads: int
+    decoded: Iterator[tuple[Source, np.ndarray | str]], unreadable: dict[str, str]
 ) -> Iterator[tuple[list[Source], np.ndarray]]:
     """Frames (B, H, W) of consecutive sources of one size and type; those that cannot be read go to ``unreadable``."""
     import numpy as np
 
     waiting: list[Source] = []
     images: list[np.ndarray] = []
-    for source, image in _decoded(sources, threads):
+    for source, image in decoded:
         if isinstance(image, str):
             unreadable[source.name] = image
             continue
@@ -94,15 +96,19 @@ def _batches(
         yield waiting, np.stack(images)
 
 
-def _decoded(sources: Sequence[Source], threads: int) -> Iterator[tuple[Source, np.ndarray | str]]:
+def _decoded(
+    sources: Sequence[Source], threads: int, tone: cameras.Tone | None
+) -> Iterator[tuple[Source, np.ndarray | str]]:
     """Every source in order with its frame (H, W), or the reason why there is none; threads decode ahead."""
     from concurrent.futures import ThreadPoolExecutor
 
+    from torchpose.camera import LINEAR
     from torchpose.io.images import UnreadableImageError, decode
+    from torchpose.io.reader import linear_image
 
     def load(source: Source) -> np.ndarray | str:
         try:
-            return decode(source.path, threads=threads)
+            return linear_image(decode(source.path, threads=threads), tone or LINEAR)
         except UnreadableImageError as error:
             return error.reason
 

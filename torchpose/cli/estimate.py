@@ -14,11 +14,13 @@ from torchpose.cli.common import (
     Overlay,
     Silent,
     Threads,
+    Tone,
     check_outputs,
     check_robot_poses,
     cores,
     ended,
     interrupted,
+    with_tone,
 )
 
 if TYPE_CHECKING:  # imported where they are used: torch takes more than a second, which --help need not wait for
@@ -44,6 +46,7 @@ _CAMERA = (
 _METHODS = "photometric|edges|centers|paper"  # torchpose.pipeline.Method, which takes a second to import
 _METHOD = "Last stage: grey values, edge points, ring centres, or the paper's own chain."
 _HAND_EYE = "Calibrated camera-to-base or camera-to-tool transform; adds the poses in the robot base."
+_JUDGED = 16  # frames that the tone is judged by
 _RESUME = "Keep the frames that an earlier run finished and do the rest."
 _INSTANCES = "Most copies of a target in a frame (a tray of equal parts): up to as many rows, column instance."
 _RELATIVE = "Name of a target: give the poses of the others (of their parts) in its frame (that of its part)."
@@ -62,7 +65,8 @@ def estimate(
     hand_eye: Annotated[Path | None, typer.Option(help=_HAND_EYE)] = None,
     relative_to: Annotated[str | None, typer.Option(metavar="NAME", help=_RELATIVE)] = None,
     method: Annotated[str, typer.Option(metavar=_METHODS, help=_METHOD)] = "photometric",
-    srgb: Annotated[bool, typer.Option("--srgb", help="The frames are sRGB-encoded: linearise them first.")] = False,
+    tone: Tone = None,
+    srgb: Annotated[bool, typer.Option("--srgb", help="The same as --tone srgb.")] = False,
     batch: Batch = None,
     threads: Threads = None,
     quiet: Silent = False,
@@ -82,11 +86,50 @@ def estimate(
         if path is not None:
             check_table_path(path, option)
     lens, targets, sources = Camera.load(camera), [Target.load(name) for name in target], find_sources(inputs)
+    lens = with_tone(lens, "srgb" if srgb and tone is None else tone)
+    lens = lens if lens.tone is not None else _with_judged_tone(lens, targets[0], sources)
     _check_relative(relative_to, targets, hand_eye, instances)
-    work = _Work(lens, targets, sources, _load_hand_eye(hand_eye, sources), method, srgb, instances, relative_to)
+    work = _Work(lens, targets, sources, _load_hand_eye(hand_eye, sources), method, instances, relative_to)
     check_outputs(inputs, sources, [p for p in (out, detections) if p is not None], overlay)
     with native_stderr_silenced():
         return _run(work, out, detections, overlay, resume=resume, batch=batch, threads=threads or cores(), quiet=quiet)
+
+
+def _with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -> Camera:
+    """The camera with the tone that the frames tell, where their kind of file makes one likely; says what it took."""
+    from torchpose.io.images import UnreadableImageError, decode, likely_encoded
+
+    if not sources or not likely_encoded(sources[0].path):
+        return lens
+    from dataclasses import replace
+
+    import numpy as np
+    import torch
+
+    from torchpose.calibration.tone import judge_tone, sizes_of_target
+    from torchpose.camera import LINEAR
+
+    images = []
+    for source in sources[:: (len(sources) - 1) // _JUDGED + 1]:
+        try:
+            image = decode(source.path)
+        except UnreadableImageError:
+            continue
+        if image.shape == (lens.height, lens.width) and image.dtype == np.uint8:
+            images.append(image)
+    tone, shift = None, None
+    if images:
+        frames = torch.from_numpy(np.stack(images))
+        tone, shift = judge_tone(lambda one: sizes_of_target(one.linear(frames), lens, target))
+    told = (
+        "too few rings to tell" if shift is None else f"as linear ones their edges would be {abs(shift.px):.2g} px off"
+    )
+    typer.echo(
+        f"torchpose: {sources[0].name}: JPEG or colour, and neither the camera file nor --tone says its tone: taken as "
+        f"{tone or LINEAR} ({told})",
+        err=True,
+    )
+    return replace(lens, tone=tone or LINEAR)
 
 
 @dataclass(frozen=True)
@@ -98,7 +141,6 @@ class _Work:
     sources: list[Source]
     hand_eye: HandEye | None
     method: str
-    srgb: bool
     instances: int
     relative_to: str | None
 
@@ -117,7 +159,7 @@ class _Work:
             "--target": [[target.name, _digest(target)] for target in self.targets],
             "--hand-eye": None if self.hand_eye is None else _digest(self.hand_eye),
             "--method": self.method,
-            "--srgb": self.srgb,
+            "--tone": str(self.camera.tone or "linear"),
             "--instances": self.instances,
             "--relative-to": self.relative_to,
             "--detections": detections,
@@ -137,9 +179,12 @@ def _run(
     quiet: bool,
 ) -> int:
     """Estimates what is not done yet and writes the tables; returns the exit code."""
+    from dataclasses import replace
+
     import cv2
     import torch
 
+    from torchpose.camera import LINEAR
     from torchpose.cli.terminal import FrameProgress
     from torchpose.io.reader import FrameReader, default_batch, in_batches
     from torchpose.io.rows import BASE_SCHEMA, POSE_SCHEMA
@@ -153,7 +198,9 @@ def _run(
     torch.set_num_threads(max(1, threads // 2))
     camera, targets, sources = work.camera, work.targets, work.sources
     method: Any = work.method  # it checks
-    estimator = PoseEstimator(camera, targets, instances=work.instances, method=method, srgb=work.srgb)
+    tone = camera.tone or LINEAR
+    # the reader hands on linear frames
+    estimator = PoseEstimator(replace(camera, tone=None), targets, instances=work.instances, method=method)
     painter = None if overlay is None else Overlay(camera, targets, overlay, threads=threads)
     schema = POSE_SCHEMA | (BASE_SCHEMA if work.hand_eye else {})
     origin = work.origin(detections is not None)
@@ -161,7 +208,7 @@ def _run(
     # a resumed run works on the same batches as one that was not interrupted, so that rows agree to the last bit
     batches = in_batches(sources, batch or default_batch(camera.width, camera.height))
     pending = [one for one in batches if any(source.name not in store for source in one)]
-    reader = FrameReader(pending, camera.width, camera.height, threads=threads)
+    reader = FrameReader(pending, camera.width, camera.height, threads=threads, tone=tone)
     try:
         with FrameProgress(len(sources), len(store), quiet=quiet) as progress, torch.inference_mode():
             for frames in reader:

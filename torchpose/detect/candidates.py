@@ -158,7 +158,10 @@ def find_ellipses(grad: Gradient, wanted: Wanted = ANYTHING, known: Candidates |
     found = merge_duplicates(Candidates.cat([whole, pieces]), explain=True)
     if known is not None:
         found = without_known(found, known)
-    valid = positions(asked_for(grad, found, wanted, found.verdict == Verdict.ACCEPTED))
+    part = found.verdict == Verdict.ACCEPTED
+    if wanted.concentric:  # what stands beside a ring that is seen whole is left out when its edges are measured
+        part = part & (found.cover <= WHOLE)
+    valid = positions(asked_for(grad, found, wanted, part))
     some = found[valid]
     settle = _RING_SETTLE if wanted.concentric else SETTLE
     freed = free_of_stumps(grad, some.frame, some.ellipse, some.polarity, settle)

@@ -36,6 +36,7 @@ _NODES_A_SIGMA = 1.1  # Gauss-Legendre nodes a half length in narrow Gaussians: 
 _MOST_NODES = 40
 _ON_CPU = torch.zeros(0, dtype=torch.float64)  # nodes are numbers
 _CORE = 0.6  # px, of what is not the line or the disc, to begin with: a pixel, and a sharp lens
+_FAR = 8.0  # standard deviations: beyond, a Gaussian is 0 to single precision, and denormal numbers cost tenfold
 _SQUARE = 1 / (24 * 120)  # fourth cumulant of a pixel along its side, over -24
 _LEAST_SHARE = 0.25  # of a variance that terms of second order may leave: beyond, the expansion has failed
 _MOST_STEP = 0.6  # of the size of a blur that it may change by in a step: the derivatives hold no farther
@@ -95,7 +96,7 @@ class Spread(Rows):
         return replace(self, values=torch.stack([core, one, two], -1))
 
     def at(self, row: Tensor, nu: Tensor, nv: Tensor) -> Callable[[Tensor, Tensor], Edge]:
-        """Edges, of distances and curvatures (K, P), under the blurs of rows (K,) where the normals are nu, nv."""
+        """Edges, of distances and curvatures (..., K, P), under the blurs of rows (K,) where the normals are nu, nv."""
         values = self.values[row].float()
         if self.kind == "gauss":
             return _Gauss(values, nu, nv)
@@ -130,7 +131,7 @@ class _Gauss:
         variance = (self.across + bend2 * self.more).maximum(_LEAST_SHARE * self.across)
         over2 = variance.reciprocal()
         over = over2.sqrt()
-        z = (distance + half * self.along) * over
+        z = ((distance + half * self.along) * over).clamp(-_FAR, _FAR)
         z2 = z.square()
         density = torch.exp(-0.5 * z2) * (1 / math.sqrt(2 * math.pi))
         third = self.third * bend * over2 * over
@@ -151,7 +152,8 @@ class _Gauss:
 
 
 class _Nodes(NamedTuple):
-    """Sums over nodes: their places along the normal and half their mean squares along the edge (K, P) or numbers."""
+    """Means over nodes: of the step, of the slope, of its derivative by the core, and of the slope times the share of
+    each node and its square."""
 
     step: Tensor
     slope: Tensor
@@ -160,40 +162,58 @@ class _Nodes(NamedTuple):
     by_square: Tensor
 
 
-def _averaged(distance: Tensor, bend: Tensor, core: Tensor, nodes: list[tuple[float, float, Tensor, Tensor]]) -> _Nodes:
-    """Means of narrow edges over nodes: weight, share, place along the normal and square along the edge of each.
+class _Averaged:
+    """Narrow edges averaged over nodes: those at a share x lie x times ``reach`` along the normal, and their mean
+    square along the edge is (a + b x^2) times ``square``; planes (K, P), or columns of one number a row."""
 
-    by_place: mean slope times share; by_square: mean slope times k / 2 times share^2.
-    """
-    sigma = core.sqrt()
-    out = [torch.zeros_like(distance) for _ in range(5)]
-    for weight, share, place, square in nodes:
-        z = (distance + place + 0.5 * bend * (core + square * (1 - bend * place))) / sigma
-        slope = torch.exp(-0.5 * z.square()) * (weight / math.sqrt(2 * math.pi)) / sigma
-        out[0] += (0.5 * weight) * torch.erfc(-z * math.sqrt(0.5))
-        out[1] += slope
-        out[2] += slope * (0.5 * bend - 0.5 * z / sigma)
-        out[3] += share * slope
-        out[4] += share * share * slope
-    return _Nodes(*out)
+    def __init__(
+        self,
+        nodes: tuple[Tensor, Tensor],
+        core: Tensor,
+        reach: Tensor,
+        square: Tensor,
+        profile: tuple[float, float],
+    ) -> None:
+        self.nodes = tuple(zip(*(v.tolist() for v in nodes), strict=True))
+        self.core, self.reach, self.square, self.profile = core, reach, square, profile
+        self.scale = (2 * core).rsqrt()
+
+    def __call__(self, distance: Tensor, bend: Tensor) -> _Nodes:
+        # y = (d + x n + k / 2 (s + q (1 - k x n))) / sqrt(2 s) is a cubic in the share, by Horner's rule and in place:
+        # a dozen nodes of some ten thousand pixels each are most of what a motion or a defocus costs
+        a, b = self.profile
+        half = 0.5 * bend * self.scale
+        one, lean = self.reach * self.scale, half * bend * self.reach
+        y0 = (distance * self.scale).addcmul(half, self.core + a * self.square)
+        y1, y2, y3 = one - a * self.square * lean, b * self.square * half, -b * self.square * lean
+        step, slope, by_y, by_place, by_square = torch.zeros(5, *distance.shape, device=distance.device).unbind(0)
+        step += 0.5
+        moved, y, density = torch.empty_like(y3), torch.empty_like(y0), torch.empty_like(y0)
+        for share, weight in self.nodes:
+            torch.add(y2, y3, alpha=share, out=moved).mul_(share).add_(y1).mul_(share)
+            torch.add(moved, y0, out=y).clamp_(-_FAR / math.sqrt(2), _FAR / math.sqrt(2))
+            torch.mul(y, y, out=density).neg_().exp_()
+            slope.add_(density, alpha=weight)
+            by_place.add_(density, alpha=weight * share)
+            by_square.add_(density, alpha=weight * share * share)
+            by_y.addcmul_(density, y, value=weight)
+            step.add_(y.erf_(), alpha=0.5 * weight)
+        norm = self.scale / math.sqrt(math.pi)
+        by_core = (half * slope).addcmul_(by_y, self.scale, value=-1) * (norm * self.scale) / self.scale
+        return _Nodes(step, slope * norm, by_core, by_place * norm, by_square * norm)
 
 
 class _Line:
     """A line of the vector m: displaced evenly from -m / 2 to m / 2."""
 
     def __init__(self, values: Tensor, nu: Tensor, nv: Tensor) -> None:
-        self.core, self.mu, self.mv = values.split(1, -1)
-        self.nu, self.nv = nu, nv
-        self.normal, self.along = nu * self.mu + nv * self.mv, nu * self.mv - nv * self.mu
-        self.node, self.weight = gauss_legendre(_nodes(0.5 * torch.hypot(self.mu, self.mv), self.core), _ON_CPU)
+        core, mu, mv = values.split(1, -1)
+        self.nu, self.nv, self.along = nu, nv, nu * mv - nv * mu
+        place, weight = gauss_legendre(_nodes(0.5 * torch.hypot(mu, mv), core), _ON_CPU)
+        self.mean = _Averaged((place - 0.5, weight), core, nu * mu + nv * mv, self.along.square(), (0.0, 1.0))
 
     def __call__(self, distance: Tensor, bend: Tensor) -> Edge:
-        square = self.along.square()
-        nodes = [
-            (float(w), float(x), float(x) * self.normal, float(x) ** 2 * square)
-            for w, x in zip(self.weight, self.node - 0.5, strict=True)
-        ]
-        mean = _averaged(distance, bend, self.core, nodes)
+        mean = self.mean(distance, bend)
         lean = bend * self.along * mean.by_square
         by_blur = (mean.by_core, mean.by_place * self.nu - lean * self.nv, mean.by_place * self.nv + lean * self.nu)
         return Edge(mean.step, mean.slope, by_blur)
@@ -203,17 +223,13 @@ class _Disc:
     """A disc of a radius r: chords across the normal, of mean square (r^2 - x^2) / 3 along it."""
 
     def __init__(self, values: Tensor) -> None:
-        self.core, self.radius, _ = values.split(1, -1)
-        self.node, self.weight = disc_chords(_nodes(self.radius, self.core), _ON_CPU)
+        core, self.radius, _ = values.split(1, -1)
+        nodes = disc_chords(_nodes(self.radius, core), _ON_CPU)
+        self.mean = _Averaged(nodes, core, self.radius, self.radius.square(), (1 / 3, -1 / 3))
 
     def __call__(self, distance: Tensor, bend: Tensor) -> Edge:
-        radius = self.radius
-        nodes = [
-            (float(w), float(x), float(x) * radius, (1 - float(x) ** 2) / 3 * radius.square())
-            for w, x in zip(self.weight, self.node, strict=True)
-        ]
-        mean = _averaged(distance, bend, self.core, nodes)
-        by_radius = mean.by_place + bend * radius / 3 * (mean.slope - mean.by_square)
+        mean = self.mean(distance, bend)
+        by_radius = mean.by_place + bend * self.radius / 3 * (mean.slope - mean.by_square)
         return Edge(mean.step, mean.slope, (mean.by_core, by_radius, torch.zeros_like(by_radius)))
 
 

@@ -20,10 +20,15 @@ from torch import Tensor
 _STEP = 1.0  # standard deviations of the blur from node to node: an error below 1e-8
 
 
-def nodes_needed(semi_major: Float[Tensor, " K"], sigma: Float[Tensor, " K"]) -> int:
-    """Number of nodes for the most demanding of K ellipses with these semi-major axes and (least) blurs."""
+def nodes_of_each(semi_major: Float[Tensor, " K"], sigma: Float[Tensor, " K"]) -> Float[Tensor, " K"]:
+    """Number of nodes for ellipses with these semi-major axes and (least) blurs."""
     # equal steps of the eccentric anomaly are longest at the ends of the minor axis
-    return max(8, int((2 * math.pi / _STEP * semi_major / sigma).max().ceil()))
+    return (2 * math.pi / _STEP * semi_major / sigma).ceil().clamp_min(8)
+
+
+def nodes_needed(semi_major: Float[Tensor, " K"], sigma: Float[Tensor, " K"]) -> int:
+    """The same for the most demanding of them."""
+    return int(nodes_of_each(semi_major, sigma).max())
 
 
 def blurred_ellipse(

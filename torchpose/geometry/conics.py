@@ -33,22 +33,21 @@ def from_matrix(matrix: Matrix) -> Conic:
 
 def ellipse_from_conic(conic: Conic) -> Ellipse:
     """Ellipses of conic coefficients; NaN where the conic is no real ellipse."""
-    a, b, c, d, e, f = conic.unbind(-1)
+    a, b, c, _, _, f = conic.unbind(-1)
+    squares, linear = conic[..., :3:2], conic[..., 3:5]
     disc = 4 * a * c - b * b
-    cx, cy = (b * e - 2 * c * d) / disc, (b * d - 2 * a * e) / disc
-    f0 = f + 0.5 * (d * cx + e * cy)  # value at the centre
-    mean, diff = 0.5 * (a + c), torch.hypot(0.5 * (a - c), 0.5 * b)
-    sign = torch.where(mean < 0, -1.0, 1.0)
-    mean, f0 = mean * sign, f0 * sign
+    center = (b[..., None] * linear.flip(-1) - 2 * squares.flip(-1) * linear) / disc[..., None]
+    f0 = f + 0.5 * (linear * center).sum(-1)  # value at the centre
+    half = torch.where(a + c < 0, -0.5, 0.5)
+    mean, f0 = (a + c) * half, f0 * (2 * half)
     # the smaller eigenvalue as a quotient: mean - diff cancels for slender ellipses; rounding must not exchange a and b
-    large = mean + diff
+    large = mean + 0.5 * torch.hypot(a - c, b)
     small = torch.minimum(0.25 * disc / large, large)
-    major, minor = (-f0 / small).sqrt(), (-f0 / large).sqrt()
-    theta = 0.5 * torch.atan2(-b * sign, (c - a) * sign)
-    theta = torch.remainder(theta, torch.pi)
+    axes = (-f0[..., None] / torch.stack([small, large], -1)).sqrt()
+    theta = torch.remainder(0.5 * torch.atan2(-b * half, (c - a) * half), torch.pi)
     # remainder may round a tiny negative angle up to pi itself
-    theta = torch.where(theta >= torch.pi, torch.zeros_like(theta), theta)
-    ellipse = torch.stack([cx, cy, major, minor, theta], -1)
+    theta = torch.where(theta >= torch.pi, 0.0, theta)
+    ellipse = torch.cat([center, axes, theta[..., None]], -1)
     valid = (disc > 0) & (f0 < 0) & ellipse.isfinite().all(-1)
     return torch.where(valid[..., None], ellipse, torch.nan)
 

@@ -6,4 +6,12 @@ from torchpose.identify.markers import Identified, identify
 from torchpose.identify.scene import MarkerTable, Scene
 from torchpose.identify.second_look import look_again
 
-__all__ = ["MIN_MARKERS", "Identified", "MarkerTable", "Scene", "identify", "indistinguishable", "look_again"]
+__all__ = [
+    "MIN_MARKERS",
+    "Identified",
+    "MarkerTable",
+    "Scene",
+    "identify",
+    "indistinguishable",
+    "look_again",
+]

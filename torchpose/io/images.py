@@ -25,6 +25,7 @@ _NEUTRAL = frozenset(b"IHDR IDAT IEND tEXt zTXt iTXt tIME pHYs gAMA cHRM sRGB iC
 # kornia_rs holds the interpreter while it decodes, OpenCV does not: more threads than these decode sooner with OpenCV
 _HOLDERS = 2
 _MOST_PIXELS = 1 << 28  # that kornia_rs is asked for; OpenCV has limits of its own
+_PNG_COLOUR = 25  # where the header of a PNG file has its type of colour: 2 and 6 are colour, 3 a palette
 _DEFLATE = 1032  # largest ratio of deflate: a header that promises more pixels is wrong, no memory is taken for it
 
 
@@ -75,6 +76,20 @@ def decode(path: Path, *, threads: int = 1) -> np.ndarray:
     if image.dtype not in (np.uint8, np.uint16):
         raise UnreadableImageError("unsupported_depth")
     return image
+
+
+def likely_encoded(path: Path) -> bool:
+    """Whether a file is of a kind that mostly holds values bent by a tone curve: JPEG, or colour (PNG, BMP)."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(64)
+    except OSError:
+        return False
+    if head.startswith(_PNG):
+        return len(head) > _PNG_COLOUR and head[_PNG_COLOUR] in (2, 3, 6)
+    if head.startswith(b"BM"):
+        return len(head) > 29 and int.from_bytes(head[28:30], "little") > 8
+    return head.startswith(_JPEG)
 
 
 def _plain_png(data: bytes) -> np.ndarray | None:

@@ -4,12 +4,14 @@ import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 import torch
 from jaxtyping import Shaped
 from torch import Tensor
 
+from torchpose.camera import LINEAR, Tone
 from torchpose.io.images import UnreadableImageError, decode
 from torchpose.io.sources import Source
 from torchpose.results import Status
@@ -65,16 +67,18 @@ class FrameReader:
         width: of the camera, px. Frames of another size are `Status.WRONG_SIZE`.
         height: of the camera, px.
         threads: decoding threads.
+        tone: of the files; frames that are not linear come as linear ones, uint16.
     """
 
     batches: Sequence[Sequence[Source]]
     width: int
     height: int
     threads: int = field(kw_only=True)
+    tone: Tone = field(default=LINEAR, kw_only=True)
 
     def __iter__(self) -> Iterator[Batch]:
         largest = max((len(batch) for batch in self.batches), default=0)
-        buffers = [_Buffer(largest, (self.height, self.width), self.threads) for _ in range(2)]
+        buffers = [_Buffer(largest, (self.height, self.width), self.threads, self.tone) for _ in range(2)]
         pool = ThreadPoolExecutor(self.threads, thread_name_prefix="decode")
 
         def submit(number: int) -> list[Future[Fault | np.dtype]]:
@@ -92,11 +96,23 @@ class FrameReader:
             pool.shutdown(wait=True, cancel_futures=True)
 
 
+def linear_image(image: np.ndarray, tone: Tone) -> np.ndarray:
+    """A decoded frame by its light: as it is where it is linear, else uint16."""
+    return image if tone == LINEAR else _table(tone, image.dtype.itemsize)[image]
+
+
+@lru_cache
+def _table(tone: Tone, size: int) -> np.ndarray:
+    table: np.ndarray = tone.table(256**size).numpy()
+    return table
+
+
 class _Buffer:
     """Memory of one batch for each pixel type, allocated when the first frame of the type arrives."""
 
-    def __init__(self, frames: int, shape: tuple[int, int], threads: int) -> None:
+    def __init__(self, frames: int, shape: tuple[int, int], threads: int, tone: Tone) -> None:
         self._threads = threads
+        self._tone = tone
         self._size = (frames, *shape)
         self._planes: dict[np.dtype, Tensor] = {}
         self._lock = threading.Lock()
@@ -109,6 +125,7 @@ class _Buffer:
             return Fault(Status.UNREADABLE, error.reason)
         if image.shape != self._size[1:]:
             return Fault(Status.WRONG_SIZE, f"{image.shape[1]}x{image.shape[0]}")
+        image = linear_image(image, self._tone)
         with self._lock:
             if image.dtype not in self._planes:
                 self._planes[image.dtype] = torch.empty(self._size, dtype=_TORCH_DTYPE[image.dtype])

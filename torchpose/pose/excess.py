@@ -138,7 +138,8 @@ def _weighed(modes: _Modes, parts: tuple[tuple[Tensor, Tensor], ...]) -> tuple[T
 
 def _values(ends: tuple[float, float], modes: _Modes) -> Tensor:
     like = modes.residual
-    return torch.logspace(*(math.log10(v) for v in ends), _GRID, dtype=like.dtype, device=like.device)
+    least, most = (math.log10(value) for value in ends)
+    return torch.logspace(least, most, _GRID, dtype=like.dtype, device=like.device)
 
 
 def _mean(likelihood: Tensor) -> Tensor:

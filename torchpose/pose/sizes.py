@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from torchpose.pose.evidence import Evidence
+from torchpose.target import MIN_RATIO_GAP
 
 # px, of a radius, and times the blur: measured ones of clutter_statistics.py --seed 54 err by less
 _SIZE_ERROR = 0.1
-_SAME_CODE = 1e-3  # of the ratio of radii: what differs by less is one code
 
 
 def code_shift(evidence: Evidence, predicted: Tensor) -> Tensor:
@@ -35,5 +35,5 @@ def code_shift(evidence: Evidence, predicted: Tensor) -> Tensor:
 def _code_gap(ratio: Tensor) -> Tensor:
     """Least difference (N,) between ratios (N, M) of radii; padded ones are 1."""
     apart = (ratio[:, :, None] - ratio[:, None]).abs()
-    both = (ratio < 1)[:, :, None] & (ratio < 1)[:, None] & (apart > _SAME_CODE)
+    both = (ratio < 1)[:, :, None] & (ratio < 1)[:, None] & (apart > 0.5 * MIN_RATIO_GAP)
     return torch.where(both, apart, torch.inf).flatten(1).amin(1)

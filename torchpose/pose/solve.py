@@ -17,7 +17,7 @@ from torchpose.pose.sizes import code_shift
 from torchpose.pose.solutions import AMBIGUOUS_CHI2, Solutions
 from torchpose.results import Reason, Status
 
-_CODE_SHIFT = 0.5  # derived: of the way to the next code; beyond, the markers may as well be their neighbours in code
+_CODE_SHIFT = 0.5  # of the way to the next code; beyond, markers may as well be their neighbours (derived)
 _ITERATIONS = 60  # of the solver, at most: rows that have converged rest
 
 

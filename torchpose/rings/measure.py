@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchpose import ellipse
 from torchpose.camera import Camera
-from torchpose.detect import Candidates
+from torchpose.detect import Candidates, Verdict
 from torchpose.detect.reduce import only_reduced, reduction_for
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import blur as blurs
@@ -22,7 +22,7 @@ from torchpose.rings import zernike
 from torchpose.rings.edges import REACH, STEP_RANGE, RingEdges, ring_edges
 from torchpose.rings.inner_circles import InnerCircles, find_inner
 from torchpose.rings.lens import ideal_pixels, mapped
-from torchpose.rings.small_rings import fit_small_rings
+from torchpose.rings.small_rings import BLURRED, fit_small_rings
 
 # of the perimeter with edge points, outer and inner circle: a third covered and noise beside (convention)
 _LEAST_COVER = (0.4, 0.33)
@@ -115,12 +115,11 @@ def rough_rings(circles: Circles, camera: Camera) -> Rings:
     covariance = _ROUGH**2 * torch.eye(5, dtype=outer.dtype, device=outer.device).expand(len(outer), 5, 5)
     one = torch.ones_like(circles.outer.polarity)
 
-    def fit(ellipses: Tensor) -> EllipseFit:
-        return EllipseFit(mapped(ellipses, lambda points: ideal_pixels(camera, points)), covariance, _ROUGH * one, one)
-
+    ideal = mapped(torch.cat([outer, inner]), lambda points: ideal_pixels(camera, points))
+    first, second = (EllipseFit(ellipses, covariance, _ROUGH * one, one) for ellipses in ideal.split(len(outer)))
     inside = circles.inside
     known = (inside.blur, inside.clipped, inside.seen)
-    return Rings(circles.outer.frame, circles.outer.polarity, outer, inner, fit(outer), fit(inner), *known)
+    return Rings(circles.outer.frame, circles.outer.polarity, outer, inner, first, second, *known)
 
 
 def measure_circles(
@@ -148,11 +147,25 @@ def measure_predicted(
     return _measured(frames, Circles(candidates, inside), camera, _How(correct))
 
 
+def measure_exactly(frames: Tensor, rings: Rings, camera: Camera) -> Rings:
+    """Rings measured before, those whose blur is wide for their size again, by the exact model of `fit_small_rings`."""
+    blurred = blurs.axes(rings.blur)[1].sqrt() > BLURRED * rings.inner_raw[:, 3]
+    some = rings[blurred]
+    if len(some) == 0:
+        return rings
+    unknown, verdict = torch.full_like(some.polarity, torch.nan), torch.full_like(some.frame, int(Verdict.ACCEPTED))
+    candidates = Candidates(some.frame, some.outer_raw, some.polarity, unknown, unknown, verdict)
+    inside = replace(find_inner(frames, candidates, camera), ellipse=some.inner_raw, blur=some.blur)
+    again, _ = _measured(frames, Circles(candidates, inside), camera, _How(correct=True, begun=True))
+    return Rings.cat([rings[~blurred], again])
+
+
 class _How(NamedTuple):
-    """correct: as for `measure_rings`. precise: as for `fit_small_rings`."""
+    """correct: as for `measure_rings`. precise, begun: as for `fit_small_rings`."""
 
     correct: bool
     precise: bool = True
+    begun: bool = False
 
 
 def _measured(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tuple[Rings, Tensor]:
@@ -205,6 +218,8 @@ def _measure(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tup
     ratio = (inner[:, 2:4].prod(-1) / outer[:, 2:4].prod(-1)).sqrt()
     inside = replace(circles.inside, ratio=ratio, seen=clear_of_ends(circles.inside.seen))
     circles = replace(circles, inside=inside)
+    if how.begun:
+        return _as_a_whole(frames, circles, camera, how)
     # ... and so do two edges with less than a pixel beside it
     narrow = torch.minimum((1 - ratio) * outer[:, 3] - 1, ratio * outer[:, 3]) < _SMALL
     small = narrow & (outer[:, 3] < _LARGE)
@@ -235,7 +250,8 @@ def _by_edges(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
     reach = torch.cat([gap, gap]).clamp(1.0, REACH)
     outward = torch.cat([candidates.polarity, -candidates.polarity])
     edges = ring_edges(frames, frame, rough, outward, reach)
-    sector = sector_about(*edges.points.unbind(-1), rough, edges.ring)
+    u, v = edges.points.unbind(-1)
+    sector = sector_about(u, v, rough, edges.ring)
     shown = clear.repeat(2, 1)[edges.ring, sector]
     edges, sector = edges[shown], sector[shown]
 
@@ -283,22 +299,21 @@ def _as_a_whole(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> 
     """The same for rings whose circles are too close to each other, or too small, to be measured one by one."""
     focal = camera.matrix.diagonal()[:2].mean()
     candidates = circles.outer
-    found = fit_small_rings(frames, candidates, circles.inside, focal, precise=how.precise)
+    found = fit_small_rings(frames, candidates, circles.inside, focal, precise=how.precise, begun=how.begun)
     least_outer, least_inner = _LEAST_SEMI_MINOR
     large = (found.outer.params[:, 3] > least_outer) & (found.inner.params[:, 3] > least_inner)
     index = (found.good & large).nonzero()[:, 0]
     outer, inner = found.outer[index], found.inner[index]
 
-    def to_ideal(points: Tensor) -> Tensor:
-        return ideal_pixels(camera, points)
-
+    both = torch.cat([outer.params, inner.params])
+    ideal_outer, ideal_inner = mapped(both, lambda points: ideal_pixels(camera, points)).tensor_split(2)
     rings = Rings(
         candidates.frame[index],
         candidates.polarity[index],
         outer.params,
         inner.params,
-        replace(outer, params=mapped(outer.params, to_ideal)),
-        replace(inner, params=mapped(inner.params, to_ideal)),
+        replace(outer, params=ideal_outer),
+        replace(inner, params=ideal_inner),
         found.blur[index],
         circles.inside.clipped[index],
         found.seen[index],

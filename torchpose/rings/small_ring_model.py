@@ -27,7 +27,7 @@ def outer_ellipses(theta: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class Depth(NamedTuple):
-    """Of pixels (K, P) and an ellipse: first-order distance outside, unit normal, S^-1 (x - c), |grad|, and the
+    """Of pixels (..., K, P) and an ellipse: first-order distance outside, unit normal, S^-1 (x - c), |grad|, and the
     curvature of the level curve through the pixel."""
 
     distance: Tensor
@@ -39,21 +39,18 @@ class Depth(NamedTuple):
     curvature: Tensor
 
 
-def depth(theta: Tensor, x: Tensor, y: Tensor, inner: bool = False) -> Depth:
-    """Where pixels (K, P) are about the outer ellipses (K, 5 at least), or about the inner ones."""
-    cx, cy, s11, s12, s22 = theta[:, :5].unbind(-1)
-    if inner:
-        cx, cy = cx + theta[:, 6], cy + theta[:, 7]
+def depth(theta: Tensor, x: Tensor, y: Tensor, scale: Tensor | float = 1.0) -> Depth:
+    """Where pixels (K, P) are about ellipses (..., K, 5 at least), grown by a scale (..., K, 1)."""
+    cx, cy, s11, s12, s22 = theta[..., :5, None].unbind(-2)
     det = s11 * s22 - s12 * s12
-    i11, i12, i22 = ((s / det)[:, None] for s in (s22, -s12, s11))
-    dx, dy = x - cx[:, None], y - cy[:, None]
+    i11, i12, i22 = s22 / det, -s12 / det, s11 / det
+    dx, dy = x - cx, y - cy
     u, v = i11 * dx + i12 * dy, i12 * dx + i22 * dy
     rho = (u * u + v * v).sqrt().clamp_min(1e-6)
     gx, gy = (i11 * u + i12 * v) / rho, (i12 * u + i22 * v) / rho
     length = (gx * gx + gy * gy).sqrt().clamp_min(1e-9)
-    scale = theta[:, 5:6] if inner else 1.0
     distance = (rho - scale) / length
-    curvature = 1 / (length.pow(3) * det.square()[:, None] * scale).clamp_min(1e-9)
+    curvature = 1 / (length.pow(3) * (det.square() * scale)).clamp_min(1e-9)
     curvature = curvature / (1 + curvature * distance).clamp_min(HOLDS)
     return Depth(distance, gx / length, gy / length, u, v, length, curvature)
 
@@ -61,22 +58,19 @@ def depth(theta: Tensor, x: Tensor, y: Tensor, inner: bool = False) -> Depth:
 def first_order(theta: Tensor, spread: Spread, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     """E(1) - E(q) (K, P) to first order in the distance, and derivatives (K, 11, P) by theta and the blur; float32."""
     theta, x, y = theta.float(), x.float(), y.float()
-    row = torch.arange(len(theta), device=theta.device)
-    outer, inner = depth(theta, x, y), depth(theta, x, y, inner=True)
+    # both circles at once, outer and inner
+    ratio = theta[:, 5:6]
+    inner = torch.cat([theta[:, :2] + theta[:, 6:8], theta[:, 2:5]], -1)
+    d = depth(torch.stack([theta[:, :5], inner]), x, y, torch.stack([torch.ones_like(ratio), ratio]))
     # perspective parts the centres by little: both circles have nearly the same normal at a pixel
-    edge = spread.at(row, outer.nx, outer.ny)
-    columns, value = [], []
-    for d in (outer, inner):
-        step, by_distance, by_blur = edge(d.distance, d.curvature)
-        value.append(step)
-        by_x, by_y = by_distance * d.nx, by_distance * d.ny
-        by_shape = (by_x * d.u, by_x * d.v + by_y * d.u, by_y * d.v)
-        columns.append(((by_x, by_y), by_shape, by_distance / d.length, by_blur))
-    (center, shape, _, blur), (own, own_shape, by_ratio, own_blur) = columns
-    difference = [a - b for a, b in zip((*center, *shape, *blur), (*own, *own_shape, *own_blur), strict=True)]
+    edge = spread.at(torch.arange(len(theta), device=theta.device), d.nx[0], d.ny[0])
+    step, by_distance, by_blur = edge(d.distance, d.curvature)
+    by_x, by_y = by_distance * d.nx, by_distance * d.ny
+    each = torch.stack([by_x, by_y, by_x * d.u, by_x * d.v + by_y * d.u, by_y * d.v, *by_blur], 2)
     # the distance falls where the ellipse grows: E is the inside
-    planes = [*difference[:5], -by_ratio, -own[0], -own[1], *(-b for b in difference[5:])]
-    return value[1] - value[0], torch.stack(planes, 1)
+    ring, blur = (each[0] - each[1]).split([5, len(by_blur)], 1)
+    own = torch.stack([by_distance[1] / d.length[1], by_x[1], by_y[1]], 1)
+    return step[1] - step[0], torch.cat([ring, -own, -blur], 1)
 
 
 def exact(theta: Tensor, spread: Spread, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:

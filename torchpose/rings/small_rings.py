@@ -29,6 +29,7 @@ from torchpose.ellipse import EllipseFit
 from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
 from torchpose.geometry.blurred_edge import BLUR, MOST, Spread
+from torchpose.geometry.blurred_ellipse import nodes_of_each
 from torchpose.geometry.least_squares import (
     Eliminated,
     Normal,
@@ -53,11 +54,12 @@ _MOST_MOVE = (*[0.7] * 5, 0.1, *[0.7] * 2)  # of an iteration: px, and the ratio
 _START_SIGMA = 0.8  # px, at least
 _OVAL = 0.3  # of a blur's mean variance: what is expected of its lean, which a ring as small as its blur hardly tells
 # blur over inner semi-minor axis above which edges are no edges any more (measured: decisions/0053 and docs/tried.md)
-_BLURRED = 0.33
+BLURRED = 0.33
 _BLURRED_MARGIN = 2.5  # blurs around the outer ellipse
 # of the variance of grey around the ring: noise of half of the contrast's deviation remains (convention)
 _LEAST_EXPLAINED = 0.75
 _PART = 400_000  # pixels times nodes at a time
+_FEW = 10_000  # pixels: the calls of a part cost as much, so fewer are padded to one size (measured: docs/tried.md)
 _UNEVEN = 2.0  # most pixels of a window over the least, of those that are padded to one size
 _RATIO_SIGMA = 0.1  # of the ratio: an inner circle that is not sure is none (convention)
 _LEVELS = 4  # paper, its slope 2, contrast
@@ -119,6 +121,7 @@ def fit_small_rings(
     focal: Float[Tensor, ""],
     *,
     precise: bool = True,
+    begun: bool = False,
 ) -> SmallRings:
     """Fits the model above by damped Gauss-Newton from rough rings.
 
@@ -128,6 +131,7 @@ def fit_small_rings(
         inside: what is inside of them, about; directions in which the outer edge does not show do not count.
         focal: px.
         precise: fit rings of a wide blur by the exact integral; else a code may be off by a fifth of its tolerance.
+        begun: circles and blur are those of such a fit already, and only the exact one is wanted.
     """
     frame, outer, polarity, ratio, seen = (
         candidates.frame,
@@ -138,23 +142,27 @@ def fit_small_rings(
     )
     shape = conics.shape_matrix(outer)
     start = [outer[:, :2], shape[:, 0, :1], shape[:, 0, 1:], shape[:, 1, 1:], ratio[:, None]]
-    theta = torch.cat([*start, torch.zeros_like(outer[:, :2])], -1)
+    apart = inside.ellipse[:, :2] - outer[:, :2] if begun else torch.zeros_like(outer[:, :2])
+    theta = torch.cat([*start, apart], -1)
     parted = (outer[:, 2].square() * (1 - ratio.square()) / focal).clamp_min(_LEAST_PARTED)
-    begun = _Start(theta, Spread(blurs.limited(inside.blur, _START_SIGMA**2, MOST**2)), seen, parted, inside.clipped)
-    fit = _no_fit(begun)
-    margin = torch.full_like(ratio, _MARGIN)
-    for part in _parts(_pixels(outer, margin), 1):
-        some = _fitted(_windows(frames, frame[part], outer[part], margin[part]), begun[part], _ROUGH)
-        fit = fit.replaced(part, some)
-    if not precise:
-        return _judged(fit, outer, polarity)
-    which = _blurred(fit, outer, polarity)
-    reach = (_BLURRED_MARGIN * blurs.axes(fit.blur)[1].sqrt()).clamp_min(_MARGIN)
-    begun = replace(begun, theta=fit.theta, spread=Spread(fit.blur))
-    for part in _parts(_pixels(outer[which], reach[which]), MOST_NODES):
+    first = _Start(theta, Spread(blurs.limited(inside.blur, _START_SIGMA**2, MOST**2)), seen, parted, inside.clipped)
+    fit, which = _no_fit(first), torch.arange(len(outer), device=outer.device)
+    if not begun:
+        margin = torch.full_like(ratio, _MARGIN)
+        for part in _parts(_pixels(outer, margin)):
+            some = _fitted(_windows(frames, frame[part], outer[part], margin[part]), first[part], _ROUGH)
+            fit = fit.replaced(part, some)
+        if not precise:
+            return _judged(fit, outer, polarity)
+        which = _blurred(fit, outer, polarity)
+    least, most = (axis.sqrt() for axis in blurs.axes(fit.blur))
+    reach = (_BLURRED_MARGIN * most).clamp_min(_MARGIN)
+    first = replace(first, theta=fit.theta, spread=Spread(fit.blur))
+    nodes = nodes_of_each(outer[which, 2], least[which]).clamp_max(MOST_NODES)
+    for part in _parts(_pixels(outer[which], reach[which]), nodes):
         part = which[part]
         window = _windows(frames, frame[part], outer[part], reach[part])
-        fit = fit.replaced(part, _fitted(window, begun[part], _PRECISE))
+        fit = fit.replaced(part, _fitted(window, first[part], _PRECISE))
     return _judged(fit, outer, polarity)
 
 
@@ -216,12 +224,14 @@ def _half_sides(outer: Tensor, margin: Tensor) -> Tensor:
     return (shape.square().sum(-1).sqrt() + margin[:, None]).ceil().long()
 
 
-def _parts(pixels: Tensor, nodes: int) -> Iterator[Tensor]:
-    """Indices in parts that fit the cache, each padded to the largest of them."""
+def _parts(pixels: Tensor, nodes: Tensor | None = None) -> Iterator[Tensor]:
+    """Indices in parts that fit the cache, each padded to the largest of them; few pixels are one part."""
     order = torch.argsort(pixels)
     size = pixels[order].double()
     step = (size / size[:1].clamp_min(1)).log().div(math.log(_UNEVEN)).long()
-    part = 1_000_000 * step + (size.cumsum(0) * nodes / _PART).long()
+    if len(order) and len(order) * float(size[-1]) < _FEW:
+        step = torch.zeros_like(step)
+    part = 1_000_000 * step + ((size if nodes is None else size * nodes[order]).cumsum(0) / _PART).long()
     yield from order.split(part.unique_consecutive(return_counts=True)[1].tolist() if len(order) else [])
 
 
@@ -230,7 +240,7 @@ def _blurred(fit: _Fit, outer: Tensor, polarity: Tensor) -> Tensor:
     blur, inner = blurs.axes(fit.blur)[1].sqrt(), fit.theta[:, 5] * outer[:, 3]
     # the first fit may leave twice as much
     promising = fit.sound & (fit.contrast * polarity < 0) & (1 - fit.explained < 2 * (1 - _LEAST_EXPLAINED))
-    return (promising & (blur > _BLURRED * inner)).nonzero()[:, 0]
+    return (promising & (blur > BLURRED * inner)).nonzero()[:, 0]
 
 
 def _fitted(window: _Window, begun: _Start, scheme: _Scheme) -> _Fit:

@@ -123,7 +123,7 @@ def _refined_in(sight: Sight, start: Pose, known: PosePrior | None, thorough: bo
     band = band_width(spread)
     result = _refined(_Fit(sight, band, known, _MOST_COARSE), start, spread, _QUICK)
 
-    def again(rows: Tensor, kind: Kind, stages: tuple[_Stage, ...]) -> tuple[Tensor, _Result]:
+    def again(result: _Result, rows: Tensor, kind: Kind, stages: tuple[_Stage, ...]) -> tuple[Tensor, _Result]:
         index = rows.nonzero()[:, 0]
         refined = result.refined[index]
         spread = Spread.of(refined.spread, kind)
@@ -131,25 +131,30 @@ def _refined_in(sight: Sight, start: Pose, known: PosePrior | None, thorough: bo
         other = _refined(fit, start[index].where(~refined.good, Pose(refined.R, refined.t)), spread, stages)
         return index[other.refined.good], other[other.refined.good]
 
+    def shaped(result: _Result, kind: Tensor) -> tuple[_Result, Tensor]:
+        """With the shape of the blur that explains misshapen rows better, where there is one."""
+        least, most = blurs.axes(result.refined.spread)
+        long, open_ones = most > _LONG * least, result.misshapen & (kind == 0)
+        for number, rows in ((1, open_ones & long), (2, open_ones & ~long)):
+            if not bool(rows.any()):
+                continue
+            index, other = again(result, rows, _KINDS[number], _QUICK)
+            better = other.refined.noise < result.refined.noise[index]
+            better &= other.refined.kept > result.refined.kept[index] - _FEWER
+            result = result.replaced(index[better], other[better])
+            kind = kind.index_fill(0, index[better], number)
+        return result, kind
+
+    result, kind = shaped(result, torch.zeros_like(sight.frame))
     # a wide blur needs a wider band, or it takes the levels on both sides of the edge for its own
-    wide = band_width(Spread(result.refined.spread)) > band + 1
+    later = result.refined.doubt & thorough  # a wider band is theirs then
+    wide = (kind == 0) & ~later & (band_width(Spread(result.refined.spread)) > band + 1)
     if bool(wide.any()):
-        result = result.replaced(*again(wide, "gauss", _QUICK))
-    kind = torch.zeros_like(sight.frame)
-    least, most = blurs.axes(result.refined.spread)
-    long = most > _LONG * least
-    for number, rows in ((1, result.misshapen & long), (2, result.misshapen & ~long)):
-        if not bool(rows.any()):
-            continue
-        index, other = again(rows, _KINDS[number], _QUICK)
-        better = other.refined.noise < result.refined.noise[index]
-        better &= other.refined.kept > result.refined.kept[index] - _FEWER
-        result = result.replaced(index[better], other[better])
-        kind = kind.index_fill(0, index[better], number)
+        result, kind = shaped(result.replaced(*again(result, wide, "gauss", _QUICK)), kind)
     for number, name in enumerate(_KINDS if thorough else ()):
         doubt = result.refined.doubt & (kind == number)
         if bool(doubt.any()):
-            result = result.replaced(*again(doubt, name, _THOROUGH))
+            result = result.replaced(*again(result, doubt, name, _THOROUGH))
     return result.refined
 
 
@@ -207,7 +212,7 @@ class _Fit:
     def __init__(self, sight: Sight, band: Tensor, prior: PosePrior | None, most_coarse: int | None = None) -> None:
         self.mask = sight.mask
         self.blocks = gather_pixels(sight, band, TILE * _COARSE)
-        self.coarse = self.blocks.every(_COARSE, most_coarse)
+        self.coarse = self.blocks.every(_COARSE, most_coarse, whole=TILE)
         self.prior = prior
         self.gain = prior is not None and prior.more
         self.stage = _QUICK[0]

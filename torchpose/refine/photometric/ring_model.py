@@ -77,12 +77,16 @@ class PixelBlocks(Rows):
         grown = (self.polarity * gain[self.row])[:, None] * gain.new_tensor([1.0, -1.0])
         return replace(self, radii=self.radii + grown)
 
-    def every(self, nth: int, most: int | None = None) -> PixelBlocks:
-        """The same with one pixel of ``nth``, or as many fewer as leave ``most`` of each marker."""
+    def every(self, nth: int, most: int | None = None, whole: int = 0) -> PixelBlocks:
+        """The same with one pixel of ``nth``, or as many fewer as leave ``most`` of a marker; all of up to ``whole``.
+
+        Of a marker 6 px wide a sixth of its pixels would not tell its 15 unknowns.
+        """
         count = self.grey.shape[1] // nth
         count = count if most is None else min(count, most)
         i = torch.arange(count, device=self.row.device)
-        index = i * self.size.clamp_min(nth * count)[:, None] // count
+        stretched = torch.where(self.size <= min(whole, count), count, self.size.clamp_min(nth * count))
+        index = i * stretched[:, None] // count
         inside = index < self.size[:, None]
         index = index.minimum((self.size[:, None] - 1).clamp_min(0))
         planes = {n: getattr(self, n).gather(1, index) for n in ("ray_x", "ray_y", "grey", "valid", "sector", "seen")}
@@ -288,11 +292,10 @@ def ring_model(blocks: PixelBlocks, R: Tensor, t: Tensor, spread: Spread, *, che
         most = blurs.axes(blur)[1][:, None]
         near = (rim.bend.square() * most < _CURVED) & ((rim.second * straight).abs() < HOLDS)
         sound = near | (d_inner.square() > CUT**2 * blurs.across(blur[:, None], *rim.normal))
-    edge = spread.at(blocks.row, *rim.normal)
-    outer, inner = edge(d_outer, rim.bend), edge(d_inner, rim.bend)
-    by_blur = tuple(one - other for one, other in zip(outer.by_blur, inner.by_blur, strict=True))
+    both = spread.at(blocks.row, *rim.normal)(torch.stack([d_outer, d_inner]), rim.bend)
+    by_blur = tuple(one - other for one, other in both.by_blur)
     size = blocks.radii[:, :1].float()
-    fraction, by_d = outer.fraction + 1 - inner.fraction, outer.by_distance - inner.by_distance
+    fraction, by_d = both.fraction[0] + 1 - both.fraction[1], both.by_distance[0] - both.by_distance[1]
     # dark edges move outwards: those of a dark ring away from each other
-    by_gain = -blocks.polarity[:, None].float() * (outer.by_distance + inner.by_distance) * rim.per_mm
+    by_gain = -blocks.polarity[:, None].float() * both.by_distance.sum(0) * rim.per_mm
     return RingModel(fraction, by_d, by_blur, rim.by_pose, by_gain, foot.x / size, foot.y / size, sound)
