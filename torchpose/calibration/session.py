@@ -74,7 +74,7 @@ def calibrate_camera(
         ConfigError: nothing in view, or as `calibrate_intrinsics`.
     """
     stored, frames = frames, linear_frames(frames, tone or LINEAR)
-    starts = start_cameras(start.width, start.height, lens) if guess else [with_lens(start, lens)]
+    starts = start_cameras(start.width, start.height, lens) if guess else [with_lens(replace(start, tone=None), lens)]
     if isinstance(shown, Board):
         return calibrate_intrinsics(_all_corners(frames, shown), starts, lens=lens)
     if isinstance(shown, Grid):
@@ -148,7 +148,9 @@ def measure_target(
     tone = start.tone or LINEAR if held else tone
     frames = linear_frames(stored, tone or LINEAR)
     if not held:
-        starts = start_cameras(start.width, start.height, lens) if guess else [with_lens(start, lens)]
+        starts = (
+            start_cameras(start.width, start.height, lens) if guess else [with_lens(replace(start, tone=None), lens)]
+        )
         camera = _rough(frames, target, starts, lens)
         tone = tone or frames_tone(stored, target, camera)
         frames = linear_frames(stored, tone)
