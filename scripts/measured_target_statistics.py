@@ -384,7 +384,7 @@ def rendered_set(options: argparse.Namespace, seed: int) -> dict[str, float]:
     )
     names = [f"{k}.png" for k in range(len(frames))]
     started = time.process_time()
-    found = measure_target(lambda: [(names, frames)], scene.nominal, scene.start, held=False, lens=LENS)
+    found = measure_target(lambda: [(names, frames)], scene.nominal, scene.start, lens=LENS)
     seconds = time.process_time() - started
     places, *_ = true_frame(scene)
     error = (found.target.centers - places).flatten()

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -121,8 +122,7 @@ def measure_target(
     target: Target,
     start: Camera,
     *,
-    held: bool,
-    guess: bool = False,
+    given: Literal["camera", "start", "size"] = "start",
     lens: str = "brown5",
     distance: Distance | None = None,
     tone: Tone | None = None,
@@ -133,10 +133,10 @@ def measure_target(
     tilt at which a ring is fitted nor the pixels that are taken depend on the print's errors.
 
     Args:
-        frames: read twice where the camera is ``held``, else three times.
-        held: ``start`` is the camera, its covariance is carried through.
-        guess: see `calibrate_camera`.
-        lens: the same.
+        frames: read twice where the camera is given, else three times.
+        given: what ``start`` is: the camera, whose covariance is carried through, a camera to start from, or the size
+            of the frames alone.
+        lens: see `calibrate_camera`.
         distance: what gives the scale; None: the mean of the nominal distances.
         tone: see `calibrate_camera`; of a camera that is held, its own.
 
@@ -145,11 +145,14 @@ def measure_target(
     """
     # frames are taken for linear below: the camera's tone would count twice
     camera, known, stored = replace(start, tone=None), target, frames
+    held = given == "camera"
     tone = start.tone or LINEAR if held else tone
     frames = linear_frames(stored, tone or LINEAR)
     if not held:
         starts = (
-            start_cameras(start.width, start.height, lens) if guess else [with_lens(replace(start, tone=None), lens)]
+            start_cameras(start.width, start.height, lens)
+            if given == "size"
+            else [with_lens(replace(start, tone=None), lens)]
         )
         camera = _rough(frames, target, starts, lens)
         tone = tone or frames_tone(stored, target, camera)

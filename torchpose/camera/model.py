@@ -84,7 +84,7 @@ class Camera:
             model: Model = "brown_conrady",
             covariance: Tensor | np.ndarray | Sequence[Sequence[float]] | None = None,
             tone: Tone | None = None,
-            adjustment: str | None = None,
+            **adjustment: str | None,
         ) -> None: ...
 
     @classmethod

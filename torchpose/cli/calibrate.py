@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -228,9 +228,8 @@ def _measured(
 
     assert isinstance(shown, Target)  # checked with the options
     first = start or start_cameras(frames.width, frames.height, model)[0]
-    return measure_target(
-        frames, shown, first, held=held, guess=start is None, lens=model, distance=distance, tone=tone
-    )
+    given: Literal["camera", "start", "size"] = "camera" if held else "start" if start is not None else "size"
+    return measure_target(frames, shown, first, given=given, lens=model, distance=distance, tone=tone)
 
 
 def _hand_eye(frames: _Frames, shown: Shown, calibration: Calibration | None, camera: Camera | None) -> HandEyeFit:
