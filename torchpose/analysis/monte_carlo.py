@@ -128,11 +128,13 @@ def _draw(camera: Camera, target: Target, uncertainty: Uncertainty, draws: int, 
     focal, center = camera.matrix.diagonal()[:2].expand(draws, 2), camera.matrix[:2, 2].expand(draws, 2)
     focal = focal * (1 + uncertainty.focal_length * shift[:, 4:5])
     center = center + uncertainty.principal_point * shift[:, 5:7]
+    distortion = camera.distortion + centers.new_tensor(uncertainty.distortion or 0.0) * shift[:, 7:]
     if camera.covariance is not None:
         values, vectors = torch.linalg.eigh(camera.covariance)
-        intrinsics = shift[:, :4] @ (vectors * values.clamp_min(0).sqrt()).mT
-        focal, center = focal + intrinsics[:, :2], center + intrinsics[:, 2:]
-    distortion = camera.distortion + centers.new_tensor(uncertainty.distortion or 0.0) * shift[:, 7:]
+        numbers = torch.cat([shift[:, :4], normal(len(values) - 4)], -1)
+        intrinsics = numbers @ (vectors * values.clamp_min(0).sqrt()).mT
+        focal, center = focal + intrinsics[:, :2], center + intrinsics[:, 2:4]
+        distortion = distortion + intrinsics[:, 4:] if len(values) > 4 else distortion
     in_plane, along, radius = uncertainty.print_centers, uncertainty.print_flatness, uncertainty.print_radii
     off = normal(len(target), 5) * centers.new_tensor([in_plane, in_plane, along, radius, radius])
     scale = 1 + uncertainty.print_scale * normal(1, 1)

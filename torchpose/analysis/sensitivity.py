@@ -175,7 +175,8 @@ def _shares(camera: Camera, gain: Tensor, uncertainty: Uncertainty) -> dict[str,
     sizes = {name: float(bent if name == "distortion" else getattr(uncertainty, name)) for name in columns}
     shares = {name: size**2 * (columns[name] @ columns[name].mT).sum(1) for name, size in sizes.items() if size}
     if camera.covariance is not None:
-        shares["calibration"] = whole[:, :, :4] @ camera.covariance @ whole[:, :, :4].mT
+        by_camera = torch.cat([whole[:, :, :4], whole[:, :, 10:]], -1)[:, :, : len(camera.covariance)]
+        shares["calibration"] = by_camera @ camera.covariance @ by_camera.mT
     return shares
 
 
