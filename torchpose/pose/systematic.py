@@ -209,9 +209,13 @@ def _excess(normals: MarkerNormals, known: Tensor, count: int, setting: Setting)
 
 def _by_target(setting: Setting) -> Tensor:
     """How markers seem moved (N, M, 7, L), each alone, by the numbers of unit variance of the target."""
-    by_target = setting.evidence.by_target
-    aside = setting.R[:, None] @ by_target[:, :, :3]
-    return torch.cat([aside, torch.zeros_like(aside), by_target[:, :, 3:]], 2)
+    return _displaced(setting.R, setting.evidence.by_target)
+
+
+def _displaced(R: Tensor, by: Tensor) -> Tensor:
+    """Motions (N, M, 7, L) of markers whose places (target frame) and edge gain vary so (N, M, 4, L)."""
+    aside = R[:, None] @ by[:, :, :3]
+    return torch.cat([aside, torch.zeros_like(aside), by[:, :, 3:]], 2)
 
 
 def _by_camera(setting: Setting) -> Tensor:
@@ -224,7 +228,9 @@ def _by_camera(setting: Setting) -> Tensor:
     if camera.covariance is None:
         return like.new_zeros(*like.shape[:2], POSE + 1, 0)
     factor = covariance_factor(camera.covariance.to(like))
-    return _as_motions(setting, lambda xy: by_intrinsics(camera, xy)[..., : len(factor)] @ factor)
+    moved = _as_motions(setting, lambda xy: by_intrinsics(camera, xy)[..., : len(factor)] @ factor)
+    together = setting.evidence.by_camera  # of a target that was measured by this camera
+    return moved + _displaced(setting.R, together) if together.shape[-1] else moved
 
 
 def _camera_shifts(setting: Setting) -> Tensor:
