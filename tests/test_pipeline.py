@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import cv2
 import pytest
@@ -17,6 +17,7 @@ import torchpose as tp
 from tests.exact import F64, pinhole, random_poses
 from torchpose.geometry import rotations
 from torchpose.io.truth import read_truth
+from torchpose.pipeline import Method
 from torchpose.sim import add_noise, render
 
 SAMPLE = Path(__file__).parent.parent / "data" / "sample"
@@ -295,3 +296,31 @@ def test_refined_poses_follow_the_intrinsics_as_predicted(method: Literal["photo
         predicted = added.diagonal(dim1=1, dim2=2).clamp_min(0).sqrt()
         scale = predicted.amax(0, keepdim=True)
         assert ((change - predicted).abs() / (0.1 * predicted + 0.2 * scale)).max() < 1
+
+
+def test_mirrored_frames_are_rejected() -> None:
+    """What ReverseX of a camera or a mirror in the path makes of them; a target drawn y-up is one, too, and says so."""
+    camera = tp.Camera.ideal(640, 480, 700.0)
+    r, t = random_poses(2, 30, (150, 170), seed=4)
+    t[:, :2] = 0
+    frames = add_noise(render(camera, QUAD, r, t, psf_sigma=0.7), 1.0).flip(-1)
+    poses = tp.PoseEstimator(camera, QUAD)(frames)
+    assert poses.status.tolist() == [tp.Status.REJECTED] * 2
+    assert poses.reason.tolist() == [tp.Reason.MIRRORED] * 2
+    up = dataclasses.replace(QUAD, normals=-QUAD.normals)
+    assert tp.PoseEstimator(camera, up)(frames).ok.all()
+
+
+def test_no_row_is_ok_without_a_covariance() -> None:
+    """Three of four markers of a camera that is off by up to 1 %, of small rings far away."""
+    camera = tp.Camera.ideal(640, 480, 700.0)
+    off = dataclasses.replace(camera, matrix=camera.matrix * torch.tensor([[1.01], [0.995], [1.0]], dtype=F64))
+    r, t = random_poses(6, 20, (260, 300), seed=6)
+    t[:, :2] = 0
+    three = dataclasses.replace(QUAD, **{n: getattr(QUAD, n)[1:] for n in ("ids", "centers", "normals", "radii")})
+    frames = add_noise(render(camera, three, r, t, psf_sigma=0.7), 1.0)
+    for method in get_args(Method):
+        poses = tp.PoseEstimator(off, QUAD, method=method)(frames)
+        certain = poses[poses.ok]
+        assert (torch.linalg.eigvalsh(certain.covariance)[:, 0] > 0).all()
+        assert (certain.std > 0).all()

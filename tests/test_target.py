@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -273,3 +274,25 @@ def test_checks_hold_without_a_file() -> None:
         Target("a", "light", quad.ids, quad.centers, 2 * quad.normals, quad.radii)
     with pytest.raises(ConfigError, match=r"^part_from_target: is half given; "):
         Target("a", "light", quad.ids, quad.centers, quad.normals, quad.radii, part_rotation=torch.zeros(3))
+
+
+def test_what_a_target_shares_with_its_camera_round_trips(tmp_path: Path) -> None:
+    target = Target.load("quad40")
+    root = torch.randn(13, 13, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    covariance = 1e-6 * root @ root.mT
+    covariance = 0.5 * (covariance + covariance.mT)
+    covariance[-1, :-1] = covariance[:-1, -1] = 0.0
+    cross = torch.randn(13, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    shared = replace(target, covariance=covariance, adjustment="ba-0123456789ab", cross_covariance=cross)
+    path = tmp_path / "measured.yaml"
+    shared.save(path)
+    again = Target.load(path)
+    assert again.adjustment == shared.adjustment
+    assert again.cross_covariance is not None
+    assert torch.equal(again.cross_covariance, cross)
+    assert again.covariance is not None
+    torch.testing.assert_close(again.covariance, covariance, rtol=1e-12, atol=0)
+    with pytest.raises(ConfigError, match="camera_cross_covariance: stands without adjustment"):
+        replace(shared, adjustment=None)
+    with pytest.raises(ConfigError, match=r"camera_cross_covariance: has shape \(12, 8\); give 13 rows"):
+        replace(shared, cross_covariance=cross[1:])

@@ -102,7 +102,7 @@ class PoseEstimator(nn.Module):
         self.solves_compiled = compile
         if compile:
             find_compiler()
-        self.table = MarkerTable.of(self.targets)
+        self.table = MarkerTable.of(self.targets, self.camera)
         for owner in ("camera", "table"):
             for name, value in _tensors(getattr(self, owner)).items():
                 self.register_buffer(f"{owner}_{name}", value.detach().clone())  # the caller's own stays the caller's

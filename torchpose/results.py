@@ -40,6 +40,7 @@ class Reason(IntEnum):
     NOT_CONVERGED = 4
     BEHIND_CAMERA = 5
     TWO_SOLUTIONS = 6  # with Status.AMBIGUOUS
+    MIRRORED = 7  # the target is seen from behind its printed side: a mirror in the path, or a file drawn y-up
 
 
 class Misfit(IntEnum):

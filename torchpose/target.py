@@ -75,6 +75,8 @@ class _TargetFile(BaseModel):
     edge_gain: FiniteFloat = 0.0
     edge_gain_sigma: Deviation | None = None
     centers_covariance: _MatrixFile | None = None
+    adjustment: str | None = None
+    camera_cross_covariance: _MatrixFile | None = None
 
     @field_validator("units", mode="before")
     @classmethod
@@ -102,6 +104,9 @@ class Target:
             `printed_radii` are those of the circles on the part.
         covariance: (3 M + 1, 3 M + 1) float64, mm^2, of the centres on the part, x, y, z by marker, and last of the
             edge gain; None where the file claims a perfect target.
+        adjustment: name of the adjustment that measured the target and a camera together, None where there was none.
+        cross_covariance: (3 M + 1, 4 + n) float64, of the same and that camera's fx, fy, cx, cy and distortion; it
+            holds for a `Camera` of the same ``adjustment``.
 
     Raises:
         ConfigError: duplicate ids, rings that cannot be told apart or read, overlapping markers, fewer than 3 markers,
@@ -118,6 +123,8 @@ class Target:
     part_translation: Tensor | None = None
     edge_gain: float = 0.0
     covariance: Tensor | None = None
+    adjustment: str | None = None
+    cross_covariance: Tensor | None = None
 
     def __post_init__(self) -> None:
         _check_name(self.name)
@@ -132,6 +139,8 @@ class Target:
         self._check_markers()
         if self.covariance is not None:
             _check_covariance(self.covariance.detach(), 3 * m + 1)
+        if self.cross_covariance is not None:
+            _check_cross(self.cross_covariance, 3 * m + 1, self.adjustment)
         printed = self.printed_radii
         if not bool((printed > 0).all() & (printed[:, 1] < printed[:, 0]).all()):
             raise ConfigError(
@@ -274,6 +283,8 @@ class Target:
                 part_translation=None if pose is None else _floats(pose.translation),
                 edge_gain=data.edge_gain,
                 covariance=covariance,
+                adjustment=data.adjustment,
+                cross_covariance=_cross_covariance(data),
             )
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -283,8 +294,8 @@ class Target:
             ConfigError: the folder does not exist or cannot be written.
         """
         lines = [f'name: "{self.name}"', "units: mm", f"background: {self.background}", "markers:"]
-        rows = zip(self.ids.tolist(), self.centers.tolist(), self.radii.tolist(), self.normals.tolist(), strict=True)
-        for marker, center, (outer, inner), normal in rows:
+        markers = zip(self.ids.tolist(), self.centers.tolist(), self.radii.tolist(), self.normals.tolist(), strict=True)
+        for marker, center, (outer, inner), normal in markers:
             facing = "" if normal == [0, 0, 1] else f", normal: {format_list(normal)}"
             lines.append(
                 f"  - {{id: {marker}, center: {format_list(center)}, outer_radius: {format_number(outer)}, "
@@ -300,6 +311,11 @@ class Target:
             lines.append(f"edge_gain_sigma: {format_number(gain**0.5)}")
             if bool(places.any()):
                 lines.append(_stated_places(places))
+        if self.adjustment is not None:
+            lines.append(f'adjustment: "{self.adjustment}"')
+        if self.cross_covariance is not None:
+            (rows, cols), data = self.cross_covariance.shape, format_list(self.cross_covariance.flatten().tolist())
+            lines.append(f"camera_cross_covariance: {{rows: {rows}, cols: {cols}, data: {data}}}")
         write_text(path, "\n".join(lines) + "\n")
 
 
@@ -337,6 +353,27 @@ def _stated_places(places: Tensor) -> str:
         return f"center_sigma: {format_number(sigma[0]) if len(set(sigma)) == 1 else format_list(sigma)}"
     data = format_list(places.flatten().tolist())
     return f"centers_covariance: {{rows: {len(places)}, cols: {len(places)}, data: {data}}}"
+
+
+def _cross_covariance(data: _TargetFile) -> Tensor | None:
+    table = data.camera_cross_covariance
+    if table is None:
+        return None
+    if len(table.data) != table.rows * table.cols:
+        raise ConfigError(
+            f"camera_cross_covariance: {len(table.data)} numbers for {table.rows} x {table.cols}; measure again"
+        )
+    return _floats(table.data).view(table.rows, table.cols)
+
+
+def _check_cross(table: Tensor, size: int, adjustment: str | None) -> None:
+    field = "camera_cross_covariance"
+    if table.ndim != 2 or len(table) != size or table.shape[1] < 4:
+        raise ConfigError(f"{field}: has shape {tuple(table.shape)}; give {size} rows, of fx fy cx cy and distortion")
+    if not bool(table.isfinite().all()):
+        raise ConfigError(f"{field}: holds NaN or infinity; measure the target again")
+    if adjustment is None:
+        raise ConfigError(f"{field}: stands without adjustment, the name that the camera file shares; measure again")
 
 
 def _check_covariance(covariance: Tensor, size: int) -> None:

@@ -105,8 +105,12 @@ def test_centres_of_different_quality_are_weighted() -> None:
     assert (drawn / budget.std() - 1).abs().max() < 0.03
 
 
-def test_the_calibration_of_the_camera_file_is_a_source() -> None:
+@pytest.mark.parametrize("lens", [False, True])
+def test_the_calibration_of_the_camera_file_is_a_source(lens: bool) -> None:
     root = torch.tensor([[2.0, 0, 0, 0], [1.9, 0.3, 0, 0], [0.1, 0.2, 1.5, 0], [0, 0.1, 0.3, 1.2]], dtype=F64)
+    if lens:  # the distortion with its own deviations and in step with the focal length
+        root = torch.block_diag(0.1 * root, torch.diag(torch.tensor([3e-3, 3e-3, 1e-4, 1e-4], dtype=F64)))
+        root[4, 0], root[5, 4] = 1e-3, -2e-3
     camera = replace(distorted(), covariance=root @ root.T)
     R, t = volume((160.0,), (30,))
     budget = propagate(camera, Target.load("quad40"), R, t, Uncertainty())

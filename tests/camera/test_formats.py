@@ -435,3 +435,33 @@ def test_our_cameras_load(path: Path) -> None:
     center = camera.distort(torch.zeros(2, dtype=torch.float64))
     # the paper's setting: the optical axis in the middle of the frame
     assert center.tolist() == [(camera.width - 1) / 2, (camera.height - 1) / 2]
+
+
+@pytest.mark.parametrize("format", ["opencv", "json", "ros", "kalibr"])
+def test_covariance_of_all_intrinsics_and_the_adjustment_round_trip(tmp_path: Path, format: str) -> None:
+    """The whole table goes first; other readers find the part of the matrix where they look for it."""
+    root = torch.randn(8, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    units = torch.tensor([1, 1, 1, 1, 1e-3, 1e-3, 1e-4, 1e-4], dtype=torch.float64)
+    covariance = units[:, None] * (root @ root.T) * units
+    covariance = 0.5 * (covariance + covariance.T)
+    camera = Camera(2048, 1536, K, BROWN, covariance=covariance, adjustment="ba-0123456789ab")
+    path = tmp_path / "cam.any"
+    camera.save(path, format=format)  # type: ignore[arg-type]
+    again = Camera.load(path)
+    assert again.adjustment == "ba-0123456789ab"
+    assert again.covariance is not None
+    assert torch.equal(again.covariance[:8, :8], covariance)
+    # ROS has five coefficients at least: the one that was added is known to be zero
+    assert not bool(again.covariance[8:].any())
+    if format == "opencv":
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+        np.testing.assert_array_equal(storage.getNode("camera_matrix_covariance").mat(), covariance[:4, :4].numpy())
+
+
+def test_covariance_of_another_number_of_intrinsics_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"has shape \(9, 9\); give 4 x 4 for fx fy cx cy, or 8 x 8 with the dist"):
+        Camera(2048, 1536, K, BROWN, covariance=torch.eye(9, dtype=torch.float64))
+    bad = torch.eye(8, dtype=torch.float64)
+    bad[7, 7] = -1e-12
+    with pytest.raises(ConfigError, match="intrinsics_covariance: has a negative eigenvalue"):
+        Camera(2048, 1536, K, BROWN, covariance=bad)

@@ -156,3 +156,46 @@ def test_what_no_print_may_have_is_not_explained() -> None:
     deviation = torch.zeros(14, dtype=F64)
     deviation[:9] = 30.0
     assert not excess_of(*problem(20, 2, deviation)).explained.any()
+
+
+def test_a_target_measured_by_the_same_camera_shares_its_errors() -> None:
+    """The pose of a measured target with both files, against draws of camera and places from their joint covariance."""
+    g = torch.Generator().manual_seed(7)
+    size = 3 * len(QUAD) + 1
+    scale = torch.cat([torch.full((size,), 0.004, dtype=F64), torch.full((4,), 0.3, dtype=F64)])
+    root = scale[:, None] * torch.randn(size + 4, size + 4, dtype=F64, generator=g) / (size + 4) ** 0.5
+    joint = root @ root.T
+    joint[size - 1], joint[:, size - 1] = 0.0, 0.0  # centres tell of no gain
+    camera = dataclasses.replace(pinhole(), covariance=joint[size:, size:], adjustment="one")
+    parts = {"covariance": joint[:size, :size], "adjustment": "one", "cross_covariance": joint[:size, size:]}
+    target = dataclasses.replace(QUAD, **parts)
+    r, t = random_poses(1, 30, (150, 190))
+    table = MarkerTable.of([target], camera)
+    both = table.by_print[0] @ table.by_print[0].mT + table.by_camera[0] @ table.by_camera[0].mT
+    torch.testing.assert_close(both[0, :3, :3], joint[:3, :3], rtol=1e-6, atol=1e-12)
+    draws = 3000
+    drawn = torch.linalg.cholesky(joint + 1e-14 * torch.eye(size + 4, dtype=F64)) @ torch.randn(
+        size + 4, draws, dtype=F64, generator=g
+    )
+    matrix = camera.matrix + torch.zeros(draws, 3, 3, dtype=F64)
+    for k, (i, j) in enumerate(((0, 0), (1, 1), (0, 2), (1, 2))):
+        matrix[:, i, j] += drawn[size + k]
+    x = (r @ (QUAD.centers + drawn[: size - 1].T.unflatten(-1, (-1, 3))).mT).mT + t[:, None]
+    raw = (x @ matrix.mT)[..., :2] / x[..., 2:]
+    noise = 0.003
+    raw = raw + noise * torch.randn(raw.shape, dtype=F64, generator=g)
+    ellipses = exact_ellipses(QUAD, camera, r, t)
+    rings = rings_of(ellipses.flatten(0, 1), torch.zeros(4, dtype=torch.int64), noise * 10)
+    one = gather_evidence(rings, torch.arange(4).view(1, 4), table[torch.zeros(1, dtype=torch.int64)], camera)
+    covariance = noise**2 * torch.eye(2, dtype=F64).expand(1, 4, 2, 2)
+    every = dataclasses.replace(one, covariance=covariance)[torch.zeros(draws, dtype=torch.int64)]
+    every = dataclasses.replace(every, center=raw)
+    s = solve_poses(every, (r.expand(draws, -1, -1), t.expand(draws, -1)))
+    setting = Setting(every, s.R, s.t, camera, False)
+    found = on_print(center_normals(every, s.R, s.t), setting, torch.zeros(draws, 4, 4, dtype=F64))
+    turned = rotations.exp(found.step[:, 3:]) @ s.R
+    error = torch.cat([s.t + found.step[:, :3] - t, rotations.log(turned @ r.mT)], -1)
+    nees = (error[:, None] @ torch.linalg.solve(found.covariance, error[..., None]))[:, 0, 0]
+    assert 5.6 < nees.mean() < 6.4
+    apart = dataclasses.replace(camera, adjustment="another")
+    assert (MarkerTable.of([target], apart).by_camera == 0).all()

@@ -116,7 +116,7 @@ class _Draws(NamedTuple):
         matrix = self.camera.matrix.clone()
         matrix[[0, 1], [0, 1]], matrix[:2, 2] = self.focal[draw].to(matrix), self.center[draw].to(matrix)
         camera = replace(self.camera, matrix=matrix, distortion=self.distortion[draw], covariance=None)
-        exact = replace(self.target, edge_gain=0.0, covariance=None)
+        exact = replace(self.target, edge_gain=0.0, covariance=None, cross_covariance=None)
         return camera, replace(exact, centers=self.centers[draw], radii=self.radii[draw])
 
 

@@ -1,7 +1,11 @@
 """Intrinsics of a camera from views of known points, with their covariance and what there is to doubt about them."""
 
+from __future__ import annotations
+
+import hashlib
 import math
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -9,10 +13,12 @@ from torch import Tensor
 
 from torchpose import pnp
 from torchpose.calibration.bundle import Bundle, adjust
+from torchpose.calibration.plate import Plate
 from torchpose.calibration.views import Views
 from torchpose.camera import Camera
 from torchpose.camera.model import Model
 from torchpose.errors import ConfigError
+from torchpose.geometry.projection import image_by_point
 
 LENS_MODELS: dict[str, tuple[Model, tuple[str, ...]]] = {
     "pinhole": ("brown_conrady", ()),
@@ -28,7 +34,9 @@ _START_FOCALS = (0.6, 1.0, 1.8, 3.5)  # over the width, tried where no camera is
 _START_SIGMA = 1.0  # px, of points without a covariance, until their residuals tell
 _OUTLIER = 27.6  # chi-squared of a point beyond which it is left out: 1e-6 of good points
 _MEDIAN = 2 * math.log(2)  # of chi-squared with two degrees of freedom
+_RIM_OUTLIER, _RIM_MEDIAN = 38.3, 5.35  # the same of a ring, with six degrees of freedom
 _ROUNDS = 4  # of leaving out points and finding the common error
+_PLATE_ROUNDS = 1  # more where the plate has unknowns: the first fit of its places
 _WIDE_SIGMA = 1e-3  # of a focal length, above which views are called too alike
 _LITTLE_TILT_DEG = 15.0  # between the views' normals, below which they are
 _LARGE_ERROR = 1.0  # px, of all points, above which something else than their noise is wrong
@@ -37,6 +45,7 @@ _LEAST_AGREEING = 0.5  # of the points, of a calibration that more than chance e
 _LEAST_FACTOR = 0.25  # of numerator and denominator of a rational lens: a real one's stay above, what cancels does not
 _OPEN_COEFFICIENT = 1.0  # standard deviation of k4: as much as the coefficient of a real lens
 _LITTLE_COVER = 0.5  # of the frame's width or height, below which distortion is extrapolated
+_DIGITS = 12  # of the name of an adjustment
 _SINGULAR = 1e-12  # least eigenvalue of the information, scaled to a unit diagonal
 
 
@@ -44,17 +53,20 @@ _SINGULAR = 1e-12  # least eigenvalue of the information, scaled to a unit diago
 class Calibration:
     """Result of `calibrate_intrinsics`."""
 
-    camera: Camera  # with ``camera.covariance`` of fx, fy, cx, cy
+    camera: Camera  # with its covariance
     covariance: Float[Tensor, "n n"]  # of fx, fy, cx, cy (px) and the distortion
+    joint: Float[Tensor, "u u"]  # of these and the unknowns of the plate
     names: tuple[str, ...]  # of the intrinsics
     views: Views  # that were used, with the points that were used
     bundle: Bundle  # poses and residuals of these
     left_out: int  # points left out because they contradict the others
     chi2: float  # sum over all points
-    degrees: int  # of freedom
+    degrees: float  # of freedom
     # px per axis, that had to be added to every point (print, flatness, lens model) to make the reduced chi-squared 1;
     # 0 where the covariances of the points explain the residuals
     common_sigma_px: float
+    plate: Plate | None = None  # what was unknown of the target
+    seen: Views | None = None  # all views that there were
     warnings: list[str] = field(default_factory=list)  # what makes the result doubtful, one sentence each
 
     @property
@@ -68,9 +80,9 @@ class Calibration:
 
     @property
     def pose_covariance(self) -> Float[Tensor, "N 6 6"]:
-        """Of the views' poses, the uncertainty of the intrinsics included."""
+        """Of the views' poses, the uncertainty of the intrinsics and of the plate included."""
         gain = self.bundle.gain
-        return self.bundle.pose_covariance + gain @ self.covariance @ gain.mT
+        return self.bundle.pose_covariance + gain @ self.joint @ gain.mT
 
 
 def start_cameras(width: int, height: int, lens: str) -> list[Camera]:
@@ -102,25 +114,28 @@ def with_lens(camera: Camera, lens: str) -> Camera:
     return replace(camera, model=model, distortion=distortion, covariance=None).to(torch.float64)
 
 
-def calibrate_intrinsics(views: Views, starts: list[Camera], *, lens: str = "brown5") -> Calibration:
+def calibrate_intrinsics(
+    views: Views, starts: list[Camera], *, lens: str = "brown5", plate: Plate | None = None
+) -> Calibration:
     """Maximum-likelihood intrinsics of one camera and the poses of its views.
 
     All points of all views are adjusted together (`torchpose.calibration.bundle.adjust`). Points that contradict the
     others by more than 1e-6 of good ones would are left out. Where the residuals are larger than the covariances of the
     points say, an error common to all points and axes is added to these (variance component by its residuals, as
-    Foerstner 1979), so that the covariance of the result covers it; errors that repeat in every view, such as those of
-    the print, are then counted as if they did not.
+    Foerstner 1979), so that the covariance of the result covers it. Errors that repeat in every view, such as those of
+    the print, are counted as such where ``plate`` has them, and else as if they did not repeat.
 
     Args:
         views: a covariance of zero means unknown; the common error then stands for it.
         starts: cameras to start from; the one that fits best is taken. `start_cameras` where nothing is known.
         lens: a name of `LENS_MODELS`.
+        plate: what is unknown of the target beside its poses; None where its points are exact.
 
     Raises:
         ConfigError: too few views or points, views that do not determine the intrinsics, or no convergence.
     """
     _, coefficients = _lens(lens)
-    names = ("fx", "fy", "cx", "cy", *coefficients)
+    names, seen = ("fx", "fy", "cx", "cy", *coefficients), views
     views = views.of_views(views.counts >= MIN_POINTS)
     _check_count(views, len(names))
     fits = [_first_fit(views, with_lens(start, lens).to(views.pixels)) for start in starts]
@@ -128,24 +143,34 @@ def calibrate_intrinsics(views: Views, starts: list[Camera], *, lens: str = "bro
     if best is None:
         raise ConfigError("INPUT: no pose explains the views; give --camera to start from and check the target")
     before = len(best[0].view)
-    views, bundle, common = _weigh(*best, len(names))
+    views, bundle, common = _weigh(*best, len(names), plate)
     if not bundle.converged:
         raise ConfigError("INPUT: calibration did not converge; use a simpler --model or more varied views")
     _check_residuals(views, bundle, before)
-    covariance = _covariance(bundle, names)
+    joint = _covariance(bundle.information, names)
+    covariance = joint[: len(names), : len(names)]
     _check_lens(bundle.camera, covariance, names)
     return Calibration(
-        replace(bundle.camera, covariance=covariance[:4, :4]),
+        replace(bundle.camera, covariance=covariance, adjustment=name_of(joint, bundle.camera.matrix)),
         covariance,
+        joint,
         names,
         views,
         bundle,
         before - len(views.view),
         float(bundle.chi2.sum()),
-        _degrees(views, len(names)),
-        common,
-        _warnings(views, bundle, covariance, common),
+        _channels(views, bundle)[0].redundancy(common.px),
+        common.px,
+        plate,
+        seen,
+        _warnings(views, bundle, covariance, common.px),
     )
+
+
+def name_of(*results: Tensor) -> str:
+    """A name of an adjustment that two of different frames do not share."""
+    digest = hashlib.sha256(b"".join(result.detach().double().cpu().numpy().tobytes() for result in results))
+    return f"ba-{digest.hexdigest()[:_DIGITS]}"
 
 
 def locate_views(views: Views, camera: Camera) -> tuple[Views, Bundle]:
@@ -154,32 +179,139 @@ def locate_views(views: Views, camera: Camera) -> tuple[Views, Bundle]:
     Raises:
         ConfigError: no view has a pose.
     """
+    return _located(views, camera, None)[:2]
+
+
+def measure_plate(views: Views, camera: Camera, plate: Plate) -> Calibration:
+    """What is unknown of a plate seen by a camera that is known, held as it is; its covariance is carried through.
+
+    Raises:
+        ConfigError: no view has a pose, or the views do not determine the plate.
+    """
+    seen, n = views, 4 + len(camera.distortion)
+    views, bundle, common = _located(views, camera, plate)
+    if not bundle.converged:
+        raise ConfigError("INPUT: the target could not be measured; use more varied views")
+    names = ("fx", "fy", "cx", "cy", *(f"d{k}" for k in range(1, n - 3)))
+    of_plate = _covariance(bundle.information[n:, n:], ())
+    held = bundle.information.new_zeros(n, n)
+    if camera.covariance is not None:
+        known = len(camera.covariance)
+        held[:known, :known] = camera.covariance
+    moved = -of_plate @ bundle.information[n:, :n]  # d plate / d intrinsics
+    cross = moved @ held
+    joint = torch.cat([torch.cat([held, cross.mT], 1), torch.cat([cross, of_plate + cross @ moved.mT], 1)])
+    degrees = _channels(views, bundle)[0].redundancy(common.px)
+    left_out, chi2 = len(seen.view) - len(views.view), float(bundle.chi2.sum())
+    return Calibration(camera, held, joint, names, views, bundle, left_out, chi2, degrees, common.px, plate, seen)
+
+
+def _located(views: Views, camera: Camera, plate: Plate | None) -> tuple[Views, Bundle, Common]:
     views = views.of_views(views.counts >= MIN_POINTS)
     first = _first_fit(views, camera.to(views.pixels), free=False) if len(views) else None
     if first is None:
         raise ConfigError("INPUT: no view has a pose; check --camera, the target and the frames")
-    return _weigh(*first, 0)[:2]
+    return _weigh(*first, 0, plate)
 
 
-def _weigh(views: Views, bundle: Bundle, unknowns: int) -> tuple[Views, Bundle, float]:
-    """Views without contradicting points, their fit, weighted, of n unknown intrinsics, and the common error in px."""
-    free, common = unknowns > 0, 0.0
-    for _ in range(_ROUNDS):
-        common = common_sigma(bundle.residual, views.covariance, _degrees(views, unknowns))
-        bundle = adjust(_with_common(views, common), bundle.camera, bundle.R, bundle.t, free=free)
-        keep = bundle.chi2 < _OUTLIER * max(1.0, float(bundle.chi2.median()) / _MEDIAN)
+class Common(NamedTuple):
+    """Standard deviations that are added to every point (px) and to what its rims tell (relative depth, gain in mm)."""
+
+    px: float = 0.0
+    depth: float = 0.0
+    gain: float = 0.0
+
+
+def _weigh(views: Views, bundle: Bundle, unknowns: int, plate: Plate | None = None) -> tuple[Views, Bundle, Common]:
+    """Views without contradicting points, their fit, weighted, of n unknown intrinsics, and the common error.
+
+    ``bundle`` is a `_first_fit`: with equal weights.
+    """
+    # with wrong places residuals tell nothing of the noise: the first fit that moves them goes by the covariances alone
+    told = plate is not None and bool(views.covariance.any())
+    common = Common() if told else _common(views, bundle, Common(_START_SIGMA))
+
+    def fit(bundle: Bundle, views: Views, common: Common, rows: slice | Tensor = slice(None)) -> Bundle:
+        start = bundle.plate if len(bundle.plate) else None
+        poses = bundle.R[rows], bundle.t[rows]
+        return adjust(_with_common(views, common), bundle.camera, *poses, free=unknowns > 0, plate=plate, start=start)
+
+    for number in range(_ROUNDS + (0 if plate is None else _PLATE_ROUNDS)):
+        if number:
+            common = _common(views, bundle, common)
+        bundle = fit(bundle, views, common)
+        keep = _agree(bundle.chi2, _OUTLIER, _MEDIAN)
+        keep &= _agree(_rim_chi2(views, bundle, common), _RIM_OUTLIER, _RIM_MEDIAN)
         if bool(keep.all()):
             continue
         views = views[keep]
         enough = views.counts >= MIN_POINTS
         views = views.of_views(enough)
         _check_count(views, unknowns)
-        bundle = adjust(_with_common(views, common), bundle.camera, bundle.R[enough], bundle.t[enough], free=free)
+        bundle = fit(bundle, views, common, enough)
     return views, bundle, common
 
 
-def common_sigma(residual: Float[Tensor, "K 2"], covariance: Float[Tensor, "K 2 2"], degrees: int) -> float:
-    """Standard deviation s, px per axis, with sum of r^T (C + s^2 I)^-1 r = degrees of freedom; 0 where C suffices.
+def _agree(chi2: Tensor, most: float, median: float) -> Tensor:
+    """Points (K,) that do not contradict the others, by the chi-squared of one in 10^6 and of every second good one."""
+    return chi2 < most * max(1.0, float(chi2.median()) / median)
+
+
+def _rim_chi2(views: Views, bundle: Bundle, common: Common) -> Tensor:
+    """Chi-squared (K,) of what the rims tell, zero where they were not asked."""
+    rims = _with_common(views, common).rims
+    if rims is None or bundle.rims.shape[1] == 0:
+        return torch.zeros_like(bundle.chi2)
+    return (rims.roots @ bundle.rims[..., None]).square().sum((-1, -2))
+
+
+class _Channel(NamedTuple):
+    """Residuals of K observations that share a common error, their covariance by noise, and that of the prediction."""
+
+    residual: Float[Tensor, "K d"]
+    covariance: Float[Tensor, "K d d"]
+    predicted: Float[Tensor, "K d d"]
+
+    def redundancy(self, common: float) -> float:
+        """The sum of the observations' redundancies: degrees of freedom of their residuals."""
+        share = torch.linalg.solve(_widened(self.covariance, common), self.predicted)
+        return float(self.residual.numel() - share.diagonal(dim1=-2, dim2=-1).sum())
+
+
+def _channels(views: Views, bundle: Bundle) -> tuple[_Channel, ...]:
+    """Pixels, and where rims were asked their relative distances and edge gains."""
+    rims = views.rims
+    if rims is None or bundle.rims.shape[1] == 0:
+        return (_Channel(bundle.residual, views.covariance, bundle.predicted),)
+    xy = rims.t[:, :2] / rims.t[:, 2:]
+    by_place = rims.camera.J_distort(xy) @ image_by_point(xy, rims.t[:, 2])
+    parts = [_Channel(bundle.residual, views.covariance, by_place @ bundle.predicted[:, :3, :3] @ by_place.mT)]
+    for k, unit in ((2, rims.t[:, 2]), (6, torch.ones_like(rims.t[:, 2]))):
+        of = (
+            values[:, k, k, None, None] / unit[:, None, None].square() for values in (rims.covariance, bundle.predicted)
+        )
+        parts.append(_Channel((bundle.rims[:, k] / unit)[:, None], *of))
+    return tuple(parts)
+
+
+def redundancy(views: Views, bundle: Bundle) -> float:
+    """Degrees of freedom of the residuals of a fit to pixels."""
+    return _channels(replace(views, rims=None), bundle)[0].redundancy(0.0)
+
+
+def _common(views: Views, bundle: Bundle, before: Common) -> Common:
+    """The common errors that the residuals of a fit show, which was made with other ones."""
+    channels = _channels(views, bundle)
+    return Common(
+        *(
+            common_sigma(one.residual, one.covariance, max(1.0, one.redundancy(sigma)))
+            for one, sigma in zip(channels, before, strict=False)
+        )
+    )
+
+
+def common_sigma(residual: Float[Tensor, "K d"], covariance: Float[Tensor, "K d d"], degrees: float) -> float:
+    """Standard deviation s per axis, with sum of r^T (C + s^2 I)^-1 r = degrees of freedom; 0 where C suffices.
 
     The covariance C is zero where it is unknown.
     """
@@ -199,11 +331,15 @@ def common_sigma(residual: Float[Tensor, "K 2"], covariance: Float[Tensor, "K 2 
 
 
 def _widened(covariance: Tensor, sigma: float) -> Tensor:
-    return covariance + sigma * sigma * torch.eye(2, dtype=covariance.dtype, device=covariance.device)
+    size = covariance.shape[-1]
+    return covariance + sigma * sigma * torch.eye(size, dtype=covariance.dtype, device=covariance.device)
 
 
-def _with_common(views: Views, sigma: float) -> Views:
-    return replace(views, covariance=_widened(views.covariance, sigma))
+def _with_common(views: Views, common: Common) -> Views:
+    rims = views.rims
+    if rims is not None and any(common):
+        rims = rims.widened(*common)
+    return replace(views, covariance=_widened(views.covariance, common.px), rims=rims)
 
 
 def _first_fit(views: Views, camera: Camera, *, free: bool = True) -> tuple[Views, Bundle] | None:
@@ -220,7 +356,7 @@ def _first_fit(views: Views, camera: Camera, *, free: bool = True) -> tuple[View
         if not bool(solved.any()):
             return None
         views = views.of_views(solved)
-        equal = _with_common(replace(views, covariance=torch.zeros_like(views.covariance)), _START_SIGMA)
+        equal = replace(views, covariance=_widened(torch.zeros_like(views.covariance), _START_SIGMA))
         try:
             found = views, adjust(equal, camera, R[solved], t[solved], free=free)
         except (ConfigError, torch.linalg.LinAlgError):
@@ -298,14 +434,16 @@ def _check_lens(camera: Camera, covariance: Tensor, names: tuple[str, ...]) -> N
         )
 
 
-def _covariance(bundle: Bundle, names: tuple[str, ...]) -> Tensor:
-    information = bundle.information
+def _covariance(information: Tensor, names: tuple[str, ...]) -> Tensor:
+    """Inverse of the information about the intrinsics of these names, and whatever follows them."""
     scale = information.diagonal().clamp_min(1e-300).rsqrt()
     values, vectors = torch.linalg.eigh(information * scale[:, None] * scale)
     if not float(values[0]) > _SINGULAR:
-        direction = ", ".join(names[i] for i in vectors[:, 0].abs().topk(2).indices.sort().values.tolist())
+        told, what = dict(enumerate(names)), "intrinsics" if names else "places"
+        most = vectors[:, 0].abs().topk(2).indices.sort().values.tolist()
+        direction = ", ".join(dict.fromkeys(told.get(i, "places of the target") for i in most))
         raise ConfigError(
-            f"INPUT: the views are too alike to tell the intrinsics apart (mostly {direction}); "
+            f"INPUT: the views are too alike to tell the {what} apart (mostly {direction}); "
             "add views tilted by 20 to 45 degrees in different directions"
         )
     root = scale[:, None] * vectors * values.rsqrt()

@@ -1,7 +1,8 @@
 """From frames to a calibration: one camera, a ring target or a board, and the robot's poses where there are any."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -10,7 +11,22 @@ from torchpose.calibration.boards import Board, find_corners
 from torchpose.calibration.bundle import Bundle
 from torchpose.calibration.grids import Grid, Marks, find_marks, measure_marks, sizes_of_marks
 from torchpose.calibration.hand_eye import HandEyeFit, Mount, calibrate_hand_eye
-from torchpose.calibration.intrinsics import Calibration, calibrate_intrinsics, locate_views, start_cameras, with_lens
+from torchpose.calibration.intrinsics import (
+    Calibration,
+    calibrate_intrinsics,
+    locate_views,
+    measure_plate,
+    start_cameras,
+    with_lens,
+)
+from torchpose.calibration.measured import (
+    Distance,
+    check_seen,
+    doubts,
+    measured_target,
+    scaled_by_distance,
+)
+from torchpose.calibration.plate import free_plate, stated_plate
 from torchpose.calibration.rings import find_rings, measure_centers
 from torchpose.calibration.tone import judge_tone, sizes_of_target
 from torchpose.calibration.views import Views
@@ -25,6 +41,7 @@ Frames = Callable[[], Iterable[tuple[Sequence[str], Tensor]]]
 Shown = Target | Board | Grid
 """What the frames show."""
 
+_MEASURED = 2  # times that the grey values are fitted: the second changes places by less than their deviation
 _SAMPLE = 16  # frames that the tone is judged by
 _MOST_NOISE = (5.0, 0.05)  # mm, rad: a robot that is farther off was not there when the frames were taken
 
@@ -45,6 +62,7 @@ def calibrate_camera(
 
     A ring target, or a grid of discs or rings, is measured in two rounds: rough centres to calibrate the camera, with
     which `measure_centers` or `measure_marks` fits the grey values.
+    The places of a target are unknowns with the covariance that its file states.
 
     Args:
         frames: read once for a board of squares, else twice.
@@ -57,7 +75,7 @@ def calibrate_camera(
         ConfigError: nothing in view, or as `calibrate_intrinsics`.
     """
     stored, frames = frames, linear_frames(frames, tone or LINEAR)
-    starts = start_cameras(start.width, start.height, lens) if guess else [with_lens(start, lens)]
+    starts = start_cameras(start.width, start.height, lens) if guess else [with_lens(replace(start, tone=None), lens)]
     if isinstance(shown, Board):
         return calibrate_intrinsics(_all_corners(frames, shown), starts, lens=lens)
     if isinstance(shown, Grid):
@@ -69,15 +87,94 @@ def calibrate_camera(
             marks = _all_marks(frames, shown, camera)
         found = calibrate_intrinsics(_all_mark_centers(frames, shown, camera, marks), [camera], lens=lens)
         return replace(found, camera=replace(found.camera, tone=tone))
-    batches = [find_rings(names, part, starts, shown) for names, part in frames()]
+    camera = _rough(frames, shown, starts, lens)
+    tone = tone or frames_tone(stored, shown, camera)
+    plate = None
+    if shown.covariance is not None:
+        plate = stated_plate(shown.ids, shown.centers, shown.covariance[:-1, :-1])
+    seen = _all_centers(linear_frames(stored, tone), shown, camera)
+    found = calibrate_intrinsics(seen, [camera], lens=lens, plate=plate)
+    return replace(found, camera=replace(found.camera, tone=tone))
+
+
+def _rough(frames: Frames, target: Target, starts: Sequence[Camera], lens: str) -> Camera:
+    """The camera from the ellipses of a target that is taken as exact."""
+    batches = [find_rings(names, part, starts, target) for names, part in frames()]
     every = [Views.cat(views) for views in zip(*batches, strict=True)]
     rough = max(every, key=lambda views: len(views.view), default=None)
     if rough is None or not len(rough.view):
-        raise ConfigError(f"INPUT: no marker of target {shown.name} in any frame; check --target and the frames")
-    camera = calibrate_intrinsics(rough, starts, lens=lens).camera
-    tone = tone or frames_tone(stored, shown, camera)
-    found = calibrate_intrinsics(_all_centers(linear_frames(stored, tone), shown, camera), [camera], lens=lens)
-    return replace(found, camera=replace(found.camera, tone=tone))
+        raise ConfigError(f"INPUT: no marker of target {target.name} in any frame; check --target and the frames")
+    return calibrate_intrinsics(rough, list(starts), lens=lens).camera
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """A target measured by a camera: the adjustment, and both as their files hold them."""
+
+    calibration: Calibration
+    nominal: Target
+    target: Target
+    camera: Camera
+
+
+def measure_target(
+    frames: Frames,
+    target: Target,
+    start: Camera,
+    *,
+    given: Literal["camera", "start", "size"] = "start",
+    lens: str = "brown5",
+    distance: Distance | None = None,
+    tone: Tone | None = None,
+) -> Measurement:
+    """Places, edge gain and sizes of a target's rings, and the camera with them unless it is known.
+
+    The grey values are fitted twice: with the target as its file has it, then as it was measured, so that neither the
+    tilt at which a ring is fitted nor the pixels that are taken depend on the print's errors.
+
+    Args:
+        frames: read twice where the camera is given, else three times.
+        given: what ``start`` is: the camera, whose covariance is carried through, a camera to start from, or the size
+            of the frames alone.
+        lens: see `calibrate_camera`.
+        distance: what gives the scale; None: the mean of the nominal distances.
+        tone: see `calibrate_camera`; of a camera that is held, its own.
+
+    Raises:
+        ConfigError: nothing in view, a marker that is in too few views, or as `calibrate_intrinsics`.
+    """
+    # frames are taken for linear below: the camera's tone would count twice
+    camera, known, stored = replace(start, tone=None), target, frames
+    held = given == "camera"
+    tone = start.tone or LINEAR if held else tone
+    frames = linear_frames(stored, tone or LINEAR)
+    if not held:
+        starts = (
+            start_cameras(start.width, start.height, lens)
+            if given == "size"
+            else [with_lens(replace(start, tone=None), lens)]
+        )
+        camera = _rough(frames, target, starts, lens)
+        tone = tone or frames_tone(stored, target, camera)
+        frames = linear_frames(stored, tone)
+    for _ in range(_MEASURED):
+        views = _all_centers(frames, known, camera, rims=True)
+        check_seen(views, target)
+        plate = free_plate(target.ids, target.centers, known.normals)
+        if held:
+            found = measure_plate(views, camera, plate)
+        else:
+            found = calibrate_intrinsics(views, [camera], lens=lens, plate=plate)
+        if distance is not None:
+            found = scaled_by_distance(found, distance)
+        measured, camera_of = measured_target(found, known)
+        if held:  # what both share is of use where the camera's file has a name for it
+            cross = None if start.adjustment is None else measured.cross_covariance
+            measured, camera_of = replace(measured, adjustment=start.adjustment, cross_covariance=cross), start
+        camera, known = replace(camera_of, tone=None), measured
+    camera_of = camera_of if held else replace(camera_of, tone=tone)
+    found = replace(found, camera=camera_of, warnings=[*found.warnings, *doubts(found, target)])
+    return Measurement(found, target, measured, camera_of)
 
 
 def linear_frames(frames: Frames, tone: Tone) -> Frames:
@@ -143,8 +240,8 @@ def _all_mark_centers(frames: Frames, grid: Grid, camera: Camera, marks: Marks) 
     return Views.cat([measure_marks(names, part, some, grid, camera) for names, part, some in batches])
 
 
-def _all_centers(frames: Frames, target: Target, camera: Camera) -> Views:
-    return Views.cat([measure_centers(names, part, camera, target) for names, part in frames()])
+def _all_centers(frames: Frames, target: Target, camera: Camera, *, rims: bool = False) -> Views:
+    return Views.cat([measure_centers(names, part, camera, target, rims=rims) for names, part in frames()])
 
 
 def calibrate_robot(

@@ -27,6 +27,8 @@ FIELDS: dict[str, tuple[str, ...]] = {
     "camera_matrix": ("camera_matrix", "cameraMatrix", "K", "k"),
     "distortion_coefficients": ("distortion_coefficients", "dist_coeffs", "distCoeffs", "D", "d"),
 }
+COVARIANCES = ("intrinsics_covariance", "camera_matrix_covariance")
+"""Of fx fy cx cy and the distortion, or of the former alone; the first that a file has counts."""
 MODELS: dict[str, Model] = {
     "brown_conrady": "brown_conrady",
     "plumb_bob": "brown_conrady",
@@ -144,6 +146,7 @@ def _native(data: Mapping[str, Any]) -> Camera:
         _model(data.get("distortion_model", default)),
         _covariance(data),
         tone=_tone(data),
+        adjustment=_adjustment(data),
     )
 
 
@@ -176,6 +179,7 @@ def _kalibr(key: str, entry: Any) -> Camera:
             _model(entry["distortion_model"]),
             _covariance(entry),
             tone=_tone(entry),
+            adjustment=_adjustment(entry),
         )
 
 
@@ -225,8 +229,13 @@ def _matrix(fx: float, fy: float, cx: float, cy: float) -> torch.Tensor:
 
 
 def _covariance(data: Mapping[str, Any]) -> torch.Tensor | None:
-    field = "camera_matrix_covariance"
-    return None if data.get(field) is None else _numbers(data[field], field)
+    field = next((name for name in COVARIANCES if data.get(name) is not None), None)
+    return None if field is None else _numbers(data[field], field)
+
+
+def _adjustment(data: Mapping[str, Any]) -> str | None:
+    name = data.get("adjustment")
+    return None if name is None else str(name)
 
 
 def _tone(data: Mapping[str, Any]) -> Tone | None:
@@ -286,9 +295,19 @@ def _entries(camera: Camera) -> dict[str, Any]:
         "camera_matrix": camera.matrix,
         "distortion_model": camera.model,
         "distortion_coefficients": camera.distortion,
-        "camera_matrix_covariance": camera.covariance,
+        **_covariances(camera),
         "tone": None if camera.tone is None else str(camera.tone),
+        "adjustment": camera.adjustment,
     }
+
+
+def _covariances(camera: Camera) -> dict[str, torch.Tensor]:
+    """Keys and tables of a camera's covariance: that of the matrix for all readers, and the whole one where known."""
+    whole, of_matrix = COVARIANCES
+    if camera.covariance is None:
+        return {}
+    tables = {of_matrix: camera.covariance[:4, :4]}
+    return tables if len(camera.covariance) == 4 else tables | {whole: camera.covariance}
 
 
 def _opencv_text(camera: Camera) -> str:
@@ -308,7 +327,8 @@ def _json_text(camera: Camera) -> str:
 def _ros_text(camera: Camera) -> str:
     entries, model = _entries(camera), "equidistant"
     coefficients = camera.distortion
-    covariance, tone = entries.pop("camera_matrix_covariance"), entries.pop("tone")
+    covariances = {name: entries.pop(name) for name in COVARIANCES if name in entries}
+    last = {name: entries.pop(name) for name in ("tone", "adjustment")}
     if camera.model == "brown_conrady":  # plumb_bob has five coefficients, rational_polynomial eight
         model = "rational_polynomial" if len(coefficients) == 8 else "plumb_bob"
         coefficients = pad(coefficients, (0, (8 if len(coefficients) == 8 else 5) - len(coefficients)))
@@ -318,10 +338,12 @@ def _ros_text(camera: Camera) -> str:
         "camera_name": "camera",
         "rectification_matrix": torch.eye(3),
         "projection_matrix": pad(camera.matrix, (0, 1)),
-        "camera_matrix_covariance": covariance,
-        "tone": tone,
     }
-    return _yaml(entries)
+    added = len(coefficients) - len(camera.distortion)  # coefficients of 0, as good as known
+    covariances = {
+        name: pad(table, (0, added, 0, added)) if len(table) > 4 else table for name, table in covariances.items()
+    }
+    return _yaml(entries | covariances | last)
 
 
 def _focal_center(camera: Camera) -> tuple[float, float, float, float]:
@@ -341,8 +363,10 @@ def _kalibr_text(camera: Camera) -> str:
         f"  resolution: [{camera.width}, {camera.height}]\n"
         "  rostopic: /cam0/image_raw\n"
     )
-    if camera.covariance is not None:
-        text += "  camera_matrix_covariance:\n" + "".join(f"    - {_row(row)}\n" for row in camera.covariance)
+    for name, table in _covariances(camera).items():
+        text += f"  {name}:\n" + "".join(f"    - {_row(row)}\n" for row in table)
+    if camera.adjustment is not None:
+        text += f"  adjustment: {camera.adjustment}\n"
     if camera.tone is not None:
         text += f'  tone: "{camera.tone}"\n'
     return text

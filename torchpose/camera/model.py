@@ -51,8 +51,11 @@ class Camera:
         distortion: (0|4|5|8,) float64 for brown_conrady, (4,) for kannala_brandt. The 12 or 14 coefficients of OpenCV's
             thin-prism and tilted models are accepted where those beyond the eighth are zero.
         model: which of the two.
-        covariance: (4, 4) float64 of fx, fy, cx, cy in px^2, or None.
+        covariance: float64 of fx, fy, cx, cy in px^2 (4, 4), or of these and all n coefficients of the distortion
+            (4 + n, 4 + n), or None.
         tone: how stored grey values follow light; None where nothing is said, which counts as linear.
+        adjustment: name of the adjustment that it comes from: a target measured there is correlated with it
+            (`Target.cross_covariance`). None where there is none.
 
     Arguments may be anything that `torch.as_tensor` accepts. All methods take any leading dimensions (...), work in the
     dtype and on the device of their points, and are differentiable in the points, ``matrix`` and ``distortion``.
@@ -68,6 +71,7 @@ class Camera:
     model: Model = "brown_conrady"
     covariance: Tensor | None = None
     tone: Tone | None = None
+    adjustment: str | None = None
 
     if TYPE_CHECKING:  # of tensors the fields are made by __post_init__
 
@@ -80,6 +84,7 @@ class Camera:
             model: Model = "brown_conrady",
             covariance: Tensor | np.ndarray | Sequence[Sequence[float]] | None = None,
             tone: Tone | None = None,
+            **adjustment: str | None,
         ) -> None: ...
 
     @classmethod
@@ -106,7 +111,7 @@ class Camera:
         self._check_matrix()
         self._check_distortion()
         if self.covariance is not None:
-            _check_covariance(self.covariance.detach())
+            _check_covariance(self.covariance.detach(), len(self.distortion))
 
     def _check_matrix(self) -> None:
         if self.matrix.shape != (3, 3):
@@ -343,15 +348,23 @@ class Camera:
         )
 
 
-def _check_covariance(covariance: Tensor) -> None:
-    fix = "give the covariance of fx fy cx cy in px^2"
-    if covariance.shape != (4, 4):
-        raise ConfigError(f"camera_matrix_covariance: has shape {tuple(covariance.shape)}; give 4 x 4 for fx fy cx cy")
-    slack = covariance.abs().max() * (1e-9 if covariance.dtype == torch.float64 else 1e-5)
-    if bool((covariance - covariance.T).abs().max() > slack):
-        raise ConfigError(f"camera_matrix_covariance: is not symmetric; {fix}")
-    if bool(torch.linalg.eigvalsh(covariance)[0] < -slack):
-        raise ConfigError(f"camera_matrix_covariance: has a negative eigenvalue; {fix}")
+def _check_covariance(covariance: Tensor, coefficients: int) -> None:
+    field, fix = "camera_matrix_covariance", "give the covariance of fx fy cx cy in px^2"
+    whole = 4 + coefficients
+    if covariance.shape == (whole, whole) and coefficients:
+        field, fix = "intrinsics_covariance", f"give the covariance of fx fy cx cy and {coefficients} coefficients"
+    elif covariance.shape != (4, 4):
+        of_all = f", or {whole} x {whole} with the distortion" if coefficients else ""
+        raise ConfigError(f"{field}: has shape {tuple(covariance.shape)}; give 4 x 4 for fx fy cx cy{of_all}")
+    slack = 1e-9 if covariance.dtype == torch.float64 else 1e-5
+    # units differ by orders between the intrinsics: each counts in its own deviation
+    scale = covariance.diagonal().clamp_min(0).sqrt()
+    scale = torch.where(scale > 0, scale, covariance.abs().max().sqrt()).clamp_min(1e-30)
+    scaled = covariance / (scale[:, None] * scale)
+    if bool((scaled - scaled.T).abs().max() > slack):
+        raise ConfigError(f"{field}: is not symmetric; {fix}")
+    if bool((covariance.diagonal() < 0).any() | (torch.linalg.eigvalsh(scaled)[0] < -slack)):
+        raise ConfigError(f"{field}: has a negative eigenvalue; {fix}")
 
 
 def _first_positive_root(polynomial: np.polynomial.Polynomial) -> float:

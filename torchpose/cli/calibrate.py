@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 
     from torchpose import camera as cameras
     from torchpose.calibration import Calibration, HandEyeFit
-    from torchpose.calibration.session import Shown
+    from torchpose.calibration.measured import Distance
+    from torchpose.calibration.session import Measurement, Shown
     from torchpose.camera import Camera
     from torchpose.io.sources import Source
 
@@ -39,6 +40,14 @@ _BOARD = (
 _HAND_EYE_OUT = (
     "Hand-eye file to write; needs a manifest with robot poses. Which of camera and target is on the tool is found "
     "from the poses."
+)
+_MEASURE_TARGET = (
+    "Target file to write: places, edge gain and radii of the target's markers as the frames show them, with their "
+    "covariance. With --camera and without --out the camera is held."
+)
+_DISTANCE = (
+    "Distance between the centres of two markers, which gives the measured target its scale: ids, mm, and its standard "
+    "deviation in mm if it is not 0. By default the scale is that of the nominal places."
 )
 _LENSES = "pinhole|brown4|brown5|rational8|kannala_brandt"
 _INPUTS = "Image files, folders or capture manifests (.jsonl) of one camera."
@@ -52,6 +61,8 @@ def calibrate(
     out: Annotated[Path | None, typer.Option(help=_OUT)] = None,
     camera: Annotated[str | None, typer.Option(help="Camera file to start from, or to use.")] = None,
     model: Annotated[str, typer.Option(metavar=_LENSES, help="Distortion of the lens.")] = "brown5",
+    target_out: Annotated[Path | None, typer.Option("--measure-target", metavar="FILE", help=_MEASURE_TARGET)] = None,
+    distance: Annotated[tuple[int, int, float] | None, typer.Option(metavar="ID ID MM [SIGMA]", help=_DISTANCE)] = None,
     hand_eye_out: Annotated[Path | None, typer.Option(help=_HAND_EYE_OUT)] = None,
     tone: Tone = None,
     plots: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for residual plots and tables.")] = None,
@@ -67,7 +78,8 @@ def calibrate(
 
     if (target is None) == (board is None):
         raise ConfigError("--target: give either --target or --board, what the frames show")
-    _check_files(out, hand_eye_out, camera)
+    _check_files(out, hand_eye_out, camera, target_out)
+    between, inputs = _distance(distance, inputs, target, target_out)
     sources = find_sources(inputs)
     if hand_eye_out is not None:
         check_robot_poses(sources)
@@ -75,10 +87,18 @@ def calibrate(
     said = start.tone if start is not None else read_tone(tone)
     shown = Target.load(target) if target is not None else parse_board(board or "")
     frames = _Frames(sources, start, threads=threads or cores(), quiet=quiet)
-    calibration = fit = None
+    calibration = fit = measured = None
     try:
         with native_stderr_silenced():
-            if out is not None:
+            if target_out is not None:
+                measured = _measured(frames, shown, start, model, between, said, held=out is None)
+                calibration = measured.calibration
+                _show(calibration, len(sources), held=out is None)
+                _show_target(measured)
+                measured.target.save(target_out)
+                if out is not None:
+                    measured.camera.save(out)
+            elif out is not None:
                 calibration = _calibrate(frames, shown, start, model, said)
                 _show(calibration, len(sources))
                 calibration.camera.save(out)
@@ -89,23 +109,54 @@ def calibrate(
             if plots is not None:
                 from torchpose.report.calibration import save_calibration
 
-                for path in save_calibration(calibration, fit, plots):
+                for path in save_calibration(calibration, fit, plots, measured):
                     typer.echo(str(path))
     except KeyboardInterrupt:
         return interrupted("nothing more was written; run again")
     return ended(frames.unreadable)
 
 
-def _check_files(out: Path | None, hand_eye_out: Path | None, camera: str | None) -> None:
-    if out is None and hand_eye_out is None:
+def _check_files(
+    out: Path | None, hand_eye_out: Path | None, camera: str | None, target_out: Path | None = None
+) -> None:
+    if out is None and hand_eye_out is None and target_out is None:
         raise ConfigError(
-            "--out: nothing to write; give --out for the camera, --hand-eye-out for its place on the robot"
+            "--out: nothing to write; give --out for the camera, --measure-target for the target, --hand-eye-out for "
+            "the camera's place on the robot"
         )
     if out is None and camera is None:
-        raise ConfigError("--camera: needed to find --hand-eye-out; give the camera file, or --out to calibrate it now")
-    for path, option in ((out, "--out"), (hand_eye_out, "--hand-eye-out")):
+        found = "--measure-target" if target_out is not None else "--hand-eye-out"
+        raise ConfigError(f"--camera: needed to find {found}; give the camera file, or --out to calibrate it now")
+    for path, option in ((out, "--out"), (hand_eye_out, "--hand-eye-out"), (target_out, "--measure-target")):
         if path is not None and not path.parent.is_dir():
             raise ConfigError(f"{path}: {option}: folder {path.parent} does not exist; create it or choose another")
+
+
+def _distance(
+    given: tuple[int, int, float] | None, inputs: list[Path], target: str | None, target_out: Path | None
+) -> tuple[Distance | None, list[Path]]:
+    """The distance with its deviation, which the command line has among the INPUTs, and what is left of these."""
+    from torchpose.calibration.measured import Distance
+    from torchpose.target import Target
+
+    if target_out is not None and target is None:
+        raise ConfigError("--measure-target: give --target, the file of the target that is measured")
+    if given is None:
+        return None, inputs
+    if target_out is None or target is None:
+        raise ConfigError("--distance: scales a measured target; give --measure-target too")
+    numbers = [path for path in inputs if not path.exists() and _is_number(str(path))]
+    sigma = float(str(numbers[0])) if numbers else 0.0
+    distance = Distance(*given, sigma)
+    distance.check(Target.load(target))
+    return distance, [path for path in inputs if path not in numbers[:1]]
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
 
 
 class _Frames:
@@ -161,24 +212,41 @@ def _calibrate(
     return calibrate_camera(frames, shown, first, guess=start is None, lens=model, tone=tone)
 
 
+def _measured(
+    frames: _Frames,
+    shown: Shown,
+    start: Camera | None,
+    model: str,
+    distance: Distance | None,
+    tone: cameras.Tone | None,
+    *,
+    held: bool,
+) -> Measurement:
+    from torchpose.calibration.intrinsics import start_cameras
+    from torchpose.calibration.session import measure_target
+    from torchpose.target import Target
+
+    assert isinstance(shown, Target)  # checked with the options
+    first = start or start_cameras(frames.width, frames.height, model)[0]
+    given: Literal["camera", "start", "size"] = "camera" if held else "start" if start is not None else "size"
+    return measure_target(frames, shown, first, given=given, lens=model, distance=distance, tone=tone)
+
+
 def _hand_eye(frames: _Frames, shown: Shown, calibration: Calibration | None, camera: Camera | None) -> HandEyeFit:
     from torchpose.calibration.session import calibrate_robot, locate_camera
 
     robot = {source.name: source.robot_pose for source in frames.sources if source.robot_pose is not None}
     if calibration is not None:
-        return calibrate_robot(calibration.views, calibration.bundle, calibration.covariance, robot)
+        return calibrate_robot(calibration.views, calibration.bundle, calibration.joint, robot)
     assert camera is not None  # checked with the options
     views, bundle = locate_camera(frames, shown, camera)
     return calibrate_robot(views, bundle, camera.covariance, robot)
 
 
-def _show(found: Calibration, frames: int) -> None:
-    """The intrinsics with their standard deviations, and what they were computed from."""
-    matrix = found.camera.matrix
-    values = [*matrix.diagonal()[:2].tolist(), *matrix[:2, 2].tolist(), *found.camera.distortion.tolist()]
-    for name, value, sigma in zip(found.names, values, found.covariance.diagonal().sqrt().tolist(), strict=True):
-        digits = max(0, 1 - math.floor(math.log10(sigma))) if sigma > 0 else 6
-        typer.echo(f"{name:>3} {value:14.{digits}f} +- {sigma:.2g}{' px' if name[0] in 'fc' else ''}")
+def _show(found: Calibration, frames: int, *, held: bool = False) -> None:
+    """The intrinsics with their standard deviations unless they were held, and what they were computed from."""
+    if not held:
+        _show_intrinsics(found)
     points = f"{len(found.views.view)} points{f', {found.left_out} points left out' if found.left_out else ''}"
     typer.echo(f"{len(found.views)} of {frames} views, {points}, residual RMS {found.rms_px:.3g} px")
     if found.common_sigma_px:
@@ -187,6 +255,29 @@ def _show(found: Calibration, frames: int) -> None:
         typer.echo(f"tone {found.camera.tone}")
     for warning in found.warnings:
         typer.echo(f"warning: {warning}", err=True)
+
+
+def _show_target(found: Measurement) -> None:
+    """How far the markers are from their nominal places, and how well that is known."""
+    target, nominal = found.target, found.nominal
+    assert target.covariance is not None  # always there after a measurement
+    off = target.centers - nominal.centers
+    sigma = target.covariance.diagonal()[:-1].view(-1, 3).sqrt()
+    for name, of, known in zip("xyz", off.unbind(1), sigma.unbind(1), strict=True):
+        rms, most = float(of.square().mean().sqrt()), float(of.abs().max())
+        known_um = 1e3 * float(known.square().mean().sqrt())
+        typer.echo(f"places {name}: {1e3 * rms:.3g} um RMS off, {1e3 * most:.3g} at most; known to {known_um:.2g} um")
+    size = float((target.radii / nominal.radii).mean())
+    gain, gain_sigma = 1e3 * target.edge_gain, 1e3 * float(target.covariance[-1, -1].sqrt())
+    typer.echo(f"edge gain {gain:.3g} +- {gain_sigma:.2g} um, rings {size:.5f} times as large as in the file")
+
+
+def _show_intrinsics(found: Calibration) -> None:
+    matrix = found.camera.matrix
+    values = [*matrix.diagonal()[:2].tolist(), *matrix[:2, 2].tolist(), *found.camera.distortion.tolist()]
+    for name, value, sigma in zip(found.names, values, found.covariance.diagonal().sqrt().tolist(), strict=True):
+        digits = max(0, 1 - math.floor(math.log10(sigma))) if sigma > 0 else 6
+        typer.echo(f"{name:>3} {value:14.{digits}f} +- {sigma:.2g}{' px' if name[0] in 'fc' else ''}")
 
 
 def _show_hand_eye(fit: HandEyeFit) -> None:

@@ -254,6 +254,13 @@ def _tell_misfits(misfits: dict[str, Misfits], work: _Work) -> None:
             "and what residuals show beyond it",
             err=True,
         )
+    mirrored = sum(m.mirrored for m in misfits.values())
+    if mirrored:
+        typer.echo(
+            f"torchpose: {mirrored} rows show a target mirrored, from behind its printed side: turn the camera's "
+            "mirroring off, or write normal: [0, 0, -1] for the markers of a target that is drawn y-up",
+            err=True,
+        )
     for target in work.rows_of:
         for line in misfits[target.name].lines(target.name, target.ids.tolist()) if target.name in misfits else ():
             typer.echo(f"torchpose: {line}", err=True)

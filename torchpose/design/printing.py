@@ -57,7 +57,7 @@ class PrintClass:
         flat = self.places if self.flatness is None else self.flatness
         each = target.centers.new_tensor([self.places, self.places, flat]).repeat(len(target))
         covariance = torch.diag(torch.cat([each, each.new_tensor([self.gain])]).square())
-        return replace(target, covariance=covariance)
+        return replace(target, covariance=covariance, adjustment=None, cross_covariance=None)
 
 
 # places: the issue of office laser printers off by 50 to 100 um, photo plotters by 10, chrome on glass by 1, as

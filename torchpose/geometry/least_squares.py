@@ -87,10 +87,18 @@ class Vector(Rows):
 
 @dataclass(frozen=True, eq=False)
 class PosePrior(Rows):
-    """What is known of poses beside the data: the information about them, and where it has them."""
+    """What is known of poses beside the data: the information about them, and where it has them.
 
-    information: Float[Tensor, "N 6 6"]
+    It may be about more unknowns than the pose, which come after it and are known to be about zero.
+    """
+
+    information: Float[Tensor, "N k k"]
     pose: Pose
+
+    @property
+    def more(self) -> bool:
+        """Whether it is about more than the pose."""
+        return self.information.shape[-1] > self.pose.size
 
     def at(self, pose: Pose, size: int = 6) -> tuple[Tensor, Tensor]:
         """For `Normal.with_prior`: information (N, size, size) about a pose and more unknowns, and how far it moved."""

@@ -35,7 +35,9 @@ class MarkerTable(Rows):
         half_gap: half of the least difference between two codes of each target, as ratios of radii; inf where there is
             one.
         by_print: how place (mm) and edge gain (mm) of the markers vary with each of Q numbers of unit variance, as
-            `Target.covariance` says.
+            `Target.covariance` says and those of the camera leave open.
+        by_camera: the same with each of the C uncertain numbers of a camera that was calibrated together with the
+            target (`Target.cross_covariance`); 0 with any other.
     """
 
     ids: Int[Tensor, "T M"]
@@ -49,12 +51,16 @@ class MarkerTable(Rows):
     gain_scale: Float[Tensor, " T"]
     half_gap: Float[Tensor, " T"]
     by_print: Float[Tensor, "T M 4 Q"]
+    by_camera: Float[Tensor, "T M 4 C"]
 
     @classmethod
-    def of(cls, targets: Sequence[Target]) -> Self:
+    def of(cls, targets: Sequence[Target], camera: Camera | None = None) -> Self:
+        """Of the targets, seen by a camera if it is known."""
+
         def padded(rows: Sequence[Tensor], fill: float) -> Tensor:
             return torch.nn.utils.rnn.pad_sequence(list(rows), batch_first=True, padding_value=fill)
 
+        by_print, by_camera = _by_numbers(targets, camera)
         return cls(
             padded([t.ids for t in targets], -1),
             padded([t.centers for t in targets], 0.0),
@@ -66,7 +72,8 @@ class MarkerTable(Rows):
             torch.stack([_gain_sigma(t) for t in targets]),
             torch.stack([_gain_scale(t) for t in targets]),
             torch.stack([_half_gap(t.printed_radii) for t in targets]),
-            _by_print(targets),
+            by_print,
+            by_camera,
         )
 
 
@@ -97,16 +104,40 @@ def _half_gap(radii: Tensor) -> Tensor:
     return 0.5 * torch.where(apart > 0.5 * MIN_RATIO_GAP, apart, torch.inf).amin()
 
 
-def _by_print(targets: Sequence[Target]) -> Tensor:
-    """`MarkerTable.by_print`; Q is the most directions that a covariance has, 0 where all targets are perfect."""
-    factors = [covariance_factor(t.centers.new_zeros(1, 1) if t.covariance is None else t.covariance) for t in targets]
-    table = torch.zeros(len(targets), max(map(len, targets)), 4, max(f.shape[1] for f in factors), dtype=torch.float64)
-    for of_target, target, factor in zip(table, targets, factors, strict=True):
-        if target.covariance is not None:
-            places = factor[:-1].unflatten(0, (-1, 3))
-            of_target[: len(target), :3, : factor.shape[1]] = places
-            of_target[: len(target), 3, : factor.shape[1]] = factor[-1]
-    return table
+def _by_numbers(targets: Sequence[Target], camera: Camera | None) -> tuple[Tensor, Tensor]:
+    """`MarkerTable.by_print`, of the most directions that a covariance has, and `MarkerTable.by_camera`."""
+    nothing = torch.zeros(1, 1, dtype=torch.float64)
+    lens = covariance_factor(nothing if camera is None or camera.covariance is None else camera.covariance.double())
+    parts = [_by_both(target, camera, lens) for target in targets]
+    markers = max(map(len, targets))
+
+    def laid_out(factors: Sequence[Tensor], numbers: int) -> Tensor:
+        table = torch.zeros(len(factors), markers, 4, numbers, dtype=torch.float64)
+        for of_target, factor in zip(table, factors, strict=True):
+            of_target[: len(factor) // 3, :3, : factor.shape[1]] = factor[:-1].unflatten(0, (-1, 3))
+            of_target[: len(factor) // 3, 3, : factor.shape[1]] = factor[-1]
+        return table
+
+    alone, together = ([part[k] for part in parts] for k in range(2))
+    return laid_out(alone, max(f.shape[1] for f in alone)), laid_out(together, lens.shape[1])
+
+
+def _by_both(target: Target, camera: Camera | None, lens: Tensor) -> tuple[Tensor, Tensor]:
+    """Factors (3 M + 1, Q) and (3 M + 1, C) of what is open of a target: by numbers of its own, by the camera's.
+
+    The camera's parameters are L u, by its factor L ``lens`` (n, C), so that the target has the covariance
+    S L^+T with u, S that with the parameters; what u leaves open of the target is its own.
+    """
+    size, covariance = 3 * len(target) + 1, target.covariance
+    by_camera = torch.zeros(size, lens.shape[1], dtype=torch.float64)
+    if covariance is None:
+        return torch.zeros(size, 0, dtype=torch.float64), by_camera
+    covariance, cross = covariance.double(), target.cross_covariance
+    same = camera is not None and camera.adjustment is not None and camera.adjustment == target.adjustment
+    if same and cross is not None and cross.shape[1] == len(lens):
+        by_camera = cross.double() @ torch.linalg.pinv(lens).mT
+        covariance = covariance - by_camera @ by_camera.mT
+    return covariance_factor(covariance), by_camera
 
 
 class Scene(NamedTuple):

@@ -12,10 +12,10 @@ _AXES = ("x", "y", "z", "edge")
 
 
 class Misfits:
-    """Misfits of the ``ok`` rows of one target."""
+    """Misfits of the ``ok`` rows of one target, and how many rows show it mirrored."""
 
     def __init__(self) -> None:
-        self.frames = 0
+        self.frames = self.mirrored = 0
         self.kinds: Counter[str] = Counter()
         self._count: np.ndarray | int = 0
         self._sum: np.ndarray | float = 0.0
@@ -23,6 +23,7 @@ class Misfits:
 
     def add(self, row: dict[str, Any]) -> None:
         """Counts a row of `rows.POSE_SCHEMA`."""
+        self.mirrored += row["reason"] == "mirrored"
         if row["status"] != "ok":
             return
         self.frames += 1

@@ -205,7 +205,7 @@ def _all_finite(value: Tensor, keep: Tensor | None) -> Tensor:
 
 def _calibration(whitening: Tensor, image: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     assert camera.covariance is not None
-    values, vectors = torch.linalg.eigh(camera.covariance.to(image))
+    values, vectors = torch.linalg.eigh(camera.covariance[:4, :4].to(image))
     root = vectors * values.clamp_min(0).sqrt()  # (4, 4)
     matrix = camera.matrix.to(image)
     x, y = (image[0] - matrix[0, 2]) / matrix[0, 0], (image[1] - matrix[1, 2]) / matrix[1, 1]

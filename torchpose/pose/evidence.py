@@ -42,6 +42,7 @@ class Evidence(Rows):
         polarity: of the target, as `MarkerTable.polarity`.
         placed: covariance that uncertain places on the print add to the centres, at most, ideal px^2.
         by_target: `MarkerTable.by_print`.
+        by_camera: the same of `MarkerTable`.
         matrix: of the camera.
         of_camera: how many independent numbers are uncertain of it.
         gain: mm, edge gain of each plate that ``radii`` hold beyond those of the target's file; None for none.
@@ -60,6 +61,7 @@ class Evidence(Rows):
     polarity: Float[Tensor, " N"]
     placed: Float[Tensor, "N M 2 2"]
     by_target: Float[Tensor, "N M 4 L"]
+    by_camera: Float[Tensor, "N M 4 C"]
     matrix: Float[Tensor, "3 3"] = shared()
     of_camera: int = shared(0)
     gain: Float[Tensor, " N"] | None = None
@@ -119,6 +121,7 @@ def gather_evidence(
         markers.polarity,
         variance[..., None, None] * shape @ shape,
         markers.by_print,
+        markers.by_camera,
         camera.matrix,
         0 if camera.covariance is None else covariance_factor(camera.covariance).shape[1],
     )

@@ -63,6 +63,10 @@ def outcome(scene: Scene, found: Found) -> Poses:
         "rms_alt",
         "chi2_alt",
     )
+    # no row is sure of its pose without a covariance that is one
+    unknown = (status == Status.OK) & ~_positive(spread(solutions.covariance))
+    status = torch.where(unknown, int(Status.REJECTED), status)
+    reason = torch.where(unknown, int(Reason.DEGENERATE), reason)
     every = Poses(
         frame=scene.frame,
         target=scene.target,
@@ -79,6 +83,13 @@ def outcome(scene: Scene, found: Found) -> Poses:
         **{name: spread(getattr(solutions, name)) for name in names},
     )
     return every if rows == scene.groups else _numbered(scene, every, awarded)
+
+
+def _positive(covariance: Tensor) -> Tensor:
+    """Covariances (N,) bool, each scaled by its own deviations, that are positive definite."""
+    scale = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).rsqrt()
+    scaled = torch.where(scale.isfinite()[..., None], covariance * scale[..., :, None] * scale[..., None, :], -1.0)
+    return torch.linalg.cholesky_ex(scaled.nan_to_num(nan=-1.0))[1] == 0
 
 
 def _numbered(scene: Scene, poses: Poses, awarded: Tensor) -> Poses:

@@ -78,6 +78,7 @@ def _solve(evidence: Evidence, rough: tuple[Tensor, Tensor], compile: bool) -> S
         (chi2_alt - chi2[:, 0] < AMBIGUOUS_CHI2, Reason.TWO_SOLUTIONS),
         (of_shapes[:, 0] > CUT**2 * 4 * seen, Reason.RING_SHAPE),
         (contradicts | (shift > _CODE_SHIFT), Reason.RESIDUAL),
+        (_from_behind(evidence, R[:, 0], t[:, 0]), Reason.MIRRORED),
         (~solvable, Reason.NOT_CONVERGED),
         (result.code == pnp.PnPCode.BEHIND_CAMERA, Reason.BEHIND_CAMERA),
         ((result.code == pnp.PnPCode.DEGENERATE) | (solvable & ~determined), Reason.DEGENERATE),
@@ -90,6 +91,13 @@ def _solve(evidence: Evidence, rough: tuple[Tensor, Tensor], compile: bool) -> S
     parts = (covariance, covariance, alone)
     rest = (evidence.mask, one[1].new_zeros(*evidence.mask.shape, 4), torch.zeros_like(status))
     return Solutions(one[0], one[1], *parts, one[2], chi2[:, 0], *two, chi2_alt, status, reason, *rest)
+
+
+def _from_behind(evidence: Evidence, R: Tensor, t: Tensor) -> Tensor:
+    """Poses (N,) bool that show all rings seen from behind their printed side."""
+    x = (R[:, None] @ evidence.points[..., None]).squeeze(-1) + t[:, None]
+    normal = (R[:, None] @ evidence.normals[..., None]).squeeze(-1)
+    return (((normal * x).sum(-1) < 0) | ~evidence.mask).all(-1)
 
 
 def _no_solutions(evidence: Evidence, R: Tensor, t: Tensor) -> Solutions:

@@ -209,9 +209,13 @@ def _excess(normals: MarkerNormals, known: Tensor, count: int, setting: Setting)
 
 def _by_target(setting: Setting) -> Tensor:
     """How markers seem moved (N, M, 7, L), each alone, by the numbers of unit variance of the target."""
-    by_target = setting.evidence.by_target
-    aside = setting.R[:, None] @ by_target[:, :, :3]
-    return torch.cat([aside, torch.zeros_like(aside), by_target[:, :, 3:]], 2)
+    return _displaced(setting.R, setting.evidence.by_target)
+
+
+def _displaced(R: Tensor, by: Tensor) -> Tensor:
+    """Motions (N, M, 7, L) of markers whose places (target frame) and edge gain vary so (N, M, 4, L)."""
+    aside = R[:, None] @ by[:, :, :3]
+    return torch.cat([aside, torch.zeros_like(aside), by[:, :, 3:]], 2)
 
 
 def _by_camera(setting: Setting) -> Tensor:
@@ -224,7 +228,9 @@ def _by_camera(setting: Setting) -> Tensor:
     if camera.covariance is None:
         return like.new_zeros(*like.shape[:2], POSE + 1, 0)
     factor = covariance_factor(camera.covariance.to(like))
-    return _as_motions(setting, lambda xy: by_intrinsics(camera, xy)[..., : len(factor)] @ factor)
+    moved = _as_motions(setting, lambda xy: by_intrinsics(camera, xy)[..., : len(factor)] @ factor)
+    together = setting.evidence.by_camera  # of a target that was measured by this camera
+    return moved + _displaced(setting.R, together) if together.shape[-1] else moved
 
 
 def _camera_shifts(setting: Setting) -> Tensor:
@@ -243,11 +249,17 @@ def _camera_shifts(setting: Setting) -> Tensor:
 
 
 def _print_shifts(setting: Setting) -> Tensor:
-    """The same (N, M, 7, 3 M + 1) of every marker's place (target frame) and of the gain, 1 mm each."""
+    """The same (N, M, 7, 3 M + 1) of every marker's place, 1 mm along the print and 2 across, and of the gain, 1 mm.
+
+    Paper and plates bend by more than they stretch: twice as much is a convention.
+    """
     rows, markers = setting.evidence.mask.shape
-    eye = torch.eye(markers, dtype=setting.R.dtype, device=setting.R.device)
-    columns = setting.R.new_zeros(rows, markers, POSE + 1, 3 * markers + 1)
-    columns[:, :, :3, :-1] = (eye[:, None, :, None] * setting.R[:, None, :, None]).flatten(-2)
+    normal = setting.evidence.normals
+    eye = torch.eye(3, dtype=normal.dtype, device=normal.device)
+    moved = setting.R[:, None] @ (eye + normal[..., :, None] * normal[..., None, :])
+    each = torch.eye(markers, dtype=normal.dtype, device=normal.device)
+    columns = normal.new_zeros(rows, markers, POSE + 1, 3 * markers + 1)
+    columns[:, :, :3, :-1] = (each[:, None, :, None] * moved[:, :, :, None]).flatten(-2)
     columns[:, :, -1, -1] = 1
     return columns
 

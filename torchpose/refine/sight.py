@@ -112,7 +112,7 @@ def refined_by_blur(
     """N rows refined in parts, each in frames reduced by its ``factor``; blurs in px of the frames themselves.
 
     Args:
-        prior: (N, 6, 6), information about the pose where it starts.
+        prior: (N, 6, 6), information about the pose where it starts, or (N, 7, 7) with an edge gain of zero.
     """
     known = None if prior is None else PosePrior(prior, start)
     order, parts = [], []
@@ -138,6 +138,7 @@ class Refined(Rows):
         good: where False the refinement failed and the other fields mean nothing.
         doubt: something in the frame contradicts the model of the rings.
         normals: what each marker tells, at the pose.
+        gain: by which every dark edge lies outwards, mm, where it was an unknown.
     """
 
     R: Float[Tensor, "N 3 3"]
@@ -149,6 +150,7 @@ class Refined(Rows):
     good: Bool[Tensor, " N"]
     doubt: Bool[Tensor, " N"]
     normals: MarkerNormals
+    gain: Float[Tensor, " N"] | None = None
 
     @property
     def blur(self) -> Float[Tensor, " N"]:

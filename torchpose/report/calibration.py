@@ -8,10 +8,12 @@ import torch
 from matplotlib.figure import Figure
 
 from torchpose.calibration import Calibration, HandEyeFit
+from torchpose.calibration.session import Measurement
 from torchpose.geometry.segments import segment_mean
 from torchpose.io.writers import write_rows
 from torchpose.report.figures import COLOURS, GREY, subplots
 from torchpose.report.files import make_folder, save_figures
+from torchpose.report.measured import plot_target, save_places
 
 _BLUE, _RED = COLOURS[:2]
 
@@ -88,7 +90,9 @@ def plot_hand_eye(fit: HandEyeFit) -> Figure:
     return figure
 
 
-def save_calibration(calibration: Calibration | None, hand_eye: HandEyeFit | None, folder: Path) -> list[Path]:
+def save_calibration(
+    calibration: Calibration | None, hand_eye: HandEyeFit | None, folder: Path, measured: Measurement | None = None
+) -> list[Path]:
     """Writes the plots and tables that there are; the paths. ConfigError: the folder cannot be written."""
     make_folder(folder, "--plots")
     figures = {}
@@ -96,7 +100,11 @@ def save_calibration(calibration: Calibration | None, hand_eye: HandEyeFit | Non
         figures["residuals.png"] = plot_residuals(calibration)
     if hand_eye is not None:
         figures["hand_eye.png"] = plot_hand_eye(hand_eye)
-    return [*(() if calibration is None else _tables(calibration, folder)), *save_figures(figures, folder)]
+    tables = []
+    if measured is not None:
+        figures["target.png"] = plot_target(measured)
+        tables = [save_places(measured, folder)]
+    return [*tables, *(() if calibration is None else _tables(calibration, folder)), *save_figures(figures, folder)]
 
 
 def _tables(calibration: Calibration, folder: Path) -> list[Path]:

@@ -59,9 +59,7 @@ _BLURRED_MARGIN = 2.5  # blurs around the outer ellipse
 # of the variance of grey around the ring: noise of half of the contrast's deviation remains (convention)
 _LEAST_EXPLAINED = 0.75
 _PART = 400_000  # pixels times nodes at a time
-_FEW = (
-    10_000  # pixels: the calls of a part cost as much, so fewer are padded to one size (measured: docs/tried.md)
-)
+_FEW = 10_000  # pixels: the calls of a part cost as much, so fewer are padded to one size (measured: docs/tried.md)
 _UNEVEN = 2.0  # most pixels of a window over the least, of those that are padded to one size
 _RATIO_SIGMA = 0.1  # of the ratio: an inner circle that is not sure is none (convention)
 _LEVELS = 4  # paper, its slope 2, contrast

@@ -85,6 +85,8 @@ _LONG = 1.7
 _MATTERS = 0.004
 # of the pixels that a shape of the blur may keep less than a Gaussian, and still explain them better (convention)
 _FEWER = 0.02
+# of what would close the smallest hole, or the thinnest ring (convention)
+_MOST_GAIN = 0.5
 _QUICK = (_Stage(3, coarse=True), _Stage(1))
 _THOROUGH = (_Stage(3, coarse=True, wary=True), _Stage(2, wary=True), _Stage(2, wary=True, tempered=True))
 
@@ -99,7 +101,8 @@ def refine_photometric(
         rotation: (N, 3, 3) to start from, within about a pixel.
         translation: (N, 3), the same.
         prior: (N, 6, 6), information about the pose besides the frames, that is the inverse covariance of the start:
-            from the robot, or to hold what is known.
+            from the robot, or to hold what is known. (N, 7, 7): the edge gain, mm, is an unknown too, and this is
+            known of it, about zero.
         thorough: rows whose grey values contradict the model are refined once more, without what does not follow it.
     """
     factor = reduction_for(blurs.axes(sight.common_blur)[0].clamp_min(0).sqrt(), _WIDEST)
@@ -171,12 +174,17 @@ def _refined(fit: _Fit, start: Pose, spread: Spread, stages: tuple[_Stage, ...])
     more = (seen / of_them.clamp_min(1)).clamp_min(1)
     doubt = doubtful(fit.sectors, fit.clear, fit.variance[owner], owner, found.step.own_chi2, more)
     noise, kept = fit.variance.sqrt(), kept / usable
-    refined = Refined(pose.R, pose.t, covariance, spread.covariance, noise, kept, good, doubt, normals)
+    gain = found.unknowns.values("gain")[:, 0] if fit.gain else None
+    refined = Refined(pose.R, pose.t, covariance, spread.covariance, noise, kept, good, doubt, normals, gain)
     return _Result(refined, fit.misshapen)
 
 
 def _minimised(fit: _Fit, start: Pose, spread: Spread, stages: tuple[_Stage, ...]) -> Minimum:
     own: dict[str, Block] = {"pose": start, "blur": spread}
+    if fit.gain:
+        outer, inner = fit.blocks.radii.unbind(-1)
+        most = _MOST_GAIN * torch.minimum(inner, 0.5 * (outer - inner)).amin().reshape(1)
+        own["gain"] = Vector(torch.zeros_like(start.t[:, :1]), low=-most, high=most)
     levels = first_levels(fit.coarse, start.R, start.t, spread)
     unknowns = Unknowns(own, {"levels": Vector(levels)}, fit.blocks.row)
     for stage in stages:
@@ -206,6 +214,7 @@ class _Fit:
         self.blocks = gather_pixels(sight, band, TILE * _COARSE)
         self.coarse = self.blocks.every(_COARSE, most_coarse, whole=TILE)
         self.prior = prior
+        self.gain = prior is not None and prior.more
         self.stage = _QUICK[0]
         self.variance = torch.ones_like(band)
         self.least = torch.full_like(band, sight.quantisation)
@@ -215,6 +224,8 @@ class _Fit:
         stage, part, pose = self.stage, self.coarse if self.stage.coarse else self.blocks, unknowns.pose
         levels = unknowns.values("levels")
         spread = cast(Spread, unknowns.own["blur"])
+        if self.gain:
+            part = part.wider(unknowns.values("gain")[:, 0])
         model = ring_model(part, pose.R, pose.t, spread, check=True)
         columns, slope = columns_of(part, model, levels)
         residual = columns[:, :, -2].flatten(1)
@@ -228,9 +239,20 @@ class _Fit:
             self.factor = factor.to(self.weight.dtype)
             self.weight = self.weight * self.sectors.of_pixels(self.factor)
         self.sums = sum_products(columns, self.weight)
-        prior = None if self.prior is None else self.prior.at(pose, POSE)
-        normal, self.variance = normal_equations(self.sums, self.weight.sum(-1), levels, part.row, self.least, prior)
+        used, known = self.weight.sum(-1), self._known(unknowns)
+        normal, self.variance = normal_equations(self.sums, used, levels, part.row, self.least, known, gain=self.gain)
         return normal
+
+    def _known(self, unknowns: Unknowns) -> tuple[Tensor, Tensor] | None:
+        """The prior's information (N, n, n) about the frames' unknowns, and how far these moved from it (N, n)."""
+        if self.prior is None or not self.gain:
+            return None if self.prior is None else self.prior.at(unknowns.pose, POSE)
+        both = self.prior.information
+        _, moved = replace(self.prior, information=both[:, :6, :6]).at(unknowns.pose, POSE)
+        place = torch.tensor([*range(6), POSE], device=both.device)
+        information = both.new_zeros(len(both), POSE + 1, POSE + 1)
+        information[:, place[:, None], place] = both
+        return information, torch.cat([moved, unknowns.values("gain")], -1)
 
     def _stands_out(self, residual: Tensor, slope: Tensor, levels: Tensor) -> Tensor:
         """Rows (N,) bool whose mean square residual is larger at the edges than elsewhere, beyond chance and by so much

@@ -32,6 +32,8 @@ def normal_equations(
     owner: Tensor,
     least: Tensor,
     prior: tuple[Tensor, Tensor] | None = None,
+    *,
+    gain: bool = False,
 ) -> tuple[Normal, Tensor]:
     """Normal equations of N frames in units of the noise, with the prior about the levels, and the noise's variance.
 
@@ -43,19 +45,20 @@ def normal_equations(
         owner: (K,) int64, frame of every marker.
         least: (N,) variance below which the noise's does not fall.
         prior: information (N, 9, 9) about the pose, and how far the pose is from the prior's (N, 9).
+        gain: the edge gain is an unknown of the frame, too, the tenth; the prior is about it as well.
     """
-    rows = len(least)
+    rows, chosen = len(least), _chosen(sums) if gain else [*range(POSE)]
     count = torch.bincount(owner, minlength=rows)
     chi2 = segment_sum(sums[:, -2, -2], owner, rows)
-    freedom = segment_sum(used, owner, rows) - POSE - levels.shape[1] * count
+    freedom = segment_sum(used, owner, rows) - len(chosen) - levels.shape[1] * count
     variance = (chi2 / freedom.clamp_min(1)).maximum(least)
     sums = sums / variance[owner, None, None]
-    own, mixed, of_levels = sums[:, :POSE, :POSE], sums[:, :POSE, POSE:-2], sums[:, POSE:-2, POSE:-2]
+    own, mixed, of_levels = sums[:, chosen][:, :, chosen], sums[:, chosen, POSE:-2], sums[:, POSE:-2, POSE:-2]
     ridge = (_RIDGE * of_levels.diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)).expand(levels.shape)
     part = Eliminated(mixed, of_levels + torch.diag_embed(ridge), sums[:, POSE:-2, -2], owner)
     own = segment_sum(own, owner, rows)
-    own.diagonal(dim1=-2, dim2=-1)[:, POSE - BLUR :] += _BLUR_KNOWN
-    normal = Normal(own, segment_sum(sums[:, :POSE, -2], owner, rows), chi2 / variance, part)
+    own.diagonal(dim1=-2, dim2=-1)[:, POSE - BLUR : POSE] += _BLUR_KNOWN
+    normal = Normal(own, segment_sum(sums[:, chosen, -2], owner, rows), chi2 / variance, part)
     normal = normal if prior is None else normal.with_prior(*prior)
     precision = _precision(normal, part, levels)
     held = replace(
@@ -74,19 +77,24 @@ def of_markers(sums: Tensor, variance: Tensor, levels: Eliminated, mask: Tensor,
         variance: (N,) of the noise.
         levels: part of the normal equations, with the prior.
         mask: (N, M), markers seen.
-        step: (N, 9), of pose and blur, made since.
+        step: (N, 9), of pose and blur, made since; (N, 10) where the edge gain is an unknown, too.
     """
     scaled = sums / variance[levels.owner, None, None]
-    chosen = [*range(POSE), sums.shape[-1] - 1]  # gain stands last
-    by_level = torch.cat([levels.mixed, scaled[:, -1:, POSE:-2]], 1)
+    chosen, moved = _chosen(sums), step.shape[-1]
+    by_level = scaled[:, chosen, POSE:-2]
     taken = by_level @ solve_scaled(levels.information, torch.cat([by_level.mT, levels.right[..., None]], -1))
     information = scaled[:, chosen][:, :, chosen] - taken[..., :-1]
     right = scaled[:, chosen, -2] - taken[..., -1]
-    right = right - (information[..., :POSE] @ step[levels.owner, :, None])[..., 0]
+    right = right - (information[..., :moved] @ step[levels.owner, :, None])[..., 0]
     held = torch.zeros(POSE + 1, dtype=right.dtype, device=right.device)
     held[POSE - BLUR : POSE] = _BLUR_KNOWN
     count = mask.sum(-1)[levels.owner].clamp_min(1)
     return MarkerNormals.laid_out(information + torch.diag(held) / count[:, None, None], right, mask)
+
+
+def _chosen(sums: Tensor) -> list[int]:
+    """Columns of pose, blur and edge gain: the latter stands last."""
+    return [*range(POSE), sums.shape[-1] - 1]
 
 
 def _precision(normal: Normal, part: Eliminated, levels: Tensor) -> Tensor:

@@ -72,6 +72,11 @@ class PixelBlocks(Rows):
     limits: Float[Tensor, "K 2"]
     quantisation: float = shared()
 
+    def wider(self, gain: Tensor) -> PixelBlocks:
+        """The same with every dark edge outwards by the edge gain (N,) of its row, mm."""
+        grown = (self.polarity * gain[self.row])[:, None] * gain.new_tensor([1.0, -1.0])
+        return replace(self, radii=self.radii + grown)
+
     def every(self, nth: int, most: int | None = None, whole: int = 0) -> PixelBlocks:
         """The same with one pixel of ``nth``, or as many fewer as leave ``most`` of a marker; all of up to ``whole``.
 

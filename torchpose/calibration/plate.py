@@ -1,0 +1,130 @@
+"""What is unknown of a plate of M points while a camera sees it: places, and edge gain, sizes, tilts of its rings.
+
+All of it is linear in few unknowns z: p = p0 + B z, with p the places x, y, z of every point, the edge gain, the
+logarithms of the sizes of all rings, and how they are turned out of the plane of the file. The columns of B are either
+those directions in which the places can be told at all by views of an unknown camera pose (`free_plate`), or the
+deviations that a target file states (`stated_plate`), then with z of unit variance a priori.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchpose.geometry import rotations
+from torchpose.geometry.rotations import plane_axes
+from torchpose.geometry.rows import Rows
+
+_TURNED = 0.02  # rad, deviation of a ring's tilt against the plane of the file: a plate of 100 mm bent by 0.5 mm
+_NOTHING = 1e-12  # of the largest variance, below which a direction is as good as known
+
+
+@dataclass(frozen=True, eq=False)
+class Plate:
+    """M points and what is unknown of them, k numbers.
+
+    Attributes:
+        ids: of the points.
+        nominal: places that the unknowns count from, mm.
+        larger: logarithms of the sizes that they count from.
+        places: the part of B that moves the places.
+        gain: its row of the edge gain, mm.
+        sizes: its rows of the logarithms of the rings' sizes.
+        turns: its rows of the turns of the rings, rotation vectors in the frame of the target.
+        known: information about each unknown besides the views: 0 or 1.
+    """
+
+    ids: Int[Tensor, " M"]
+    nominal: Float[Tensor, "M 3"]
+    larger: Float[Tensor, " M"]
+    places: Float[Tensor, "M 3 k"]
+    gain: Float[Tensor, " k"]
+    sizes: Float[Tensor, "M k"]
+    turns: Float[Tensor, "M 3 k"]
+    known: Float[Tensor, " k"]
+
+    def __len__(self) -> int:
+        """Number of unknowns."""
+        return len(self.known)
+
+    @property
+    def rims(self) -> bool:
+        """Whether gain and sizes of the rings are among the unknowns."""
+        return bool(self.gain.any())
+
+    def index(self, ids: Tensor) -> Tensor:
+        """Which of the points each of these ids (K,) is."""
+        return (ids[:, None] == self.ids).long().argmax(1)
+
+    def at(self, z: Tensor) -> Layout:
+        """Places, gain and sizes for unknowns (k,)."""
+        return Layout(self.nominal + self.places @ z, self.gain @ z, self.larger + self.sizes @ z, self.turns @ z)
+
+
+@dataclass(frozen=True, eq=False)
+class Layout(Rows):
+    """Places (M, 3) mm, edge gain () mm beyond the file's, logarithms of the sizes (M,) over it, and turns (M, 3)."""
+
+    places: Tensor
+    gain: Tensor
+    sizes: Tensor
+    turns: Tensor
+
+    def of(self, point: Tensor) -> Self:
+        """The same by observation, for points (K,)."""
+        return type(self)(self.places[point], self.gain.expand(len(point)), self.sizes[point], self.turns[point])
+
+
+def motions(places: Float[Tensor, "M 3"]) -> Float[Tensor, "D 7"]:
+    """How the places move with a shift (3), a turn (3) and a change of scale (1) of their frame."""
+    eye = torch.eye(3, dtype=places.dtype, device=places.device).expand(len(places), 3, 3)
+    arm = places - places.mean(0)
+    return torch.cat([eye, -rotations.skew(arm), arm[..., None]], -1).flatten(0, 1)
+
+
+def free_plate(ids: Tensor, nominal: Float[Tensor, "M 3"], normals: Float[Tensor, "M 3"] | None = None) -> Plate:
+    """A plate of which only the frame is held, by inner constraints: it fits the nominal places best.
+
+    Least squares of the distances to the nominal places over shift, turn and scale have their least where the
+    deviations are orthogonal to `motions` of the nominal places. So their complement is all that moves: the frame stays
+    where it fits best however far the places go.
+
+    Args:
+        normals: of the rings of the points; None where the points have none, or nothing is asked of them.
+    """
+    count = len(ids)
+    shape = torch.linalg.qr(motions(nominal), mode="complete").Q[:, 7:]
+    parts = [shape]
+    if normals is not None:
+        tilts = torch.stack(plane_axes(normals), -1) * _TURNED  # (M, 3, 2)
+        parts += [torch.eye(count + 1).to(shape), torch.block_diag(*tilts)]
+    places, *of_rims = _side_by_side(parts)
+    k = places.shape[1]
+    rims, turns = of_rims or (places.new_zeros(count + 1, k), places.new_zeros(3 * count, k))
+    larger = torch.zeros_like(nominal[:, 0])
+    known = turns.any(0).to(places)
+    return Plate(
+        ids, nominal, larger, places.unflatten(0, (-1, 3)), rims[0], rims[1:], turns.unflatten(0, (-1, 3)), known
+    )
+
+
+def _side_by_side(parts: Sequence[Tensor]) -> list[Tensor]:
+    """Matrices (r, k) with columns of zeros for those of the others: the rows of a block diagonal matrix."""
+    return list(torch.block_diag(*parts).split([len(part) for part in parts]))
+
+
+def stated_plate(ids: Tensor, nominal: Float[Tensor, "M 3"], covariance: Float[Tensor, "D D"]) -> Plate | None:
+    """A plate whose places are known as well as a file states; None where it states that they are exact."""
+    values, vectors = torch.linalg.eigh(covariance)
+    some = values > _NOTHING * values[-1]
+    if not float(values[-1]) > 0:
+        return None
+    places = (vectors * values.clamp_min(0).sqrt())[:, some].unflatten(0, (len(ids), 3))
+    k = places.shape[-1]
+    none = torch.zeros_like(places)
+    return Plate(ids, nominal, none[:, 0, 0], places, none[0, 0], none[:, 0], none, places.new_ones(k))
