@@ -138,11 +138,39 @@ def test_what_the_target_file_states_is_a_source() -> None:
     torch.testing.assert_close(again.sources["target"], same.sources["print_centers"], rtol=1e-6, atol=1e-15)
 
 
+def test_what_a_target_shares_with_its_camera_counts_once() -> None:
+    """Errors of focal length and of the target's size, in step: depth errs by their sum, or by their difference."""
+    target, (R, t) = Target.load("quad40"), volume((160.0,), (0, 40))
+    places = target.centers.flatten()
+    share = 1e-3  # of focal length and of all lengths
+    focal = distorted().matrix.diagonal()[:2]
+    lens = torch.cat([focal, torch.zeros(6, dtype=F64)]) * share
+    camera = replace(distorted(), covariance=torch.outer(lens, lens) + 1e-12 * torch.eye(8, dtype=F64), adjustment="a")
+    of_target = torch.cat([share * places, torch.zeros(1, dtype=F64)])
+    both = replace(
+        target,
+        covariance=torch.outer(of_target, of_target),
+        adjustment="a",
+        cross_covariance=torch.outer(of_target, lens),
+    )
+    budget = propagate(camera, both, R, t, Uncertainty(0.02))
+    drawn = spread(simulate_points(camera, both, R, t, Uncertainty(0.02), draws=6000, seed=3))
+    assert (drawn / budget.std() - 1).abs().max() < 0.03
+    apart = propagate(camera, replace(both, adjustment="b"), R, t, Uncertainty(0.02))
+    # face on both move the depth by 0.16 mm, together by twice that
+    assert apart.sources["target"][0, 2, 2].sqrt() == pytest.approx(0.16, rel=0.01)
+    assert budget.sources["calibration"][0, 2, 2].sqrt() == pytest.approx(0.32, rel=0.01)
+    assert float(budget.sources["target"].diagonal(dim1=1, dim2=2).max()) < 1e-8
+    opposite = propagate(camera, replace(both, cross_covariance=-both.cross_covariance), R, t, Uncertainty(0.02))  # type: ignore[operator]
+    assert opposite.sources["calibration"][0, 2, 2].sqrt() < 0.002
+
+
 @pytest.mark.parametrize(("place", "gain"), [(0.001, 0.001), (0.01, 0.015), (0.05, 0.05)])
 @pytest.mark.parametrize("name", ["quad40", "hexa50"])
 def test_the_budget_of_rings_is_what_estimate_states(name: str, place: float, gain: float) -> None:
     """Of rendered frames: all three sources, each where it counts, and the noise of the frame alone."""
     square = torch.diag(torch.tensor([0.05, 0.05, 0.03, 0.03], dtype=F64).square())
+    square = torch.block_diag(square, torch.diag(torch.tensor([1e-3, 1e-2, 1e-5, 1e-5], dtype=F64).square()))
     camera = replace(pinhole(800.0, 600, 500), distortion=distorted().distortion, covariance=square)
     target = stating(Target.load(name), place, gain)
     R, t = volume((160.0,), (0, 30))

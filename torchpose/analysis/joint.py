@@ -7,7 +7,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose.geometry.least_squares import covariance_factor, scaled_inverse
+from torchpose.camera import Camera
+from torchpose.geometry.least_squares import scaled_inverse
+from torchpose.identify import MarkerTable
 from torchpose.target import Target
 
 POSE = 6
@@ -16,12 +18,13 @@ POSE = 6
 _LEAST_NOISE = 1e-4
 
 
-def print_numbers(target: Target) -> Float[Tensor, "M 4 L"]:
-    """How places (mm, target frame) and edge gain (mm) vary with L numbers of unit variance, as the file states."""
-    if target.covariance is None:
-        return target.centers.new_zeros(len(target), 4, 0)
-    factor = covariance_factor(target.covariance)
-    return torch.cat([factor[:-1].unflatten(0, (-1, 3)), factor[-1:].expand(len(target), 1, -1)], 1)
+def print_numbers(target: Target, camera: Camera) -> tuple[Float[Tensor, "M 4 L"], Float[Tensor, "M 4 C"]]:
+    """How places (mm, target frame) and edge gain (mm) vary with numbers of unit variance, as the files state.
+
+    With L numbers of the print's own, and with the C of a camera that was calibrated together with the target.
+    """
+    table = MarkerTable.of([target], camera)
+    return table.by_print[0].to(target.centers), table.by_camera[0].to(target.centers)
 
 
 def grown(target: Target) -> Float[Tensor, " 2"]:
@@ -29,9 +32,9 @@ def grown(target: Target) -> Float[Tensor, " 2"]:
     return target.radii.new_tensor([1.0, -1.0] if target.background == "light" else [-1.0, 1.0])
 
 
-def marker_columns(target: Target, R: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B M 7 k"]:
+def marker_columns(target: Target, camera: Camera, R: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B M 7 k"]:
     """How pose (6) and the numbers of the print move each marker, as a pose of its own, and its edges."""
-    numbers = print_numbers(target)
+    numbers = print_numbers(target, camera)[0]
     own = torch.eye(POSE + 1, dtype=R.dtype, device=R.device)[:, :POSE].expand(len(R), len(target), -1, -1)
     aside = R[:, None] @ numbers[:, :3]
     return torch.cat(

@@ -13,6 +13,7 @@ from torchpose.analysis.joint import grown, print_numbers
 from torchpose.analysis.sensitivity import Uncertainty, marker_axes, markers_seen, radius_shift
 from torchpose.camera import Camera
 from torchpose.geometry import least_squares
+from torchpose.geometry.least_squares import covariance_factor
 from torchpose.pipeline import PoseEstimator
 from torchpose.sim import add_noise, render
 from torchpose.target import Target
@@ -133,18 +134,20 @@ def _draw(camera: Camera, target: Target, uncertainty: Uncertainty, draws: int, 
     focal = focal * (1 + uncertainty.focal_length * shift[:, 4:5])
     center = center + uncertainty.principal_point * shift[:, 5:7]
     distortion = camera.distortion + centers.new_tensor(uncertainty.distortion or 0.0) * shift[:, 7:]
+    by_print, by_camera = print_numbers(target, camera)
+    stated = (by_print @ normal(by_print.shape[-1])[:, None, :, None]).squeeze(-1)  # (D, M, 4)
     if camera.covariance is not None:
-        values, vectors = torch.linalg.eigh(camera.covariance)
-        numbers = torch.cat([shift[:, :4], normal(len(values) - 4)], -1)
-        intrinsics = numbers @ (vectors * values.clamp_min(0).sqrt()).mT
+        factor = covariance_factor(camera.covariance)
+        count = factor.shape[1]
+        numbers = torch.cat([shift[:, :4], normal(max(count - 4, 0))], -1)[:, :count]
+        intrinsics = numbers @ factor.mT
         focal, center = focal + intrinsics[:, :2], center + intrinsics[:, 2:4]
-        distortion = distortion + intrinsics[:, 4:] if len(values) > 4 else distortion
+        distortion = distortion + intrinsics[:, 4:] if len(factor) > 4 else distortion
+        stated = stated + (by_camera @ numbers[:, None, :, None]).squeeze(-1)
     in_plane, along, radius = uncertainty.print_centers, uncertainty.print_flatness, uncertainty.print_radii
     off = normal(len(target), 5) * centers.new_tensor([in_plane, in_plane, along, radius, radius])
     scale = 1 + uncertainty.print_scale * normal(1, 1)
     moved = (off[..., None, :3] @ marker_axes(target)).squeeze(-2)
-    by_print = print_numbers(target)
-    stated = (by_print @ normal(by_print.shape[-1])[:, None, :, None]).squeeze(-1)  # (D, M, 4)
     radii = target.printed_radii * scale + off[..., 3:] + stated[..., 3:] * grown(target)
     printed = target.centers * scale + moved + stated[..., :3], radii
     return _Draws(camera, target, focal, center, distortion, *printed)

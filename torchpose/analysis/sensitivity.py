@@ -19,6 +19,7 @@ from torch import Tensor
 from torchpose.analysis.joint import POSE, grown, joint_inverse, marker_columns, print_numbers
 from torchpose.camera import Camera
 from torchpose.camera.derivatives import by_intrinsics
+from torchpose.geometry.least_squares import covariance_factor
 from torchpose.geometry.projection import by_pose, image_by_point
 from torchpose.geometry.rotations import plane_axes
 from torchpose.target import Target
@@ -73,8 +74,9 @@ class Uncertainty:
 class ErrorBudget:
     """What every source contributes to the covariance of B poses.
 
-    By the names of the fields of `Uncertainty`, ``calibration`` for `Camera.covariance`, and ``target`` for
-    `Target.covariance`; those that are not zero.
+    By the names of the fields of `Uncertainty`, ``calibration`` for `Camera.covariance` with what a target measured in
+    the same adjustment has in common with it, and ``target`` for the rest of `Target.covariance`; those that are not
+    zero.
     In mm and rad: translation, then rotation w with R_true = exp(w) R, in camera axes. NaN where the markers in view do
     not determine the pose.
     """
@@ -133,7 +135,7 @@ def propagate(
     jacobian = torch.where(seen[:, :, None, None, None], _jacobian(camera, target, R, point), 0.0)
     own = torch.cat([jacobian[..., :POSE], jacobian[..., _RADII] @ grown(target)[:, None]], -1)
     weighted = own.mT @ information  # (B, M, N, 7, 2): N points of each marker
-    columns = marker_columns(target, R)
+    columns = marker_columns(target, camera, R)
     columns = columns if features == "rings" else columns[..., :POSE]
     inverted, known = joint_inverse((weighted @ own).sum(2), columns, variance)
     inverted = torch.where(known[:, None, None], inverted, torch.nan)[:, :POSE]
@@ -183,13 +185,14 @@ def _shares(camera: Camera, target: Target, gain: Tensor, uncertainty: Uncertain
     }
     sizes = {name: float(bent if name == "distortion" else getattr(uncertainty, name)) for name in columns}
     shares = {name: size**2 * (columns[name] @ columns[name].mT).sum(1) for name, size in sizes.items() if size}
+    on_print = torch.cat([gain[..., 4:7] @ marker_axes(target), gain[..., 7:9] @ grown(target)[:, None]], -1)
+    own, together = ((on_print @ numbers).sum(1) for numbers in print_numbers(target, camera))
     if camera.covariance is not None:
-        by_camera = torch.cat([whole[:, :, :4], whole[:, :, 10:]], -1)[:, :, : len(camera.covariance)]
-        shares["calibration"] = by_camera @ camera.covariance @ by_camera.mT
+        factor = covariance_factor(camera.covariance)
+        by_camera = torch.cat([whole[:, :, :4], whole[:, :, 10:]], -1)[:, :, : len(factor)] @ factor + together
+        shares["calibration"] = by_camera @ by_camera.mT
     if target.covariance is not None:
-        places, edges = print_numbers(target).tensor_split([3], 1)
-        moved = gain[..., 4:7] @ marker_axes(target) @ places + gain[..., 7:9] @ grown(target)[:, None] @ edges
-        shares["target"] = moved.sum(1) @ moved.sum(1).mT
+        shares["target"] = own @ own.mT
     return shares
 
 

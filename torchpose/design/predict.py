@@ -98,7 +98,7 @@ def edge_covariance(camera: Camera, target: Target, R: Tensor, t: Tensor, imagin
     Returns:
         float64, mm and rad, translation first, rotation multiplied from the left.
     """
-    columns = marker_columns(target, R)
+    columns = marker_columns(target, camera, R)
     inverse, known = joint_inverse(marker_information(camera, target, R, t, imaging), columns)
     return torch.where(known[:, None, None], inverse[:, :POSE, :POSE], torch.nan)
 
@@ -161,14 +161,15 @@ def predicted_covariance(
 def _stated(refined: Refined, camera: Camera, target: Target) -> Float[Tensor, "B 6 6"]:
     """Covariance of refined poses with that of print and camera, all markers seen, residuals as the noise has them."""
     rows, markers = len(refined), len(target)
-    table = MarkerTable.of([target]).to(refined.t.device)
+    table = MarkerTable.of([target], camera).to(refined.t.device)
     table = table[torch.zeros(rows, dtype=torch.int64, device=refined.t.device)]
     nothing = refined.t.new_zeros(rows, markers, 2)
     square = torch.eye(2).to(nothing).expand(rows, markers, 2, 2)
     ellipses, shapes = nothing.new_zeros(rows, markers, 2, 5), nothing.new_zeros(rows, markers, 2, 5, 5)
     evidence = Evidence(
         *(table.centers, table.normals, table.radii, nothing, square, ellipses, shapes, nothing[..., 0], table.valid),
-        *(table.coplanar, table.polarity, torch.zeros_like(square), table.by_print, camera.matrix),
+        *(table.coplanar, table.polarity, torch.zeros_like(square), table.by_print, table.by_camera),
+        matrix=camera.matrix,
     )  # what was measured is in the normal equations
     normals = replace(refined.normals, right=torch.zeros_like(refined.normals.right))
     setting = Setting(evidence, refined.R, refined.t, camera, on_rims=True)

@@ -95,11 +95,12 @@ def measured(camera: Camera, target: Target, volume: WorkingVolume, imaging: Ima
     places of the file best, so shift, turn and scale have no part: a millimetre is that of the file
     (`scale_deviation`). The camera is taken as known.
     """
+    target = replace(target, adjustment=None, cross_covariance=None)
     assert target.covariance is not None
     z = float(volume.middle[1][0, 2])
     poses = volume.poses(distances=[z], tilts=[MEASURING_TILT], azimuths=MEASURING_VIEWS)
     R, t = (part.to(camera.matrix) for part in poses)
-    columns = marker_columns(target, R)
+    columns = marker_columns(target, camera, R)
     information = marker_information(camera, target, R, t, imaging)
     matrix = (columns.mT @ information @ columns).sum(1)
     inverse, _ = scaled_inverse(matrix[:, :POSE, :POSE])
