@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose.geometry.least_squares import LEAST_DIRECTION
 from torchpose.geometry.robust import of_chance
 from torchpose.geometry.rows import Rows
 
@@ -26,7 +27,6 @@ CAMERA = 4  # numbers of a camera that may be off: focal length, principal point
 # px at the corner of the frame, of a camera file that is a mistake beyond; of variances, as a factor
 _PRINT, _CAMERA, _SCALE = (1e-4, 0.15), (1e-3, 3.0), (1.0, 1e3)
 _GRID = 16  # values of each, logarithmic: the closest are a factor of 1.5 apart, which a few residuals do not tell
-_LEAST_MODE = 1e-9  # of the best known direction of the residuals: less is rounding (convention)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +89,7 @@ def _modes(information: Tensor, right: Tensor) -> _Modes:
     finite = (information.isfinite().all(-1) & right.isfinite()).all(-1, keepdim=True)
     right = torch.where(finite, right, 0.0)
     values, vectors = torch.linalg.eigh(torch.where(finite[..., None], information, 0.0))
-    there = values > _LEAST_MODE * values[:, -1:].clamp_min(torch.finfo(values.dtype).tiny)
+    there = values > LEAST_DIRECTION * values[:, -1:].clamp_min(torch.finfo(values.dtype).tiny)
     root = torch.where(there, values, 0.0).sqrt()
     residual = torch.where(there, (vectors.mT @ right[..., None])[..., 0] / root.clamp_min(1e-300), 0.0)
     return _Modes(residual, root[..., None] * vectors.mT, there)
