@@ -149,7 +149,7 @@ def predicted_covariance(
             ellipse.fit((pixel - low).flatten(0, 1), index, len(pixel)).view(1, len(target), 2, 5).expand(2, -1, -1, -1)
         )
         refined = refine_photometric(
-            Sight.of(noisy, crop, target, torch.arange(2).to(index), seen),
+            Sight.of(noisy, crop, target, torch.arange(2, device=index.device), seen),
             *(part.repeat(2, *[1] * (part.ndim - 1)) for part in pose),
         )
         found = torch.where(refined.good[:, None, None], _stated(refined, crop, target), torch.inf)
@@ -164,7 +164,7 @@ def _stated(refined: Refined, camera: Camera, target: Target) -> Float[Tensor, "
     table = MarkerTable.of([target], camera).to(refined.t.device)
     table = table[torch.zeros(rows, dtype=torch.int64, device=refined.t.device)]
     nothing = refined.t.new_zeros(rows, markers, 2)
-    square = torch.eye(2).to(nothing).expand(rows, markers, 2, 2)
+    square = torch.eye(2, dtype=nothing.dtype, device=nothing.device).expand(rows, markers, 2, 2)
     ellipses, shapes = nothing.new_zeros(rows, markers, 2, 5), nothing.new_zeros(rows, markers, 2, 5, 5)
     evidence = Evidence(
         *(table.centers, table.normals, table.radii, nothing, square, ellipses, shapes, nothing[..., 0], table.valid),

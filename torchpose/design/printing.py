@@ -106,7 +106,8 @@ def measured(camera: Camera, target: Target, volume: WorkingVolume, imaging: Ima
     inverse, _ = scaled_inverse(matrix[:, :POSE, :POSE])
     told = matrix[:, POSE:, POSE:] - matrix[:, POSE:, :POSE] @ inverse @ matrix[:, :POSE, POSE:]
     told = 0.5 * (told + told.mT).sum(0)
-    root = torch.linalg.cholesky(told + torch.eye(len(told)).to(told))
+    told.diagonal().add_(1)  # what the file states
+    root = torch.linalg.cholesky(told)
     # as a square, which no rounding makes negative: what is left may be 1e-5 of what the file states
     factor = _inner(target.centers) @ covariance_factor(target.covariance)
     left = torch.linalg.solve_triangular(root, factor.mT, upper=False)
