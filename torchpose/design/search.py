@@ -144,10 +144,10 @@ def design_target(
     if task.excess(precision) > 1:
         # another layout may be the best one of those that are measured
         again = _fewest(task, task.measured) or (target, later)
-        if task.excess(again[1]) > 1:
-            raise _not_reached(task, target, precision, later)
         target, later = again
         precision = task.precision(target)
+        if task.excess(later) > 1:
+            raise _not_reached(task, target, precision, later)
     return Design(target, plate, limits, precision, made, later)
 
 
