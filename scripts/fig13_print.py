@@ -25,7 +25,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import torch
@@ -144,7 +144,7 @@ def cases(folder: Path, settings: Settings) -> list[Case]:
             camera = calibrate_camera(lambda: batches(views), target, true, guess=False, lens=LENS).camera
         found.append(Case(name, moves, camera, target))
     for name, scale in (("measured", None), (f"measured, distance to {settings.distance_sigma:g}", distance)):
-        given = "start" if settings.calibrate else "camera"
+        given: Literal["start", "camera"] = "start" if settings.calibrate else "camera"
         both = measure_target(lambda: batches(views), exact, true, given=given, lens=LENS, distance=scale)
         found.append(Case(name, moves, both.camera, both.target))
     return found
