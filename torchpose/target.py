@@ -310,8 +310,7 @@ class Target:
             places, gain = self.covariance[:-1, :-1], float(self.covariance[-1, -1])
             lines.append(f"edge_gain_sigma: {format_number(gain**0.5)}")
             if bool(places.any()):
-                data = format_list(places.flatten().tolist())
-                lines.append(f"centers_covariance: {{rows: {len(places)}, cols: {len(places)}, data: {data}}}")
+                lines.append(_stated_places(places))
         if self.adjustment is not None:
             lines.append(f'adjustment: "{self.adjustment}"')
         if self.cross_covariance is not None:
@@ -344,6 +343,16 @@ def _covariance(data: _TargetFile) -> Tensor | None:
         covariance[:-1, :-1] = torch.diag(_floats([s or [0.0] * 3 for s in sigmas]).flatten().square())
     covariance[-1, -1] = (data.edge_gain_sigma or 0.0) ** 2
     return covariance
+
+
+def _stated_places(places: Tensor) -> str:
+    """The line of a file that states the covariance of places: one deviation for all where that says it."""
+    variance = places.diagonal().unflatten(0, (-1, 3))
+    if bool((variance == variance[0]).all()) and torch.equal(places, torch.diag(places.diagonal())):
+        sigma = variance[0].sqrt().tolist()
+        return f"center_sigma: {format_number(sigma[0]) if len(set(sigma)) == 1 else format_list(sigma)}"
+    data = format_list(places.flatten().tolist())
+    return f"centers_covariance: {{rows: {len(places)}, cols: {len(places)}, data: {data}}}"
 
 
 def _cross_covariance(data: _TargetFile) -> Tensor | None:

@@ -24,7 +24,10 @@ from torchpose.analysis.sensitivity import radius_shift
 from torchpose.camera import Camera
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import rotations
+from torchpose.pipeline import PoseEstimator
 from torchpose.pose import centers as stage
+from torchpose.results import Status
+from torchpose.sim import add_noise, render
 from torchpose.target import Target
 
 # torch's forward mode loads a module that warns of torch's own use of torch.jit.script
@@ -102,14 +105,85 @@ def test_centres_of_different_quality_are_weighted() -> None:
     assert (drawn / budget.std() - 1).abs().max() < 0.03
 
 
-def test_the_calibration_of_the_camera_file_is_a_source() -> None:
+@pytest.mark.parametrize("lens", [False, True])
+def test_the_calibration_of_the_camera_file_is_a_source(lens: bool) -> None:
     root = torch.tensor([[2.0, 0, 0, 0], [1.9, 0.3, 0, 0], [0.1, 0.2, 1.5, 0], [0, 0.1, 0.3, 1.2]], dtype=F64)
+    if lens:  # the distortion with its own deviations and in step with the focal length
+        root = torch.block_diag(0.1 * root, torch.diag(torch.tensor([3e-3, 3e-3, 1e-4, 1e-4], dtype=F64)))
+        root[4, 0], root[5, 4] = 1e-3, -2e-3
     camera = replace(distorted(), covariance=root @ root.T)
     R, t = volume((160.0,), (30,))
     budget = propagate(camera, Target.load("quad40"), R, t, Uncertainty())
     assert list(budget.sources) == ["calibration"]
     drawn = spread(simulate_points(camera, Target.load("quad40"), R, t, Uncertainty(), draws=6000))
     assert (drawn / budget.std() - 1).abs().max() < 0.03
+
+
+def stating(target: Target, places: float | tuple[float, ...], gain: float) -> Target:
+    """The target with deviations of its places and its edge gain, mm."""
+    each = torch.tensor(places, dtype=F64).expand(len(target), 3).flatten()
+    return replace(target, covariance=torch.diag(torch.cat([each, torch.tensor([gain], dtype=F64)]).square()))
+
+
+def test_what_the_target_file_states_is_a_source() -> None:
+    target = stating(Target.load("quad40_dark"), (0.01, 0.02, 0.05), 0.1)
+    R, t = volume((160.0,), (0, 40))
+    budget = propagate(distorted(), target, R, t, Uncertainty(0.02))
+    assert list(budget.sources) == ["image", "target"]
+    drawn = spread(simulate_points(distorted(), target, R, t, Uncertainty(0.02), draws=6000, seed=4))
+    assert (drawn / budget.std() - 1).abs().max() < 0.03
+    same = propagate(distorted(), Target.load("quad40_dark"), R, t, Uncertainty(0.02, print_centers=0.01))
+    alike = stating(Target.load("quad40_dark"), (0.01, 0.01, 0.0), 0.0)
+    again = propagate(distorted(), alike, R, t, Uncertainty(0.02))
+    torch.testing.assert_close(again.sources["target"], same.sources["print_centers"], rtol=1e-6, atol=1e-15)
+
+
+def test_what_a_target_shares_with_its_camera_counts_once() -> None:
+    """Errors of focal length and of the target's size, in step: depth errs by their sum, or by their difference."""
+    target, (R, t) = Target.load("quad40"), volume((160.0,), (0, 40))
+    places = target.centers.flatten()
+    share = 1e-3  # of focal length and of all lengths
+    focal = distorted().matrix.diagonal()[:2]
+    lens = torch.cat([focal, torch.zeros(6, dtype=F64)]) * share
+    camera = replace(distorted(), covariance=torch.outer(lens, lens) + 1e-12 * torch.eye(8, dtype=F64), adjustment="a")
+    of_target = torch.cat([share * places, torch.zeros(1, dtype=F64)])
+    both = replace(
+        target,
+        covariance=torch.outer(of_target, of_target),
+        adjustment="a",
+        cross_covariance=torch.outer(of_target, lens),
+    )
+    budget = propagate(camera, both, R, t, Uncertainty(0.02))
+    drawn = spread(simulate_points(camera, both, R, t, Uncertainty(0.02), draws=6000, seed=3))
+    assert (drawn / budget.std() - 1).abs().max() < 0.03
+    apart = propagate(camera, replace(both, adjustment="b"), R, t, Uncertainty(0.02))
+    # face on both move the depth by 0.16 mm, together by twice that
+    assert apart.sources["target"][0, 2, 2].sqrt() == pytest.approx(0.16, rel=0.01)
+    assert budget.sources["calibration"][0, 2, 2].sqrt() == pytest.approx(0.32, rel=0.01)
+    assert float(budget.sources["target"].diagonal(dim1=1, dim2=2).max()) < 1e-8
+    opposite = propagate(camera, replace(both, cross_covariance=-both.cross_covariance), R, t, Uncertainty(0.02))  # type: ignore[operator]
+    assert opposite.sources["calibration"][0, 2, 2].sqrt() < 0.002
+
+
+@pytest.mark.parametrize(("place", "gain"), [(0.001, 0.001), (0.01, 0.015), (0.05, 0.05)])
+@pytest.mark.parametrize("name", ["quad40", "hexa50"])
+def test_the_budget_of_rings_is_what_estimate_states(name: str, place: float, gain: float) -> None:
+    """Of rendered frames: all three sources, each where it counts, and the noise of the frame alone."""
+    square = torch.diag(torch.tensor([0.05, 0.05, 0.03, 0.03], dtype=F64).square())
+    square = torch.block_diag(square, torch.diag(torch.tensor([1e-3, 1e-2, 1e-5, 1e-5], dtype=F64).square()))
+    camera = replace(pinhole(800.0, 600, 500), distortion=distorted().distortion, covariance=square)
+    target = stating(Target.load(name), place, gain)
+    R, t = volume((160.0,), (0, 30))
+    R, t = R[::2], t[::2]
+    found = PoseEstimator(camera, target)(add_noise(render(camera, target, R, t, psf_sigma=0.7), 2.0, bits=8))
+    assert (found.status == Status.OK).all()
+    image = edge_noise(math.sqrt(2.0**2 + 1 / 12), 190.0, 0.7)
+    budget = propagate(camera, target, R, t, Uncertainty(image), features="rings")
+    assert list(budget.sources) == ["image", "calibration", "target"]
+    stated = found.covariance.diagonal(dim1=1, dim2=2).sqrt()
+    assert (stated / budget.std() - 1).abs().max() < 0.08
+    noise = found.noise.diagonal(dim1=1, dim2=2).sqrt()
+    assert (noise / budget.std("image") - 1).abs().max() < 0.12
 
 
 def test_rings_reach_the_cramer_rao_bound() -> None:

@@ -86,6 +86,24 @@ def test_the_precision_of_an_existing_target(run: Callable[..., Any], tmp_path: 
     assert all(float(row["middle"]) > 0 for row in rows)
 
 
+def test_a_print_class_is_counted_and_stated(run: Callable[..., Any], tmp_path: Path) -> None:
+    words = ("--camera", "camera.yaml", *GOOD, "--markers", 4, "--name", "mine")
+    code, out, err = run(*words, "--print", "plotter", "--out", "made")
+    assert (code, err) == (0, "")
+    assert "print: too coarse as it comes, good enough once it is measured; worst measured: after torchpose cal" in out
+    text = (tmp_path / "made" / "mine.yaml").read_text()
+    assert "center_sigma: 0.01\n" in text
+    assert "edge_gain_sigma: 0.015\n" in text
+    with (tmp_path / "made" / "mine_precision.csv").open(newline="") as file:
+        rows = {row["axis"]: row for row in csv.DictReader(file)}
+    assert float(rows["x"]["worst"]) > float(rows["x"]["needed"]) > 3 * float(rows["x"]["worst_measured"])
+    assert b"Print: centres to 10 um, edges to 15 um, 1 sigma." in (tmp_path / "made" / "mine.pdf").read_bytes()
+    assert "print: counted as exact; give --print" in run(*words, "--out", "exact")[1]
+    code, out, _ = run(*words[:2], "--distance", 150, "--target", "quad40", "--print", "5,5", "--out", "there")
+    assert code == 0
+    assert "print: counted as the target file states it" in out
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -116,6 +134,9 @@ def test_the_precision_of_an_existing_target(run: Callable[..., Any], tmp_path: 
         (["--camera", "camera.yaml", *GOOD, "--f-number", "4"], "--focal-length"),
         (["--camera", "camera.yaml", *GOOD, "--f-number", "-4", "--focal-length", "8"], "f_number: -4"),
         (["--camera", "camera.yaml", *GOOD, "--markers", "5"], "markers: 5"),
+        (["--camera", "camera.yaml", *GOOD, "--print", "inkjet"], "print: 'inkjet' is none of glass, plotter, laser"),
+        (["--camera", "camera.yaml", *GOOD, "--print", "-1,2"], "print: places off by -1 um, edges by 2 um; give"),
+        (["--camera", "camera.yaml", *GOOD, "--print-gain", "-1"], "print_gain: -0.001 mm"),
         (["--camera", "camera.yaml", *GOOD, "--background", "grey"], "background: is 'grey'"),
         (["--camera", "camera.yaml", *GOOD, "--name", "a/b"], "name: has the character '/'"),
         (["--target", "quad41"], "quad41: target: is neither a file nor built in"),

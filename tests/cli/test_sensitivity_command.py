@@ -49,6 +49,42 @@ def test_another_camera_and_every_source(tmp_path: Path, capsys: pytest.CaptureF
     assert {"image", "distortion", "print_centers", "print_flatness", "print_radii", "print_scale", "total"} <= found
 
 
+PRINTED = """
+name: mine
+units: mm
+background: light
+center_sigma: 0.02
+edge_gain_sigma: 0.03
+markers:
+  - {id: 0, center: [-20, -20], outer_radius: 5.0, inner_radius: 1.5}
+  - {id: 1, center: [20, -20], outer_radius: 5.0, inner_radius: 2.0}
+  - {id: 2, center: [20, 20], outer_radius: 5.0, inner_radius: 2.5}
+  - {id: 3, center: [-20, 20], outer_radius: 5.0, inner_radius: 3.0}
+"""
+
+
+def test_what_the_files_state_is_counted_and_what_they_do_not_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "target.yaml").write_text(PRINTED)
+    view = ("--camera", "data/sample/camera.yaml", "--target", tmp_path / "target.yaml", "--distance", 150, 170)
+    few = ("--steps", 3, "--focal-error-percent", 0, "--sigma-px", 0.01, "--draws", 400, "--noise", 2)
+    assert run("--out", tmp_path / "o", *view, *few) == 0
+    shown = capsys.readouterr().out
+    assert "edges of the rings, noise 2" in shown
+    assert "so exact but for the options: camera (its covariance" in shown
+    rows = rows_of(tmp_path / "o" / "budget.csv")
+    near = {(r["case"], r["source"]): r for r in rows if float(r["distance_mm"]) == 150}
+    assert {source for _, source in near} == {"image", "target", "total"}
+    edges = {source: row for (case, source), row in near.items() if "edges" in case}
+    # four markers of 20 um: the mean of their places, whatever the noise
+    assert float(edges["target"]["x_um"]) == pytest.approx(10, rel=0.1)
+    assert float(edges["total"]["z_um"]) < 0.3 * float(near["0.01 px", "total"]["z_um"])  # sizes of rings tell
+    drawn = next(r for r in rows_of(tmp_path / "o" / "errors.csv") if r["axis"] == "z")
+    assert float(drawn["rms"]) == pytest.approx(float(drawn["predicted_rms"]), rel=0.15)
+    assert cv2.imread(str(tmp_path / "o" / "budget_rings.png")) is not None
+
+
 def test_without_other_sources_there_is_noise_alone(tmp_path: Path) -> None:
     assert run("--out", tmp_path, "--focal-error-percent", 0, "--sigma-px", 0.5, "--steps", 3, "--draws", 5) == 0
     assert {row["case"] for row in rows_of(tmp_path / "errors.csv")} == {"0.5 px"}
@@ -68,6 +104,9 @@ def test_without_other_sources_there_is_noise_alone(tmp_path: Path) -> None:
         (("--target", "quad9"), "quad9: target: is neither a file nor built in"),
         (("--camera", "missing.yaml"), "missing.yaml"),
         (("--draws", 1), "draws"),
+        (("--noise", 0), "--noise: is 0"),
+        (("--noise", 2, "--levels", 200, 100), "--levels: is 200 100"),
+        (("--noise", 2, "--blur", -1), "--blur: is -1"),
     ],
 )
 def test_wrong_input_is_one_line(

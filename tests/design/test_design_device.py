@@ -12,7 +12,7 @@ from torchpose.analysis.evaluation import Estimates, evaluate
 from torchpose.analysis.localisers import by_centroid, by_corner, centre_bound
 from torchpose.analysis.marks import marks
 from torchpose.analysis.sweep import fit, sweep
-from torchpose.design import Imaging, Need, WorkingVolume, design_target, predict_volume
+from torchpose.design import PRINTS, Imaging, Need, WorkingVolume, design_target, predict_volume
 from torchpose.design.precision import precision_map
 from torchpose.geometry import rotations
 from torchpose.io.truth import Truth
@@ -30,9 +30,14 @@ def test_designs_follow_the_camera() -> None:
     near = WorkingVolume((140.0, 140.0))
     with DeviceNamed("design", "analysis"):
         made = design_target(CAMERA, VOLUME, (50.0, 50.0), Need(1.0, 5.0), Imaging(), markers=6)
+        printed = design_target(
+            CAMERA, VOLUME, (50.0, 50.0), Need(8.0, 30.0), Imaging(), markers=4, printing=PRINTS["plotter"]
+        )
         again = predict_volume(CAMERA, made.target, near, Imaging())
         found = precision_map(CAMERA, made.target, near, Imaging())
-    for value in (made.target.centers, made.target.radii, made.precision.worst, again.t, found.by_tilt, found.by_place):
+    assert printed.measured is not None
+    places = (made.target.centers, made.target.radii, again.t, found.by_tilt, found.by_place)
+    for value in (*places, made.precision.worst, printed.precision.worst, printed.measured.worst):
         assert value.device.type == "cpu"
         assert value.dtype == F64
 

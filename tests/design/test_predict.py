@@ -21,6 +21,7 @@ from torchpose.design import (
     predicted_covariance,
     sharp_range,
 )
+from torchpose.design.printing import PRINTS
 from torchpose.errors import ConfigError
 from torchpose.sim import Defocus, add_noise, render
 
@@ -40,8 +41,20 @@ def poses(count: int) -> tuple[torch.Tensor, torch.Tensor]:
     return VOLUME.random(count, torch.Generator().manual_seed(3))
 
 
-def test_edges_are_propagated_as_by_the_sensitivity_analysis() -> None:
+def stated_by_estimate(
+    cam: tp.Camera, target: tp.Target, R: torch.Tensor, t: torch.Tensor, noise: float
+) -> torch.Tensor:
+    """Median of what the estimator states for each pose in five frames."""
+    levels = render(cam, target, R, t, psf_sigma=0.7)
+    every = [tp.PoseEstimator(cam, target)(add_noise(levels, noise, seed=seed)) for seed in range(5)]
+    assert all((one.status == tp.Status.OK).all() for one in every)
+    return torch.stack([deviations(one.covariance) for one in every]).median(0).values
+
+
+@pytest.mark.parametrize("kind", [None, "plotter"])
+def test_edges_are_propagated_as_by_the_sensitivity_analysis(kind: str | None) -> None:
     cam, target, imaging = camera(), tp.Target.load("hexa50"), Imaging(psf_sigma=0.9, noise=3.0)
+    target = target if kind is None else PRINTS[kind].stated_by(target)
     R, t = poses(10)
     found = edge_covariance(cam, target, R, t, imaging)
     size = edge_noise(math.sqrt(3.0**2 + 1 / 12), 190.0, 0.9)
@@ -64,11 +77,24 @@ def test_prediction_lies_a_little_above_the_bound() -> None:
 def test_prediction_is_what_the_estimator_states() -> None:
     cam, target, imaging = camera(), tp.Target.load("quad40"), Imaging(noise=3.0)
     R, t = poses(4)
-    frames = add_noise(render(cam, target, R, t, psf_sigma=0.7), 3.0, seed=9)
-    stated = tp.PoseEstimator(cam, target)(frames)
-    assert (stated.status == tp.Status.OK).all()
+    stated = stated_by_estimate(cam, target, R, t, 3.0)
     found = deviations(predicted_covariance(cam, target, R, t, imaging))
-    torch.testing.assert_close(found, deviations(stated.covariance), rtol=0.05, atol=0)
+    torch.testing.assert_close(found, stated, rtol=0.05, atol=0)
+
+
+@pytest.mark.parametrize("kind", ["plotter", "laser"])
+def test_prediction_counts_print_and_camera_as_the_estimator_does(kind: str) -> None:
+    square = torch.diag(torch.tensor([0.2, 0.2, 0.1, 0.1], dtype=F64).square())
+    cam, target = replace(camera(), covariance=square), PRINTS[kind].stated_by(tp.Target.load("quad40"))
+    R, t = poses(4)
+    found = deviations(predicted_covariance(cam, target, R, t, Imaging(noise=3.0)))
+    torch.testing.assert_close(found, stated_by_estimate(cam, target, R, t, 3.0), rtol=0.05, atol=0)
+    exact = deviations(predicted_covariance(camera(), tp.Target.load("quad40"), R, t, Imaging(noise=3.0)))
+    assert (found[:, :2] > 2 * exact[:, :2]).all()
+    # the closed form that searches go by: without the camera, and the refinement's gradients of light
+    quick = deviations(edge_covariance(cam, target, R, t, Imaging(noise=3.0)))
+    alone = deviations(predicted_covariance(camera(), target, R, t, Imaging(noise=3.0)))
+    assert ((alone / quick - 1).abs() < 0.15).all()
 
 
 def test_deviations_in_um_and_mdeg() -> None:

@@ -16,7 +16,7 @@ import torch
 
 from torchpose.camera import Camera
 from torchpose.cli.main import main
-from torchpose.design import Sheet, make_sheet, plate_around
+from torchpose.design import PRINTS, PrintClass, Sheet, make_sheet, plate_around
 from torchpose.design.drawing import Circle, Line, Page, Text
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
@@ -65,6 +65,25 @@ def test_bars_have_the_length_that_they_say() -> None:
     assert "70 mm" in texts
     assert "50 mm" in texts
     assert any("70 mm (x), 50 mm (y)" in text for text in texts)
+
+
+def test_the_sheet_says_what_the_print_has_to_hold() -> None:
+    def last(target: Target) -> str:
+        words = [s for s in make_sheet(target, (75.0, 52.0)).page.shapes if isinstance(s, Text) and "Print:" in s.text]
+        # beside the plan of the ids and above the edge of the page
+        assert len(words) == 1
+        page = make_sheet(target, (75.0, 52.0)).page
+        assert words[0].y < page.height - 1
+        width = (
+            cv2.getTextSize(words[0].text, cv2.FONT_HERSHEY_SIMPLEX, 1.0, 1)[0][0] / 30 * words[0].size
+        )  # wider letters
+        assert words[0].x + width < page.width - 28
+        return words[0].text
+
+    assert last(Target.load("quad40")) == "Print: its file claims it exact; add center_sigma, edge_gain_sigma."
+    glass, bent = PRINTS["plotter"], PrintClass(0.02, 0.015, 0.04)
+    assert last(glass.stated_by(Target.load("quad40"))) == "Print: centres to 10 um, edges to 15 um, 1 sigma."
+    assert "to 20 um (40 along z), edges to 15 um" in last(bent.stated_by(Target.load("quad40")))
 
 
 @pytest.mark.parametrize("name", ["quad8", "quad40_dark"])

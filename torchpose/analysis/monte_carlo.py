@@ -9,9 +9,11 @@ from torch import Tensor
 
 from torchpose import pnp
 from torchpose.analysis.errors import Pose, pose_difference
+from torchpose.analysis.joint import grown, print_numbers
 from torchpose.analysis.sensitivity import Uncertainty, marker_axes, markers_seen, radius_shift
 from torchpose.camera import Camera
 from torchpose.geometry import least_squares
+from torchpose.geometry.least_squares import covariance_factor
 from torchpose.pipeline import PoseEstimator
 from torchpose.sim import add_noise, render
 from torchpose.target import Target
@@ -51,8 +53,10 @@ def simulate_points(
     points = torch.einsum("bij,dmj->dbmi", R, drawn.centers) + t[:, None]
     normals = (target.normals @ R.mT).expand_as(points)
     xy = points[..., :2] / points[..., 2:]
-    xy = xy + radius_shift(points, normals, drawn.radii[:, None].expand(*points.shape[:-1], 2), target.radii)
-    bent = [replace(true, distortion=row) for row in drawn.distortion] if uncertainty.distortion else [true]
+    radii = drawn.radii[:, None].expand(*points.shape[:-1], 2)
+    xy = xy + radius_shift(points, normals, radii, target.printed_radii)
+    unbent = bool((drawn.distortion == true.distortion).all())
+    bent = [true] if unbent else [replace(true, distortion=row) for row in drawn.distortion]
     pixels = torch.cat([one.distort(part) for one, part in zip(bent, xy.chunk(len(bent)), strict=True)])
     nominal = true.matrix.to(t)
     ideal = (pixels - nominal[:2, 2]) / nominal.diagonal()[:2]
@@ -113,7 +117,8 @@ class _Draws(NamedTuple):
         matrix = self.camera.matrix.clone()
         matrix[[0, 1], [0, 1]], matrix[:2, 2] = self.focal[draw].to(matrix), self.center[draw].to(matrix)
         camera = replace(self.camera, matrix=matrix, distortion=self.distortion[draw], covariance=None)
-        return camera, replace(self.target, centers=self.centers[draw], radii=self.radii[draw])
+        exact = replace(self.target, edge_gain=0.0, covariance=None, cross_covariance=None)
+        return camera, replace(exact, centers=self.centers[draw], radii=self.radii[draw])
 
 
 def _draw(camera: Camera, target: Target, uncertainty: Uncertainty, draws: int, generator: torch.Generator) -> _Draws:
@@ -129,17 +134,22 @@ def _draw(camera: Camera, target: Target, uncertainty: Uncertainty, draws: int, 
     focal = focal * (1 + uncertainty.focal_length * shift[:, 4:5])
     center = center + uncertainty.principal_point * shift[:, 5:7]
     distortion = camera.distortion + centers.new_tensor(uncertainty.distortion or 0.0) * shift[:, 7:]
+    by_print, by_camera = print_numbers(target, camera)
+    stated = (by_print @ normal(by_print.shape[-1])[:, None, :, None]).squeeze(-1)  # (D, M, 4)
     if camera.covariance is not None:
-        values, vectors = torch.linalg.eigh(camera.covariance)
-        numbers = torch.cat([shift[:, :4], normal(len(values) - 4)], -1)
-        intrinsics = numbers @ (vectors * values.clamp_min(0).sqrt()).mT
+        factor = covariance_factor(camera.covariance)
+        count = factor.shape[1]
+        numbers = torch.cat([shift[:, :4], normal(max(count - 4, 0))], -1)[:, :count]
+        intrinsics = numbers @ factor.mT
         focal, center = focal + intrinsics[:, :2], center + intrinsics[:, 2:4]
-        distortion = distortion + intrinsics[:, 4:] if len(values) > 4 else distortion
+        distortion = distortion + intrinsics[:, 4:] if len(factor) > 4 else distortion
+        stated = stated + (by_camera @ numbers[:, None, :, None]).squeeze(-1)
     in_plane, along, radius = uncertainty.print_centers, uncertainty.print_flatness, uncertainty.print_radii
     off = normal(len(target), 5) * centers.new_tensor([in_plane, in_plane, along, radius, radius])
     scale = 1 + uncertainty.print_scale * normal(1, 1)
     moved = (off[..., None, :3] @ marker_axes(target)).squeeze(-2)
-    printed = target.centers * scale + moved, target.radii * scale + off[..., 3:]
+    radii = target.printed_radii * scale + off[..., 3:] + stated[..., 3:] * grown(target)
+    printed = target.centers * scale + moved + stated[..., :3], radii
     return _Draws(camera, target, focal, center, distortion, *printed)
 
 

@@ -2,7 +2,8 @@
 
 The estimator minimises the residuals of what it measures, taking its camera and target for exact. With the Jacobian J
 of the measurements by the pose, their weights W and the Jacobian S by another quantity, an error e of that quantity
-moves the pose by (J^T W J)^-1 J^T W S e to first order. `torchpose.analysis.monte_carlo` runs the chain itself.
+moves the pose by (J^T W J)^-1 J^T W S e to first order. What the target file states of its print are further unknowns
+with that prior where the estimator has them, too. `torchpose.analysis.monte_carlo` runs the chain itself.
 """
 
 from __future__ import annotations
@@ -15,15 +16,17 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchpose.analysis.joint import POSE, grown, joint_inverse, marker_columns, print_numbers
 from torchpose.camera import Camera
 from torchpose.camera.derivatives import by_intrinsics
-from torchpose.geometry.least_squares import scaled_inverse
+from torchpose.geometry.least_squares import covariance_factor
 from torchpose.geometry.projection import by_pose, image_by_point
 from torchpose.geometry.rotations import plane_axes
 from torchpose.target import Target
 
 Features = Literal["centers", "rings"]
 MIN_MARKERS = 3
+_RADII = slice(13, 15)  # columns of `_jacobian`
 _POINTS = 24  # on a circle: the sums over it are exact to the perspective's sixth power
 
 
@@ -71,7 +74,9 @@ class Uncertainty:
 class ErrorBudget:
     """What every source contributes to the covariance of B poses.
 
-    By the names of the fields of `Uncertainty`, and ``calibration`` for `Camera.covariance`; those that are not zero.
+    By the names of the fields of `Uncertainty`, ``calibration`` for `Camera.covariance` with what a target measured in
+    the same adjustment has in common with it, and ``target`` for the rest of `Target.covariance`; those that are not
+    zero.
     In mm and rad: translation, then rotation w with R_true = exp(w) R, in camera axes. NaN where the markers in view do
     not determine the pose.
     """
@@ -105,9 +110,10 @@ def propagate(
         R: (B, 3, 3), target to camera.
         t: (B, 3), target to camera, mm.
         uncertainty: of measurement, camera and print.
-        features: what the pose is fitted to. "centers": the compensated marker centres, as `torchpose.pnp.solve`.
-            "rings": both edges of every ring, weighted by their length in the image, as the refinements on edges and
-            grey values do; the size of each ring then counts too.
+        features: what the pose is fitted to. "centers": the compensated marker centres, as `torchpose.pnp.solve`,
+            weighted by their noise. "rings": both edges of every ring, weighted by their length in the image, as the
+            refinements on edges and grey values do; the size of each ring then counts too, and the places and the edge
+            gain of which the target states a covariance are unknowns with that prior.
 
     Raises:
         ValueError: as many standard deviations of distortion as coefficients are needed; shapes of R and t disagree.
@@ -127,13 +133,18 @@ def propagate(
     else:
         information, variance = point.information, float(image) ** 2
     jacobian = torch.where(seen[:, :, None, None, None], _jacobian(camera, target, R, point), 0.0)
-    weighted = jacobian[..., :6].mT @ information  # (B, M, N, 6, 2): N points of each marker
-    inverted, known = scaled_inverse((weighted @ jacobian[..., :6]).sum((1, 2)))
-    inverted = torch.where(known[:, None, None], inverted, torch.nan)
+    own = torch.cat([jacobian[..., :POSE], jacobian[..., _RADII] @ grown(target)[:, None]], -1)
+    weighted = own.mT @ information  # (B, M, N, 7, 2): N points of each marker
+    columns = marker_columns(target, camera, R)
+    columns = columns if features == "rings" else columns[..., :POSE]
+    inverted, known = joint_inverse((weighted @ own).sum(2), columns, variance)
+    inverted = torch.where(known[:, None, None], inverted, torch.nan)[:, :POSE]
+    by_marker = inverted[:, None] @ columns.mT
     # (B, M, 6, columns): how an error common to the points of a marker moves the pose
-    gain = inverted[:, None] @ (weighted @ jacobian[..., 6:]).sum(2)
-    sources = ({"image": variance * inverted} if variance else {}) | _shares(camera, gain, uncertainty)
-    return ErrorBudget(sources, torch.stack([0 * inverted, *sources.values()]).sum(0), seen)
+    gain = by_marker @ (weighted @ jacobian[..., POSE:]).sum(2)
+    noise = variance * (by_marker @ (weighted @ own).sum(2) @ by_marker.mT).sum(1)
+    sources = ({"image": noise} if variance else {}) | _shares(camera, target, gain, uncertainty)
+    return ErrorBudget(sources, torch.stack([0 * noise, *sources.values()]).sum(0), seen)
 
 
 class Points(NamedTuple):
@@ -158,7 +169,7 @@ def _jacobian(camera: Camera, target: Target, R: Tensor, point: Points) -> Tenso
     return torch.cat([by_pose(point.by_point, point.arm), both[0], *by_print, both[1]], -1)
 
 
-def _shares(camera: Camera, gain: Tensor, uncertainty: Uncertainty) -> dict[str, Tensor]:
+def _shares(camera: Camera, target: Target, gain: Tensor, uncertainty: Uncertainty) -> dict[str, Tensor]:
     """Covariance (B, 6, 6) by every source but the image that is not exact, from `propagate`'s gains of markers."""
     whole = gain.sum(1)
     bent = any(uncertainty.distortion)
@@ -174,9 +185,14 @@ def _shares(camera: Camera, gain: Tensor, uncertainty: Uncertainty) -> dict[str,
     }
     sizes = {name: float(bent if name == "distortion" else getattr(uncertainty, name)) for name in columns}
     shares = {name: size**2 * (columns[name] @ columns[name].mT).sum(1) for name, size in sizes.items() if size}
+    on_print = torch.cat([gain[..., 4:7] @ marker_axes(target), gain[..., 7:9] @ grown(target)[:, None]], -1)
+    own, together = ((on_print @ numbers).sum(1) for numbers in print_numbers(target, camera))
     if camera.covariance is not None:
-        by_camera = torch.cat([whole[:, :, :4], whole[:, :, 10:]], -1)[:, :, : len(camera.covariance)]
-        shares["calibration"] = by_camera @ camera.covariance @ by_camera.mT
+        factor = covariance_factor(camera.covariance)
+        by_camera = torch.cat([whole[:, :, :4], whole[:, :, 10:]], -1)[:, :, : len(factor)] @ factor + together
+        shares["calibration"] = by_camera @ by_camera.mT
+    if target.covariance is not None:
+        shares["target"] = own @ own.mT
     return shares
 
 
@@ -192,12 +208,12 @@ def markers_seen(camera: Camera, target: Target, R: Tensor, t: Tensor) -> Bool[T
 
 def _centers(camera: Camera, target: Target, R: Tensor, t: Tensor) -> Points:
     """The compensated centres, one point a marker."""
-    arm, normal = target.centers @ R.mT, target.normals @ R.mT
+    arm, normal, radii = target.centers @ R.mT, target.normals @ R.mT, target.printed_radii
     xy, depth, by_point = _seen(camera, arm + t[:, None])
     # of `radius_shift` by the true radii
-    outer, inner = target.radii.square().unbind(-1)
-    by_factor = torch.stack([inner, -outer], -1) * 2 * target.radii / (outer - inner).square()[:, None]
-    shift = _between_ellipses(arm + t[:, None], normal, target.radii)[..., None] * by_factor[:, None]
+    outer, inner = radii.square().unbind(-1)
+    by_factor = torch.stack([inner, -outer], -1) * 2 * radii / (outer - inner).square()[:, None]
+    shift = _between_ellipses(arm + t[:, None], normal, radii)[..., None] * by_factor[:, None]
     eye = torch.eye(2, dtype=t.dtype, device=t.device).expand(*xy.shape, 2)
     return Points(*(value[:, :, None] for value in (arm, depth, xy, by_point, camera.J_distort(xy) @ shift, eye)))
 
@@ -232,7 +248,7 @@ def ring_edges(camera: Camera, target: Target, R: Tensor, t: Tensor, count: int)
 
     The information about a bit is n n^T ds, n its normal in the image.
     """
-    (out, ahead), radii = around(target, count), target.radii[..., None, None]
+    (out, ahead), radii = around(target, count), target.printed_radii[..., None, None]
     turn = R[:, None, None]
     out, ahead = out[:, None] @ turn.mT, ahead[:, None] @ turn.mT  # (B, M, 1, count, 3)
     arm = (target.centers @ R.mT)[:, :, None, None] + radii * out

@@ -16,15 +16,21 @@ from torchpose.target import Target
 
 
 @dataclass(frozen=True, eq=False)
-class Sweep:
+class Swept:
+    """Predicted errors of a target's pose at D distances on the optical axis."""
+
+    distance: Float[Tensor, " D"]
+    budget: ErrorBudget  # by source
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep(Swept):
     """Errors of a target's pose at D distances on the optical axis; mm and rad, x y z and rotations about x y z.
 
     The focal length is wrong by its whole share in every one of N draws; in the budget, ``focal_length`` is the size of
     the effect of an error of exactly that share.
     """
 
-    distance: Float[Tensor, " D"]
-    budget: ErrorBudget  # predicted, by source
     errors: Float[Tensor, "N D 6"]  # estimate minus truth
     lateral: Float[Tensor, " D"]  # size of eq. (3) for the distance between neighbouring markers
     depth: Float[Tensor, " D"]  # the same of eq. (2)
@@ -60,9 +66,7 @@ def sweep(
         tilt: rad, about the x axis.
     """
     distance = distance.double()
-    R = rotations.exp(distance.new_tensor([tilt, 0.0, 0.0])).expand(len(distance), 3, 3)
-    x, y, _ = (R @ target.centers.mean(0)).unbind(-1)
-    t = torch.stack([-x, -y, distance], -1)
+    R, t = on_axis(target, distance, tilt)
     longer = camera.matrix.clone()
     longer[[0, 1], [0, 1]] *= 1 + uncertainty.focal_length
     true = replace(camera, matrix=longer)
@@ -78,6 +82,21 @@ def sweep(
         depth=uncertainty.image * equations.depth_per_pixel(near, f, distance, 1.0).abs(),
         depth_focal=equations.depth_focal_error(distance, 1.0, 1 + uncertainty.focal_length),
     )
+
+
+def on_axis(target: Target, distance: Float[Tensor, " D"], tilt: float = 0.0) -> tuple[Tensor, Tensor]:
+    """Poses (D, 3, 3), (D, 3) with the target's middle on the optical axis, tilted about x by so many rad."""
+    R = rotations.exp(distance.new_tensor([tilt, 0.0, 0.0])).expand(len(distance), 3, 3)
+    x, y, _ = (R @ target.centers.mean(0)).unbind(-1)
+    return R, torch.stack([-x, -y, distance], -1)
+
+
+def sweep_rings(
+    camera: Camera, target: Target, distance: Tensor, uncertainty: Uncertainty, *, tilt: float = 0.0
+) -> Swept:
+    """The same as `sweep` of poses fitted to the edges of the rings, predicted alone; ``image`` is of such edges."""
+    distance = distance.double()
+    return Swept(distance, propagate(camera, target, *on_axis(target, distance, tilt), uncertainty, features="rings"))
 
 
 def fit(distance: Tensor, value: Tensor, powers: Sequence[int]) -> Tensor:

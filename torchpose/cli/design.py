@@ -6,7 +6,7 @@ import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -27,7 +27,11 @@ _TILT = "Largest tilt against the optical axis, in any direction, degrees."
 _OFFSET = "Largest distance off the optical axis, mm."
 _ANGLE = "Standard deviation needed about every axis, degrees."
 _MARKERS = "Number of rings: 4, 6, 8, 9, 10 or 12; by default the fewest that do."
-_GAIN = "Most dot gain of the print, either way, um: room for it is left between codes (office printers: 60 to 100)."
+_PRINT = (
+    "How the target is printed: glass (places off by 1 um, edges by 1), plotter (10, 15), laser (70, 60), or standard "
+    "deviations PLACES,GAIN or PLACES,GAIN,FLATNESS in um. By default exactly."
+)
+_GAIN = "Most dot gain of the print, either way, um: room for it is left between codes; by default that of --print."
 _LEVELS = "Grey levels of print and paper."
 _APERTURE = "Aperture: counts the blur out of focus and notes the depth of field."
 _TONE = "Tone around the rings: dark rings on light, or the reverse."
@@ -46,7 +50,8 @@ def design(
     accuracy_um: _Need = None,
     accuracy_deg: Annotated[float | None, typer.Option(help=_ANGLE)] = None,
     markers: Annotated[int | None, typer.Option(help=_MARKERS)] = None,
-    print_gain: Annotated[float, typer.Option(metavar="UM", help=_GAIN)] = 0.0,
+    printing: Annotated[str | None, typer.Option("--print", metavar="CLASS", help=_PRINT)] = None,
+    print_gain: Annotated[float | None, typer.Option(metavar="UM", help=_GAIN)] = None,
     blur: Annotated[float, typer.Option(help="Standard deviation of the lens's blur in focus, px.")] = 0.7,
     noise: Annotated[float, typer.Option(help="Standard deviation of the noise, grey levels of 255.")] = 2.0,
     levels: Annotated[tuple[float, float], typer.Option(metavar="DARK LIGHT", help=_LEVELS)] = (30.0, 220.0),
@@ -57,42 +62,51 @@ def design(
 ) -> int:
     """Choose a target for a camera, a working volume and an accuracy, and draw it at true scale (SVG, PDF).
 
-    Standard deviations are those of the image noise with an exactly known camera and print. The target is the one with
-    the fewest rings that does, at the worst point of the volume.
+    Standard deviations are those of the image noise, of the print (--print) and of what the camera file states of
+    itself. The target is the one with the fewest rings that does, at the worst point of the volume.
     """
-    from torchpose.design import Need, make_sheet, plate_around, predict_volume
+    from torchpose.design import Need, make_sheet, plate_around, print_of
     from torchpose.report.files import make_folder
     from torchpose.target import Target
 
     sides = None if plate is None else _sides(plate)
-    if target is None:
-        for option, value in (("--plate", plate), ("--accuracy-um", accuracy_um)):
-            if value is None:
-                raise ConfigError(f"{option}: is missing; a design needs it (--target draws an existing target alone)")
-    elif name is not None or markers is not None or print_gain != 0:
-        raise ConfigError("--target: is there already; leave --name, --markers and --print-gain out")
+    _check({"--plate": plate, "--accuracy-um": accuracy_um}, target, (name, markers, print_gain))
     existing = None if target is None else Target.load(target)
     scene = None
     if existing is None or camera is not None or distance is not None or distance_range is not None:
         volume = _volume(distance, distance_range, tilt, roll, offset)
         scene = _Scene(_camera(camera), volume, _imaging(volume, blur, noise, levels, f_number, focal_length))
+    made = None if printing is None else print_of(printing)
     need = None if accuracy_um is None else Need(*accuracy_um, *(() if accuracy_deg is None else (accuracy_deg,)))
     make_folder(out, "--out")
+    promise: _Promise | None
+    written: list[Path] = []
     if existing is None:
-        assert scene is not None
-        assert need is not None
-        assert sides is not None
-        chosen, precision, written = _new_target(scene, sides, need, out, (name, background, markers, print_gain / 1e3))
+        assert scene
+        assert need
+        assert sides
+        gain = None if print_gain is None else print_gain / 1e3
+        choice = {"name": name, "background": background, "markers": markers, "printing": made, "print_gain": gain}
+        chosen, promise, written = _new_target(scene, sides, need, out, choice)
     else:
-        chosen, written = existing, []
-        if scene is not None:
-            precision = predict_volume(scene.camera, chosen, scene.volume, scene.imaging)
+        chosen = existing if made is None else made.stated_by(existing)
+        promise = None if scene is None else _Promise.of(scene, chosen)
     written += make_sheet(chosen, sides or plate_around(chosen)).save(out, chosen.name)
-    if scene is not None:
-        written += _tell_precision(chosen, scene, precision, need, out)
+    if scene is not None and promise is not None:
+        written += _tell_precision(chosen, scene, promise, need, out)
     for path in written:
         typer.echo(str(path))
     return 0
+
+
+def _check(needed: dict[str, object], target: str | None, chosen: tuple[object, ...]) -> None:
+    """Refuses a design without what it needs, and choices about a target that is there already."""
+    if target is None:
+        for option, value in needed.items():
+            if value is None:
+                raise ConfigError(f"{option}: is missing; a design needs it (--target draws an existing target alone)")
+    elif any(value is not None for value in chosen):
+        raise ConfigError("--target: is there already; leave --name, --markers and --print-gain out")
 
 
 @dataclass(frozen=True)
@@ -100,6 +114,24 @@ class _Scene:
     camera: Camera
     volume: WorkingVolume
     imaging: Imaging
+
+
+@dataclass(frozen=True, eq=False)
+class _Promise:
+    """Predicted precision of a target as printed, and once it is measured; None where its file states no print."""
+
+    printed: Precision
+    measured: Precision | None
+
+    @classmethod
+    def of(cls, scene: _Scene, target: Target) -> _Promise:
+        from torchpose.design import measured, predict_volume
+
+        setting = scene.volume, scene.imaging
+        printed = predict_volume(scene.camera, target, *setting)
+        if target.covariance is None:
+            return cls(printed, None)
+        return cls(printed, predict_volume(scene.camera, measured(scene.camera, target, *setting), *setting))
 
 
 def _camera(name: str | None) -> Camera:
@@ -150,17 +182,12 @@ def _sides(text: str) -> tuple[float, float]:
 
 
 def _new_target(
-    scene: _Scene,
-    plate: tuple[float, float],
-    need: Need,
-    out: Path,
-    choice: tuple[str | None, str, int | None, float],
-) -> tuple[Target, Precision, list[Path]]:
+    scene: _Scene, plate: tuple[float, float], need: Need, out: Path, choice: dict[str, Any]
+) -> tuple[Target, _Promise, list[Path]]:
     """The designed target, its precision and its file; its rings are told."""
     from torchpose.design import design_target
 
-    named = dict(zip(("name", "background", "markers", "print_gain"), choice, strict=True))
-    made = design_target(scene.camera, scene.volume, plate, need, scene.imaging, **named)
+    made = design_target(scene.camera, scene.volume, plate, need, scene.imaging, **choice)
     ratios = ", ".join(f"{ratio:.2f}" for ratio in sorted(made.target.codes.sqrt().tolist()))
     typer.echo(
         f"{len(made.target)} rings of {2 * made.radius:g} mm, semi-minor axis at least {made.semi_minor:.0f} px; "
@@ -168,24 +195,41 @@ def _new_target(
     )
     path = out / f"{made.target.name}.yaml"
     made.target.save(path)
-    return made.target, made.precision, [path]
+    return made.target, _Promise(made.precision, made.measured), [path]
 
 
-def _tell_precision(target: Target, scene: _Scene, precision: Precision, need: Need | None, out: Path) -> list[Path]:
+def _tell_precision(target: Target, scene: _Scene, promise: _Promise, need: Need | None, out: Path) -> list[Path]:
     """Tells the predicted precision of a target; paths of its table and map."""
     from torchpose.cli.terminal import print_table
     from torchpose.design import precision_map
     from torchpose.io.writers import write_rows
     from torchpose.report.design import save_plot
 
-    rows = precision.rows(need)
+    rows = promise.printed.rows(need, promise.measured)
     columns = [column.replace("_", " ") for column in rows[0]]
     print_table(f"{target.name}: predicted standard deviations", columns, [list(row.values()) for row in rows])
+    typer.echo(_print_told(target, promise, need))
     typer.echo(_focus(scene))
     table, picture = out / f"{target.name}_precision.csv", out / f"{target.name}_map.png"
     write_rows(table, rows, {column: str if column in ("axis", "unit") else float for column in rows[0]})
     save_plot(precision_map(scene.camera, target, scene.volume, scene.imaging), target.name, picture)
     return [table, picture]
+
+
+def _print_told(target: Target, promise: _Promise, need: Need | None) -> str:
+    """What the print costs, and what measuring it buys."""
+    from torchpose.design import MEASURING_VIEWS, scale_deviation
+
+    if promise.measured is None:
+        return "print: counted as exact; give --print glass, plotter, laser or PLACES,GAIN in um"
+    verdict = "counted as the target file states it"
+    if need is not None:
+        enough = float(need.excess(promise.printed.worst)) <= 1
+        verdict = "good enough as it comes" if enough else "too coarse as it comes, good enough once it is measured"
+    return (
+        f"print: {verdict}; worst measured: after torchpose calibrate --measure-target with {MEASURING_VIEWS} views, "
+        f"in the scale of the print: {100 * scale_deviation(target):.2g} % of any length, unless --distance tells it"
+    )
 
 
 def _focus(scene: _Scene) -> str:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,13 +14,20 @@ from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:
     from torchpose.analysis.sensitivity import Uncertainty
-    from torchpose.analysis.sweep import Sweep
+    from torchpose.analysis.sweep import Sweep, Swept
+    from torchpose.camera import Camera
+    from torchpose.target import Target
 
 _Sigmas = Annotated[
     list[float] | None,
     typer.Option(help="Standard deviation of a marker centre on each axis; may be repeated. By default 0.2 and 1."),
 ]
 _Distances = Annotated[tuple[float, float], typer.Option(metavar="NEAR FAR", help="Working distances, mm.")]
+_NOISE = (
+    "Standard deviation of the noise, grey levels of 255: adds the budget of the rings' edges, as estimate claims it."
+)
+_LEVELS = "Grey levels of print and paper, with --noise."
+_FOCAL = "Error of the focal length; by default 0.25, or 0 where the camera file states a covariance."
 _DISTORTION = "Standard deviations of the camera's coefficients: 1e-3,1e-3,1e-5,1e-5."
 
 
@@ -30,56 +39,65 @@ def sensitivity(
     steps: Annotated[int, typer.Option(min=3, max=1000, help="Number of distances.")] = 11,
     tilt_deg: Annotated[float, typer.Option(help="Tilt of the target about the x axis.")] = 0.0,
     sigma_px: _Sigmas = None,
-    focal_error_percent: Annotated[float, typer.Option(help="Error of the focal length.")] = 0.25,
+    focal_error_percent: Annotated[float | None, typer.Option(help=_FOCAL)] = None,
     principal_point_px: Annotated[float, typer.Option(help="Standard deviation of cx and cy.")] = 0.0,
     distortion: Annotated[str, typer.Option(metavar="LIST", help=_DISTORTION)] = "",
     print_um: Annotated[float, typer.Option(help="Standard deviation of a printed centre, on each axis.")] = 0.0,
     flatness_um: Annotated[float, typer.Option(help="Standard deviation of a marker along its normal.")] = 0.0,
     radius_um: Annotated[float, typer.Option(help="Standard deviation of a printed radius.")] = 0.0,
     scale_percent: Annotated[float, typer.Option(help="Standard deviation of the print's scale.")] = 0.0,
+    noise: Annotated[float | None, typer.Option(help=_NOISE)] = None,
+    blur: Annotated[float, typer.Option(help="Standard deviation of the lens's blur, px, with --noise.")] = 0.7,
+    levels: Annotated[tuple[float, float], typer.Option(metavar="DARK LIGHT", help=_LEVELS)] = (30.0, 220.0),
     draws: Annotated[int, typer.Option(min=2, max=100000, help="Random draws at every distance.")] = 300,
     seed: Annotated[int, typer.Option(min=0, help="Of the draws.")] = 0,
 ) -> int:
-    """Predict pose errors by source over the working distance, and check the prediction by Monte-Carlo."""
-    sizes = {
-        "--principal-point-px": principal_point_px,
-        "--print-um": print_um,
-        "--flatness-um": flatness_um,
-        "--radius-um": radius_um,
-        "--scale-percent": scale_percent,
-        "--focal-error-percent": focal_error_percent,
-    }
+    """Predict pose errors by source over the working distance, and check the prediction by Monte-Carlo.
+
+    What target file and camera file state of themselves is counted: center_sigma, edge_gain_sigma, centers_covariance,
+    and the covariance of the camera's parameters.
+    """
+    lens = _lens(camera)
+    if focal_error_percent is None:
+        focal_error_percent = 0.25 if lens.covariance is None else 0.0
+    options = ("focal-error-percent", "principal-point-px", "print-um", "flatness-um", "radius-um", "scale-percent")
+    values = (focal_error_percent, principal_point_px, print_um, flatness_um, radius_um, scale_percent)
+    sizes = {f"--{option}": value for option, value in zip(options, values, strict=True)}
     sigmas = list(dict.fromkeys(sigma_px or [0.2, 1.0]))
     _check(sizes, sigmas, distance, tilt_deg)
     import torch
 
     from torchpose.analysis.sensitivity import Uncertainty
-    from torchpose.analysis.sweep import sweep
-    from torchpose.camera import Camera
-    from torchpose.studies.fig04_sensitivity import cases_of, paper_camera, tabulate
+    from torchpose.analysis.sweep import sweep, sweep_rings
+    from torchpose.studies.fig04_sensitivity import cases_of, tabulate
     from torchpose.target import Target
 
-    lens, printed = Camera.load(camera) if camera else paper_camera(), Target.load(target)
-    size = Uncertainty(
-        focal_length=focal_error_percent / 100,
-        principal_point=principal_point_px,
-        distortion=_coefficients(distortion, len(lens.distortion)),
-        print_centers=print_um / 1000,
-        print_flatness=flatness_um / 1000,
-        print_radii=radius_um / 1000,
-        print_scale=scale_percent / 100,
-    )
+    printed = Target.load(target)
+    bent = _coefficients(distortion, len(lens.distortion))
+    of_print = (print_um / 1000, flatness_um / 1000, radius_um / 1000, scale_percent / 100)
+    size = Uncertainty(0.0, focal_error_percent / 100, principal_point_px, bent, *of_print)
     at, tilt = torch.linspace(*distance, steps, dtype=torch.float64), math.radians(tilt_deg)
     cases = {
         title: sweep(lens, printed, at, case, tilt=tilt, draws=draws, seed=seed)
         for title, case in cases_of(sigmas, size).items()
     }
     _check_view(cases)
-    files = tabulate(cases).save(out)
-    _show(cases, size)
-    for path in files:
-        typer.echo(str(path))
+    rings: dict[str, Swept] = {}
+    if noise is not None:
+        edges = replace(size, image=_of_edges(noise, levels, blur))
+        rings[f"edges of the rings, noise {noise:g}"] = sweep_rings(lens, printed, at, edges, tilt=tilt)
+    files = tabulate(cases, rings).save(out)
+    _show(cases | rings, size)
+    for line in (*_unstated(lens, printed), *files):
+        typer.echo(str(line))
     return 0
+
+
+def _lens(path: Path | None) -> Camera:
+    from torchpose.camera import Camera
+    from torchpose.studies.fig04_sensitivity import paper_camera
+
+    return Camera.load(path) if path else paper_camera()
 
 
 def _check(sizes: dict[str, float], sigmas: list[float], distance: tuple[float, float], tilt_deg: float) -> None:
@@ -94,6 +112,29 @@ def _check(sizes: dict[str, float], sigmas: list[float], distance: tuple[float, 
         raise ConfigError(f"sensitivity: --distance: is {distance[0]} {distance[1]}; give NEAR above 0 and FAR beyond")
     if not abs(tilt_deg) < 85:
         raise ConfigError(f"sensitivity: --tilt-deg: is {tilt_deg}; give an angle between -85 and 85")
+
+
+def _of_edges(noise: float, levels: tuple[float, float], blur: float) -> float:
+    """Of `Uncertainty.image`: px of an edge averaged over 1 px, with the noise of rounding to grey levels."""
+    from torchpose.analysis.sensitivity import edge_noise
+
+    for option, value in (("--noise", noise), ("--blur", blur)):
+        if not 0 < value < math.inf:
+            raise ConfigError(f"sensitivity: {option}: is {value}; give a number above 0")
+    dark, light = levels
+    if not 0 <= dark < light <= 255:
+        raise ConfigError(f"sensitivity: --levels: is {dark:g} {light:g}; give 0 <= DARK < LIGHT <= 255")
+    return edge_noise(math.sqrt(noise**2 + 1 / 12), light - dark, blur)
+
+
+def _unstated(camera: Camera, target: Target) -> list[str]:
+    """What the budget takes for exact because its file says nothing."""
+    keys = []
+    if target.covariance is None:
+        keys.append(f"target {target.name} (center_sigma, edge_gain_sigma)")
+    if camera.covariance is None:
+        keys.append("camera (its covariance, which torchpose calibrate writes)")
+    return [f"stated by no file, so exact but for the options: {' and '.join(keys)}"] if keys else []
 
 
 def _coefficients(text: str, count: int) -> tuple[float, ...]:
@@ -120,8 +161,9 @@ def _check_view(cases: dict[str, Sweep]) -> None:
             )
 
 
-def _show(cases: dict[str, Sweep], size: Uncertainty) -> None:
+def _show(cases: Mapping[str, Swept], size: Uncertainty) -> None:
     from torchpose.analysis.evaluation import AXES, SCALE, UNITS
+    from torchpose.analysis.sweep import Sweep
     from torchpose.cli.terminal import print_table
 
     columns = ("distance mm", "source", *(f"{axis} {unit}" for axis, unit in zip(AXES, UNITS, strict=True)))
@@ -129,7 +171,9 @@ def _show(cases: dict[str, Sweep], size: Uncertainty) -> None:
         rows = []
         for k in (0, len(case.distance) // 2, len(case.distance) - 1):
             lines = {name: case.budget.std(name)[k] for name in case.budget.sources}
-            lines |= {"total": case.budget.std()[k], "drawn, rms": case.rms[k], "drawn, largest": case.largest[k]}
+            lines["total"] = case.budget.std()[k]
+            if isinstance(case, Sweep):
+                lines |= {"drawn, rms": case.rms[k], "drawn, largest": case.largest[k]}
             for i, (name, std) in enumerate(lines.items()):
                 values = [value if value > 1e-9 else 0.0 for value in (SCALE * std).tolist()]  # below, rounding
                 rows.append(("" if i else f"{float(case.distance[k]):g}", name.replace("_", " "), *values))

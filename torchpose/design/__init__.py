@@ -9,16 +9,20 @@ from torchpose.design.predict import (
     predicted_covariance,
     sharp_range,
 )
+from torchpose.design.printing import MEASURING_VIEWS, PRINTS, PrintClass, measured, print_of, scale_deviation
 from torchpose.design.search import Design, design_target
 from torchpose.design.sheet import Sheet, make_sheet, plate_around
 from torchpose.design.volume import WorkingVolume
 
 __all__ = [
+    "MEASURING_VIEWS",
+    "PRINTS",
     "Design",
     "Imaging",
     "Need",
     "Precision",
     "PrecisionMap",
+    "PrintClass",
     "Sheet",
     "WorkingVolume",
     "best_focus",
@@ -26,9 +30,12 @@ __all__ = [
     "deviations",
     "edge_covariance",
     "make_sheet",
+    "measured",
     "plate_around",
     "precision_map",
     "predict_volume",
     "predicted_covariance",
+    "print_of",
+    "scale_deviation",
     "sharp_range",
 ]

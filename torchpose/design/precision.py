@@ -1,5 +1,7 @@
 """Predicted precision of a target over a working volume: its middle, its worst points, and maps."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 
@@ -22,6 +24,7 @@ _DIRECTIONS = 8  # of the tilt, and turns about the axis, among which the weakes
 _STEPS = 4  # of distance and tilt in a map
 _PLACES = 3  # across the offset, along x and y
 _COLUMNS = ["axis", "unit", "needed", "middle", "worst", "worst_x_mm", "worst_y_mm", "worst_z_mm", "worst_tilt_deg"]
+_MEASURED = "worst_measured"
 
 
 @dataclass(frozen=True)
@@ -58,13 +61,19 @@ class Precision(Rows):
     R: Float[Tensor, "6 3 3"]  # where it was found
     t: Float[Tensor, "6 3"]
 
-    def rows(self, need: Need | None = None) -> list[Row]:
-        """One row an axis: what is needed, the deviation in the middle, the largest one, and where that is."""
+    def rows(self, need: Need | None = None, measured: Precision | None = None) -> list[Row]:
+        """One row an axis: what is needed, the deviation in the middle, the largest one, and where that is.
+
+        With the precision of the same target once its print is measured, its largest deviation, too.
+        """
         tilt = self.R[:, 2, 2].clamp(max=1).acos().rad2deg()
         columns = (self.middle, self.worst, *self.t.unbind(1), tilt)
         needed = [None] * len(AXES) if need is None else need.allowed
         rows = zip(AXES, UNITS, needed, *(column.tolist() for column in columns), strict=True)
-        return [dict(zip(_COLUMNS, row, strict=True)) for row in rows]
+        made: list[Row] = [dict(zip(_COLUMNS, row, strict=True)) for row in rows]
+        if measured is not None:
+            made = [row | {_MEASURED: worst} for row, worst in zip(made, measured.worst.tolist(), strict=True)]
+        return made
 
 
 @dataclass(frozen=True, eq=False)

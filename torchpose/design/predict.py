@@ -10,11 +10,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose import ellipse
+from torchpose.analysis.joint import POSE, grown, joint_inverse, marker_columns
 from torchpose.analysis.sensitivity import around, ring_edges
 from torchpose.camera import Camera
 from torchpose.errors import ConfigError
 from torchpose.geometry.projection import by_pose
-from torchpose.refine import Sight, refine_photometric
+from torchpose.identify import MarkerTable
+from torchpose.pose import Evidence, Setting, on_print
+from torchpose.refine import Refined, Sight, refine_photometric
 from torchpose.sim import Defocus, add_noise, render
 from torchpose.target import Target
 
@@ -84,8 +87,9 @@ def edge_covariance(camera: Camera, target: Target, R: Tensor, t: Tensor, imagin
 
     A straight blurred edge of contrast h and length L px fixes its offset with the information
     h^2 L / (2 sqrt(pi) s n^2), s and n the standard deviations of blur and noise (integral of the squared derivative
-    of the normal law). The same as `torchpose.analysis.sensitivity.propagate` gives for the image's noise on "rings",
-    but with no derivative besides those by the pose, for searches.
+    of the normal law). What the target states of its print counts as further unknowns. The same as
+    `torchpose.analysis.sensitivity.propagate` gives for the image's noise and the target on "rings", but with no
+    derivative besides those by the pose and the edge gain, for searches.
 
     Args:
         R: (B, 3, 3), target to camera.
@@ -94,12 +98,24 @@ def edge_covariance(camera: Camera, target: Target, R: Tensor, t: Tensor, imagin
     Returns:
         float64, mm and rad, translation first, rotation multiplied from the left.
     """
+    columns = marker_columns(target, camera, R)
+    inverse, known = joint_inverse(marker_information(camera, target, R, t, imaging), columns)
+    return torch.where(known[:, None, None], inverse[:, :POSE, :POSE], torch.nan)
+
+
+def marker_information(
+    camera: Camera, target: Target, R: Tensor, t: Tensor, imaging: Imaging
+) -> Float[Tensor, "B M 7 7"]:
+    """What the edges of every marker tell of a pose of its own and of the edge gain.
+
+    Arguments as of `edge_covariance`.
+    """
     edge = ring_edges(camera, target, R, t, _SAMPLES)
-    jacobian = by_pose(edge.by_point, edge.arm)
+    jacobian = torch.cat([by_pose(edge.by_point, edge.arm), edge.by_radii @ grown(target)[:, None]], -1)
     blur = (imaging.blur(camera, edge.depth).square() + _PIXEL_VARIANCE).sqrt()
     weight = (imaging.light - imaging.dark) ** 2 / (2 * math.sqrt(math.pi) * (imaging.noise**2 + _QUANTISATION)) / blur
     weighted = weight[..., None, None] * (edge.information @ jacobian)
-    return torch.linalg.inv(jacobian.flatten(1, 3).mT @ weighted.flatten(1, 3))
+    return jacobian.flatten(2, 3).mT @ weighted.flatten(2, 3)
 
 
 def predicted_covariance(
@@ -107,8 +123,10 @@ def predicted_covariance(
 ) -> Float[Tensor, "B 6 6"]:
     """Covariance that the estimator (``method="photometric"``) states for a target at every pose.
 
-    One simulated frame a pose, cropped to the target, refined from the true pose: the covariance holds whatever the
-    refinement leaves out or adds as unknowns. The frame's noise scatters it by about a percent.
+    Simulated frames, cropped to the target, refined from the true pose: the covariance holds whatever the
+    refinement leaves out or adds as unknowns, and what the files of target and camera state. The frame's noise scatters
+    it by about a percent. One frame in twenty or so happens to look as if its noise were correlated, and the estimator
+    then claims less: of two frames a pose the one that claims more counts.
 
     Arguments and result as of `edge_covariance`; NaN where the refinement fails.
     """
@@ -125,16 +143,42 @@ def predicted_covariance(
         crop = replace(camera, width=width, height=height, matrix=matrix)
         pose = R[i : i + 1], t[i : i + 1]
         levels = render(crop, target, *pose, **look)
-        noisy = add_noise(levels, imaging.noise, index=index.new_tensor([i]))
-        seen = ellipse.fit((pixel - low).flatten(0, 1), index, len(pixel)).view(1, len(target), 2, 5)
-        refined = refine_photometric(Sight.of(noisy, crop, target, index.new_zeros(1), seen), *pose)
-        out.append(torch.where(refined.good[:, None, None], refined.covariance, torch.nan))
+        twice = index.new_tensor([i, i + len(t)])
+        noisy = add_noise(levels.expand(2, -1, -1), imaging.noise, index=twice)
+        seen = (
+            ellipse.fit((pixel - low).flatten(0, 1), index, len(pixel)).view(1, len(target), 2, 5).expand(2, -1, -1, -1)
+        )
+        refined = refine_photometric(
+            Sight.of(noisy, crop, target, torch.arange(2, device=index.device), seen),
+            *(part.repeat(2, *[1] * (part.ndim - 1)) for part in pose),
+        )
+        found = torch.where(refined.good[:, None, None], _stated(refined, crop, target), torch.inf)
+        least = found.diagonal(dim1=1, dim2=2).sum(-1).argmin()
+        out.append(torch.where(refined.good.any(), found[least], torch.nan)[None])
     return torch.cat(out) if out else t.new_zeros(0, 6, 6)
+
+
+def _stated(refined: Refined, camera: Camera, target: Target) -> Float[Tensor, "B 6 6"]:
+    """Covariance of refined poses with that of print and camera, all markers seen, residuals as the noise has them."""
+    rows, markers = len(refined), len(target)
+    table = MarkerTable.of([target], camera).to(refined.t.device)
+    table = table[torch.zeros(rows, dtype=torch.int64, device=refined.t.device)]
+    nothing = refined.t.new_zeros(rows, markers, 2)
+    square = torch.eye(2, dtype=nothing.dtype, device=nothing.device).expand(rows, markers, 2, 2)
+    ellipses, shapes = nothing.new_zeros(rows, markers, 2, 5), nothing.new_zeros(rows, markers, 2, 5, 5)
+    evidence = Evidence(
+        *(table.centers, table.normals, table.radii, nothing, square, ellipses, shapes, nothing[..., 0], table.valid),
+        *(table.coplanar, table.polarity, torch.zeros_like(square), table.by_print, table.by_camera),
+        matrix=camera.matrix,
+    )  # what was measured is in the normal equations
+    normals = replace(refined.normals, right=torch.zeros_like(refined.normals.right))
+    setting = Setting(evidence, refined.R, refined.t, camera, on_rims=True)
+    return on_print(normals, setting, nothing.new_zeros(rows, markers, 4)).covariance
 
 
 def rims(target: Target) -> Float[Tensor, "circles samples 3"]:
     """Points on the outer and inner circle of every marker, in turn, mm."""
-    circle = target.radii[..., None, None] * around(target, _SAMPLES)[0][:, None]
+    circle = target.printed_radii[..., None, None] * around(target, _SAMPLES)[0][:, None]
     return (target.centers[:, None, None] + circle).flatten(0, 1)
 
 

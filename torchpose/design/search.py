@@ -1,7 +1,7 @@
 """The choice: the fewest rings that reach the accuracy needed at the worst point of the working volume."""
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,6 +12,7 @@ from torchpose.camera import Camera
 from torchpose.design.layout import ARRANGEMENTS, Limits, Size, assign_codes, largest
 from torchpose.design.precision import FRAME_MARGIN_PX, Need, Precision, on_device, predict_volume
 from torchpose.design.predict import Imaging, deviations, edge_covariance, in_view, outlines
+from torchpose.design.printing import PrintClass, measured
 from torchpose.design.volume import WorkingVolume
 from torchpose.errors import ConfigError
 from torchpose.identify.markers import ratio_tolerance
@@ -26,10 +27,12 @@ _MICRON = 1e-2  # mm, to which radii and places are rounded: a target file that 
 class Design:
     """A target and what it promises."""
 
-    target: Target
+    target: Target  # it states its print
     plate: Size
     limits: Limits  # of its rings
-    precision: Precision  # over the working volume
+    precision: Precision  # over the working volume, as printed
+    printing: PrintClass | None = None  # None: an exact print
+    measured: Precision | None = None  # the same once a camera has measured the print; None of an exact one
 
     @property
     def radius(self) -> float:
@@ -55,7 +58,53 @@ class Choice:
     name: str | None = None  # by default number of rings and size
     background: str = "light"  # or dark
     markers: int | None = None  # number of rings; by default the fewest that do
-    print_gain: float = 0.0  # most dot gain of the print either way, mm: room for it is left between codes
+    printing: PrintClass | None = None  # what it is printed with; by default exactly
+    print_gain: float | None = None  # most dot gain of the print either way, mm; by default that of ``printing``
+
+    def __post_init__(self) -> None:
+        if self.markers is not None and self.markers not in ARRANGEMENTS:
+            raise ConfigError(
+                f"markers: {self.markers}; there are layouts of {', '.join(map(str, ARRANGEMENTS))} rings"
+            )
+        if self.print_gain is not None and not 0 <= self.print_gain < math.inf:
+            raise ConfigError(f"print_gain: {self.print_gain:g} mm; give a length from 0")
+
+    @property
+    def made(self) -> PrintClass | None:
+        """What the target's file states of its print; None: nothing."""
+        if self.print_gain is None:
+            return self.printing
+        gain = self.print_gain / MOST_GAIN
+        if self.printing is not None:
+            return replace(self.printing, gain=gain)
+        return PrintClass(0.0, gain) if gain else None
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """What a target is searched for."""
+
+    camera: Camera
+    volume: WorkingVolume
+    plate: Size
+    need: Need
+    imaging: Imaging
+    choice: Choice
+    limits: Limits
+
+    @property
+    def counts(self) -> list[int]:
+        """Numbers of rings that are tried, rising."""
+        return list(ARRANGEMENTS) if self.choice.markers is None else [self.choice.markers]
+
+    def precision(self, target: Target) -> Precision:
+        return predict_volume(self.camera, target, self.volume, self.imaging)
+
+    def excess(self, precision: Precision) -> float:
+        return float(self.need.excess(precision.worst).nan_to_num(nan=math.inf))
+
+    def measured(self, target: Target) -> Target:
+        return measured(self.camera, target, self.volume, self.imaging)
 
 
 def design_target(
@@ -65,62 +114,78 @@ def design_target(
 
     For every number of rings the outer radius is the one with the smallest excess over the need: large rings have long
     edges, small ones lie farther out. Radii are compared by `edge_covariance`; what is promised comes from
-    `predicted_covariance`.
+    `predicted_covariance`. Where the print is too coarse, the target is the one that meets the need once it is
+    measured.
 
     Args:
         plate: width and height, mm.
-        choice: fields of `Choice`: ``name``, ``background``, ``markers``, ``print_gain``.
+        choice: fields of `Choice`: ``name``, ``background``, ``markers``, ``printing``, ``print_gain``.
 
     Raises:
-        ConfigError: the rings are out of view or too small, or the accuracy is out of reach; with the figure that can
-            be reached.
+        ConfigError: the rings are out of view or too small, or the accuracy is out of reach, also of a measured target;
+            with the figure that can be reached.
     """
     if not all(0 < side < math.inf for side in plate):
         raise ConfigError(f"plate: {plate[0]:g} x {plate[1]:g} mm; give two positive lengths")
     chosen = Choice(**choice)
-    markers, background = chosen.markers, chosen.background
-    if markers is not None and markers not in ARRANGEMENTS:
-        raise ConfigError(f"markers: {markers}; there are layouts of {', '.join(map(str, ARRANGEMENTS))} rings")
-    if not 0 <= chosen.print_gain < math.inf:
-        raise ConfigError(f"print_gain: {chosen.print_gain:g} mm; give a length from 0")
-    limits = Limits.of(camera, volume.least_scale(camera, (plate[0] / 2, plate[1] / 2)), chosen.print_gain)
-    best: tuple[float, Design] | None = None
-    counts = list(ARRANGEMENTS) if markers is None else [markers]
-    for count in counts:
-        target = _best(camera, volume, need, imaging, _targets(limits, count, plate, camera.matrix.device))
+    made = chosen.made
+    gain = 0.0 if made is None else made.most_gain
+    limits = Limits.of(camera, volume.least_scale(camera, (plate[0] / 2, plate[1] / 2)), gain)
+    task = _Task(camera, volume, plate, need, imaging, chosen, limits)
+    found = _fewest(task, lambda target: target)
+    if found is None:
+        raise _no_room(camera, volume, plate, limits, task.counts[0])
+    target, precision = found
+    if made is None:
+        if task.excess(precision) > 1:
+            raise _not_reached(task, target, precision)
+        return Design(target, plate, limits, precision)
+    later = task.precision(task.measured(target))
+    if task.excess(precision) > 1:
+        # another layout may be the best one of those that are measured
+        again = _fewest(task, task.measured) or (target, later)
+        if task.excess(again[1]) > 1:
+            raise _not_reached(task, target, precision, later)
+        target, later = again
+        precision = task.precision(target)
+    return Design(target, plate, limits, precision, made, later)
+
+
+def _fewest(task: _Task, as_used: Callable[[Target], Target]) -> tuple[Target, Precision] | None:
+    """Of the best target of each number of rings the first that meets the need, or else the best; None: none has room.
+
+    With its precision as it is used: as printed or as measured.
+    """
+    best: tuple[float, Target, Precision] | None = None
+    for count in task.counts:
+        target = _best(task, count, as_used)
         if target is None:
             continue
-        name = chosen.name or f"rings{count}_{plate[0]:g}x{plate[1]:g}"
-        target = replace(_stating(target, chosen.print_gain), name=name, background=background)  # type: ignore[arg-type]  # it checks
-        precision = predict_volume(camera, target, volume, imaging)
-        excess = float(need.excess(precision.worst).nan_to_num(nan=math.inf))
+        precision = task.precision(as_used(target))
+        excess = task.excess(precision)
         if best is None or excess < best[0]:
-            best = excess, Design(target, plate, limits, precision)
+            best = excess, target, precision
         if excess <= 1:
             break
-    if best is None:
-        raise _no_room(camera, volume, plate, limits, counts[0])
-    if best[0] > 1:
-        raise _not_reached(best[1], need)
-    return best[1]
+    return None if best is None else best[1:]
 
 
-def _best(
-    camera: Camera, volume: WorkingVolume, need: Need, imaging: Imaging, targets: Iterable[Target]
-) -> Target | None:
-    """The target with the smallest excess over the need; None where none is in view."""
-    R, t = on_device(volume.extremes(), camera)
+def _best(task: _Task, count: int, as_used: Callable[[Target], Target]) -> Target | None:
+    """The target of so many rings with the smallest excess over the need; None where none is in view."""
+    R, t = on_device(task.volume.extremes(), task.camera)
     some = slice(None, None, 7)  # 7 and the turns of the volume have no common factor: all of them are met
 
     def excess(target: Target) -> float:
-        return float(need.excess(deviations(edge_covariance(camera, target, R[some], t[some], imaging))).max())
+        found = edge_covariance(task.camera, as_used(target), R[some], t[some], task.imaging)
+        return float(task.need.excess(deviations(found)).max())
 
-    seen = (one for one in targets if in_view(camera, outlines(one), R, t, FRAME_MARGIN_PX))
+    seen = (one for one in _targets(task, count) if in_view(task.camera, outlines(one), R, t, FRAME_MARGIN_PX))
     return min(seen, key=excess, default=None)
 
 
-def _targets(limits: Limits, count: int, plate: Size, device: torch.device) -> Iterator[Target]:
-    """Targets of ``count`` rings of all radii that fit."""
+def _targets(task: _Task, count: int) -> Iterator[Target]:
+    """Targets of ``count`` rings of all radii that fit, which state their print."""
+    limits, plate, made, device = task.limits, task.plate, task.choice.made, task.camera.matrix.device
     least, most = limits.outer / limits.scale, limits.largest_radius(count, plate)
     for radius in torch.linspace(least, most, _RADII, device="cpu").tolist() if most >= least else []:
         radius = math.floor(radius / _MICRON) * _MICRON
@@ -130,23 +195,15 @@ def _targets(limits: Limits, count: int, plate: Size, device: torch.device) -> I
         places = limits.places(count, plate, radius).to(device)
         ordered = assign_codes(places, ratios.to(device))
         centers = torch.nn.functional.pad(places, (0, 1))
-        yield Target(
-            name="rings",
-            background="light",
+        target = Target(
+            name=task.choice.name or f"rings{count}_{plate[0]:g}x{plate[1]:g}",
+            background=task.choice.background,  # type: ignore[arg-type]  # it checks
             ids=torch.arange(count, device=places.device),
             centers=_rounded(centers),
             normals=centers.new_tensor([0.0, 0.0, 1.0]).repeat(count, 1),
             radii=_rounded(torch.stack([torch.full_like(ordered, radius), radius * ordered], 1)),
         )
-
-
-def _stating(target: Target, gain: float) -> Target:
-    """The target with the standard deviation of its edge gain, so that codes are read up to ``gain`` mm."""
-    if gain == 0:
-        return target
-    covariance = target.centers.new_zeros(3 * len(target) + 1, 3 * len(target) + 1)
-    covariance[-1, -1] = (gain / MOST_GAIN) ** 2
-    return replace(target, covariance=covariance)
+        yield target if made is None else made.stated_by(target)
 
 
 def _rounded(length: Tensor) -> Tensor:
@@ -174,13 +231,22 @@ def _no_room(camera: Camera, volume: WorkingVolume, plate: Size, limits: Limits,
     )
 
 
-def _not_reached(best: Design, need: Need) -> ConfigError:
-    worst = best.precision.worst
-    lateral, depth, angle = float(worst[:2].max()), float(worst[2]), float(worst[3:].max()) / 1e3
+def _not_reached(task: _Task, best: Target, found: Precision, later: Precision | None = None) -> ConfigError:
+    """What the best target reaches, as printed and measured."""
+    need, made = task.need, task.choice.made
     angles = f" and {need.angle_deg:g} degrees" if math.isfinite(need.angle_deg) else ""
+    has, printed = _figures(found), ""
+    if made is not None and later is not None:
+        printed = f" with a print of {made.told}, not even once it is measured (calibrate --measure-target)"
+        has += f" as printed and {_figures(later)} as measured"
     return ConfigError(
-        f"accuracy: {need.lateral_um:g} um lateral, {need.depth_um:g} um depth{angles} cannot be reached: the best "
-        f"layout ({len(best.target)} rings of {2 * best.radius:.3g} mm) has {lateral:.3g} um, "
-        f"{depth:.3g} um and {angle:.2g} degrees at its worst; enlarge the plate, come nearer, narrow the volume, or "
-        "take less noise or more pixels a mm"
+        f"accuracy: {need.lateral_um:g} um lateral, {need.depth_um:g} um depth{angles} cannot be reached{printed}: the "
+        f"best layout ({len(best)} rings of {2 * float(best.radii[0, 0]):.3g} mm) has {has} at its worst; enlarge the "
+        "plate, come nearer, narrow the volume, or take less noise or more pixels a mm"
     )
+
+
+def _figures(precision: Precision) -> str:
+    worst = precision.worst
+    lateral, depth, angle = float(worst[:2].max()), float(worst[2]), float(worst[3:].max()) / 1e3
+    return f"{lateral:.3g} um, {depth:.3g} um and {angle:.2g} degrees"

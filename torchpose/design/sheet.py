@@ -134,6 +134,18 @@ def _bar(x: float, y: float, length: float, *, upright: bool) -> list[Shape]:
     return shapes
 
 
+def _needed(target: Target) -> str:
+    """What the print has to hold for the accuracy that the target file claims."""
+    if target.covariance is None:
+        return "Print: its file claims it exact; add center_sigma, edge_gain_sigma."
+    deviation = target.covariance.diagonal().sqrt()
+    x, y, flat = deviation[:-1].unflatten(0, (-1, 3)).amax(0).tolist()
+    off_plane = "" if flat == max(x, y) else f" ({1e3 * flat:.3g} along z)"
+    return (
+        f"Print: centres to {1e3 * max(x, y):.3g} um{off_plane}, edges to {1e3 * float(deviation[-1]):.3g} um, 1 sigma."
+    )
+
+
 def _legend(target: Target, plate: tuple[float, float], page_width: float, bottom: float) -> list[Shape]:
     """Name and how to print, and a plan of the ids without rings, which a camera would take for markers."""
     left, top = 6.0, bottom + _BAR_AWAY + 8
@@ -143,6 +155,7 @@ def _legend(target: Target, plate: tuple[float, float], page_width: float, botto
         f"plate {plate[0]:g} x {plate[1]:g} mm, {len(ids)} rings, {target.background} background",
         f"ids {' '.join(map(str, ids))}, see the plan (side that the camera sees)",
         f"Print at 100 % (actual size); the bars must be {bars}.",
+        _needed(target),
     )
     shapes: list[Shape] = [Text(left, top + 3, 4.0, target.name)]
     shapes += [Text(left, top + 8 + 4 * k, 2.5, line) for k, line in enumerate(words)]

@@ -23,13 +23,13 @@ from torchpose.geometry.segments import segment_sum
 
 _RIDGE = 1e-12  # of a unit diagonal
 _LEAST_DIAGONAL = 1e-30  # of unknowns that nothing tells of
-# beyond the latter rounding decides: nowhere lower (derived: float64 has 16 digits)
-_LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e12
+# beyond, and below its inverse, rounding decides: nowhere lower (derived: float64 has 16 digits)
+_MOST_DAMPING = 1e12
 _PROMISED = 1e-12  # chi-squared: a step that promises less is none (convention: far below any digit that counts)
 # of a parameter's variance by the others' freedom, beyond which it counts as open (derived: the inverse has lost ten of
 # 16 digits)
 _MOST_INFLATION = 1e10
-_LEAST_DIRECTION = 1e-9  # of the largest variance of correlations: less is rounding of what a file holds (convention)
+LEAST_DIRECTION = 1e-9  # of the largest variance of correlations: less is rounding of what a file holds (convention)
 
 
 class Code(IntEnum):
@@ -315,7 +315,7 @@ def minimise(
         if adaptive and share is not None:
             better = there.cost < now.cost
             unknowns, now = trial.where(better, unknowns), there.where(better, now)
-            share = torch.where(better, 0.1 * share, 10 * share).clamp_min(_LEAST_DAMPING)
+            share = torch.where(better, 0.1 * share, 10 * share).clamp_min(1 / _MOST_DAMPING)
         else:
             unknowns, now = trial, there
     information = now.solve().information if settle or share is not None else step.information
@@ -349,7 +349,7 @@ def covariance_factor(covariance: Float[Tensor, "n n"]) -> Float[Tensor, "n k"]:
     """L with L L^T = covariance, by its k directions of any variance."""
     scale = covariance.diagonal().clamp_min(torch.finfo(covariance.dtype).tiny).sqrt()
     values, vectors = torch.linalg.eigh(covariance / scale / scale[:, None])
-    there = values > _LEAST_DIRECTION * values.amax()
+    there = values > LEAST_DIRECTION * values.amax()
     return scale[:, None] * vectors[:, there] * values[there].sqrt()
 
 

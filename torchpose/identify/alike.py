@@ -3,9 +3,7 @@
 import torch
 
 from torchpose.identify.hypotheses import SIZE_TOLERANCE
-from torchpose.target import MIN_RATIO_GAP, Target
-
-_PLACE_TOLERANCE = 0.01  # of the markers' spread: 1 px where they lie 100 px about their middle (a convention)
+from torchpose.target import MIN_RATIO_GAP, MIN_SPREAD, Target
 
 
 def indistinguishable(one: Target, other: Target) -> bool:
@@ -26,7 +24,8 @@ def indistinguishable(one: Target, other: Target) -> bool:
     turn = u @ torch.diag(torch.stack([*u.new_ones(2), (u @ v).det().sign()])) @ v
     off = torch.linalg.vector_norm(places @ turn - places_2, dim=-1).max()
     lean = torch.linalg.vector_norm(normals @ turn - normals_2, dim=-1).max()
-    return bool(torch.maximum(off, lean) < _PLACE_TOLERANCE)
+    # as near as centres may lie to a line: 1 px where they lie 100 px about their middle
+    return bool(torch.maximum(off, lean) < MIN_SPREAD)
 
 
 def _shape(target: Target) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:

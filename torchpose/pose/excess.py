@@ -2,7 +2,7 @@
 
 Of every row three explanations are weighed by their evidence (the likelihood, averaged over how large each may be):
 
-- the print: places of markers, and an edge gain, that are off by amounts of their own;
+- the print: places of markers along it, across it (paper bends), and an edge gain, off by amounts of their own;
 - the camera: its focal length, principal point and radial distortion are off;
 - all else: whatever it is, it makes the scatter larger by one factor (Birge 1932).
 
@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose.geometry.least_squares import LEAST_DIRECTION
 from torchpose.geometry.robust import of_chance
 from torchpose.geometry.rows import Rows
 
@@ -25,8 +26,9 @@ CAMERA = 4  # numbers of a camera that may be off: focal length, principal point
 # how large each may be, from below any noise: mm, places and edges of an office print (50 to 100 um);
 # px at the corner of the frame, of a camera file that is a mistake beyond; of variances, as a factor
 _PRINT, _CAMERA, _SCALE = (1e-4, 0.15), (1e-3, 3.0), (1.0, 1e3)
-_GRID = 16  # values of each, logarithmic: the closest are a factor of 1.5 apart, which a few residuals do not tell
-_LEAST_MODE = 1e-9  # of the best known direction of the residuals: less is rounding (convention)
+_GRID = 16  # values, logarithmic: the closest are a factor of 1.5 apart, which a few residuals do not tell
+_COARSE = 10  # of each of three: 2.3
+_AT_ONCE = 10_000_000  # numbers: 80 MB
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,8 +36,8 @@ class Excess(Rows):
     """What N rows show beyond noise and stated uncertainties.
 
     Attributes:
-        deviation: standard deviations of the further unknowns: places (3 by marker, mm), gain (mm), camera (px); 0
-            where they need not be off.
+        deviation: standard deviations of the further unknowns: places (by marker two along the print and one across,
+            mm), gain (mm), camera (px); 0 where they need not be off.
         factor: of the variance of all noise, 1 where it suffices.
         misfit: `Misfit`, what is behind it.
         explained: whether the residuals then agree with all that.
@@ -70,10 +72,8 @@ class _Family(NamedTuple):
 def excess_of(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) -> Excess:
     """What speaks from the information about the further unknowns, and their right side, all else being unknown."""
     modes = _modes(information, right)
-    chi2, freedom = modes.residual.square().sum(-1), modes.there.sum(-1).clamp_min(1)
-    most = freedom * of_chance(freedom)
-    explained = chi2 < most
-    none = Excess(torch.zeros_like(right), torch.ones_like(chi2), torch.zeros_like(freedom), explained)
+    most, explained = _of_noise(modes)
+    none = _none(right, explained)
     row = (~explained).nonzero()[:, 0]
     if row.numel() == 0:
         return none
@@ -85,23 +85,43 @@ def excess_of(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) 
     return none.replaced(row, Excess(deviation, factor, best + 1, chi2 < most[row]))
 
 
+def no_excess(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) -> Excess:
+    """The same where noise explains the residuals; elsewhere `Excess.explained` is False and nothing else is said."""
+    return _none(right, _of_noise(_modes(information, right))[1])
+
+
+def _none(right: Tensor, explained: Tensor) -> Excess:
+    return Excess(
+        torch.zeros_like(right), right.new_ones(len(right)), explained.new_zeros(len(right)).long(), explained
+    )
+
+
+def _of_noise(modes: _Modes) -> tuple[Tensor, Tensor]:
+    """The most that chi-squared may be by chance (N,), and whether it is less (N,) bool."""
+    chi2, freedom = modes.residual.square().sum(-1), modes.there.sum(-1).clamp_min(1)
+    most = freedom * of_chance(freedom)
+    return most, chi2 < most
+
+
 def _modes(information: Tensor, right: Tensor) -> _Modes:
     finite = (information.isfinite().all(-1) & right.isfinite()).all(-1, keepdim=True)
     right = torch.where(finite, right, 0.0)
     values, vectors = torch.linalg.eigh(torch.where(finite[..., None], information, 0.0))
-    there = values > _LEAST_MODE * values[:, -1:].clamp_min(torch.finfo(values.dtype).tiny)
+    there = values > LEAST_DIRECTION * values[:, -1:].clamp_min(torch.finfo(values.dtype).tiny)
     root = torch.where(there, values, 0.0).sqrt()
     residual = torch.where(there, (vectors.mT @ right[..., None])[..., 0] / root.clamp_min(1e-300), 0.0)
     return _Modes(residual, root[..., None] * vectors.mT, there)
 
 
 def _print(modes: _Modes) -> _Family:
+    """A print bends by no less than it stretches: across it the variance of the places along it counts, and more."""
     places, gain = modes.by[..., : -CAMERA - 1], modes.by[..., -CAMERA - 1 : -CAMERA]
-    one, two = (v.flatten() for v in torch.meshgrid(*[_values(_PRINT, modes).square()] * 2, indexing="ij"))
-    evidence, weight, chi2 = _weighed(modes, ((places, one), (gain, two)))
-    of_places, of_gain = ((weight * v).sum(-1, keepdim=True).sqrt() for v in (one, two))
-    none = torch.zeros_like(modes.by[:, 0, -CAMERA:])
-    deviation = torch.cat([of_places.expand(-1, places.shape[-1]), of_gain, none], -1)
+    values = _values(_PRINT, modes, _COARSE).square()
+    variances = torch.cartesian_prod(values, values, values).unbind(-1)
+    evidence, weight, chi2 = _weighed(modes, tuple(zip((places, places[..., 2::3], gain), variances, strict=True)))
+    every, bent, of_gain = ((weight * v).sum(-1, keepdim=True) for v in variances)
+    none, place = torch.zeros_like(modes.by[:, 0, -CAMERA:]), torch.cat([every, every, every + bent], -1)
+    deviation = torch.cat([place.repeat(1, places.shape[-1] // 3), of_gain, none], -1).sqrt()
     return _Family(evidence, deviation, torch.ones_like(evidence), chi2)
 
 
@@ -125,21 +145,31 @@ def _weighed(modes: _Modes, parts: tuple[tuple[Tensor, Tensor], ...]) -> tuple[T
     """Log evidence (N,) of unknowns with derivatives (N, r, e) and G variances each, their weights (N, G), and the mean
     chi-squared (N,).
     """
-    spread = torch.eye(modes.residual.shape[-1], dtype=modes.by.dtype, device=modes.by.device)
-    for by, variance in parts:
-        spread = spread + variance[:, None, None] * (by @ by.mT)[:, None]
-    factor = torch.linalg.cholesky(spread)
-    whitened = torch.linalg.solve_triangular(factor, modes.residual[:, None, :, None], upper=False)
-    square = whitened.square().sum((-1, -2))
-    likelihood = -0.5 * square - factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    rows, r = modes.residual.shape
+    some = max(1, _AT_ONCE // (len(parts[0][1]) * r * r))
+    likelihood, square = (
+        torch.cat(x)
+        for x in zip(*(_likelihood(modes, parts, slice(k, k + some)) for k in range(0, rows, some)), strict=True)
+    )
     weight = torch.softmax(likelihood, -1)
     return _mean(likelihood), weight, (weight * square).sum(-1)
 
 
-def _values(ends: tuple[float, float], modes: _Modes) -> Tensor:
+def _likelihood(modes: _Modes, parts: tuple[tuple[Tensor, Tensor], ...], rows: slice) -> tuple[Tensor, Tensor]:
+    """Logarithm (n, G) under each of the variances, and chi-squared (n, G), of some rows."""
+    spread = torch.eye(modes.residual.shape[-1], dtype=modes.by.dtype, device=modes.by.device)
+    for by, variance in parts:
+        spread = spread + variance[:, None, None] * (by[rows] @ by[rows].mT)[:, None]
+    factor = torch.linalg.cholesky(spread)
+    whitened = torch.linalg.solve_triangular(factor, modes.residual[rows, None, :, None], upper=False)
+    square = whitened.square().sum((-1, -2))
+    return -0.5 * square - factor.diagonal(dim1=-2, dim2=-1).log().sum(-1), square
+
+
+def _values(ends: tuple[float, float], modes: _Modes, count: int = _GRID) -> Tensor:
     like = modes.residual
     least, most = (math.log10(value) for value in ends)
-    return torch.logspace(least, most, _GRID, dtype=like.dtype, device=like.device)
+    return torch.logspace(least, most, count, dtype=like.dtype, device=like.device)
 
 
 def _mean(likelihood: Tensor) -> Tensor:

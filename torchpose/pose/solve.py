@@ -17,7 +17,6 @@ from torchpose.pose.sizes import code_shift
 from torchpose.pose.solutions import AMBIGUOUS_CHI2, Solutions
 from torchpose.results import Reason, Status
 
-_CODE_SHIFT = 0.5  # of the way to the next code; beyond, markers may as well be their neighbours (derived)
 _ITERATIONS = 60  # of the solver, at most: rows that have converged rest
 
 
@@ -71,13 +70,14 @@ def _solve(evidence: Evidence, rough: tuple[Tensor, Tensor], compile: bool) -> S
     chi2_alt = torch.where(chi2[:, 1].isfinite(), chi2[:, 1], torch.nan)
     seen = evidence.mask.sum(-1)
     freedom = (2 * seen - 6).clamp_min(1)
-    contradicts = (of_centers[:, 0] > CUT**2 * freedom) & (rms[:, 0] > CENTER_RMS)
+    # half of the way to the next code, markers may as well be their neighbours
+    contradicts = (of_centers[:, 0] > CUT**2 * freedom) & (rms[:, 0] > CENTER_RMS) | (shift > 0.5)
     solvable = chi2[:, 0].isfinite()
     reason = torch.full_like(seen, Reason.NONE)
     for condition, why in (
         (chi2_alt - chi2[:, 0] < AMBIGUOUS_CHI2, Reason.TWO_SOLUTIONS),
         (of_shapes[:, 0] > CUT**2 * 4 * seen, Reason.RING_SHAPE),
-        (contradicts | (shift > _CODE_SHIFT), Reason.RESIDUAL),
+        (contradicts, Reason.RESIDUAL),
         (_from_behind(evidence, R[:, 0], t[:, 0]), Reason.MIRRORED),
         (~solvable, Reason.NOT_CONVERGED),
         (result.code == pnp.PnPCode.BEHIND_CAMERA, Reason.BEHIND_CAMERA),

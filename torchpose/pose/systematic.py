@@ -25,7 +25,7 @@ from torchpose.geometry.rotations import plane_axes
 from torchpose.geometry.rows import Rows
 from torchpose.pose.covariance import center_jacobian, derivative
 from torchpose.pose.evidence import Evidence
-from torchpose.pose.excess import CAMERA, Excess, excess_of
+from torchpose.pose.excess import CAMERA, Excess, excess_of, no_excess
 
 POSE = 6
 _RIM_POINTS = 24  # of a circle: sums over it are exact up to the perspective's high orders
@@ -195,8 +195,8 @@ def _excess(normals: MarkerNormals, known: Tensor, count: int, setting: Setting)
     further = _print_shifts(setting)
     camera = further.new_zeros(*further.shape[:3], CAMERA)
     every = torch.cat([further, camera], -1)
-    excess = excess_of(*_remaining(normals, known, _among(every, n), count))
-    wide = (excess.misfit > 0).nonzero()[:, 0]
+    excess = no_excess(*_remaining(normals, known, _among(every, n), count))
+    wide = (~excess.explained).nonzero()[:, 0]
     if wide.numel() == 0:
         return excess, every
     # only where the print alone would have to explain it, the camera is asked, too
@@ -249,14 +249,10 @@ def _camera_shifts(setting: Setting) -> Tensor:
 
 
 def _print_shifts(setting: Setting) -> Tensor:
-    """The same (N, M, 7, 3 M + 1) of every marker's place, 1 mm along the print and 2 across, and of the gain, 1 mm.
-
-    Paper and plates bend by more than they stretch: twice as much is a convention.
-    """
+    """The same (N, M, 7, 3 M + 1) of each marker's place, two along the print and one across, and of the gain, 1 mm."""
     rows, markers = setting.evidence.mask.shape
     normal = setting.evidence.normals
-    eye = torch.eye(3, dtype=normal.dtype, device=normal.device)
-    moved = setting.R[:, None] @ (eye + normal[..., :, None] * normal[..., None, :])
+    moved = setting.R[:, None] @ torch.stack([*plane_axes(normal), normal], -1)
     each = torch.eye(markers, dtype=normal.dtype, device=normal.device)
     columns = normal.new_zeros(rows, markers, POSE + 1, 3 * markers + 1)
     columns[:, :, :3, :-1] = (each[:, None, :, None] * moved[:, :, :, None]).flatten(-2)

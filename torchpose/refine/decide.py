@@ -19,8 +19,6 @@ from torchpose.refine.photometric.grey_chi2 import grey_chi2
 from torchpose.refine.sight import LEAST_KEPT, Refined, Sight
 from torchpose.results import Reason, Status
 
-_CLOSE = 200.0  # difference of chi-squared: small blurred rings were seen to be wrong by 37 (convention)
-
 
 def decide(solutions: Solutions, evidence: Evidence, sight: Sight | None = None) -> Solutions:
     """Solutions whose ambiguous rows are `Status.OK` where the ellipses' centres and shapes tell which pose is right.
@@ -77,7 +75,8 @@ def decide_on_grey(solutions: Solutions, evidence: Evidence, sight: Sight) -> So
         sight: the same rows in their frames.
     """
     shape = (solutions.status == Status.REJECTED) & (solutions.reason == Reason.RING_SHAPE)
-    close = (solutions.status == Status.OK) & (solutions.chi2_alt - solutions.chi2 < _CLOSE)
+    # ten times what leaves it open: small blurred rings were seen to be wrong by 37
+    close = (solutions.status == Status.OK) & (solutions.chi2_alt - solutions.chi2 < 10 * AMBIGUOUS_CHI2)
     row = ((solutions.status == Status.AMBIGUOUS) | shape | close).nonzero()[:, 0]
     if row.numel() == 0:
         return solutions

@@ -32,8 +32,7 @@ from torchpose.results import Reason, Status
 # `scripts/corruption_statistics.py`)
 _LEAST_KEPT_NEAR = 0.2
 # px, by which a marker may sit beside its place before it is looked at there: edges bend little so far (convention)
-_BESIDE = 0.05
-_ASIDE = 0.02  # px, RMS of the centres, from where on they tell first how far (convention)
+_BESIDE = 0.03
 _ROUNDS = 3  # of fits with markers where the last one found them; the second one ends nearly always
 
 Step = Callable[[Solutions, Evidence, Sight], Solutions]
@@ -96,7 +95,7 @@ def on_frames(refine: Callable[..., Refined]) -> Step:
 def _start(rows: Solutions, seen: Evidence, camera: Camera) -> tuple[Pose, Tensor]:
     """Poses, and places (N, M, 4) of markers and edges beside those of the file, as `OnPrint.place`, by the centres."""
     start, place = Pose(rows.R, rows.t), -_beyond(rows.t.new_zeros(*seen.mask.shape, 4), seen)
-    off = (rows.rms > _ASIDE).nonzero()[:, 0]
+    off = (rows.rms > _BESIDE).nonzero()[:, 0]
     if off.numel() == 0:
         return start, place
     found, joint = _by_centers(rows[off], seen[off], camera)

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from matplotlib.figure import Figure
 
 from torchpose.analysis.evaluation import AXES, SCALE, UNITS
-from torchpose.analysis.sweep import Sweep, fit
+from torchpose.analysis.sweep import Sweep, Swept, fit
 from torchpose.report.figures import COLOURS, GREY, subplots
 
 POWERS = {"x": (0, 1), "y": (0, 1), "z": (1, 2)}  # of the line through the largest errors: with a linear term for focal
@@ -38,7 +38,7 @@ def plot_sweeps(cases: Mapping[str, Sweep]) -> Figure:
     return figure
 
 
-def plot_budget(case: Sweep, title: str) -> Figure:
+def plot_budget(case: Swept, title: str) -> Figure:
     """What every source contributes to each component, against the distance."""
     figure, axes = subplots(2, 3, (14, 8))
     for i, panel in enumerate(axes.flat):

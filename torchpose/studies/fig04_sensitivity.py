@@ -11,7 +11,7 @@ import torch
 
 from torchpose.analysis.evaluation import AXES, SCALE, UNITS
 from torchpose.analysis.sensitivity import Uncertainty
-from torchpose.analysis.sweep import Sweep, fit, sweep
+from torchpose.analysis.sweep import Sweep, Swept, fit, sweep
 from torchpose.camera import Camera
 from torchpose.io.rows import Row
 from torchpose.report.sensitivity import POWERS, plot_budget, plot_sweeps
@@ -65,19 +65,21 @@ def cases_of(sigmas_px: Sequence[float], uncertainty: Uncertainty) -> dict[str, 
     return cases
 
 
-def tabulate(cases: Mapping[str, Sweep]) -> StudyResult:
-    """Tables and pictures of the sweeps by title."""
+def tabulate(cases: Mapping[str, Sweep], rings: Mapping[str, Swept] | None = None) -> StudyResult:
+    """Tables and pictures of the sweeps by title, and of predictions for poses from edges of rings."""
+    rings = rings or {}
     title, last = list(cases.items())[-1]
     return StudyResult(
         tables=[
             Table("errors", "Errors against the distance", _errors(cases)),
-            Table("budget", "Standard deviations by source", _budget(cases)),
+            Table("budget", "Standard deviations by source", _budget({**cases, **rings})),
         ],
         pictures=[
             Picture(
                 "errors", "Largest and root mean square errors of the draws, and the prediction", plot_sweeps(cases)
             ),
             Picture("budget", "Error budget of the last case", plot_budget(last, title)),
+            *(Picture("budget_rings", "Error budget of edges", plot_budget(one, name)) for name, one in rings.items()),
         ],
     )
 
@@ -101,7 +103,7 @@ def _errors(cases: Mapping[str, Sweep]) -> list[Row]:
     return rows
 
 
-def _budget(cases: Mapping[str, Sweep]) -> list[Row]:
+def _budget(cases: Mapping[str, Swept]) -> list[Row]:
     columns = [f"{axis}_{unit}" for axis, unit in zip(AXES, UNITS, strict=True)]
     return [
         {"case": title, "distance_mm": distance, "source": source}

@@ -30,7 +30,6 @@ _KEPT = 0.9  # of a sector's pixels that must follow the model for it to count (
 _CELL = 4  # sectors over which a misfit is taken for one
 _UNCLEAR = 3  # sectors of an outer circle: more are no chance (measured: decisions/0064)
 _DISPLACED = 0.005  # px, displacement that a camera or print slightly off may cause: no reason for doubt
-_BEYOND = 2.0  # standard deviations of a mean chi-squared: a wrong factor then costs little, and seldom (convention)
 _TINY = 1e-12  # least divisor (convention: below any sum that counts)
 
 
@@ -164,7 +163,8 @@ def overdispersion(sectors: Sectors, variance: Tensor, row: Tensor, rows: int) -
     chi2 = segment_sum(((hold * error.square()).sum(-1) - taken).sum(-1), row, rows)
     freedom = segment_sum(((hold > 0).sum(-1) - basis.shape[-1]).clamp_min(0).sum(-1).double(), row, rows).clamp_min(1)
     factor = chi2 / freedom
-    return torch.where(factor > 1 + _BEYOND * (2 / freedom).sqrt(), factor, 1.0)
+    # half of the deviations that make a value no noise: a wrong factor costs little, and comes once in forty frames
+    return torch.where(factor > 1 + 0.5 * CUT * (2 / freedom).sqrt(), factor, 1.0)
 
 
 def doubtful(sectors: Sectors, clear: Tensor, variance: Tensor, row: Tensor, step_chi2: Tensor, more: Tensor) -> Tensor:
