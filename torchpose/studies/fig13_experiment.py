@@ -59,8 +59,8 @@ def run(*, full: bool = False, seed: int = 0, progress: Progress = ignore_progre
         camera.save(folder / "camera.yaml")
         for name, content in files.items():
             (folder / f"{name}.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
-        manifest = _capture(folder, lambda done: progress(0.8 * done))
-        poses = _estimate(manifest, camera, target)
+        manifest = captured(folder, lambda done: progress(0.8 * done))
+        poses = estimated(manifest, camera, target)
         result = evaluated(manifest, poses, crlb(camera, target, noise, psf_sigma))
         result.pictures.insert(0, Picture("fig12", "Fig. 12: frames of the experiment", _sheet(manifest)))
         result.settings = {"noise": noise, "psf_sigma_px": psf_sigma, "frames": len(read_manifest(manifest))}
@@ -170,7 +170,7 @@ def statements(found: Experiment) -> list[str]:
     return said
 
 
-def _capture(folder: Path, progress: Progress) -> Path:
+def captured(folder: Path, progress: Progress) -> Path:
     """Runs the plan on the twin; the manifest."""
     from torchpose.rig.capture import capture, image_origin
     from torchpose.rig.plan import load_plan
@@ -186,7 +186,7 @@ def _capture(folder: Path, progress: Progress) -> Path:
     return session.manifest
 
 
-def _estimate(manifest: Path, camera: Camera, target: Target) -> Path:
+def estimated(manifest: Path, camera: Camera, target: Target) -> Path:
     """Poses of the captured frames, as ``torchpose estimate`` writes them; the table."""
     estimator = PoseEstimator(camera, target)
     names = [frame.image for frame in read_manifest(manifest)]
