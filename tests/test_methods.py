@@ -149,6 +149,19 @@ def test_the_module_moves_as_any_other(estimator: tp.PoseEstimator) -> None:
     assert "640x480" in repr(torch.nn.Sequential(estimator))
 
 
+@pytest.mark.parametrize("method", list(METHODS))
+def test_the_default_dtype_of_torch_does_not_matter(method: Method) -> None:
+    estimator, frames = tp.PoseEstimator(CAMERA, QUAD, method=method), FRAMES["good"]
+    expected = estimator(frames)
+    torch.set_default_dtype(F64)
+    try:
+        found = estimator(frames)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert found.ok.all()
+    torch.testing.assert_close(found.t, expected.t, rtol=0, atol=0)
+
+
 @pytest.mark.skipif(not has_compiler(), reason="no C++ compiler")
 def test_compiled_poses_are_the_same(estimator: tp.PoseEstimator) -> None:
     """With missing markers and an uncertain camera, and in any batch: to a thousandth of a standard deviation."""

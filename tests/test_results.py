@@ -171,7 +171,7 @@ def drawn(rows: int, numbers: int, of_camera: int, seed: int = 4) -> tuple[Poses
         place=torch.zeros(rows, 4, 4, dtype=torch.float64),
         misfit=whole,
         rms=none,
-        status=whole,
+        status=whole.clone(),
         reason=whole,
         markers=whole + 4,
         chi2=none,
@@ -223,3 +223,31 @@ def test_one_part_in_the_frame_of_another() -> None:
     expected = poses.between(torch.tensor([0, 2]), torch.tensor([1, 3]))
     torch.testing.assert_close(inside.t, expected.t)
     torch.testing.assert_close(inside.covariance, expected.covariance)
+
+
+def test_a_motion_from_many_rows_to_one() -> None:
+    poses, _, _ = drawn(3, 5, 2)
+    expected = poses.between(torch.tensor([0, 1]), torch.tensor([2, 2]))
+    torch.testing.assert_close(poses.between(torch.tensor([0, 1]), 2).covariance, expected.covariance)
+
+
+def test_no_row_is_in_the_frame_of_a_reference_that_is_not_there() -> None:
+    poses, _, _ = drawn(5, 5, 2)
+    poses = replace(poses, frame=torch.tensor([0, 0, 1, 2, 2]), target=torch.tensor([0, 1, 1, 0, 1]))
+    inside = poses.relative_to(0)
+    assert inside.status.tolist() == [Status.OK, Status.NO_TARGET, Status.OK]
+    assert inside.covariance.isfinite().flatten(1).all(1).tolist() == [True, False, True]
+    assert inside.t.isfinite().all(1).tolist() == [True, False, True]
+    assert poses.relative_to(7).status.tolist() == [Status.NO_TARGET] * 5
+    assert len(poses[:0].relative_to(0)) == 0
+
+
+def test_the_first_copy_of_a_reference_counts() -> None:
+    poses, _, _ = drawn(3, 5, 2)
+    poses = replace(
+        poses,
+        frame=torch.tensor([0, 0, 0]),
+        target=torch.tensor([0, 0, 1]),
+        instance=torch.tensor([0, 1, 0]),
+    )
+    torch.testing.assert_close(poses.relative_to(0).t, poses.between(0, 2).t)

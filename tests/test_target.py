@@ -231,6 +231,28 @@ TRAPS = {
         r"part_from_target\.rotation: has 2 entries; give 3",
     ),
     "part half": (QUAD + "part_from_target: {rotation: [0, 0, 0]}\n", r"part_from_target\.translation: is missing; "),
+    "sigma negative": (QUAD + "center_sigma: [0.1, -0.1, 0]\n", r"center_sigma\[1\]: .*greater than or equal to 0"),
+    "sigma text": (QUAD + "center_sigma: much\n", "center_sigma: is not a list; "),
+    "sigma huge": (QUAD + "center_sigma: 1.0e+100\n", r"center_sigma\[0\]: .*less than or equal to 1000"),
+    "gain sigma huge": (QUAD + "edge_gain_sigma: 1.0e+200\n", "edge_gain_sigma: .*less than or equal to 1000"),
+    "gain sigma nan": (QUAD + "edge_gain_sigma: .nan\n", "edge_gain_sigma: is not finite; "),
+    "gain closes a hole": (QUAD + "edge_gain: 1.6\n", "edge_gain: 1.6 mm leaves a ring without width or hole; "),
+    "covariance huge": (
+        QUAD + f"centers_covariance: {{rows: 12, cols: 12, data: {[1e300 * (k % 13 == 0) for k in range(144)]}}}\n",
+        r"centers_covariance: has a variance of 1e\+300 mm\^2; ",
+    ),
+    "covariance small": (
+        QUAD + f"centers_covariance: {{rows: 9, cols: 9, data: {[0.0] * 81}}}\n",
+        "centers_covariance: is 9 x 9 with 81 numbers; 4 markers have 12 x 12",
+    ),
+    "covariance twice": (
+        QUAD + f"center_sigma: 0.1\ncenters_covariance: {{rows: 12, cols: 12, data: {[0.0] * 144}}}\n",
+        "center_sigma: stands beside centers_covariance",
+    ),
+    "cross negative": (
+        QUAD + f"adjustment: a\ncamera_cross_covariance: {{rows: -13, cols: -8, data: {[0.0] * 104}}}\n",
+        "camera_cross_covariance: 104 numbers for -13 x -8; ",
+    ),
     "several errors": (replaced("5.0", "x"), M.format(0) + r"outer_radius: is not a number; .* \(and 3 more\)$"),
 }
 

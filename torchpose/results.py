@@ -96,6 +96,11 @@ class Motions(Rows):
         """Standard deviations of t (mm) and of the rotation (rad)."""
         return self.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
 
+    def unknown_where(self, unknown: Bool[Tensor, " N"]) -> Motions:
+        """The same with NaN in those rows."""
+        parts = (self.R, self.t, self.covariance, self.noise)
+        return Motions(*(part.masked_fill(unknown.view(-1, *[1] * (part.ndim - 1)), torch.nan) for part in parts))
+
 
 @dataclass(frozen=True, eq=False)
 class Poses(Rows):
@@ -202,7 +207,7 @@ class Poses(Rows):
             i: number of a row, or (N,) numbers.
             j: the same; N motions, or one.
         """
-        i, j = (torch.as_tensor(k, device=self.t.device).reshape(-1) for k in (i, j))
+        i, j = torch.broadcast_tensors(*(torch.as_tensor(k, device=self.t.device).reshape(-1) for k in (i, j)))
         one, two = self[i], self[j]
         back = one.R.mT
         arm = (two.t - one.t)[..., None]
@@ -225,17 +230,21 @@ class Poses(Rows):
         """Poses of the other targets in the frame of number ``target``: where one part is in another.
 
         One row a frame and target each, as `between` has them; their covariance is about that frame's axes. Where the
-        reference has no pose, or is not sure, a row has its status and reason.
+        reference has no pose, or is not sure, a row has its status and reason; where it has no row, `Status.NO_TARGET`.
+        Of several copies of the reference, that of instance 0 counts.
         """
         index = (self.target != target).nonzero()[:, 0]
-        at = (self.target == target).nonzero()[:, 0]
+        at = ((self.target == target) & (self.instance == 0)).nonzero()[:, 0]
         row = torch.full((int(self.frame.max()) + 1 if len(self) else 0,), -1, device=at.device)
         reference = row.index_copy(0, self.frame[at], at)[self.frame[index]]
+        there = reference >= 0
+        reference = reference.clamp_min(0)
         other, base = self[index], self[reference]
-        motion = self.between(reference, index)
-        worse = (other.ok & ~base.ok)[:, None]
-        codes = torch.stack([other.status, other.reason], -1)
-        status, reason = torch.where(worse, torch.stack([base.status, base.reason], -1), codes).unbind(-1)
+        motion = self.between(reference, index).unknown_where(~there)
+        codes, of_base = (torch.stack([rows.status, rows.reason], -1) for rows in (other, base))
+        of_base = torch.where(there[:, None], of_base, of_base.new_tensor([int(Status.NO_TARGET), int(Reason.NONE)]))
+        worse = (other.ok & (of_base[:, 0] != Status.OK))[:, None]
+        status, reason = torch.where(worse, of_base, codes).unbind(-1)
         return replace(
             other,
             R=motion.R,

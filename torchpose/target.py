@@ -19,11 +19,12 @@ from torchpose.geometry import rotations
 
 MIN_RATIO_GAP = 0.05  # smallest difference between the inner/outer ratios of two markers that can be told apart
 RATIO_RANGE = (0.15, 0.9)  # inner/outer: a smaller hole or a thinner ring is not readable
+MAX_DEVIATION = 1e3  # mm, of a place or edge (convention): far beyond any part, and its square is still a number
 MIN_SPREAD = 1e-2  # second / first singular value of the centred marker centres; below, they count as collinear
 
 _FROZEN = ConfigDict(extra="forbid", frozen=True)
 Vector = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
-Deviation = Annotated[FiniteFloat, Field(ge=0)]
+Deviation = Annotated[FiniteFloat, Field(ge=0, le=MAX_DEVIATION)]
 Deviations = Annotated[
     list[Deviation],
     BeforeValidator(lambda value: [value] * 3 if isinstance(value, int | float) else value),
@@ -359,7 +360,7 @@ def _cross_covariance(data: _TargetFile) -> Tensor | None:
     table = data.camera_cross_covariance
     if table is None:
         return None
-    if len(table.data) != table.rows * table.cols:
+    if table.rows < 1 or table.cols < 1 or len(table.data) != table.rows * table.cols:
         raise ConfigError(
             f"camera_cross_covariance: {len(table.data)} numbers for {table.rows} x {table.cols}; measure again"
         )
@@ -383,6 +384,8 @@ def _check_covariance(covariance: Tensor, size: int) -> None:
     if not bool(covariance.isfinite().all()):
         raise ConfigError(f"{field}: holds NaN or infinity; measure the target again or state center_sigma")
     scale = covariance.diagonal().abs().max().clamp_min(1e-30)
+    if bool(scale > MAX_DEVIATION**2):
+        raise ConfigError(f"{field}: has a variance of {float(scale):.3g} mm^2; write it in mm^2, up to 1e6")
     if bool(((covariance - covariance.mT).abs() > 1e-6 * scale).any()):
         raise ConfigError(f"{field}: is not symmetric; write the whole table")
     if bool(torch.linalg.eigvalsh(covariance)[0] < -1e-9 * scale):

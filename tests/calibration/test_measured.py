@@ -93,6 +93,13 @@ def test_target_and_camera_together_then_the_target_alone(
         (("--distance", 0, 1, 25, "--out", "c.yaml"), "--distance: scales a measured target; "),
         (("--measure-target", "t.yaml", "--out", "c.yaml", "--distance", 0, 9, 25), "--distance: target hexa50 has no"),
         (("--measure-target", "t.yaml", "--out", "c.yaml", "--distance", 0, 1, -1), "--distance: give two different"),
+        (("--measure-target", "t.yaml", "--out", "c.yaml", "--distance", 0, 1, 25, "nan"), "--distance: give two diff"),
+        (
+            ("--measure-target", "t.yaml", "--out", "c.yaml", "--distance", 0, 1, 1e300),
+            "--distance: markers 0 and 1 of",
+        ),
+        (("--measure-target", "t.yaml", "--out", "t.yaml"), "t.yaml: --measure-target: is the file of --out"),
+        (("--measure-target", ".", "--out", "c.yaml"), ".: --measure-target: is a folder; "),
     ],
 )
 def test_wrong_options(

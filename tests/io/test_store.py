@@ -386,6 +386,14 @@ def test_a_journal_of_another_program_is_one_clear_line(tmp_path: Path, line: st
         store(tmp_path, resume=True)
 
 
+def test_cells_of_another_kind_in_a_journal_are_one_clear_line(tmp_path: Path) -> None:
+    row = {"frame": "0.png", "target": "quad40", "status": "ok", "reason": None, "place": 5}
+    record = {"frame": "0.png", "rows": [row], "detections": []}
+    (tmp_path / "p.csv.partial").write_text(json.dumps({"origin": ORIGIN}) + "\n" + json.dumps(record) + "\n")
+    with pytest.raises(ConfigError, match="--resume: not written by torchpose"):
+        store(tmp_path, resume=True)
+
+
 @pytest.mark.parametrize("place", ["p.txt", "p", "gone/p.csv", "folder.csv", "file/p.csv", "/proc/p.csv"])
 def test_places_that_cannot_be_written_are_refused_at_once(tmp_path: Path, place: str) -> None:
     (tmp_path / "folder.csv").mkdir()

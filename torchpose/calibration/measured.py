@@ -29,6 +29,7 @@ _LEAST_VIEWS = 3  # of a marker: two give a place, without anything to check it 
 _POOR = 1e-3  # deviation of a place over the extent of the plate, above which it is called poorly known
 _OFTEN = 0.15  # share of a marker's points left out, from which on chance is no explanation
 _ODD = 0.3  # residual without a marker over that with it, below which this marker alone contradicts a view
+_SCALE = 2.0  # of a measured distance to the nominal one (convention): beyond, ids or units are others
 _SHOWN = 3  # names in a sentence
 _FEWEST, _MOST_TRIED = 5, 24  # markers of a plate of which one may be left out to see what the others say, and be tried
 _BENT = 2.0  # residual of a view over the median of all, above which it is named
@@ -49,8 +50,17 @@ class Distance:
         for marker in (self.first, self.second):
             if marker not in known:
                 raise ConfigError(f"--distance: target {target.name} has no marker {marker}; its ids are {known}")
-        if self.first == self.second or not self.length > 0 or not self.sigma >= 0:
-            raise ConfigError("--distance: give two different markers, a length above 0 mm and a deviation from 0 mm")
+        if self.first == self.second or not 0 < self.length < math.inf or not 0 <= self.sigma < self.length:
+            raise ConfigError(
+                "--distance: give two different markers, a length above 0 mm and a deviation from 0 mm, below that"
+            )
+        ends = [target.centers[known.index(marker)] for marker in (self.first, self.second)]
+        nominal = float((ends[0] - ends[1]).norm())
+        if not 1 / _SCALE < self.length / nominal < _SCALE:
+            raise ConfigError(
+                f"--distance: markers {self.first} and {self.second} of target {target.name} are {nominal:.6g} mm "
+                f"apart, not {self.length:.6g}; give their distance in mm, or correct the target file"
+            )
 
 
 def scaled_by_distance(calibration: Calibration, distance: Distance) -> Calibration:

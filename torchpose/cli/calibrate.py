@@ -127,9 +127,16 @@ def _check_files(
     if out is None and camera is None:
         found = "--measure-target" if target_out is not None else "--hand-eye-out"
         raise ConfigError(f"--camera: needed to find {found}; give the camera file, or --out to calibrate it now")
+    files: dict[Path, str] = {}
     for path, option in ((out, "--out"), (hand_eye_out, "--hand-eye-out"), (target_out, "--measure-target")):
-        if path is not None and not path.parent.is_dir():
+        if path is None:
+            continue
+        if not path.parent.is_dir():
             raise ConfigError(f"{path}: {option}: folder {path.parent} does not exist; create it or choose another")
+        if path.is_dir():
+            raise ConfigError(f"{path}: {option}: is a folder; give the name of a file")
+        if (other := files.setdefault(path.resolve(), option)) != option:
+            raise ConfigError(f"{path}: {option}: is the file of {other}, too; choose another")
 
 
 def _distance(
@@ -154,9 +161,10 @@ def _distance(
 
 def _is_number(text: str) -> bool:
     try:
-        return math.isfinite(float(text))
+        float(text)
     except ValueError:
         return False
+    return True
 
 
 class _Frames:

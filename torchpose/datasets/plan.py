@@ -260,7 +260,7 @@ class Processing(_Section):
     bayer: bool = False
     denoise: NotNegative = 0.0
     sharpen: NotNegative = 0.0
-    sharpen_px: Positive = 1.5
+    sharpen_px: Annotated[Positive, Field(le=16)] = 1.5  # px (convention): a wider one is no sharpening
     jpeg: Annotated[int, Field(ge=1, le=100)] | None = None
 
 

@@ -52,7 +52,7 @@ def crests(grad: Gradient, cell: Int[Tensor, " P"]) -> Int[Tensor, " Q"]:
         return cell
     gx, gy = grad.components(cell)
     width, power = grad.shape[2], gx * gx + gy * gy
-    table = torch.zeros(int(cell[-1]) + 2 * (width + 2), device=cell.device)
+    table = power.new_zeros(int(cell[-1]) + 2 * (width + 2))
     table[cell + (width + 1)] = power
     most = torch.maximum(gx.abs(), gy.abs())
     step = (gx / most).round_() + width * (gy / most).round_()

@@ -186,7 +186,7 @@ class _Averaged:
         one, lean = self.reach * self.scale, half * bend * self.reach
         y0 = (distance * self.scale).addcmul(half, self.core + a * self.square)
         y1, y2, y3 = one - a * self.square * lean, b * self.square * half, -b * self.square * lean
-        step, slope, by_y, by_place, by_square = torch.zeros(5, *distance.shape, device=distance.device).unbind(0)
+        step, slope, by_y, by_place, by_square = distance.new_zeros(5, *distance.shape).unbind(0)
         step += 0.5
         moved, y, density = torch.empty_like(y3), torch.empty_like(y0), torch.empty_like(y0)
         for share, weight in self.nodes:

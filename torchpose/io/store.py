@@ -200,7 +200,7 @@ class ResultStore:
                 else:
                     try:
                         self._note(_Record.model_validate(record).model_dump(), (offset, len(line)))
-                    except (ValidationError, KeyError):
+                    except (ValidationError, KeyError, TypeError, ValueError):
                         raise self._foreign(self._journal_path) from None
                 offset += len(line)
         self._journal.truncate(offset)

@@ -176,14 +176,14 @@ def gather_pixels(sight: Sight, band: Tensor, grain: int) -> PixelBlocks:
 def _seen(sight: Sight, row: Tensor, marker: Tensor) -> Tensor:
     """Sectors (K, 48) of markers, 1 or 0, see `PixelBlocks.seen`."""
     if sight.seen is None:
-        return torch.ones(len(row), SECTORS, device=row.device)
+        return torch.ones(len(row), SECTORS, dtype=torch.float32, device=row.device)
     seen = sight.seen[row, marker].float()
     return torch.where(seen.mean(-1, keepdim=True) < LEAST_KEPT, 1.0, seen)
 
 
 def _clipping(grey: Tensor, row: Tensor, rows: int) -> Tensor:
     """Limits (N, 2) at which each row's grey values are clipped: 0, and the full scale of its brightest pixel."""
-    ends = torch.tensor([torch.inf, -torch.inf], device=grey.device).repeat(rows, 1)
+    ends = grey.new_tensor([torch.inf, -torch.inf]).repeat(rows, 1)
     darkest = ends[:, 0].scatter_reduce(0, row, grey, "amin")
     brightest = ends[:, 1].scatter_reduce(0, row, grey, "amax")
     low = torch.where(darkest <= 0, 0.0, -torch.inf)
