@@ -76,6 +76,7 @@ class _TargetFile(BaseModel):
     edge_gain: FiniteFloat = 0.0
     edge_gain_sigma: Deviation | None = None
     centers_covariance: _MatrixFile | None = None
+    scale_sigma: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.0
     adjustment: str | None = None
     camera_cross_covariance: _MatrixFile | None = None
 
@@ -105,6 +106,8 @@ class Target:
             `printed_radii` are those of the circles on the part.
         covariance: (3 M + 1, 3 M + 1) float64, mm^2, of the centres on the part, x, y, z by marker, and last of the
             edge gain; None where the file claims a perfect target.
+        scale_sigma: relative standard deviation of the scale of all lengths, places and radii alike, which
+            ``covariance`` leaves out.
         adjustment: name of the adjustment that measured the target and a camera together, None where there was none.
         cross_covariance: (3 M + 1, 4 + n) float64, of the same and that camera's fx, fy, cx, cy and distortion; it
             holds for a `Camera` of the same ``adjustment``.
@@ -126,6 +129,7 @@ class Target:
     covariance: Tensor | None = None
     adjustment: str | None = None
     cross_covariance: Tensor | None = None
+    scale_sigma: float = 0.0
 
     def __post_init__(self) -> None:
         _check_name(self.name)
@@ -284,6 +288,7 @@ class Target:
                 part_translation=None if pose is None else _floats(pose.translation),
                 edge_gain=data.edge_gain,
                 covariance=covariance,
+                scale_sigma=data.scale_sigma,
                 adjustment=data.adjustment,
                 cross_covariance=_cross_covariance(data),
             )
@@ -312,6 +317,8 @@ class Target:
             lines.append(f"edge_gain_sigma: {format_number(gain**0.5)}")
             if bool(places.any()):
                 lines.append(_stated_places(places))
+        if self.scale_sigma:
+            lines.append(f"scale_sigma: {format_number(self.scale_sigma)}")
         if self.adjustment is not None:
             lines.append(f'adjustment: "{self.adjustment}"')
         if self.cross_covariance is not None:

@@ -15,7 +15,7 @@ from tests.calibration import calibration_scenes as scenes
 from torchpose.calibration import calibrate_intrinsics
 from torchpose.calibration.bundle import _Problem, moved_camera
 from torchpose.calibration.intrinsics import measure_plate
-from torchpose.calibration.measured import Distance, measured_target, scaled_by_distance
+from torchpose.calibration.measured import Distance, measured_target, scale_sigma, scaled_by_distance
 from torchpose.calibration.plate import free_plate, motions, stated_plate
 from torchpose.calibration.rings import measure_centers, rims_by_camera
 from torchpose.errors import ConfigError
@@ -154,7 +154,9 @@ def test_a_distance_gives_the_scale() -> None:
     assert target.covariance is not None
     along = torch.zeros(13, dtype=F64)
     along[:3], along[6:9] = between / between.norm(), -between / between.norm()
-    assert float(along @ target.covariance @ along) ** 0.5 == pytest.approx(0.003, rel=1e-6)
+    # the covariance knows the distance; how far it may be off is the scale's, that of places and radii
+    assert abs(float(along @ target.covariance @ along)) < 1e-12
+    assert scale_sigma(target, Distance(0, 2, true, 0.003)) == pytest.approx(0.003 / true)
     # radii and places grow together: another marker's distance is right, too, as far as its shape is known
     other = float((target.centers[1] - target.centers[3]).norm())
     assert other == pytest.approx(float((scene.printed.centers[1] - scene.printed.centers[3]).norm()), abs=2e-3)

@@ -74,15 +74,26 @@ def scaled_by_distance(calibration: Calibration, distance: Distance) -> Calibrat
     by_unknown = -(between / length.square()) @ (plate.places[ends[0]] - plate.places[ends[1]])
     row = pad(by_unknown, (len(calibration.joint) - len(plate), 0))
     factor = distance.length / float(length)
-    return _scaled(calibration, factor, row, (distance.sigma / distance.length) ** 2)
+    return _scaled(calibration, factor, row)
 
 
-def _scaled(calibration: Calibration, factor: float, row: Float[Tensor, " u"], variance: float) -> Calibration:
+def scale_sigma(target: Target, distance: Distance | None) -> float:
+    """Relative standard deviation of the scale: of the distance, or of the mean of the nominal distances."""
+    if distance is not None:
+        return distance.sigma / distance.length
+    if target.covariance is None:
+        return 0.0
+    arm = (target.centers - target.centers.mean(0)).flatten()
+    return float((arm @ target.covariance[:-1, :-1] @ arm).clamp_min(0).sqrt() / arm.square().sum())
+
+
+def _scaled(calibration: Calibration, factor: float, row: Float[Tensor, " u"]) -> Calibration:
     """Places scaled about their middle, with the scale as one more unknown of the plate.
+
+    What a deviation of the measured distance does is not in it: places and radii share that (`scale_sigma`).
 
     Args:
         row: how the relative change of scale follows the unknowns that there are.
-        variance: of it besides.
     """
     plate, bundle = calibration.plate, calibration.bundle
     assert plate is not None  # what was measured
@@ -105,7 +116,6 @@ def _scaled(calibration: Calibration, factor: float, row: Float[Tensor, " u"], v
     )
     to_scale = torch.cat([torch.eye(len(row)).to(row), row[None]])
     joint = to_scale @ calibration.joint @ to_scale.mT
-    joint[-1, -1] += variance
     turned = bundle.R @ middle
     t = factor * bundle.t + (factor - 1) * turned
     units = torch.cat([torch.full((3,), factor), torch.ones(3)]).to(t)

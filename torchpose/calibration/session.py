@@ -24,6 +24,7 @@ from torchpose.calibration.measured import (
     check_seen,
     doubts,
     measured_target,
+    scale_sigma,
     scaled_by_distance,
 )
 from torchpose.calibration.plate import free_plate, stated_plate
@@ -168,6 +169,7 @@ def measure_target(
         if distance is not None:
             found = scaled_by_distance(found, distance)
         measured, camera_of = measured_target(found, known)
+        measured = replace(measured, scale_sigma=scale_sigma(target, distance))
         if held:  # what both share is of use where the camera's file has a name for it
             cross = None if start.adjustment is None else measured.cross_covariance
             measured, camera_of = replace(measured, adjustment=start.adjustment, cross_covariance=cross), start

@@ -168,7 +168,7 @@ def _stated(refined: Refined, camera: Camera, target: Target) -> Float[Tensor, "
     ellipses, shapes = nothing.new_zeros(rows, markers, 2, 5), nothing.new_zeros(rows, markers, 2, 5, 5)
     evidence = Evidence(
         *(table.centers, table.normals, table.radii, nothing, square, ellipses, shapes, nothing[..., 0], table.valid),
-        *(table.coplanar, table.polarity, torch.zeros_like(square), table.by_print, table.by_camera),
+        *(table.coplanar, table.polarity, torch.zeros_like(square), table.by_print, table.by_camera, table.scale_sigma),
         matrix=camera.matrix,
     )  # what was measured is in the normal equations
     normals = replace(refined.normals, right=torch.zeros_like(refined.normals.right))

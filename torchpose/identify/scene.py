@@ -38,6 +38,7 @@ class MarkerTable(Rows):
             `Target.covariance` says and those of the camera leave open.
         by_camera: the same with each of the C uncertain numbers of a camera that was calibrated together with the
             target (`Target.cross_covariance`); 0 with any other.
+        scale_sigma: `Target.scale_sigma`, the last of the Q numbers where any target has one.
     """
 
     ids: Int[Tensor, "T M"]
@@ -52,6 +53,7 @@ class MarkerTable(Rows):
     half_gap: Float[Tensor, " T"]
     by_print: Float[Tensor, "T M 4 Q"]
     by_camera: Float[Tensor, "T M 4 C"]
+    scale_sigma: Float[Tensor, " T"]
 
     @classmethod
     def of(cls, targets: Sequence[Target], camera: Camera | None = None) -> Self:
@@ -74,6 +76,7 @@ class MarkerTable(Rows):
             torch.stack([_half_gap(t.printed_radii) for t in targets]),
             by_print,
             by_camera,
+            torch.tensor([t.scale_sigma for t in targets], dtype=torch.float64),
         )
 
 
@@ -119,7 +122,8 @@ def _by_numbers(targets: Sequence[Target], camera: Camera | None) -> tuple[Tenso
         return table
 
     alone, together = ([part[k] for part in parts] for k in range(2))
-    return laid_out(alone, max(f.shape[1] for f in alone)), laid_out(together, lens.shape[1])
+    scaled = int(any(target.scale_sigma for target in targets))
+    return laid_out(alone, max(f.shape[1] for f in alone) + scaled), laid_out(together, lens.shape[1])
 
 
 def _by_both(target: Target, camera: Camera | None, lens: Tensor) -> tuple[Tensor, Tensor]:

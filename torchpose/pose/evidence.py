@@ -43,6 +43,7 @@ class Evidence(Rows):
         placed: covariance that uncertain places on the print add to the centres, at most, ideal px^2.
         by_target: `MarkerTable.by_print`.
         by_camera: the same of `MarkerTable`.
+        scale_sigma: the same.
         matrix: of the camera.
         of_camera: how many independent numbers are uncertain of it.
         gain: mm, edge gain of each plate that ``radii`` hold beyond those of the target's file; None for none.
@@ -62,6 +63,7 @@ class Evidence(Rows):
     placed: Float[Tensor, "N M 2 2"]
     by_target: Float[Tensor, "N M 4 L"]
     by_camera: Float[Tensor, "N M 4 C"]
+    scale_sigma: Float[Tensor, " N"]
     matrix: Float[Tensor, "3 3"] = shared()
     of_camera: int = shared(0)
     gain: Float[Tensor, " N"] | None = None
@@ -122,6 +124,7 @@ def gather_evidence(
         variance[..., None, None] * shape @ shape,
         markers.by_print,
         markers.by_camera,
+        markers.scale_sigma,
         camera.matrix,
         0 if camera.covariance is None else covariance_factor(camera.covariance).shape[1],
     )

@@ -208,8 +208,16 @@ def _excess(normals: MarkerNormals, known: Tensor, count: int, setting: Setting)
 
 
 def _by_target(setting: Setting) -> Tensor:
-    """How markers seem moved (N, M, 7, L), each alone, by the numbers of unit variance of the target."""
-    return _displaced(setting.R, setting.evidence.by_target)
+    """How markers seem moved (N, M, 7, L), each alone, by the numbers of unit variance of the target.
+
+    A target that is larger as a whole looks like the same one that is nearer: all markers move towards the camera.
+    """
+    moved, scale = _displaced(setting.R, setting.evidence.by_target), setting.evidence.scale_sigma
+    if not bool((scale > 0).any()):
+        return moved
+    nearer = moved.new_zeros(*moved.shape[:3])
+    nearer[..., :3] = -(scale[:, None] * setting.t)[:, None]
+    return torch.cat([moved[..., :-1], nearer[..., None]], -1)
 
 
 def _displaced(R: Tensor, by: Tensor) -> Tensor:
