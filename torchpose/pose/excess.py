@@ -38,12 +38,14 @@ class Excess(Rows):
     Attributes:
         deviation: standard deviations of the further unknowns: places (by marker two along the print and one across,
             mm), gain (mm), camera (px); 0 where they need not be off.
+        printed: the same if the print is behind it; 0 where nothing is.
         factor: of the variance of all noise, 1 where it suffices.
         misfit: `Misfit`, what is behind it.
         explained: whether the residuals then agree with all that.
     """
 
     deviation: Float[Tensor, "N E"]
+    printed: Float[Tensor, "N E"]
     factor: Float[Tensor, " N"]
     misfit: Int[Tensor, " N"]
     explained: Bool[Tensor, " N"]
@@ -82,7 +84,7 @@ def excess_of(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) 
     best = torch.stack([f.evidence for f in families], -1).argmax(-1)
     at = torch.arange(len(row), device=row.device)
     deviation, factor, chi2 = (torch.stack([f[k] for f in families], 1)[at, best] for k in (1, 2, 3))
-    return none.replaced(row, Excess(deviation, factor, best + 1, chi2 < most[row]))
+    return none.replaced(row, Excess(deviation, families[0].deviation, factor, best + 1, chi2 < most[row]))
 
 
 def no_excess(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) -> Excess:
@@ -91,9 +93,8 @@ def no_excess(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) 
 
 
 def _none(right: Tensor, explained: Tensor) -> Excess:
-    return Excess(
-        torch.zeros_like(right), right.new_ones(len(right)), explained.new_zeros(len(right)).long(), explained
-    )
+    zero, nothing = torch.zeros_like(right), torch.zeros_like(explained, dtype=torch.int64)
+    return Excess(zero, zero, right.new_ones(len(right)), nothing, explained)
 
 
 def _of_noise(modes: _Modes) -> tuple[Tensor, Tensor]:

@@ -8,6 +8,8 @@ of the joint problem (generalised least squares). Its covariance has three parts
 numbers leave open, and what the residuals show beyond both (`pose.excess`).
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,6 +28,7 @@ from torchpose.geometry.rows import Rows
 from torchpose.pose.covariance import center_jacobian, derivative
 from torchpose.pose.evidence import Evidence
 from torchpose.pose.excess import CAMERA, Excess, excess_of, no_excess
+from torchpose.results import Misfit
 
 POSE = 6
 _RIM_POINTS = 24  # of a circle: sums over it are exact up to the perspective's high orders
@@ -132,12 +135,24 @@ def on_print(
     printed = torch.cat([by_target, beside[..., :-CAMERA]], -1) if wide else by_target
     lens = torch.cat([by_camera, beside[..., -CAMERA:]], -1) if wide else by_camera
     joint = _Joint.of(normals.over(excess.factor), own, _among(printed, n), _among(lens, n), estimate)
-    place = torch.cat([R.mT[:, None] @ printed[:, :, :3], printed[:, :, POSE:]], 2)
-    place = (place @ joint.numbers[:, None, :, None])[..., 0]
+    place = _places(printed, joint, R)
+    other = (excess.misfit > Misfit.PRINT).nonzero()[:, 0]
+    if other.numel():
+        # where the markers would be if it were the print: a fit that looks for them elsewhere may only seem to scatter
+        if_printed = torch.cat([by_target, (further * excess.printed[:, None, None])[..., :-CAMERA]], -1)[other]
+        some = MarkerNormals(normals.information[other], normals.right[other])
+        alone = _Joint.of(some, own[other], _among(if_printed, n), _among(lens[other], n), True)
+        place = place.index_copy(0, other, _places(if_printed, alone, R[other]))
     sure = joint.known & (torch.linalg.cholesky_ex(joint.covariance)[1] == 0)
     parts = (joint.by_camera[..., : by_camera.shape[-1]], joint.by_print[..., : by_target.shape[-1]])
     common = torch.cat(parts, -1)
     return OnPrint(joint.step, joint.covariance, joint.noise, common, place, excess.misfit, excess.explained, sure)
+
+
+def _places(printed: Tensor, joint: _Joint, R: Tensor) -> Tensor:
+    """Places (N, M, 4) of markers moved by the numbers of a solution, by their motions (N, M, 7, L)."""
+    by = torch.cat([R.mT[:, None] @ printed[:, :, :3], printed[:, :, POSE:]], 2)
+    return (by @ joint.numbers[:, None, :, None])[..., 0]
 
 
 class _Joint(NamedTuple):
