@@ -88,6 +88,7 @@ class OnPrint(Rows):
         noise: the part of it that is the frame's own.
         systematic: how the pose errs with each of the L numbers, one deviation of them; the same in all frames.
         place: where the markers sit beside their places, target frame, mm, and the edge gain, all as estimated.
+        look: the same if the print is behind the misfit, whatever is likeliest: where to look for the markers next.
         misfit: `Misfit`, what the residuals show beyond noise and stated uncertainties; it is in the covariance.
         explained: whether the residuals agree with all that.
         known: whether the pose is determined.
@@ -98,14 +99,10 @@ class OnPrint(Rows):
     noise: Float[Tensor, "N 6 6"]
     systematic: Float[Tensor, "N 6 L"]
     place: Float[Tensor, "N M 4"]
+    look: Float[Tensor, "N M 4"]
     misfit: Int[Tensor, " N"]
     explained: Bool[Tensor, " N"]
     known: Bool[Tensor, " N"]
-
-    @property
-    def moved(self) -> Tensor:
-        """(N,) mm, the largest displacement of a marker or of the edges."""
-        return torch.linalg.vector_norm(self.place[..., :3], dim=-1).amax(-1).maximum(self.place[..., 3].abs().amax(-1))
 
 
 def on_print(
@@ -135,18 +132,19 @@ def on_print(
     printed = torch.cat([by_target, beside[..., :-CAMERA]], -1) if wide else by_target
     lens = torch.cat([by_camera, beside[..., -CAMERA:]], -1) if wide else by_camera
     joint = _Joint.of(normals.over(excess.factor), own, _among(printed, n), _among(lens, n), estimate)
-    place = _places(printed, joint, R)
+    place = look = _places(printed, joint, R)
     other = (excess.misfit > Misfit.PRINT).nonzero()[:, 0]
     if other.numel():
-        # where the markers would be if it were the print: a fit that looks for them elsewhere may only seem to scatter
+        # a fit that looks for the markers where they are not may only seem to scatter
         if_printed = torch.cat([by_target, (further * excess.printed[:, None, None])[..., :-CAMERA]], -1)[other]
-        some = MarkerNormals(normals.information[other], normals.right[other])
-        alone = _Joint.of(some, own[other], _among(if_printed, n), _among(lens[other], n), True)
-        place = place.index_copy(0, other, _places(if_printed, alone, R[other]))
+        alone = _Joint.of(normals[other], own[other], _among(if_printed, n), _among(lens[other], n), True)
+        look = place.index_copy(0, other, _places(if_printed, alone, R[other]))
     sure = joint.known & (torch.linalg.cholesky_ex(joint.covariance)[1] == 0)
     parts = (joint.by_camera[..., : by_camera.shape[-1]], joint.by_print[..., : by_target.shape[-1]])
     common = torch.cat(parts, -1)
-    return OnPrint(joint.step, joint.covariance, joint.noise, common, place, excess.misfit, excess.explained, sure)
+    return OnPrint(
+        joint.step, joint.covariance, joint.noise, common, place, look, excess.misfit, excess.explained, sure
+    )
 
 
 def _places(printed: Tensor, joint: _Joint, R: Tensor) -> Tensor:
@@ -180,8 +178,8 @@ class _Joint(NamedTuple):
         By what the data tell of the print's numbers when the own unknowns are free, S = V diag(l) V^T: then they have
         the covariance (I + S)^-1, and every part of the pose's covariance is a sum of squares, whatever is large.
         """
-        matrix, right = _assembled(normals, torch.cat([own, by_print], -1))
         columns = torch.cat([own, by_print], -1)
+        matrix, right = _assembled(normals, columns)
         by_lens = (columns.mT @ (normals.information @ by_camera)).sum(1)
         k = own.shape[-1]
         alone, known = scaled_inverse(matrix[:, :k, :k])
@@ -217,8 +215,7 @@ def _excess(normals: MarkerNormals, known: Tensor, count: int, setting: Setting)
     # only where the print alone would have to explain it, the camera is asked, too
     camera = camera.index_copy(0, wide, _camera_shifts(setting.of_rows(wide)))
     every = torch.cat([further, camera], -1)
-    some = MarkerNormals(normals.information[wide], normals.right[wide])
-    again = excess_of(*_remaining(some, known[wide], _among(every[wide], n), count))
+    again = excess_of(*_remaining(normals[wide], known[wide], _among(every[wide], n), count))
     return excess.replaced(wide, again), every
 
 

@@ -56,6 +56,20 @@ class Recipe:
     on_rims: bool = False
 
 
+def _on_solved(change: Step) -> Step:
+    """The step that changes the rows that have a pose, by what they saw of the markers that it explains."""
+
+    def step(solutions: Solutions, evidence: Evidence, sight: Sight) -> Solutions:
+        index = solutions.solved.nonzero()[:, 0]
+        if index.numel() == 0:
+            return solutions
+        rows = solutions[index]
+        seen, shown = replace(evidence[index], mask=rows.mask), replace(sight[index], mask=rows.mask)
+        return solutions.replaced(index, change(rows, seen, shown))
+
+    return step
+
+
 def on_frames(refine: Callable[..., Refined]) -> Step:
     """The step that refines every pose on the frames themselves where that holds, and on the centres where not.
 
@@ -63,14 +77,10 @@ def on_frames(refine: Callable[..., Refined]) -> Step:
     rows are refined again.
     """
 
-    def step(solutions: Solutions, evidence: Evidence, sight: Sight) -> Solutions:
-        index = solutions.solved.nonzero()[:, 0]
-        if index.numel() == 0:
-            return solutions
-        rows = solutions[index]
-        seen, sight = replace(evidence[index], mask=rows.mask), replace(sight[index], mask=rows.mask)
+    def step(rows: Solutions, seen: Evidence, sight: Sight) -> Solutions:
         start, place = _start(rows, seen, sight.camera)
-        found, good, active = rows, torch.zeros_like(rows.status, dtype=torch.bool), torch.arange(len(rows)).to(index)
+        found, good = rows, torch.zeros_like(rows.status, dtype=torch.bool)
+        active = torch.arange(len(rows), device=good.device)
         for number in range(_ROUNDS):
             some = rows[active], seen[active], sight[active].displaced(_beyond(place[active], seen[active]))
             # what seems to contradict the model may be a marker beside its place
@@ -79,29 +89,27 @@ def on_frames(refine: Callable[..., Refined]) -> Step:
             )
             better = held.nonzero()[:, 0]
             found, good = found.replaced(active[better], now[better]), good.index_fill(0, active[better], True)
-            beside = (joint.place - place[active]).abs().amax((-1, -2)) * seen.matrix[0, 0] / now.t[:, 2]
-            start, place = start.replaced(active, Pose(now.R, now.t)), place.index_copy(0, active, joint.place)
+            beside = (joint.look - place[active]).abs().amax((-1, -2)) * seen.matrix[0, 0] / now.t[:, 2]
+            start, place = start.replaced(active, Pose(now.R, now.t)), place.index_copy(0, active, joint.look)
             # at first, whatever is amiss is looked at once more with the markers where the print would have them
             amiss = (doubt | (held & (joint.misfit != Misfit.NONE))) & (number == 0)
             active = active[(held & (beside > _BESIDE)) | amiss]
             if active.numel() == 0:
                 break
         bad = (~good).nonzero()[:, 0]
-        if bad.numel():
-            found = found.replaced(bad, _by_centers(rows[bad], seen[bad], sight.camera)[0])
-        return solutions.replaced(index, found)
+        return found.replaced(bad, _by_centers(rows[bad], seen[bad], sight.camera)[0]) if bad.numel() else found
 
-    return step
+    return _on_solved(step)
 
 
 def _start(rows: Solutions, seen: Evidence, camera: Camera) -> tuple[Pose, Tensor]:
-    """Poses, and places (N, M, 4) of markers and edges beside those of the file, as `OnPrint.place`, by the centres."""
+    """Poses, and places (N, M, 4) of markers and edges beside those of the file, as `OnPrint.look`, by the centres."""
     start, place = Pose(rows.R, rows.t), -_beyond(rows.t.new_zeros(*seen.mask.shape, 4), seen)
     off = (rows.rms > _BESIDE).nonzero()[:, 0]
     if off.numel() == 0:
         return start, place
     found, joint = _by_centers(rows[off], seen[off], camera)
-    beside = torch.cat([joint.place[..., :3], place[off][..., 3:]], -1)  # centres tell of no gain
+    beside = torch.cat([joint.look[..., :3], place[off][..., 3:]], -1)  # centres tell of no gain
     return start.replaced(off, Pose(found.R, found.t)), place.index_copy(0, off, beside)
 
 
@@ -158,33 +166,22 @@ def _of_joint(rows: Solutions, seen: Evidence, pose: Pose, joint: OnPrint) -> So
     return better.marked(joint.known & ~joint.explained & better.ok, Status.REJECTED, Reason.RESIDUAL)
 
 
-def on_centers(solutions: Solutions, evidence: Evidence, sight: Sight) -> Solutions:
+def _on_centers(rows: Solutions, seen: Evidence, sight: Sight) -> Solutions:
     """Refines every pose on the ellipses' own centres, where that holds."""
-    index = solutions.solved.nonzero()[:, 0]
-    if index.numel() == 0:
-        return solutions
-    rows = solutions[index]
-    seen = replace(evidence[index], mask=rows.mask)
-    return solutions.replaced(index, _by_centers(rows, seen, sight.camera)[0])
+    return _by_centers(rows, seen, sight.camera)[0]
 
 
-def as_they_are(solutions: Solutions, evidence: Evidence, sight: Sight) -> Solutions:
+def _as_they_are(rows: Solutions, seen: Evidence, sight: Sight) -> Solutions:
     """The poses of the compensated centres, with what print and camera do to them."""
-    index = solutions.solved.nonzero()[:, 0]
-    if index.numel() == 0:
-        return solutions
-    rows = solutions[index]
-    seen = replace(evidence[index], mask=rows.mask)
     nowhere, setting = rows.t.new_zeros(*seen.mask.shape, 4), Setting(seen, rows.R, rows.t, sight.camera, False)
     joint = on_print(center_normals(seen, rows.R, rows.t), setting, nowhere, estimate=False)
-    found = _of_joint(rows, seen, Pose(rows.R, rows.t), joint)
-    return solutions.replaced(index, found.where(joint.known, rows))
+    return _of_joint(rows, seen, Pose(rows.R, rows.t), joint).where(joint.known, rows)
 
 
 METHODS = {
     "photometric": Recipe(steps=(decide, decide_on_grey, on_frames(refine_photometric)), on_rims=True),
     "edges": Recipe(steps=(decide, on_frames(refine_edges)), on_rims=True),
-    "centers": Recipe(steps=(decide, on_centers)),
-    "paper": Recipe(correct=False, locate=compensate, steps=(as_they_are,)),
+    "centers": Recipe(steps=(decide, _on_solved(_on_centers))),
+    "paper": Recipe(correct=False, locate=compensate, steps=(_on_solved(_as_they_are),)),
 }
 """By name, as `PoseEstimator` and the command line take it."""
