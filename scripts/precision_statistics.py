@@ -186,17 +186,22 @@ def spread(psf: str) -> Tensor:
 Drawn = tp.Target | Prints
 
 
-def picture(case: Case, camera: tp.Camera, target: Drawn, r: Tensor, t: Tensor) -> Tensor:
-    """Frames (B, H, W), free of noise."""
+def picture(
+    case: Case, camera: tp.Camera, target: Drawn, r: Tensor, t: Tensor, twist: tuple[float, ...] | None = None
+) -> Tensor:
+    """Frames (B, H, W), free of noise; ``twist``: mm and rad by which the target moves during the exposure."""
     if case.psf == "blackman-harris":
         return filtered(case, camera, target, r, t)
+    options = plate_of(case, len(t))
+    if twist is not None:
+        options |= {"motion": torch.tensor(twist, dtype=F64).expand(len(t), 6)}
     out = torch.zeros(len(t), camera.height, camera.width)
     shifts = spread(case.psf)
     for shift in shifts:
         matrix = camera.matrix.clone()
         matrix[:2, 2] += shift
         moved = replace(camera, matrix=matrix)
-        out += render(moved, target, r, t, psf_sigma=case.blur, **plate_of(case, len(t))) / len(shifts)
+        out += render(moved, target, r, t, psf_sigma=case.blur, **options) / len(shifts)
     return out
 
 

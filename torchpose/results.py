@@ -125,9 +125,12 @@ class Poses(Rows):
         noise: the part of it that is the frame's own: how far the pose would scatter if the frame were taken again.
         systematic: how the pose errs with each of L numbers of unit variance that are the same in all frames: the
             uncertain parameters of the camera, the first ``of_camera``, and what is uncertain of the target.
-        place: where the fit found the M markers beside their places, target frame, mm, and their edges outwards, mm,
-            as far as the file or the residuals leave it open; NaN for markers that were not used.
+        place: where the fit found the M markers beside their places, target frame, their dark edges outwards, and both
+            edges of a ring further from its centre, all in mm, as far as the file or the residuals leave it open; NaN
+            for markers that were not used.
         misfit: `Misfit`.
+        residual_chi2, freedom: chi-squared of what the markers say against each other, under noise and the stated
+            uncertainties alone, and its degrees of freedom; what stands above chance is counted in the covariance.
         rms: reprojection RMS of the compensated marker centres, px.
         status, reason: `Status` and `Reason`.
         markers: number of markers used.
@@ -147,8 +150,10 @@ class Poses(Rows):
     covariance: Float[Tensor, "N 6 6"]
     noise: Float[Tensor, "N 6 6"]
     systematic: Float[Tensor, "N 6 L"]
-    place: Float[Tensor, "N M 4"]
+    place: Float[Tensor, "N M 5"]
     misfit: Int[Tensor, " N"]
+    residual_chi2: Float[Tensor, " N"]
+    freedom: Int[Tensor, " N"]
     rms: Float[Tensor, " N"]
     status: Int[Tensor, " N"]
     reason: Int[Tensor, " N"]

@@ -32,7 +32,7 @@ from torchpose.results import Detections, Poses, Reason, Status
 
 CONTRACT = (
     "frame,target,status,tx,ty,tz,rx,ry,rz,sx,sy,sz,srx,sry,srz,rms_px,markers,nx,ny,nz,nrx,nry,nrz,"
-    "reason,instance,copies,misfit"
+    "reason,instance,copies,misfit,chi2,dof"
 )
 DETECTION_CONTRACT = "frame,target,marker,u,v,su,sv,outer_a,outer_b,outer_theta,inner_a,inner_b,inner_theta,instance"
 NAN = float("nan")
@@ -72,6 +72,8 @@ def some_poses(frames: int = 3, targets: int = 2, seed: int = 0) -> Poses:
         systematic=torch.where(gone[:, None, None], NAN, 0.5**0.5 * root),
         place=torch.zeros(n, 4, 4, dtype=torch.float64),
         misfit=torch.zeros(n, dtype=torch.int64),
+        residual_chi2=torch.where(gone, NAN, normal(n).square()),
+        freedom=torch.where(gone, 0, 18),
         rms=torch.where(gone, NAN, normal(n).square()),
         status=torch.where(gone, Status.REJECTED, torch.where(second, Status.AMBIGUOUS, Status.OK)),
         reason=torch.where(gone, Reason.RING_SHAPE, torch.where(second, Reason.TWO_SOLUTIONS, Reason.NONE)),
@@ -110,6 +112,7 @@ def test_rows_hold_the_poses_exactly() -> None:
         assert row["rms_px"] == float(poses.rms[i])
         assert row["solutions"][0]["translation"] == poses.t[i].tolist()
         assert row["solutions"][0]["chi2"] == float(poses.chi2[i])
+        assert (row["chi2"], row["dof"]) == (float(poses.residual_chi2[i]), 18)
     assert [len(row["solutions"] or []) for row in rows] == [1, 1, 1, 1, 2, 0]
     assert rows[4]["solutions"][1]["translation"] == poses.t_alt[4].tolist()
     without = ("status", "reason", "frame", "target", "markers", "instance", "copies")
@@ -163,7 +166,7 @@ def test_csv_has_the_columns_of_the_contract(tmp_path: Path) -> None:
 def test_csv_cells_are_empty_where_there_is_no_pose(tmp_path: Path) -> None:
     write_rows(tmp_path / "a.csv", rows_with_base()[-1:], POSE_SCHEMA)
     (row,) = csv.DictReader(io.StringIO((tmp_path / "a.csv").read_text(), newline=""))
-    empty = {c for c, kind in POSE_SCHEMA.items() if kind is float} | {"misfit"}
+    empty = {c for c, kind in POSE_SCHEMA.items() if kind is float} | {"misfit", "dof"}
     assert {c for c, v in row.items() if v == ""} == empty
     assert (row["markers"], row["reason"]) == ("2", "ring_shape")
 

@@ -58,6 +58,8 @@ def one_pose(
         systematic=torch.zeros(1, 6, 0, dtype=torch.float64),
         place=torch.zeros(1, 4, 4, dtype=torch.float64),
         misfit=torch.zeros(1, dtype=torch.int64),
+        residual_chi2=torch.zeros(1, dtype=torch.float64),
+        freedom=torch.zeros(1, dtype=torch.int64),
         rms=torch.full((1,), 0.01, dtype=torch.float64),
         status=zero[:1] + status,
         reason=zero[:1] + reason,

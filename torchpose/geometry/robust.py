@@ -15,3 +15,9 @@ RATIO_RANGE = (0.12, 0.93)  # of inner to outer radius: beyond, a plain disc or 
 def of_chance(number: Value) -> Value:
     """Most that the mean square of so many values exceeds its expectation by chance, as a factor."""
     return 1 + CUT * (2 / number) ** 0.5
+
+
+def quantile(freedom: Value, deviations: float) -> Value:
+    """What chi-squared stays below as often as a normal deviate below so many deviations (Wilson and Hilferty 1931)."""
+    share = 2 / (9 * freedom)
+    return freedom * (1 - share + deviations * share**0.5) ** 3

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 _FEW = 3  # frames, with fewer of which nothing is the same in all
-_AXES = ("x", "y", "z", "edge")
+_AXES = ("x", "y", "z", "edge", "size")
 
 
 class Misfits:
@@ -31,7 +31,7 @@ class Misfits:
             self.kinds[row["misfit"]] += 1
         if not row.get("place"):
             return
-        place = np.array([marker or [np.nan] * 4 for marker in row["place"]], dtype=float)
+        place = np.array([marker or [np.nan] * len(_AXES) for marker in row["place"]], dtype=float)
         seen = np.isfinite(place)
         place = np.where(seen, place, 0.0)
         self._count, self._sum, self._square = self._count + seen, self._sum + place, self._square + place**2
@@ -61,9 +61,9 @@ class Misfits:
         return lines
 
     def _common(self) -> tuple[np.ndarray, float]:
-        """Mean place (M, 4) of the markers, and the RMS length of what the single frames differ from it, mm."""
+        """Mean place (M, 5) of the markers, and the RMS length of what the single frames differ from it, mm."""
         if self.frames < _FEW or not np.any(self._sum):
-            return np.zeros((0, 4)), 0.0
+            return np.zeros((0, len(_AXES))), 0.0
         count = np.maximum(np.asarray(self._count), 1)
         mean = np.asarray(self._sum) / count
         variance = np.maximum(np.asarray(self._square) / count - mean**2, 0.0)

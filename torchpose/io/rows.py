@@ -29,6 +29,8 @@ POSE_SCHEMA: Schema = {
     "instance": int,
     "copies": int,
     "misfit": str,
+    "chi2": float,
+    "dof": int,
     "covariance": list,
     "noise_covariance": list,
     "systematic": list,
@@ -40,7 +42,8 @@ POSE_SCHEMA: Schema = {
 
 t in mm, rotation vector r in rad, standard deviations s* of t and of the rotation about the camera axes, of everything,
 and n* of the noise of the frame alone; instance counts the copies of a target in its frame from the left, copies says
-how many it shows, if any; misfit is `Misfit` where the residuals show any; covariance and noise_covariance 6x6 (t, then
+how many it shows, if any; misfit is `Misfit` where the residuals show any, chi2 and dof what they amount to (see
+`Poses.residual_chi2`); covariance and noise_covariance 6x6 (t, then
 rotation), systematic and place as in `Poses`, quaternion w, x, y, z, and the one or two solutions, the row's own first.
 """
 
@@ -61,7 +64,9 @@ DETECTION_SCHEMA: Schema = {
 }
 """One row a marker: compensated centre with standard deviation, semi-axes and direction of both ellipses (px, rad)."""
 
-NEWER: Row = {"instance": 0} | dict.fromkeys(("copies", "misfit", *_NOISE, "noise_covariance", "systematic", "place"))
+NEWER: Row = {"instance": 0} | dict.fromkeys(
+    ("copies", "misfit", "chi2", "dof", *_NOISE, "noise_covariance", "systematic", "place")
+)
 """Cells of rows that were written before a frame could have several copies of a target, or two covariances."""
 
 
@@ -86,6 +91,8 @@ def pose_rows(poses: Poses, frames: Sequence[str], targets: Sequence[str]) -> li
         instance=poses.instance.tolist(),
         copies=[count or None for count in poses.copies.tolist()],
         misfit=[Misfit(misfit).name.lower() if misfit else None for misfit in poses.misfit.tolist()],
+        chi2=[finite(chi2) for chi2 in poses.residual_chi2.tolist()],
+        dof=[freedom or None for freedom in poses.freedom.tolist()],
         **_noise_cells(poses),
         quaternion=[pose and pose["quaternion"] for pose in own],
         solutions=[a and [a, *([b] if b else [])] for a, b in zip(own, other, strict=True)],

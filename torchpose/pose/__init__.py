@@ -6,13 +6,15 @@ from torchpose.pose.covariance import pose_covariance
 from torchpose.pose.doubt import crossed_out
 from torchpose.pose.evidence import CENTER_RMS, SHAPE_FLOOR, Evidence, center_rms, gather_evidence, shape_chi2
 from torchpose.pose.outcome import Found, outcome
-from torchpose.pose.solutions import AMBIGUOUS_CHI2, Solutions
+from torchpose.pose.sizes import size_beyond
+from torchpose.pose.solutions import AMBIGUOUS_CHI2, PLACE, Solutions
 from torchpose.pose.solve import solve_poses
 from torchpose.pose.systematic import MarkerNormals, OnPrint, Setting, center_normals, on_print
 
 __all__ = [
     "AMBIGUOUS_CHI2",
     "CENTER_RMS",
+    "PLACE",
     "SHAPE_FLOOR",
     "Evidence",
     "Found",
@@ -32,5 +34,6 @@ __all__ = [
     "pose_covariance",
     "raw_centers",
     "shape_chi2",
+    "size_beyond",
     "solve_poses",
 ]

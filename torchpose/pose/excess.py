@@ -2,8 +2,9 @@
 
 Of every row three explanations are weighed by their evidence (the likelihood, averaged over how large each may be):
 
-- the print: places of markers along it, across it (paper bends), and an edge gain, off by amounts of their own;
-- the camera: its focal length, principal point and radial distortion are off;
+- the print: places of markers along it, across it (paper bends, and turns the rings), and the edges of all rings,
+  off by amounts of their own;
+- the camera: its focal lengths, axes, principal point and distortion are off;
 - all else: whatever it is, it makes the scatter larger by one factor (Birge 1932).
 
 The likeliest becomes part of the row's problem with the variance that it has on average over what remains possible: a
@@ -11,7 +12,7 @@ few residuals tell a variance to a factor only, and the mean counts that, as Stu
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -19,13 +20,27 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.geometry.least_squares import LEAST_DIRECTION
-from torchpose.geometry.robust import of_chance
+from torchpose.geometry.robust import of_chance, quantile
 from torchpose.geometry.rows import Rows
 
-CAMERA = 4  # numbers of a camera that may be off: focal length, principal point (2), radial distortion
+OF_MARKER = 5  # two along the print, one across, and two turns of a ring that goes with the plate's bend
+# edge gain of the print; the same in the picture (wrong tone, light that floods), by as many px all round; and how far
+# both edges of a ring lie further out
+OF_EDGES = 3
+CAMERA = 8  # numbers of a camera that may be off: linear (focal length, aspect, skew), principal point, k1, p1, p2
+_EDGES_OFF = ((1, 0, 0), (0, 1, 0), (1, 0, 1))  # what may be off of the edges, in that order
+_OFF = (  # what may be off of a camera's numbers, in the order of `CAMERA`: one thing, or all
+    (1, 0, 0, 0, 0, 0, 0, 0),
+    (1, 1, 1, 0, 0, 0, 0, 0),
+    (0, 0, 0, 1, 1, 0, 0, 0),
+    (0, 0, 0, 0, 0, 1, 0, 0),
+    (0, 0, 0, 0, 0, 0, 1, 1),
+    (1, 1, 1, 1, 1, 1, 1, 1),
+)
 # how large each may be, from below any noise: mm, places and edges of an office print (50 to 100 um);
 # px at the corner of the frame, of a camera file that is a mistake beyond; of variances, as a factor
-_PRINT, _CAMERA, _SCALE = (1e-4, 0.15), (1e-3, 3.0), (1.0, 1e3)
+_PRINT, _CAMERA, _SCALE = (1e-4, 0.15), (1e-3, 30.0), (1.0, 1e3)
+_SURE = 2.33  # deviations: one row in 100 that is as its files say is made wider in vain, by a factor of two (derived)
 _GRID = 16  # values, logarithmic: the closest are a factor of 1.5 apart, which a few residuals do not tell
 _COARSE = 10  # of each of three: 2.3
 _AT_ONCE = 10_000_000  # numbers: 80 MB
@@ -36,12 +51,14 @@ class Excess(Rows):
     """What N rows show beyond noise and stated uncertainties.
 
     Attributes:
-        deviation: standard deviations of the further unknowns: places (by marker two along the print and one across,
-            mm), gain (mm), camera (px); 0 where they need not be off.
+        deviation: standard deviations of the further unknowns: places (by marker `OF_MARKER`, mm), edges
+            (`OF_EDGES`, mm), camera (px); 0 where they need not be off.
         printed: the same if the print is behind it; 0 where nothing is.
         factor: of the variance of all noise, 1 where it suffices.
         misfit: `Misfit`, what is behind it.
         explained: whether the residuals then agree with all that.
+        chi2: of the residuals, under noise and stated uncertainties alone.
+        freedom: its degrees of freedom.
     """
 
     deviation: Float[Tensor, "N E"]
@@ -49,6 +66,8 @@ class Excess(Rows):
     factor: Float[Tensor, " N"]
     misfit: Int[Tensor, " N"]
     explained: Bool[Tensor, " N"]
+    chi2: Float[Tensor, " N"]
+    freedom: Int[Tensor, " N"]
 
 
 class _Modes(NamedTuple):
@@ -74,9 +93,8 @@ class _Family(NamedTuple):
 def excess_of(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) -> Excess:
     """What speaks from the information about the further unknowns, and their right side, all else being unknown."""
     modes = _modes(information, right)
-    most, explained = _of_noise(modes)
-    none = _none(right, explained)
-    row = (~explained).nonzero()[:, 0]
+    none = _none(right, modes)
+    row = (~none.explained).nonzero()[:, 0]
     if row.numel() == 0:
         return none
     some = _Modes(*(x[row] for x in modes))
@@ -84,24 +102,36 @@ def excess_of(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) 
     best = torch.stack([f.evidence for f in families], -1).argmax(-1)
     at = torch.arange(len(row), device=row.device)
     deviation, factor, chi2 = (torch.stack([f[k] for f in families], 1)[at, best] for k in (1, 2, 3))
-    return none.replaced(row, Excess(deviation, families[0].deviation, factor, best + 1, chi2 < most[row]))
+    explained = chi2 < _most(none.freedom[row])
+    return none.replaced(
+        row,
+        replace(
+            none[row],
+            deviation=deviation,
+            printed=families[0].deviation,
+            factor=factor,
+            misfit=best + 1,
+            explained=explained,
+        ),
+    )
 
 
 def no_excess(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) -> Excess:
     """The same where noise explains the residuals; elsewhere `Excess.explained` is False and nothing else is said."""
-    return _none(right, _of_noise(_modes(information, right))[1])
+    return _none(right, _modes(information, right))
 
 
-def _none(right: Tensor, explained: Tensor) -> Excess:
-    zero, nothing = torch.zeros_like(right), torch.zeros_like(explained, dtype=torch.int64)
-    return Excess(zero, zero, right.new_ones(len(right)), nothing, explained)
+def _none(right: Tensor, modes: _Modes) -> Excess:
+    chi2, freedom = modes.residual.square().sum(-1), modes.there.sum(-1)
+    zero, one = torch.zeros_like(right), torch.ones_like(chi2)
+    by_chance = chi2 < quantile(freedom.clamp_min(1), _SURE)
+    return Excess(zero, zero, one, torch.zeros_like(freedom), by_chance, chi2, freedom)
 
 
-def _of_noise(modes: _Modes) -> tuple[Tensor, Tensor]:
-    """The most that chi-squared may be by chance (N,), and whether it is less (N,) bool."""
-    chi2, freedom = modes.residual.square().sum(-1), modes.there.sum(-1).clamp_min(1)
-    most = freedom * of_chance(freedom)
-    return most, chi2 < most
+def _most(freedom: Tensor) -> Tensor:
+    """What chi-squared (N,) stays below where what explains it does."""
+    freedom = freedom.clamp_min(1)
+    return freedom * of_chance(freedom)
 
 
 def _modes(information: Tensor, right: Tensor) -> _Modes:
@@ -116,21 +146,31 @@ def _modes(information: Tensor, right: Tensor) -> _Modes:
 
 def _print(modes: _Modes) -> _Family:
     """A print bends by no less than it stretches: across it the variance of the places along it counts, and more."""
-    places, gain = modes.by[..., : -CAMERA - 1], modes.by[..., -CAMERA - 1 : -CAMERA]
+    markers, edges, _ = modes.by.tensor_split([-CAMERA - OF_EDGES, -CAMERA], -1)
+    markers = markers.unflatten(-1, (-1, OF_MARKER))
     values = _values(_PRINT, modes, _COARSE).square()
-    variances = torch.cartesian_prod(values, values, values).unbind(-1)
-    evidence, weight, chi2 = _weighed(modes, tuple(zip((places, places[..., 2::3], gain), variances, strict=True)))
-    every, bent, of_gain = ((weight * v).sum(-1, keepdim=True) for v in variances)
-    none, place = torch.zeros_like(modes.by[:, 0, -CAMERA:]), torch.cat([every, every, every + bent], -1)
-    deviation = torch.cat([place.repeat(1, places.shape[-1] // 3), of_gain, none], -1).sqrt()
+    place, bend, edge = torch.cartesian_prod(values, values, values).unbind(-1)
+    off = edge.new_tensor(_EDGES_OFF).T  # (OF_EDGES, S)
+    several = off.shape[1]
+    variances = torch.cat([torch.stack([place, bend]).repeat(1, several), (off[..., None] * edge).flatten(1)])
+    by = (markers[..., :3].flatten(-2), markers[..., 2:].flatten(-2), *edges.split(1, -1))
+    evidence, weight, chi2 = _weighed(modes, tuple(zip(by, variances, strict=True)))
+    every, bent, *of_edges = (weight @ variances.T).split(1, -1)
+    of_marker = torch.cat([every, every, every + bent, bent, bent], -1).repeat(1, markers.shape[-2])
+    none = torch.zeros_like(modes.by[:, 0, -CAMERA:])
+    deviation = torch.cat([of_marker, *of_edges, none], -1).sqrt()
     return _Family(evidence, deviation, torch.ones_like(evidence), chi2)
 
 
 def _camera(modes: _Modes) -> _Family:
+    """One thing may be off, or all: of another focal length alone the mean over all tells too little."""
     variance = _values(_CAMERA, modes).square()
-    evidence, weight, chi2 = _weighed(modes, ((modes.by[..., -CAMERA:], variance),))
+    off = variance.new_tensor(_OFF)  # (S, CAMERA)
+    every = (off[:, None] * variance[:, None]).flatten(0, 1)  # (S G, CAMERA)
+    parts = tuple((modes.by[..., k - CAMERA, None], every[:, k]) for k in range(CAMERA))
+    evidence, weight, chi2 = _weighed(modes, parts)
     deviation = torch.zeros_like(modes.by[:, 0])
-    deviation[:, -CAMERA:] = (weight * variance).sum(-1, keepdim=True).sqrt()
+    deviation[:, -CAMERA:] = (weight @ every).sqrt()
     return _Family(evidence, deviation, torch.ones_like(evidence), chi2)
 
 

@@ -11,7 +11,7 @@ from torchpose.identify import MIN_MARKERS, Identified, Scene
 from torchpose.pose.centers import raw_centers
 from torchpose.pose.evidence import Evidence
 from torchpose.pose.solutions import Solutions
-from torchpose.results import Detections, Poses, Reason, Status
+from torchpose.results import Detections, Misfit, Poses, Reason, Status
 from torchpose.rings import Rings
 
 
@@ -30,7 +30,8 @@ class Found(NamedTuple):
 
 def outcome(scene: Scene, found: Found) -> Poses:
     """Rows of every frame and target: at least one, and one for each copy that has a pose."""
-    rows, solvable, solutions = len(found.evidence), found.solvable, found.solutions
+    rows, solvable = len(found.evidence), found.solvable
+    solutions = _vouched(found.solutions, found.evidence.mask[solvable])
     device = solvable.device
     mask = found.evidence.mask.index_copy(0, solvable, solutions.mask)
     status = torch.full((rows,), int(Status.REJECTED), device=device).index_copy(0, solvable, solutions.status)
@@ -56,6 +57,7 @@ def outcome(scene: Scene, found: Found) -> Poses:
         "noise",
         "systematic",
         "place",
+        "residual_chi2",
         "rms",
         "chi2",
         "R_alt",
@@ -77,12 +79,27 @@ def outcome(scene: Scene, found: Found) -> Poses:
         status=torch.where(few, few_status, status),
         reason=torch.where(few, int(Reason.NONE), reason),
         markers=torch.where(few, proposed, mask.sum(-1)),
-        misfit=torch.zeros_like(status).index_copy(0, solvable, solutions.misfit) * awarded,
+        **{
+            name: torch.zeros_like(status).index_copy(0, solvable, getattr(solutions, name)) * awarded
+            for name in ("misfit", "freedom")
+        },
         detections=_detections(scene, found, mask),
         of_camera=found.evidence.of_camera,
         **{name: spread(getattr(solutions, name)) for name in names},
     )
     return every if rows == scene.groups else _numbered(scene, every, awarded)
+
+
+def _vouched(solutions: Solutions, identified: Tensor) -> Solutions:
+    """Solutions that left a marker out of those ``identified`` (S, M) only where the others agree.
+
+    Three centres agree with any pose: if their rings do not, it is not known which marker is wrong.
+    """
+    few = solutions.mask.sum(-1) <= MIN_MARKERS
+    left_out = (identified & ~solutions.mask).any(-1)
+    return solutions.marked(
+        solutions.ok & few & left_out & (solutions.misfit != Misfit.NONE), Status.REJECTED, Reason.RESIDUAL
+    )
 
 
 def _positive(covariance: Tensor) -> Tensor:

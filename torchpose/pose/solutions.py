@@ -11,6 +11,7 @@ from torch import Tensor
 from torchpose.geometry.rows import Rows
 from torchpose.results import Status
 
+PLACE = 5  # of a marker: x, y, z beside its place, dark edges outwards, both edges from its centre; mm
 AMBIGUOUS_CHI2 = 20.0  # contract: two poses are ambiguous where their chi-squared differs by less
 
 
@@ -32,8 +33,10 @@ class Solutions(Rows):
     status: Int[Tensor, " N"]
     reason: Int[Tensor, " N"]
     mask: Bool[Tensor, "N M"]
-    place: Float[Tensor, "N M 4"]
+    place: Float[Tensor, "N M 5"]
     misfit: Int[Tensor, " N"]
+    residual_chi2: Float[Tensor, " N"]
+    freedom: Int[Tensor, " N"]
 
     @property
     def solved(self) -> Tensor:

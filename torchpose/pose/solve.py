@@ -14,7 +14,7 @@ from torchpose.geometry.robust import CUT
 from torchpose.pose.covariance import pose_covariance
 from torchpose.pose.evidence import CENTER_RMS, Evidence, misfit_of_shapes, predicted_circles, visible
 from torchpose.pose.sizes import code_shift
-from torchpose.pose.solutions import AMBIGUOUS_CHI2, Solutions
+from torchpose.pose.solutions import AMBIGUOUS_CHI2, PLACE, Solutions
 from torchpose.results import Reason, Status
 
 _ITERATIONS = 60  # of the solver, at most: rows that have converged rest
@@ -89,7 +89,9 @@ def _solve(evidence: Evidence, rough: tuple[Tensor, Tensor], compile: bool) -> S
     one, two = ((R[:, k], t[:, k], rms[:, k]) for k in range(2))
     alone = covariance.new_zeros(len(covariance), 6, evidence.numbers)
     parts = (covariance, covariance, alone)
-    rest = (evidence.mask, one[1].new_zeros(*evidence.mask.shape, 4), torch.zeros_like(status))
+    none = torch.zeros_like(status)
+    unasked = torch.full_like(chi2[:, 0], torch.nan)
+    rest = (evidence.mask, one[1].new_zeros(*evidence.mask.shape, PLACE), none, unasked, none)
     return Solutions(one[0], one[1], *parts, one[2], chi2[:, 0], *two, chi2_alt, status, reason, *rest)
 
 
@@ -104,7 +106,7 @@ def _no_solutions(evidence: Evidence, R: Tensor, t: Tensor) -> Solutions:
     """Of no rows: frames without a target cost nothing here."""
     one, code = t.new_empty(0), evidence.mask.new_empty(0, dtype=torch.int64)
     parts = (t.new_empty(0, 6, 6), t.new_empty(0, 6, 6), t.new_empty(0, 6, evidence.numbers))
-    rest = (evidence.mask, t.new_empty(*evidence.mask.shape, 4), code)
+    rest = (evidence.mask, t.new_empty(*evidence.mask.shape, PLACE), code, one, code)
     return Solutions(R, t, *parts, one, one, R, t, one, one, code, code, *rest)
 
 

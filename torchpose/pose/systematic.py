@@ -27,7 +27,7 @@ from torchpose.geometry.rotations import plane_axes
 from torchpose.geometry.rows import Rows
 from torchpose.pose.covariance import center_jacobian, derivative
 from torchpose.pose.evidence import Evidence
-from torchpose.pose.excess import CAMERA, Excess, excess_of, no_excess
+from torchpose.pose.excess import CAMERA, OF_EDGES, OF_MARKER, Excess, excess_of, no_excess
 from torchpose.results import Misfit
 
 POSE = 6
@@ -87,10 +87,11 @@ class OnPrint(Rows):
         covariance: of everything.
         noise: the part of it that is the frame's own.
         systematic: how the pose errs with each of the L numbers, one deviation of them; the same in all frames.
-        place: where the markers sit beside their places, target frame, mm, and the edge gain, all as estimated.
+        place: where the markers sit beside their places, as `Poses.place`, as estimated.
         look: the same if the print is behind the misfit, whatever is likeliest: where to look for the markers next.
         misfit: `Misfit`, what the residuals show beyond noise and stated uncertainties; it is in the covariance.
         explained: whether the residuals agree with all that.
+        chi2, freedom: of the residuals, as in `Excess`.
         known: whether the pose is determined.
     """
 
@@ -98,29 +99,30 @@ class OnPrint(Rows):
     covariance: Float[Tensor, "N 6 6"]
     noise: Float[Tensor, "N 6 6"]
     systematic: Float[Tensor, "N 6 L"]
-    place: Float[Tensor, "N M 4"]
-    look: Float[Tensor, "N M 4"]
+    place: Float[Tensor, "N M 5"]
+    look: Float[Tensor, "N M 5"]
     misfit: Int[Tensor, " N"]
     explained: Bool[Tensor, " N"]
+    chi2: Float[Tensor, " N"]
+    freedom: Int[Tensor, " N"]
     known: Bool[Tensor, " N"]
 
 
 def on_print(
-    normals: MarkerNormals, setting: Setting, moved: Float[Tensor, "N M 4"], *, estimate: bool = True
+    normals: MarkerNormals, setting: Setting, moved: Float[Tensor, "N M 5"], *, estimate: bool = True
 ) -> OnPrint:
     """The joint problem of N rows.
 
     Args:
         normals: at the poses of the setting.
         setting: the rows.
-        moved: how the markers were displaced already (target frame, mm), and the edge gain, mm, when the normal
-            equations were formed.
+        moved: where the markers were looked for beside their places, when the normal equations were formed.
         estimate: find poses; without, those that noise alone weighs stay, and their covariance counts what the rest
             does to them.
     """
     R, n = setting.R, normals.right.shape[-1]
     aside = (R[:, None] @ moved[..., :3, None])[..., 0]
-    back = torch.cat([aside, torch.zeros_like(aside), moved[..., 3:]], -1)
+    back = torch.cat([aside, torch.zeros_like(aside), moved[..., 3:4]], -1) + moved[..., 4:] * _by_size(setting)
     right = normals.right + (normals.information @ _among(back[..., None], n))[..., 0]
     normals = MarkerNormals(normals.information, right)
     own = torch.eye(n, dtype=right.dtype, device=right.device)[:, :-1].expand(*right.shape[:2], n, n - 1)
@@ -132,24 +134,33 @@ def on_print(
     printed = torch.cat([by_target, beside[..., :-CAMERA]], -1) if wide else by_target
     lens = torch.cat([by_camera, beside[..., -CAMERA:]], -1) if wide else by_camera
     joint = _Joint.of(normals.over(excess.factor), own, _among(printed, n), _among(lens, n), estimate)
-    place = look = _places(printed, joint, R)
+    place = look = _places(printed, joint, R, excess.deviation)
     other = (excess.misfit > Misfit.PRINT).nonzero()[:, 0]
     if other.numel():
         # a fit that looks for the markers where they are not may only seem to scatter
         if_printed = torch.cat([by_target, (further * excess.printed[:, None, None])[..., :-CAMERA]], -1)[other]
         alone = _Joint.of(normals[other], own[other], _among(if_printed, n), _among(lens[other], n), True)
-        look = place.index_copy(0, other, _places(if_printed, alone, R[other]))
+        look = place.index_copy(0, other, _places(if_printed, alone, R[other], excess.printed[other]))
     sure = joint.known & (torch.linalg.cholesky_ex(joint.covariance)[1] == 0)
     parts = (joint.by_camera[..., : by_camera.shape[-1]], joint.by_print[..., : by_target.shape[-1]])
     common = torch.cat(parts, -1)
-    return OnPrint(
-        joint.step, joint.covariance, joint.noise, common, place, look, excess.misfit, excess.explained, sure
-    )
+    found = (joint.step, joint.covariance, joint.noise, common, place, look)
+    return OnPrint(*found, excess.misfit, excess.explained, excess.chi2, excess.freedom, sure)
 
 
-def _places(printed: Tensor, joint: _Joint, R: Tensor) -> Tensor:
-    """Places (N, M, 4) of markers moved by the numbers of a solution, by their motions (N, M, 7, L)."""
+def _places(printed: Tensor, joint: _Joint, R: Tensor, deviation: Tensor) -> Tensor:
+    """Places (N, M, 5) of markers moved by the numbers of a solution, by their motions (N, M, 7, L).
+
+    Where these go beyond what is stated, the last ones are those of edges, see `excess.OF_EDGES`.
+    """
     by = torch.cat([R.mT[:, None] @ printed[:, :, :3], printed[:, :, POSE:]], 2)
+    by = torch.nn.functional.pad(by, (0, 0, 0, 1))
+    if bool((deviation > 0).any()):
+        gain, bloom, size = deviation[:, -CAMERA - OF_EDGES : -CAMERA].T
+        edges = by[..., -OF_EDGES:].zero_()
+        edges[:, :, POSE - 3], edges[:, :, POSE - 2] = (
+            torch.stack(parts, -1)[:, None] for parts in ((gain, bloom, 0 * size), (0 * gain, 0 * bloom, size))
+        )
     return (by @ joint.numbers[:, None, :, None])[..., 0]
 
 
@@ -254,30 +265,67 @@ def _by_camera(setting: Setting) -> Tensor:
 
 
 def _camera_shifts(setting: Setting) -> Tensor:
-    """The same of focal length, principal point and radial distortion, each off by 1 px at the frame's corner."""
+    """The same of what a camera may be off by (`excess.CAMERA`), each by 1 px at the frame's corner."""
     camera = setting.camera
     focal = camera.matrix.diagonal()[:2]
     reach = 0.5 * math.hypot(camera.width, camera.height) / float(focal.mean())
 
     def by(xy: Tensor) -> Tensor:
         eye = torch.eye(2, dtype=xy.dtype, device=xy.device).expand(*xy.shape, 2)
-        radial = xy / reach
-        cubic = radial * (xy.square().sum(-1, keepdim=True) / reach**2)
-        return torch.cat([radial[..., None], eye, cubic[..., None]], -1)
+        at = xy / reach
+        x, y = at.unbind(-1)
+        square = at.square().sum(-1)
+        linear = torch.stack([at, torch.stack([x, -y], -1), torch.stack([y, x], -1)], -1)
+        tangential = square[..., None, None] * eye + 2 * at[..., :, None] * at[..., None, :]
+        bent = torch.cat([(square[..., None] * at)[..., None], tangential / 3], -1)
+        return torch.cat([linear, eye, bent], -1)
 
     return _as_motions(setting, by)
 
 
 def _print_shifts(setting: Setting) -> Tensor:
-    """The same (N, M, 7, 3 M + 1) of each marker's place, two along the print and one across, and of the gain, 1 mm."""
-    rows, markers = setting.evidence.mask.shape
-    normal = setting.evidence.normals
-    moved = setting.R[:, None] @ torch.stack([*plane_axes(normal), normal], -1)
-    each = torch.eye(markers, dtype=normal.dtype, device=normal.device)
-    columns = normal.new_zeros(rows, markers, POSE + 1, 3 * markers + 1)
-    columns[:, :, :3, :-1] = (each[:, None, :, None] * moved[:, :, :, None]).flatten(-2)
-    columns[:, :, -1, -1] = 1
+    """The same (N, M, 7, E) of the numbers of a print in `excess`, by 1 mm each."""
+    evidence, R = setting.evidence, setting.R
+    rows, markers = evidence.mask.shape
+    normal, seen = evidence.normals, evidence.mask[..., None].to(R)
+    moved = R[:, None] @ torch.stack([*plane_axes(normal), normal], -1)
+    away = (evidence.points - (seen * evidence.points).sum(1, keepdim=True) / seen.sum(1, keepdim=True)) * seen
+    reach = torch.linalg.vector_norm(away, dim=-1).amax(-1)[:, None, None, None]
+    turn = 2 * moved[..., :2] / reach  # of a plate that is bent by 1 mm at its rim
+    arm = (R[:, None] @ evidence.points[..., None]).expand_as(turn)
+    own = torch.cat([moved, torch.linalg.cross(arm, turn, dim=-2)], -1)
+    own = torch.cat([own, torch.nn.functional.pad(turn, (3, 0))], -2)
+    each = torch.eye(markers, dtype=R.dtype, device=R.device)
+    own = (each[:, None, :, None] * own[:, :, :, None]).flatten(-2)
+    columns = R.new_zeros(rows, markers, POSE + 1, OF_MARKER * markers + OF_EDGES)
+    columns[:, :, :POSE, :-OF_EDGES] = own
+    columns[:, :, -1, -3] = 1
+    columns[..., -2] = _by_bloom(setting)
+    columns[..., -1] = _by_size(setting)
     return columns
+
+
+def _by_bloom(setting: Setting) -> Tensor:
+    """Motions (N, M, 7) that do to rings what dark edges do that lie further outwards by what 1 mm is at the target."""
+    if not setting.on_rims:
+        return setting.t.new_zeros(*setting.evidence.mask.shape, POSE + 1)
+    jacobian, _, weight = _rim_jacobian(setting.evidence, setting.R, setting.t)
+    across = torch.nn.functional.normalize(weight @ jacobian[..., -1:], dim=-2)
+    mm = setting.evidence.matrix.diagonal()[:2].mean() / setting.t[:, 2]
+    markers, weighted = setting.evidence.mask.shape[1], jacobian.mT @ weight
+    right = _by_marker(weighted @ across, markers) * mm[:, None, None, None]
+    moved = solve_scaled(_by_marker(weighted @ jacobian, markers), right)[..., 0]
+    return torch.where(setting.evidence.mask[..., None], moved, 0.0)
+
+
+def _by_size(setting: Setting) -> Tensor:
+    """Motions (N, M, 7) that do to a ring what both its edges do 1 mm further out: it is nearer, with less gain."""
+    evidence = setting.evidence
+    outer, inner = evidence.radii.unbind(-1)
+    x = (setting.R[:, None] @ evidence.points[..., None])[..., 0] + setting.t[:, None]
+    nearer = -2 / (outer + inner)[..., None] * x
+    less = -evidence.polarity[:, None] * (outer - inner) / (outer + inner)
+    return torch.cat([nearer, torch.zeros_like(x), less[..., None]], -1)
 
 
 def _as_motions(setting: Setting, by: Callable[[Tensor], Tensor]) -> Tensor:

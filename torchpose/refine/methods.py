@@ -11,6 +11,7 @@ from torchpose.camera import Camera
 from torchpose.geometry.least_squares import Pose
 from torchpose.pose import (
     CENTER_RMS,
+    PLACE,
     Evidence,
     OnPrint,
     Setting,
@@ -20,6 +21,7 @@ from torchpose.pose import (
     common_center,
     compensate,
     on_print,
+    size_beyond,
 )
 from torchpose.refine.centers import refine_centers
 from torchpose.refine.decide import decide, decide_on_grey
@@ -87,6 +89,9 @@ def on_frames(refine: Callable[..., Refined]) -> Step:
             now, joint, held, doubt = _refined(
                 partial(refine, thorough=number > 0), *some, start[active], place[active]
             )
+            if number > 0:
+                # markers looked for where they are leave less to noise: if not, they are elsewhere
+                held &= torch.logdet(now.noise) < torch.logdet(found.noise[active])
             better = held.nonzero()[:, 0]
             found, good = found.replaced(active[better], now[better]), good.index_fill(0, active[better], True)
             beside = (joint.look - place[active]).abs().amax((-1, -2)) * seen.matrix[0, 0] / now.t[:, 2]
@@ -103,8 +108,9 @@ def on_frames(refine: Callable[..., Refined]) -> Step:
 
 
 def _start(rows: Solutions, seen: Evidence, camera: Camera) -> tuple[Pose, Tensor]:
-    """Poses, and places (N, M, 4) of markers and edges beside those of the file, as `OnPrint.look`, by the centres."""
-    start, place = Pose(rows.R, rows.t), -_beyond(rows.t.new_zeros(*seen.mask.shape, 4), seen)
+    """Poses, and places (N, M, 5) of markers beside those of the file, as `OnPrint.look`, by the ellipses."""
+    start, place = Pose(rows.R, rows.t), -_beyond(rows.t.new_zeros(*seen.mask.shape, PLACE), seen)
+    place = torch.cat([place[..., :4], size_beyond(seen, rows.R, rows.t)[:, None, None].expand_as(place[..., 4:])], -1)
     off = (rows.rms > _BESIDE).nonzero()[:, 0]
     if off.numel() == 0:
         return start, place
@@ -114,10 +120,10 @@ def _start(rows: Solutions, seen: Evidence, camera: Camera) -> tuple[Pose, Tenso
 
 
 def _beyond(place: Tensor, seen: Evidence) -> Tensor:
-    """Places (N, M, 4) with the gain beyond that of the radii in sight."""
+    """Places (N, M, 5) with the gain beyond that of the radii in sight."""
     if seen.gain is None:
         return place
-    return torch.cat([place[..., :3], place[..., 3:] - seen.gain[:, None, None]], -1)
+    return torch.cat([place[..., :3], place[..., 3:4] - seen.gain[:, None, None], place[..., 4:]], -1)
 
 
 def _refined(
@@ -143,7 +149,7 @@ def _refined(
 def _by_centers(rows: Solutions, seen: Evidence, camera: Camera) -> tuple[Solutions, OnPrint]:
     """Rows refined on the centres of the ellipses, then on the print."""
     refined = refine_centers(seen, rows.R, rows.t)
-    nowhere = rows.t.new_zeros(*seen.mask.shape, 4)
+    nowhere = rows.t.new_zeros(*seen.mask.shape, PLACE)
     joint = on_print(refined.normals, Setting(seen, refined.R, refined.t, camera, False), nowhere)
     found = _of_joint(rows, seen, Pose(refined.R, refined.t), joint)
     return found.where(joint.known & found.t.isfinite().all(-1), rows), joint
@@ -161,6 +167,8 @@ def _of_joint(rows: Solutions, seen: Evidence, pose: Pose, joint: OnPrint) -> So
         systematic=joint.systematic,
         place=torch.where(seen.mask[..., None], joint.place, torch.nan),
         misfit=joint.misfit,
+        residual_chi2=joint.chi2,
+        freedom=joint.freedom,
         rms=center_rms(seen, pose.R, pose.t),
     )
     return better.marked(joint.known & ~joint.explained & better.ok, Status.REJECTED, Reason.RESIDUAL)
@@ -173,7 +181,7 @@ def _on_centers(rows: Solutions, seen: Evidence, sight: Sight) -> Solutions:
 
 def _as_they_are(rows: Solutions, seen: Evidence, sight: Sight) -> Solutions:
     """The poses of the compensated centres, with what print and camera do to them."""
-    nowhere, setting = rows.t.new_zeros(*seen.mask.shape, 4), Setting(seen, rows.R, rows.t, sight.camera, False)
+    nowhere, setting = rows.t.new_zeros(*seen.mask.shape, PLACE), Setting(seen, rows.R, rows.t, sight.camera, False)
     joint = on_print(center_normals(seen, rows.R, rows.t), setting, nowhere, estimate=False)
     return _of_joint(rows, seen, Pose(rows.R, rows.t), joint).where(joint.known, rows)
 

@@ -81,9 +81,9 @@ class Sight(Rows):
         median = torch.where(self.mask[..., None], self.blur, torch.nan).nanmedian(1).values
         return torch.where(median.isnan(), blurs.isotropic(start), median)
 
-    def displaced(self, by: Float[Tensor, "N M 4"]) -> Self:
-        """The same rows with their markers moved in the target's frame, mm, and all dark edges outwards, mm."""
-        grown = (self.polarity * by[..., 3])[..., None] * by.new_tensor([1.0, -1.0])
+    def displaced(self, by: Float[Tensor, "N M 5"]) -> Self:
+        """The same rows with places of their markers beside those they have, as `Poses.place`."""
+        grown = (self.polarity * by[..., 3])[..., None] * by.new_tensor([1.0, -1.0]) + by[..., 4:]
         return replace(self, centers=self.centers + by[..., :3], radii=self.radii + grown)
 
     def reduced(self, factor: int) -> Sight:
