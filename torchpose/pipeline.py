@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from torchpose.camera import LINEAR, Camera, Tone
 from torchpose.camera.model import Model
+from torchpose.camera.plausible import check_intrinsics
 from torchpose.detect import Candidates, Wanted, find_candidates, find_coarse
 from torchpose.errors import ConfigError, FrameError
 from torchpose.geometry import blur as blurs
@@ -68,8 +69,8 @@ class PoseEstimator(nn.Module):
         compile: solve small problems in compiled loops (`torchpose.kernels`), on the CPU; the first call takes seconds.
 
     Raises:
-        ConfigError: no target, two of one name, or two that cannot be told apart; ``instances`` below 1; an unknown
-            method; ``compile`` without a C++ compiler.
+        ConfigError: intrinsics that no camera of such frames has; no target, two of one name, or two that cannot be
+            told apart; ``instances`` below 1; an unknown method; ``compile`` without a C++ compiler.
     """
 
     made_for: Tensor
@@ -86,6 +87,7 @@ class PoseEstimator(nn.Module):
         compile: bool = False,
     ) -> None:
         super().__init__()
+        check_intrinsics(camera.matrix, camera.width, camera.height, camera.model)
         self.camera = camera
         self.targets = (target,) if isinstance(target, Target) else tuple(target)
         _check_targets(self.targets)

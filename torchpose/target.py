@@ -16,6 +16,7 @@ from torch import Tensor
 from torchpose.config import format_list, format_number, read_yaml, validate, within, write_text
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
+from torchpose.geometry.covariance import covariance_fault
 
 MIN_RATIO_GAP = 0.05  # smallest difference between the inner/outer ratios of two markers that can be told apart
 RATIO_RANGE = (0.15, 0.9)  # inner/outer: a smaller hole or a thinner ring is not readable
@@ -393,10 +394,8 @@ def _check_covariance(covariance: Tensor, size: int) -> None:
     scale = covariance.diagonal().abs().max().clamp_min(1e-30)
     if bool(scale > MAX_DEVIATION**2):
         raise ConfigError(f"{field}: has a variance of {float(scale):.3g} mm^2; write it in mm^2, up to 1e6")
-    if bool(((covariance - covariance.mT).abs() > 1e-6 * scale).any()):
-        raise ConfigError(f"{field}: is not symmetric; write the whole table")
-    if bool(torch.linalg.eigvalsh(covariance)[0] < -1e-9 * scale):
-        raise ConfigError(f"{field}: has a negative variance in some direction; it is no covariance")
+    if fault := covariance_fault(covariance):
+        raise ConfigError(f"{field}: {fault}; write the whole table as it was measured")
 
 
 def _floats(values: Any) -> Tensor:

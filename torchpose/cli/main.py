@@ -2,6 +2,7 @@
 
 import sys
 import traceback
+import warnings
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -61,9 +62,11 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """
     command = typer.main.get_command(app)
     try:
-        code = command.main(
-            args=None if arguments is None else list(arguments), prog_name="torchpose", standalone_mode=False
-        )
+        with warnings.catch_warnings():
+            warnings.showwarning = _say
+            code = command.main(
+                args=None if arguments is None else list(arguments), prog_name="torchpose", standalone_mode=False
+            )
     except TorchposeError as error:
         _fail(str(error))
     except (KeyboardInterrupt, typer.Abort):
@@ -75,6 +78,11 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         traceback.print_exc()
         _fail(f"internal: {type(error).__name__}: {error}; please report it with the lines above", INTERNAL_ERROR)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _say(message: Warning | str, *_where: object) -> None:
+    """A warning in one line: where in the program it was raised helps no user."""
+    typer.echo(f"torchpose: warning: {message}", err=True)
 
 
 def _fail_usage(message: str, arguments: Sequence[str]) -> NoReturn:

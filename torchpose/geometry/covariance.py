@@ -1,0 +1,27 @@
+"""Whether a table of numbers can be a covariance."""
+
+import torch
+from torch import Tensor
+
+# Of a correlation, for each row: files that keep single precision, or its seven digits, are rounded by this
+# (derived: an eigenvalue moves by no more than the size of the table times the error of an entry)
+_ROUNDING = 2.0**-23
+
+
+def covariance_fault(covariance: Tensor) -> str:
+    """What forbids that a square table (n, n) of numbers is a covariance; empty where nothing does.
+
+    Units differ by orders between the rows: each counts in its own standard deviation.
+    """
+    slack = len(covariance) * _ROUNDING
+    variance = covariance.diagonal()
+    largest = covariance.abs().max().clamp_min(torch.finfo(covariance.dtype).tiny)
+    scale = torch.where(variance > 0, variance, largest).sqrt()
+    scaled = covariance / scale[:, None] / scale
+    if bool(((scaled - scaled.mT).abs() > slack).any()):
+        return "is not symmetric"
+    # a correlation beyond one is looked for first: what is not finite has no eigenvalues
+    beyond = (variance < 0).any() | ~(scaled.abs() <= 1 + slack).all()
+    if bool(beyond) or bool(torch.linalg.eigvalsh(scaled)[0] < -slack):
+        return "has a negative eigenvalue"
+    return ""
