@@ -6,8 +6,8 @@ from torch import Tensor
 from torchpose.camera.model import Camera, Model
 from torchpose.errors import ConfigError
 
-# Of the frame's farthest corner, in focal lengths. Rectilinear lenses see up to 135 degrees across the diagonal, tan 67.5
-# = 2.4, and barrel distortion draws corners nearer (convention: with some air)
+# Of the frame's farthest corner, in focal lengths. Rectilinear lenses see up to 135 degrees across the diagonal, and
+# barrel distortion draws corners nearer (convention: tan 67.5 degrees, 2.4, and some air)
 _FARTHEST_CORNER: dict[Model, float] = {"brown_conrady": 3.0, "kannala_brandt": 6.0}
 # ... a fisheye of 220 degrees whose circle fills the short side of a frame of 16:9 has 1.9 x 2.04 (derived), and the
 # polynomial may bend that
@@ -80,8 +80,8 @@ def check_pinhole(matrix: Tensor, pixels: Tensor, seen: Tensor | None = None) ->
     radius = radius[counts]
     if len(radius) and bool((median := radius.median()) > _FARTHEST_POINTS):
         raise ConfigError(
-            f"camera: half of the image points lie {float(median):.3g} focal lengths and more off the axis, an impossible "
-            "field of view; give the matrix in the unit of image_points, px as a rule"
+            f"camera: half of the image points lie {float(median):.3g} focal lengths and more off the axis, an"
+            " impossible field of view; give the matrix in the unit of image_points, px as a rule"
         )
 
 
@@ -91,5 +91,8 @@ def share_without_ray(camera: Camera) -> float:
         return 0.0
     u, v = (torch.linspace(0, size - 1, _GRID, dtype=torch.float64) for size in (camera.width, camera.height))
     grid = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
+    weight = torch.ones(_GRID, dtype=torch.float64)
+    weight[[0, -1]] = 0.5  # the rim stands for half as much of the frame
     with torch.no_grad():
-        return float((~camera.undistort_points(grid).isfinite().all(-1)).double().mean())
+        without = ~camera.undistort_points(grid).isfinite().all(-1)
+    return float(weight @ without.double() @ weight) / (_GRID - 1) ** 2

@@ -49,9 +49,9 @@ def load(path: str | os.PathLike[str]) -> Camera:
         check_intrinsics(camera.matrix, camera.width, camera.height, camera.model)
     if share := share_without_ray(camera):
         warnings.warn(
-            f"{name}: distortion_coefficients: no ray reaches {100 * share:.2g} % of the frame, beyond the fold or a pole "
-            "of the lens model; markers there are not measured: calibrate with views out to the corners, or with fewer "
-            "coefficients",
+            f"{name}: distortion_coefficients: no ray reaches {100 * share:.2g} % of the frame, beyond the fold or a"
+            " pole of the lens model; markers there are not measured: calibrate with views out to the corners, or with fewer"
+            " coefficients",
             CameraWarning,
             stacklevel=2,
         )

@@ -63,7 +63,7 @@ class Statement(NamedTuple):
 
     field: str
     value: Any
-    model: Model | None | str
+    model: Model | str | None
 
 
 def refusal(field: str, value: Any) -> ConfigError:
@@ -72,7 +72,7 @@ def refusal(field: str, value: Any) -> ConfigError:
     return ConfigError(f"{field}: {shown(value)} is not supported; use one of {', '.join(MODELS)}{doubt}")
 
 
-def named(value: Any) -> Model | None | str:
+def named(value: Any) -> Model | str | None:
     """The model that a value names."""
     if not isinstance(value, str):
         return "unknown"
@@ -101,7 +101,7 @@ def lens_model(
             raise refusal(one.field, one.value)
     if other := next((s for s in sure[1:] if s.model != sure[0].model), None):
         raise ConfigError(
-            f"{other.field}: {shown(other.value)} contradicts {sure[0].field}, {shown(sure[0].value)}; keep the right one"
+            f"{other.field}: {shown(other.value)} contradicts {sure[0].field}, {shown(sure[0].value)}; keep one of them"
         )
     model = sure[0].model if sure else implied
     if implied is not None and model != implied:
@@ -163,7 +163,7 @@ def _words(key: str) -> list[str]:
     return re.split(r"[^a-z0-9]+", re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", key).lower())
 
 
-def _said(key: str, value: Any) -> Model | None | str:
+def _said(key: str, value: Any) -> Model | str | None:
     """What the value under a key says, which may be a flag such as `is_fisheye`."""
     flag = (
         value

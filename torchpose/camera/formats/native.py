@@ -76,8 +76,8 @@ def _matrix(value: Any) -> Tensor:
 def _window(data: Mapping[str, Any], camera: Camera) -> Camera:
     """The camera of the frames that ROS's `roi` and `binning` leave of the calibrated ones (sensor_msgs/CameraInfo).
 
-    The region is in pixels of the whole frame; binning then makes one pixel of a block of them, whose centre is the mean
-    of theirs: u' = (u - x_offset - (b - 1) / 2) / b.
+    The region is in pixels of the whole frame; binning then makes one pixel of a block of them, whose centre is the
+    mean of theirs: u' = (u - x_offset - (b - 1) / 2) / b.
     """
     bins = [int(number(data.get(name) or 0, name)) for name in ("binning_x", "binning_y")]
     if any(b < 0 for b in bins):
@@ -105,7 +105,7 @@ def _window(data: Mapping[str, Any], camera: Camera) -> Camera:
     covariance = camera.covariance
     if covariance is not None:
         scale = torch.ones(len(covariance), dtype=covariance.dtype)
-        scale[:4] = 1 / torch.tensor([bx, by, bx, by])
+        scale[:4] = 1 / torch.tensor([bx, by, bx, by], dtype=covariance.dtype)
         covariance = scale[:, None] * covariance * scale
     return Camera(
         size(int(width) // bx, "roi.width"),
@@ -157,7 +157,7 @@ def read_ini(lines: list[str]) -> Camera:
     count = sum(map(len, data["distortion_coefficients"]))
     if count not in (5, 8):
         raise ConfigError(
-            f"distortion: {count} coefficients; an .ini has 5 (plumb_bob) or 8 (rational_polynomial): write a YAML file "
-            "with distortion_model for another lens"
+            f"distortion: {count} coefficients; an .ini has 5 (plumb_bob) or 8 (rational_polynomial): write a YAML file"
+            " with distortion_model for another lens"
         )
     return read(data, "")

@@ -10,8 +10,8 @@ from torchpose.camera.formats.models import lens_model
 from torchpose.camera.model import Camera, Model
 from torchpose.errors import ConfigError
 
-# librealsense's rs2_distortion. The modified and the inverse Brown-Conrady are other functions than OpenCV's, f-theta is
-# an other lens: they are read where all coefficients are zero, as those of D400 are
+# librealsense's rs2_distortion. The modified and the inverse Brown-Conrady are other functions than OpenCV's, f-theta
+# is another lens: they are read where all coefficients are zero, as those of D400 are
 REALSENSE_MODELS: dict[str, Model | None] = {
     "none": None,
     "brown_conrady": "brown_conrady",
@@ -47,9 +47,8 @@ def realsense(data: Mapping[str, Any]) -> Camera:
                 f"model: {shown(name)} with coefficients other than 0 is not supported; use brown_conrady"
             )
         distortion, model = distortion[:0], "brown_conrady"
-    elif model == "kannala_brandt":
-        if len(distortion) == 5 and float(distortion[4]) == 0:
-            distortion = distortion[:4]
+    elif model == "kannala_brandt" and len(distortion) == 5:
+        distortion = distortion[:4]  # the fifth has no meaning
     lens_model(data, {"model", "coeffs"}, implied=model)
     fx, fy, cx, cy = listed(data, ("fx", "fy", "ppx", "ppy"))
     return Camera(
