@@ -41,8 +41,11 @@ def storage(suffix: str, names: tuple[str, str, str, str], distortion: np.ndarra
     """What OpenCV writes."""
     file = cv2.FileStorage(suffix, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     file.write("calibration_time", "Mon 1 Jan 2024")
-    for name, value in zip(names, (640, 480, np.array([[F[0], 0, C[0]], [0, F[1], C[1]], [0, 0, 1]]), distortion)):
-        file.write(name, value)
+    width, height, matrix, coefficients = names
+    file.write(width, 640)
+    file.write(height, 480)
+    file.write(matrix, np.array([[F[0], 0, C[0]], [0, F[1], C[1]], [0, 0, 1]]))
+    file.write(coefficients, distortion)
     file.write("per_view", np.array([1.5, math.nan]))
     return str(file.releaseAndGetString())
 
@@ -174,7 +177,7 @@ def metashape_fisheye() -> np.ndarray:
 
 
 def nerf(**changes: object) -> str:
-    data = {"w": 640, "h": 480, "fl_x": F[0], "fl_y": F[1], "cx": C[0], "cy": C[1], "aabb_scale": 16}
+    data: dict[str, object] = {"w": 640, "h": 480, "fl_x": F[0], "fl_y": F[1], "cx": C[0], "cy": C[1], "aabb_scale": 16}
     data |= dict(zip(("k1", "k2", "p1", "p2"), D, strict=False)) | {"frames": [{"file_path": "a.png"}]} | changes
     return json.dumps({key: value for key, value in data.items() if value is not None})
 
@@ -250,7 +253,10 @@ REFUSED = {
     "mrcal count": (mrcal("OPENCV5", D[:4]), "intrinsics: 8 numbers; LENSMODEL_OPENCV5 has 9"),
     "mrcal thin prism": (mrcal("OPENCV12", (*RATIONAL, 0, 0, 0, 1e-3)), "distortion_coefficients: thin-prism "),
     "mrcal code": (MRCAL.replace("0.02", "exit(1)"), "file: is no .cameramodel; "),
-    "Basalt": (basalt("ds", {"xi": -0.2, "alpha": 0.6}), r"value0\.intrinsics\.0\.camera_type: 'ds' is not supported; "),
+    "Basalt": (
+        basalt("ds", {"xi": -0.2, "alpha": 0.6}),
+        r"value0\.intrinsics\.0\.camera_type: 'ds' is not supported; ",
+    ),
     "Basalt missing": (basalt("kb4", {"k1": 0.1}), r"value0\.intrinsics\.0\.intrinsics\.k2: is missing; add it"),
     "Basalt two": (json.dumps(TWO), "file: holds 2 cameras; append one of #0, #1 to the name"),
     "ORB type": (orb("Camera1", "Mei", RADTAN), "Camera.type: 'Mei' is not supported; use PinHole, "),
@@ -271,13 +277,19 @@ REFUSED = {
     "entities": ('<!DOCTYPE a [<!ENTITY b "c">]><calibration/>', "file: declares a document type; "),
     "broken XML": ("<calibration><f></calibration>", "file: is not XML "),
     "OpenCV XML twice": ("<opencv_storage><width>1</width><width>2</width></opencv_storage>", "width: given twice; "),
-    "NeRF model": (nerf(camera_model="EQUIRECTANGULAR"), "camera_model: 'EQUIRECTANGULAR' is not supported; use SIMPLE_"),
+    "NeRF model": (
+        nerf(camera_model="EQUIRECTANGULAR"),
+        "camera_model: 'EQUIRECTANGULAR' is not supported; use SIMPLE_",
+    ),
     "NeRF k4": (nerf(k4=0.1), "k4: is no coefficient of this lens; it has k1 k2 p1 p2 k3"),
     "NeRF fisheye p1": (nerf(is_fisheye=True), "p1: is no coefficient of this lens; it has k1 k2 k3 k4"),
     "NeRF contradicts": (nerf(camera_model="OPENCV", is_fisheye=True), "is_fisheye: True contradicts the format, "),
     "NeRF frames": (nerf(frames=[{"fl_x": 600}]), "frames: have intrinsics of their own; "),
     "NeRF size": (nerf(w=None), "w: is None; give the frame size"),
-    "RealSense inverse": (realsense("distortion.inverse_brown_conrady", D), "model: 'distortion.inverse_brown_conrady' with "),
+    "RealSense inverse": (
+        realsense("distortion.inverse_brown_conrady", D),
+        "model: 'distortion.inverse_brown_conrady' with ",
+    ),
     "RealSense number": (realsense(4, D), "model: 4 is not supported; use none, brown_conrady, "),
     "Open3D rows": (
         json.dumps(OPEN3D | {"intrinsic_matrix": [650.0, 0, 322.5, 0, 660.0, 238.0, 0, 0, 1]}),
@@ -321,10 +333,16 @@ INFO = {
 @pytest.mark.parametrize(
     ("window", "size"),
     [
-        ({"binning_x": 0, "binning_y": 0, "roi": dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0)}, (640, 480)),
+        (
+            {"binning_x": 0, "binning_y": 0, "roi": dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0)},
+            (640, 480),
+        ),
         ({"binning_x": 2, "binning_y": 3}, (320, 160)),
         ({"roi": {"x_offset": 101, "y_offset": 50, "width": 300, "height": 200, "do_rectify": True}}, (300, 200)),
-        ({"binning_x": 2, "binning_y": 2, "roi": {"x_offset": 100, "y_offset": 50, "width": 301, "height": 200}}, (150, 100)),
+        (
+            {"binning_x": 2, "binning_y": 2, "roi": {"x_offset": 100, "y_offset": 50, "width": 301, "height": 200}},
+            (150, 100),
+        ),
     ],
 )
 def test_binning_and_region_of_camera_info(tmp_path: Path, window: dict[str, object], size: tuple[int, int]) -> None:
@@ -352,7 +370,10 @@ def test_binning_and_region_of_camera_info(tmp_path: Path, window: dict[str, obj
 @pytest.mark.parametrize(
     ("window", "message"),
     [
-        ({"roi": {"x_offset": 600, "y_offset": 0, "width": 100, "height": 100}}, "roi: 100 x 100 px at 600, 0 are not within "),
+        (
+            {"roi": {"x_offset": 600, "y_offset": 0, "width": 100, "height": 100}},
+            "roi: 100 x 100 px at 600, 0 are not within ",
+        ),
         ({"roi": {"x_offset": 10}}, "roi: 0 x 0 px at 10, 0 are not within 640 x 480 px; "),
         ({"roi": [1, 2]}, "roi: is a list of 2; write x_offset, "),
         ({"binning_x": -1}, "binning_x: is -1, binning_y 0; "),

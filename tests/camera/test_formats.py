@@ -42,6 +42,7 @@ def load(tmp_path: Path, text: str, name: str = "cam.yaml", selector: str = "") 
 @pytest.mark.parametrize("covariance", [None, COVARIANCE.double()])
 @pytest.mark.parametrize("distortion", [[], BROWN, [*BROWN, 0.1], [*BROWN, 0.1, 0.2, 0.3, -0.4]])
 @pytest.mark.parametrize("format", ["opencv", "json", "ros", "kalibr", "colmap"])
+@pytest.mark.filterwarnings("ignore::torchpose.camera.formats.CameraWarning")
 def test_brown_conrady_round_trip(
     tmp_path: Path, format: str, distortion: list[float], covariance: torch.Tensor | None
 ) -> None:
@@ -358,6 +359,14 @@ TRAPS = {
     "kalibr distortion": (
         replaced("radtan", "fov", KALIBR).split("cam1:")[0],
         "cam0.distortion_model: 'fov' is not supported; ",
+    ),
+    "kalibr none": (
+        replaced("radtan", "none", KALIBR).split("cam1:")[0],
+        "cam0.distortion_model: is 'none', and the coefficients are not zero; ",
+    ),
+    "kalibr omni": (
+        replaced("  rostopic", "  xi: 1.2\n  rostopic", KALIBR).split("cam1:")[0],
+        "cam0.xi: 1.2 is not supported; use one of ",
     ),
     "kalibr resolution": (replaced("[640, 480]", "640", KALIBR).split("cam1:")[0], "cam0.resolution: is 640; give "),
     "kalibr missing": (KALIBR.split("  resolution")[0], "cam0.resolution: is missing; add it"),

@@ -6,9 +6,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.polynomial import Polynomial
 
-# d log(distorted radius) / d log(radius). No polynomial that only grows exceeds its degree, 7; near a pole it has no
-# bound (derived)
-_STEEPEST = 7.0
+# d log(distorted radius) / d log(radius) of a model that has a pole. A pincushion by k1 alone stays below 3 however
+# strong it is, near a pole there is no bound (derived)
+_STEEPEST = 3.0
 _HALVINGS = 80  # of an interval: more than the digits of a float64
 
 

@@ -80,7 +80,14 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     sys.exit(code if isinstance(code, int) else 0)
 
 
-def _say(message: Warning | str, *_where: object) -> None:
+def _say(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: object = None,
+    line: object = None,
+) -> None:
     """A warning in one line: where in the program it was raised helps no user."""
     typer.echo(f"torchpose: warning: {message}", err=True)
 

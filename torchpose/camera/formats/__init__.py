@@ -8,6 +8,7 @@ import os
 import re
 import warnings
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -50,8 +51,8 @@ def load(path: str | os.PathLike[str]) -> Camera:
     if share := share_without_ray(camera):
         warnings.warn(
             f"{name}: distortion_coefficients: no ray reaches {100 * share:.2g} % of the frame, beyond the fold or a"
-            " pole of the lens model; markers there are not measured: calibrate with views out to the corners, or with fewer"
-            " coefficients",
+            " pole of the lens model; markers there are not measured: calibrate with views out to the corners, or with"
+            " fewer coefficients",
             CameraWarning,
             stacklevel=2,
         )
@@ -110,5 +111,5 @@ def _mappings(data: dict[str, Any], text: str) -> dict[str, Callable[[], Camera]
         (sensors.is_bop, sensors.bop),
     ):
         if recognised(data):
-            return {"": lambda read=read: read(data)}
+            return {"": partial(read, data)}
     return {"": lambda: native.read(data, text)}

@@ -8,6 +8,8 @@ import re
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any, NamedTuple
 
+from torch import Tensor
+
 from torchpose.camera.formats.fields import shown
 from torchpose.camera.model import Model
 from torchpose.errors import ConfigError
@@ -116,9 +118,11 @@ def lens_model(
     return "kannala_brandt" if model == "kannala_brandt" else "brown_conrady"
 
 
-def says_none(data: Mapping[str, Any], read: Collection[str]) -> str:
-    """The key that says that there is no distortion; empty where none does."""
-    return next((s.field for s in _statements(data, read) if shown(s.value).lower() == "'none'"), "")
+def check_none(data: Mapping[str, Any], read: Collection[str], distortion: Tensor) -> None:
+    """Refuses coefficients of a file that says that it has no distortion."""
+    none = next((s.field for s in _statements(data, read) if shown(s.value).lower() == "'none'"), "")
+    if none and bool((distortion != 0).any()):
+        raise ConfigError(f"{none}: is 'none', and the coefficients are not zero; write their model")
 
 
 def _harmless(one: Statement) -> bool:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchpose.camera.formats.fields import matrix, number, numbers, shown, size
-from torchpose.camera.formats.models import lens_model, says_none
+from torchpose.camera.formats.models import check_none, lens_model
 from torchpose.camera.model import Camera
 from torchpose.camera.tone import Tone
 from torchpose.errors import ConfigError
@@ -43,8 +43,7 @@ def read(data: Mapping[str, Any], text: str) -> Camera:
     distortion = numbers(get("distortion_coefficients"), "distortion_coefficients").flatten()
     known = _OWN.union(*keys.values())
     model = lens_model(data, known, text=text)
-    if (none := says_none(data, known)) and bool((distortion != 0).any()):
-        raise ConfigError(f"{none}: is 'none', and the coefficients are not zero; write their model")
+    check_none(data, known, distortion)
     covariance, tone, adjustment = extras(data)
     camera = Camera(*frame, intrinsics, distortion, model, covariance, tone=tone, adjustment=adjustment)
     return _window(data, camera)

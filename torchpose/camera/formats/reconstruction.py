@@ -47,7 +47,7 @@ _FARTHEST_FROM_MIDDLE = 0.25
 
 def colmap(rows: list[list[str]]) -> dict[str, Callable[[], Camera]]:
     """The cameras of the lines of a cameras.txt, by their CAMERA_ID."""
-    readers = {row[0]: partial(_colmap, row) for row in rows}
+    readers: dict[str, Callable[[], Camera]] = {row[0]: partial(_colmap, row) for row in rows}
     if len(readers) < len(rows):
         raise ConfigError("CAMERA_ID: given twice; keep one line for each camera")
     return readers
@@ -140,7 +140,8 @@ def metashape(root: Element) -> Camera:
         raise ConfigError(f"projection: {shown(kind)} is not supported; use {', '.join(METASHAPE_MODELS)}")
     if "fx" in values:
         raise ConfigError("fx: is of an old PhotoScan; export the calibration from Metashape again, with f")
-    model, parsed = METASHAPE_MODELS[kind], {}
+    model = METASHAPE_MODELS[kind]
+    parsed: dict[str, float] = {}
     for key in ("width", "height", "f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4"):
         if key in values:
             try:

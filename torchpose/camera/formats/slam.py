@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchpose.camera.formats.fields import listed, mapping, matrix, numbers, shown, size
-from torchpose.camera.formats.models import MODELS, lens_model, named, refusal
+from torchpose.camera.formats.models import MODELS, check_none, lens_model, named, refusal
 from torchpose.camera.formats.native import extras
 from torchpose.camera.model import Camera, Model
 from torchpose.config import within
@@ -35,6 +35,7 @@ ORB_MODELS: dict[str, Model] = {
     "Rectified": "brown_conrady",
 }
 _ORB_CAMERA = re.compile(r"(Camera[12]?)\.fx")
+_KALIBR_READ = {"distortion_coeffs", "tone", "adjustment"}
 Readers = dict[str, Callable[[], Camera]]
 
 
@@ -64,12 +65,14 @@ def _kalibr(key: str, entry: Any) -> Camera:
         if intrinsics.shape != (4,):
             raise ConfigError(f"intrinsics: has shape {tuple(intrinsics.shape)}; give [fx, fy, cx, cy]")
         distortion = numbers(entry["distortion_coeffs"], "distortion_coefficients").flatten()
+        model = lens_model(entry, _KALIBR_READ)
+        check_none(entry, _KALIBR_READ, distortion)
         covariance, tone, adjustment = extras(entry)
         return Camera(
             *_resolution(entry["resolution"]),
             matrix(*intrinsics.tolist()),
             distortion,
-            lens_model(entry, {"distortion_coeffs", "tone", "adjustment"}),
+            model,
             covariance,
             tone=tone,
             adjustment=adjustment,
