@@ -40,8 +40,8 @@ _INPUTS = (
     "taken in natural order, or capture manifests (.jsonl)."
 )
 _CAMERA = (
-    "Camera file: OpenCV YAML or JSON, ROS camera_info, Kalibr camchain, COLMAP cameras.txt. FILE#cam1 or FILE#2 picks "
-    "one of several."
+    "Camera file: OpenCV YAML, JSON or XML, ROS camera_info, Kalibr camchain, COLMAP cameras.txt and others "
+    "(docs/cameras.md). FILE#cam1 or FILE#2 picks one of several."
 )
 _METHODS = "photometric|edges|centers|paper"  # torchpose.pipeline.Method, which takes a second to import
 _METHOD = "Last stage: grey values, edge points, ring centres, or the paper's own chain."

@@ -3,17 +3,15 @@
 import torch
 from torch import Tensor
 
-# Of a correlation, for each row: files that keep single precision, or its seven digits, are rounded by this
-# (derived: an eigenvalue moves by no more than the size of the table times the error of an entry)
-_ROUNDING = 2.0**-23
-
 
 def covariance_fault(covariance: Tensor) -> str:
     """What forbids that a square table (n, n) of numbers is a covariance; empty where nothing does.
 
     Units differ by orders between the rows: each counts in its own standard deviation.
     """
-    slack = len(covariance) * _ROUNDING
+    # files that keep single precision, or its seven digits, round each correlation by that much; an eigenvalue moves by
+    # no more than the size of the table times the error of an entry
+    slack = len(covariance) * torch.finfo(torch.float32).eps
     variance = covariance.diagonal()
     largest = covariance.abs().max().clamp_min(torch.finfo(covariance.dtype).tiny)
     scale = torch.where(variance > 0, variance, largest).sqrt()

@@ -87,8 +87,7 @@ def solve(
     Raises:
         ValueError: shapes do not fit, or an unknown method.
         PnPError: with ``raise_on_failure``.
-        ConfigError: ``compile`` without a C++ compiler; a matrix that is none of a pinhole camera, or in another unit
-            than the image points: most of them lie at impossible angles.
+        ConfigError: ``compile`` without a C++ compiler; a matrix that cannot be that of the points (`check_pinhole`).
     """
     inputs, starts = _checked(
         Inputs(object_points, image_points, camera, sigma_px, covariances, weights, mask, huber), method, initial
