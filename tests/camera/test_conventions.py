@@ -376,6 +376,7 @@ def test_binning_and_region_of_camera_info(tmp_path: Path, window: dict[str, obj
         ),
         ({"roi": {"x_offset": 10}}, "roi: 0 x 0 px at 10, 0 are not within 640 x 480 px; "),
         ({"roi": [1, 2]}, "roi: is a list of 2; write x_offset, "),
+        ({"binning": 2}, "binning: is 2; write binning_x and binning_y"),
         ({"binning_x": -1}, "binning_x: is -1, binning_y 0; "),
         ({"binning_x": "two"}, "binning_x: is 'two'; write a number"),
         ({"binning_x": 1000}, "roi.width: is 0; "),

@@ -44,6 +44,8 @@ KEYS = (
     "lens",
     "dist_model",
     "undistortion-model",
+    "dist",
+    "distName",
 )
 
 
@@ -108,6 +110,9 @@ def test_flags(tmp_path: Path, key: str) -> None:
         ({"camera_name": "left_fisheye"}, "distortion_model: is missing, and the file speaks of 'fisheye'; write "),
         ({"notes": {"calibrated": ["by omnidir"]}}, "distortion_model: is missing, and the file speaks of 'omni'; "),
         ({"distortion_model": "none"}, "distortion_model: is 'none', and the coefficients are not zero; "),
+        ({"calibration": "UCM"}, "distortion_model: is missing, and the file speaks of 'UCM'; write "),
+        ({"thin_prism": [0.1, 0.2], "distortion_model": "radtan"}, "thin_prism: a list of 2 is not supported"),
+        ({"skew": 0.5, "distortion_model": "radtan"}, "skew: 0.5 is not supported"),
         ({"distortion_model": ""}, "distortion_model: '' is not supported; use one of "),
         ({"fisheye_camera_matrix": K}, "distortion_model: is missing, and the file speaks of 'fisheye'; "),
     ],
@@ -139,6 +144,7 @@ def test_a_comment_that_speaks_of_a_fisheye_counts(tmp_path: Path) -> None:
         },
         {"projection_matrix": {"rows": 1, "cols": 1, "data": [1]}, "rectification_matrix": [1.0]},
         {"board": {"type": "chessboard"}, "pattern_type": "circles", "sensor_type": "global shutter", "flags": 0},
+        {"distance": 300, "working_distance_mm": 150.0, "skew": 0, "rectified": False},
         {"xi": 0, "alpha": 0.0, "is_fisheye": False},
     ],
 )

@@ -40,10 +40,10 @@ _SPELLINGS: dict[str, Model] = {
 _NEUTRAL = {"pinhole", "perspective", "opencv", "simplepinhole", "central", "monocular"}
 # parts of keys that name a model or give its parameters: `camera_model`, `lensType`, `is_fisheye`, `projection`, ...
 _NAMING = re.compile(
-    r"model|type|(?<!re)projection|lens|distort|fish|omni|equidist|kannala|brandt|mirror|catadiop|unified|spher|rectilinear"
+    r"model|type|(?<!re)projection|lens|dist(?!anc|rib)|rectified|fish|omni|equidist|kannala|brandt|mirror|catadiop|unified|spher|rectilinear"
 )
 # single words of keys that are parameters of models that are not read (unified, double sphere, division, ...)
-_PARAMETERS = {"xi", "alpha", "beta", "eucm", "ds", "mei", "poly", "invpoly", "affine", "rpmax"}
+_PARAMETERS = {"xi", "alpha", "beta", "eucm", "ds", "mei", "poly", "invpoly", "affine", "rpmax", "prism", "tau", "skew"}
 # ... and of keys that speak of something else
 _ELSEWHERE = re.compile(
     r"matrix|covar|std|sigma|error|rms|path|file|folder|board|pattern|target|chess|marker|pixel|data|sensor|serial|device"
@@ -51,7 +51,7 @@ _ELSEWHERE = re.compile(
 )
 # lenses of another kind, in words that no other part of a file uses
 _OTHER_LENS = re.compile(
-    r"fish-?_?eye|omni|equi-?_?dist|equi-?_?solid|equi-?_?rect|kannala|\bkb[48]\b|\bmei\b|o-?cam|scaramuzza|cata-?diop"
+    r"fish-?_?eye|omni|equi-?_?dist|equi-?_?solid|equi-?_?rect|kannala|\bkb[48]?\b|\bequi\b|\bucm\b|\bmei\b|o-?cam|scaramuzza|cata-?diop"
     r"|\bxi\b|double-?_?sphere|\beucm\b|unified|f-?_?theta|stereographic|orthographic|spherical|cylind|panoram|division"
     r"|\bfov\b(?=.{0,3}model)|thin-?_?prism",
     re.IGNORECASE,

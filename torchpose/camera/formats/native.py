@@ -78,6 +78,9 @@ def _window(data: Mapping[str, Any], camera: Camera) -> Camera:
     The region is in pixels of the whole frame; binning then makes one pixel of a block of them, whose centre is the
     mean of theirs: u' = (u - x_offset - (b - 1) / 2) / b.
     """
+    for key in ("binning", "x_offset", "y_offset", "offset_x", "offset_y"):
+        if data.get(key) not in (None, 0, *([1] if key == "binning" else [])):
+            raise ConfigError(f"{key}: is {shown(data[key])}; write binning_x and binning_y, and the offsets below roi")
     bins = [int(number(data.get(name) or 0, name)) for name in ("binning_x", "binning_y")]
     if any(b < 0 for b in bins):
         raise ConfigError(
