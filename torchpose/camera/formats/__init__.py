@@ -48,9 +48,10 @@ def load(path: str | os.PathLike[str]) -> Camera:
         read = _pick(_readers(text), selector)
         camera = read()
         check_intrinsics(camera.matrix, camera.width, camera.height, camera.model)
-    if share := share_without_ray(camera):
+    if percent := 100 * share_without_ray(camera):
+        part = f"{percent:.0f}" if percent >= 10 else f"{percent:.2g}"
         warnings.warn(
-            f"{name}: distortion_coefficients: no ray reaches {100 * share:.2g} % of the frame, beyond the fold or a"
+            f"{name}: distortion_coefficients: no ray reaches {part} % of the frame, beyond the fold or a"
             " pole of the lens model; markers there are not measured: calibrate with views out to the corners, or with"
             " fewer coefficients",
             CameraWarning,
