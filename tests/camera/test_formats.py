@@ -379,6 +379,8 @@ TRAPS = {
     "colmap huge": ("1 PINHOLE 640 480 650 650 1e9999999 240\n", "camera 1: PARAMS: not all are numbers; "),
     "explicit tag": (replaced("640", "!!timestamp 640"), "file: is not YAML "),
     "colmap width": ("1 PINHOLE 64.5 480 650 650 320 240\n", "camera 1: WIDTH: is '64.5'; "),
+    "colmap id": (COLMAP + "x PINHOLE 4 4 1 1 1 1\n", "CAMERA_ID: is 'x'; write one line for each camera, "),
+    "long key": (PLAIN_JSON[:-1] + ', "a\\n' + "b" * 2000 + '_model": "omni"}', "a b+ [.][.][.] .* is not supported; "),
     "colmap twice": ("1 PINHOLE 4 4 1 1 1 1\n1 PINHOLE 4 4 1 1 1 1\n", "CAMERA_ID: given twice; "),
 }
 

@@ -7,7 +7,8 @@ what is read (`camera.formats.models`).
 import os
 import re
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from torchpose.errors import ConfigError
 
 __all__ = ["COLMAP_MODELS", "COVARIANCES", "FIELDS", "MODELS", "CameraWarning", "load", "save"]
 _COLMAP_LINE = re.compile(r"\d+\s+[A-Z][A-Z_0-9]*(\s|$)")
+_SHOWN = 300  # characters of a message at either end; none of ours is longer than both
 _INI_SECTION = re.compile(r"\[[^\[\],]+\]\s*")
 
 
@@ -44,7 +46,7 @@ def load(path: str | os.PathLike[str]) -> Camera:
     if "#" in name and not Path(name).is_file():
         name, selector = name.rsplit("#", 1)
     text = read_text(name)
-    with within(f"{name}: "):
+    with within(f"{name}: "), _one_line():
         read = _pick(_readers(text), selector)
         camera = read()
         check_intrinsics(camera.matrix, camera.width, camera.height, camera.model)
@@ -58,6 +60,18 @@ def load(path: str | os.PathLike[str]) -> Camera:
             stacklevel=2,
         )
     return camera
+
+
+@contextmanager
+def _one_line() -> Iterator[None]:
+    """Keys of a file stand in messages: of those that are long, or have line breaks, a short line is made."""
+    try:
+        yield
+    except ConfigError as error:
+        text = " ".join(str(error).split())
+        if len(text) > 2 * _SHOWN:
+            text = f"{text[:_SHOWN]} ... {text[-_SHOWN:]}"
+        raise ConfigError(text) from None
 
 
 def _pick(readers: Mapping[str, Callable[[], Camera]], selector: str | None) -> Callable[[], Camera]:

@@ -48,6 +48,8 @@ _FARTHEST_FROM_MIDDLE = 0.25
 def colmap(rows: list[list[str]]) -> dict[str, Callable[[], Camera]]:
     """The cameras of the lines of a cameras.txt, by their CAMERA_ID."""
     readers: dict[str, Callable[[], Camera]] = {row[0]: partial(_colmap, row) for row in rows}
+    if odd := next((key for key in readers if not isinstance(_integer(key), int)), None):
+        raise ConfigError(f"CAMERA_ID: is {shown(odd)}; write one line for each camera, beginning with its number")
     if len(readers) < len(rows):
         raise ConfigError("CAMERA_ID: given twice; keep one line for each camera")
     return readers
