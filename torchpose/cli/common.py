@@ -59,7 +59,7 @@ def check_outputs(
         )
     from torchpose.report.overlay import picture_path
 
-    frames = {source.path.resolve() for source in sources}
+    frames = {Path(os.path.realpath(source.path)) for source in sources}  # which takes a loop of links, too
     if any(picture_path(place, source.name) in frames for source in sources):
         raise ConfigError(f"{overlay}: --overlay: its pictures would overwrite the frames; choose another folder")
 

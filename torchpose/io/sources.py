@@ -102,7 +102,8 @@ def find_sources(inputs: Sequence[Path], tell: Callable[[str], None] = _silent) 
 
 
 def _summary(passed: Counter[str]) -> str:
-    return ", ".join(f"{count} {kind}" for kind, count in passed.most_common())
+    kinds = sorted(passed.items(), key=lambda item: (-item[1], item[0]))
+    return ", ".join(f"{count} {kind}" for kind, count in kinds if count)
 
 
 def _sources_of(given: Path, passed: Counter[str]) -> Iterator[Source]:
@@ -133,7 +134,7 @@ def _recorded(manifest: Path, camera: str | None, passed: Counter[str]) -> Itera
     root = manifest.parent.resolve()
     for frame in read_manifest(manifest, camera):
         path = manifest.parent / frame.image
-        pages = list(_pages(_text(frame.image), path, root))
+        pages = list(_pages(frame.image, path, root))
         passed["pages behind the first"] += len(pages) - 1
         yield replace(pages[0], robot_pose=frame.robot_pose)
 
@@ -189,8 +190,5 @@ def _walk(folder: Path, passed: Counter[str]) -> Iterator[Path]:
 
 
 def _text(name: str) -> str:
-    """The name as valid Unicode: bytes of the file system that are not UTF-8, and lone surrogates, become escapes."""
-    try:
-        return os.fsencode(name).decode("utf-8", "backslashreplace")
-    except UnicodeEncodeError:  # of a manifest: no file has such a name
-        return name.encode("utf-8", "backslashreplace").decode()
+    """The name as valid Unicode: bytes of the file system that are not UTF-8 are written as escapes."""
+    return os.fsencode(name).decode("utf-8", "backslashreplace")

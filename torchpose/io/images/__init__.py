@@ -4,8 +4,8 @@ import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import FileIO
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from torchpose.io.images.native import by_opencv
 __all__ = ["UnreadableImageError", "WrongSizeError", "decode", "likely_encoded", "pages"]
 
 _HEAD = 64  # bytes that tell of what kind a file is
-_MOST_BYTES = 1 << 31  # of a file but for TIFF, of which only pages are read (convention): 16-bit colour of `MOST_PIXELS`
+_MOST_BYTES = 1 << 31  # of a file other than TIFF, which is read by pages: 16-bit colour of the largest picture
 
 
 def decode(
@@ -42,7 +42,8 @@ def decode(
             raise UnreadableImageError("not_an_image" if head else "empty")
         if os.fstat(file.fileno()).st_size > _MOST_BYTES:
             raise UnreadableImageError("too_large")
-        return _decode(head + file.read(), threads, size)
+        file.seek(0)
+        return _decode(file.read(), threads, size)
 
 
 def _decode(data: bytes, threads: int, size: tuple[int, int] | None) -> np.ndarray:
@@ -89,13 +90,13 @@ def likely_encoded(path: Path) -> bool:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[BinaryIO]:
+def _opened(path: Path) -> Iterator[FileIO]:
     """A regular file to read from. UnreadableImageError: there is none.
 
     Opened without waiting: a pipe or a device would keep the reader for ever.
     """
     try:
-        file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | getattr(os, "O_NONBLOCK", 0)))
+        file = open(path, "rb", 0, opener=lambda name, flags: os.open(name, flags | getattr(os, "O_NONBLOCK", 0)))
     except (FileNotFoundError, ValueError):  # a name with zeros or lone surrogates is none that a file can have
         raise UnreadableImageError("missing") from None
     except IsADirectoryError:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 MOST_PIXELS = 1 << 28  # of a picture, camera or not (convention): four times the largest machine-vision sensors
-_ROOM = 12  # bytes a pixel that no decoder exceeds: rows of 16-bit colour, once as decoded and once as grey values
+_ROOM = 16  # bytes a pixel that no decoder exceeds: 12 bits one by one, or colour of 16 bits twice, and the grey values
 
 
 class UnreadableImageError(Exception):

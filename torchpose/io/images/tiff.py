@@ -8,7 +8,7 @@ resolution and all other tags are of no matter.
 
 import io
 import struct
-from typing import BinaryIO
+from io import FileIO
 
 import numpy as np
 
@@ -39,6 +39,7 @@ _READ = frozenset((*_SINGLES, _BITS, _STRIPS, _STRIP_BYTES, _COLOURS, _TILES, _T
 _TYPES = {1: "u1", 3: "u2", 4: "u4", 7: "u1", 13: "u4", 16: "u8", 18: "u8"}  # of numbers: bytes, shorts, longs, offsets
 _REDUCED, _MASK = 1, 4  # bits of `_KIND`: a smaller copy of another picture, a mask of one
 _DENSEST = 1 << 12  # bytes out of one: deflate reaches 1032, LZW half its longest string of 3837, JPEG 512
+_COLOUR = 6  # most bytes of a pixel: three colours of 16 bits
 _DEPTHS = (1, 2, 4, 8, 10, 12, 14, 16)
 
 Tags = dict[int, np.ndarray]
@@ -47,7 +48,7 @@ Tags = dict[int, np.ndarray]
 class TiffFile:
     """Directories and pixels of an open file. Whatever it says is held against its size before it is read."""
 
-    def __init__(self, file: BinaryIO) -> None:
+    def __init__(self, file: FileIO) -> None:
         self._file = file
         self._size = file.seek(0, io.SEEK_END)
         head = self._at(0, 4)
@@ -173,7 +174,7 @@ def _layout(tags: Tags, order: str) -> Layout:
         and _colours_known(layout)
     ):
         raise UnreadableImageError("unsupported")
-    if min(layout.rows, layout.columns) < 1 or not 0 < layout.block_size <= 8 * MOST_PIXELS:
+    if min(layout.rows, layout.columns) < 1 or not 0 < layout.block_size <= _COLOUR * MOST_PIXELS:
         raise UnreadableImageError("corrupt")
     return layout
 
