@@ -54,7 +54,7 @@ def _decode(data: bytes, threads: int, size: tuple[int, int] | None) -> np.ndarr
         image = png.decode(data, header, threads)
     elif data.startswith(jpeg.MAGIC):
         check_size(header := jpeg.read_header(data), size)
-        image = jpeg.decode(data)
+        image = jpeg.decode(data, header)
     else:
         check_size(header := (plain.read_bmp if data.startswith(plain.BMP) else plain.read_pgm)(data), size)
         image = by_opencv(data)

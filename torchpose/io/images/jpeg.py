@@ -8,6 +8,7 @@ kornia_rs decodes with the same library to the same grey values in the same time
 import numpy as np
 
 from torchpose.io.images.header import Header, UnreadableImageError
+from torchpose.io.images.jpeg_scan import is_whole, with_row_below
 from torchpose.io.images.native import by_kornia
 
 MAGIC = b"\xff\xd8"
@@ -54,9 +55,27 @@ def _checked(frame: bytes | None, size: int) -> Header:
     return Header(width, height, 8 * _BLOCK * size)
 
 
-def decode(data: bytes) -> np.ndarray:
-    """Grey values (H, W); colour by its luma, as the file has it. UnreadableImageError: libjpeg warns or refuses."""
-    image = by_kornia("decode_image_jpegturbo", data, "mono")
-    if image is None:
-        raise UnreadableImageError("corrupt")
-    return image
+def decode(data: bytes, header: Header) -> np.ndarray:
+    """Grey values (H, W); colour by its luma, as the file has it.
+
+    Raises:
+        UnreadableImageError: libjpeg warns or refuses, or the scan has more blocks than the picture.
+    """
+    first = True
+    for longer, last in with_row_below(data):
+        image = _strict(longer)
+        if image is not None and (first or is_whole(image[-1], last)):
+            return image[: header.height]
+        if first and _strict(data) is None:
+            break
+        first = False  # libjpeg tells nothing of the file as it is: the place of the row may have been wrong
+    else:
+        image = _strict(data) if first else None
+        if image is not None:
+            return image
+    raise UnreadableImageError("corrupt")
+
+
+def _strict(data: bytes) -> np.ndarray | None:
+    """Grey values; None where libjpeg warns or refuses."""
+    return by_kornia("decode_image_jpegturbo", data, "mono")
