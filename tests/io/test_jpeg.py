@@ -57,7 +57,7 @@ def test_a_flipped_bit_is_refused_where_libjpeg_warns(
         try:
             image = decode_bytes(bytes(damaged), path)
         except UnreadableImageError:
-            assert warned or not np.array_equal(expected, clean), (position, bit)
+            assert warned or (np.asarray(expected) != np.asarray(clean)).any(), (position, bit)
             refused += 1
             continue
         assert not warned, (position, bit)
@@ -102,7 +102,7 @@ def test_no_whole_file_is_refused(tmp_path: Path, quality: int, noise: float) ->
     for number in range(40):
         height, width = random.integers(1, 70, 2)
         image = np.clip(random.normal(128, noise, (height, width)), 0, 255).astype(np.uint8)
-        options = {"quality": quality, "optimize": number % 2 == 0}
+        options: dict[str, Any] = {"quality": quality, "optimize": number % 2 == 0}
         if number % 3 == 0:
             image, options = np.dstack([image, image[::-1], 255 - image]), options | {"subsampling": number % 9 // 3}
         data = by_pillow(image, **options)

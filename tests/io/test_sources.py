@@ -136,7 +136,9 @@ def test_pipes_devices_and_loops_as_input_are_refused_at_once(tmp_path: Path) ->
         os.mkfifo(tmp_path / name)
     (tmp_path / "loop.png").symlink_to(tmp_path / "loop.png")
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
-    given = [tmp_path / n for n in ("pipe.png", "pipe.jsonl", "pipe", "loop.png", "loop", "a" * 300 + ".png", "a\0.png")]
+    given = [
+        tmp_path / n for n in ("pipe.png", "pipe.jsonl", "pipe", "loop.png", "loop", "a" * 300 + ".png", "a\0.png")
+    ]
     for path in [*given, Path("/dev/zero"), Path("/dev/null")]:
         with pytest.raises(ConfigError, match=r"^[^\n]+: INPUT: [^\n]+$"):
             find_sources([path])

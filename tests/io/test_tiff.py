@@ -76,8 +76,14 @@ FILES: dict[str, tuple[bytes, np.ndarray]] = {
         RAMP16,
     ),
     "colour": (written(COLOUR, photometric="rgb"), LUMA),
-    "colour of 16 bits": (written(COLOUR.astype(np.uint16) * 257, photometric="rgb"), luma(COLOUR.astype(np.uint16) * 257)),
-    "colour in planes": (written(COLOUR.transpose(2, 0, 1), photometric="rgb", planarconfig="separate", rowsperstrip=9), LUMA),
+    "colour of 16 bits": (
+        written(COLOUR.astype(np.uint16) * 257, photometric="rgb"),
+        luma(COLOUR.astype(np.uint16) * 257),
+    ),
+    "colour in planes": (
+        written(COLOUR.transpose(2, 0, 1), photometric="rgb", planarconfig="separate", rowsperstrip=9),
+        LUMA,
+    ),
     "colour in planes of tiles": (
         written(COLOUR.transpose(2, 0, 1), photometric="rgb", planarconfig="separate", **TILES),
         LUMA,
@@ -90,7 +96,10 @@ FILES: dict[str, tuple[bytes, np.ndarray]] = {
     "1 bit": (by_pillow(Image.fromarray(RAMP > 99)), (RAMP > 99) * np.uint8(255)),
     "4 bits": (packed(RAMP >> 4, 4), (RAMP >> 4) * np.uint8(17)),
     "12 bits": (packed(RAMP16 >> 4, 12), RAMP16 >> 4 << 4),
-    "no counts of bytes": (with_tag(written(RAMP), 279, 0).replace(struct.pack("<H", 279), struct.pack("<H", 65000), 1), RAMP),
+    "no counts of bytes": (
+        with_tag(written(RAMP), 279, 0).replace(struct.pack("<H", 279), struct.pack("<H", 65000), 1),
+        RAMP,
+    ),
     "white is zero, 8 bit": (written(255 - RAMP, photometric="miniswhite"), RAMP),
     "white is zero, 16 bit": (written(65535 - RAMP16, photometric="miniswhite"), RAMP16),
     "white is zero, 12 bits": (with_tag(packed(4095 - (RAMP16 >> 4), 12), 262, 0), RAMP16 >> 4 << 4),
@@ -210,7 +219,7 @@ def test_smaller_copies_and_masks_are_no_pages(tmp_path: Path) -> None:
     path = tmp_path / "f.tif"
     with tifffile.TiffWriter(path) as file:
         for kind, image in ((1, RAMP[::2, ::2]), (0, RAMP), (1, RAMP[::2, ::2]), (4, RAMP)):
-            options = {"photometric": "mask"} if kind == 4 else {"photometric": "minisblack"}
+            options: dict[str, Any] = {"photometric": "mask"} if kind == 4 else {"photometric": "minisblack"}
             file.write(image > 9 if kind == 4 else image, subfiletype=kind, metadata=None, **options)
     (place,) = pages(path)
     np.testing.assert_array_equal(decode(path, directory=place), RAMP)

@@ -9,7 +9,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchpose.cli.common import Overlay, Silent, Threads, Tone, check_outputs, cores, ended, frames_of, interrupted, read_tone
+from torchpose.cli.common import (
+    Overlay,
+    Silent,
+    Threads,
+    Tone,
+    check_outputs,
+    cores,
+    ended,
+    frames_of,
+    interrupted,
+    read_tone,
+)
 
 if TYPE_CHECKING:  # imported where they are used: torch takes more than a second, which --help need not wait for
     import numpy as np

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from torchpose.io.images import jpeg, plain, png, tiff
-from torchpose.io.images.header import UnreadableImageError, WrongSizeError, check_size, memory_told
+from torchpose.io.images.header import Header, UnreadableImageError, WrongSizeError, check_size, memory_told
 from torchpose.io.images.native import by_opencv
 
 __all__ = ["UnreadableImageError", "WrongSizeError", "decode", "likely_encoded", "pages"]
@@ -19,9 +19,7 @@ _HEAD = 64  # bytes that tell of what kind a file is
 _MOST_BYTES = 1 << 31  # of a file other than TIFF, which is read by pages: 16-bit colour of the largest picture
 
 
-def decode(
-    path: Path, *, threads: int = 1, directory: int = 0, size: tuple[int, int] | None = None
-) -> np.ndarray:
+def decode(path: Path, *, threads: int = 1, directory: int = 0, size: tuple[int, int] | None = None) -> np.ndarray:
     """Grey values (H, W) of an image file, uint8 or uint16 as stored. Colour is reduced to luma, alpha is ignored.
 
     Args:
@@ -48,6 +46,7 @@ def decode(
 
 def _decode(data: bytes, threads: int, size: tuple[int, int] | None) -> np.ndarray:
     """The same of the bytes of a file other than TIFF."""
+    header: Header
     if data.startswith(png.MAGIC):
         header = png.read_header(data)
         check_size(header, size)

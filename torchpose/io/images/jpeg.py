@@ -61,19 +61,18 @@ def decode(data: bytes, header: Header) -> np.ndarray:
     Raises:
         UnreadableImageError: libjpeg warns or refuses, or the scan has more blocks than the picture.
     """
-    first = True
+    plain = None  # the picture without a row, where it is needed
     for longer, last in with_row_below(data):
         image = _strict(longer)
-        if image is not None and (first or is_whole(image[-1], last)):
+        if image is not None and is_whole(image[-1], last):
             return image[: header.height]
-        if first and _strict(data) is None:
-            break
-        first = False  # libjpeg tells nothing of the file as it is: the place of the row may have been wrong
-    else:
-        image = _strict(data) if first else None
-        if image is not None:
-            return image
-    raise UnreadableImageError("corrupt")
+        if plain is None and (plain := _strict(data)) is None:
+            raise UnreadableImageError("corrupt")
+    # none of the places did: the scan has other blocks than the picture. Or there was no row to begin with.
+    image = _strict(data) if plain is None else None
+    if image is None:
+        raise UnreadableImageError("corrupt")
+    return image
 
 
 def _strict(data: bytes) -> np.ndarray | None:

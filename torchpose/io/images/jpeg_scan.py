@@ -24,6 +24,9 @@ _BLOCK = 8  # px of a side
 _WINDOW = 4  # bytes in which the last codes end
 
 
+_Part = tuple[int, int, dict[int, str], dict[int, str]]
+
+
 @dataclass(frozen=True)
 class _Scan:
     """What is needed of the headers of a file with a single baseline scan.
@@ -41,7 +44,7 @@ class _Scan:
     size_at: int
     height: int
     width: int
-    parts: list[tuple[int, int, dict[int, str], dict[int, str]]]
+    parts: list[_Part]
 
 
 def with_row_below(data: bytes) -> Iterator[tuple[bytes, int]]:
@@ -55,8 +58,9 @@ def with_row_below(data: bytes) -> Iterator[tuple[bytes, int]]:
     end = None if scan is None else _MARKER.search(data, scan.start)
     if scan is None or end is None or end[0] != _END:
         return
-    unit = [(1, 1, *scan.parts[0][2:])] if len(scan.parts) == 1 else scan.parts
-    across, down = (max(part[i] for part in unit) * _BLOCK for i in (0, 1))
+    first = scan.parts[0]
+    unit: list[_Part] = [(1, 1, first[2], first[3])] if len(scan.parts) == 1 else scan.parts
+    across, down = max(part[0] for part in unit) * _BLOCK, max(part[1] for part in unit) * _BLOCK
     height = -(-scan.height // down) * down + 1
     count = -(-scan.width // across)
     row = _row(unit, count)
@@ -81,7 +85,7 @@ def is_whole(row: np.ndarray, last: int) -> bool:
     return bool(np.ptp(row[:_BLOCK]) > 0 and (row[last : last + visible] == row[:visible]).all())
 
 
-def _row(unit: list[tuple[int, int, dict[int, str], dict[int, str]]], count: int) -> str:
+def _row(unit: list[_Part], count: int) -> str:
     """Bits of so many units: of nothing, but for the first and the last. Empty where the codes do not suffice."""
     if not all(0 in dc and 0 in ac for _, _, dc, ac in unit):
         return ""
@@ -120,9 +124,7 @@ def _read(data: bytes) -> _Scan | None:
     return None
 
 
-def _parts(
-    frame: bytes, scan: bytes, codes: dict[int, dict[int, str]]
-) -> list[tuple[int, int, dict[int, str], dict[int, str]]]:
+def _parts(frame: bytes, scan: bytes, codes: dict[int, dict[int, str]]) -> list[_Part]:
     """`_Scan.parts`; none where the scan has not all colours of the frame, or codes are missing."""
     if len(frame) < 6 or len(frame) != 6 + 3 * frame[5] or len(scan) != 4 + 2 * frame[5] or scan[0] != frame[5]:
         return []

@@ -125,7 +125,7 @@ class TiffFile:
                 continue
             if not 0 < amount <= _MOST_NUMBERS:
                 raise UnreadableImageError("corrupt")
-            dtype = np.dtype(_TYPES[kind]).newbyteorder(self._order)
+            dtype = np.dtype(self._order + _TYPES[kind])
             size = dtype.itemsize * amount
             stored = value[:size] if size <= offset_size else self._at(self._number(self._offset, value), size)
             tags[tag] = np.frombuffer(stored, dtype)

@@ -165,9 +165,7 @@ def _file_of_rows(rows: Sequence[bytes], width: int, compression: int) -> bytes:
     amounts = {273: count, 279: count}
     directory = np.array([(tag, 4, amounts.get(tag, 1), n) for tag, n in numbers], "<u2,<u2,<u4,<u4").tobytes()
     start = b"II*\0" + np.array([after + 8 * count], "<u4").tobytes()
-    return b"".join(
-        [start, body, places.tobytes(), counts.tobytes(), bytes([len(numbers), 0]), directory, bytes(4)]
-    )
+    return b"".join([start, body, places.tobytes(), counts.tobytes(), bytes([len(numbers), 0]), directory, bytes(4)])
 
 
 def _grey(raw: bytes, layout: Layout) -> np.ndarray:
