@@ -1,4 +1,4 @@
-"""Files that claim too much, that are none, or that anything has happened to: an array or a reason, in bounded memory."""
+"""Files that claim too much, are none, or that anything has happened to: an array or a reason, in bounded memory."""
 
 import os
 import resource

@@ -153,7 +153,7 @@ UNSUPPORTED = {
 
 @pytest.mark.parametrize("kind", UNSUPPORTED)
 def test_what_cannot_be_decoded_is_unsupported_not_black(tmp_path: Path, kind: str) -> None:
-    with pytest.raises(UnreadableImageError, match="^unsupported$"):
+    with pytest.raises(UnreadableImageError, match=r"^unsupported$"):
         read(UNSUPPORTED[kind], tmp_path)
 
 

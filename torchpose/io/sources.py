@@ -19,14 +19,12 @@ MANIFEST_SUFFIX = ".jsonl"
 _STACKS = (".tif", ".tiff")  # that may have several pages
 # pictures and films in a folder that are not read, so that a user is told: raw files of cameras among them
 _OTHERS = frozenset(
-    (
+    (  # noqa: SIM905  # a list would be five times as long
         ".apng .arw .avi .avif .cr2 .cr3 .dib .dng .exr .fit .fits .gif .hdr .heic .heif .ico .j2c .j2k .jfif "
         ".jif .jng .jp2 .jpc .jpe .jpf .jpx .jxl .jxr .mkv .mov .mp4 .nef .npy .npz .orf .pam .pbm .pcx .pfm "
         ".pgx .pic .pnm .ppm .psd .raf .ras .raw .rw2 .sr .svg .tga .webp"
-    ).split()  # noqa: SIM905  # a list would be five times as long
+    ).split()
 )
-)
-
 _PIPE = "is a pipe or a device, no file"
 _DIGITS = re.compile(r"(\d+)", re.ASCII)
 

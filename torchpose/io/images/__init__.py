@@ -95,7 +95,7 @@ def _opened(path: Path) -> Iterator[FileIO]:
     Opened without waiting: a pipe or a device would keep the reader for ever.
     """
     try:
-        file = open(path, "rb", 0, opener=lambda name, flags: os.open(name, flags | getattr(os, "O_NONBLOCK", 0)))
+        file = FileIO(path, opener=lambda name, flags: os.open(name, flags | getattr(os, "O_NONBLOCK", 0)))
     except (FileNotFoundError, ValueError):  # a name with zeros or lone surrogates is none that a file can have
         raise UnreadableImageError("missing") from None
     except IsADirectoryError:

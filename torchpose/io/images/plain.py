@@ -16,8 +16,8 @@ def read_bmp(data: bytes) -> Header:
     """Header of a BMP file.
 
     Raises:
-        UnreadableImageError: ``truncated``, ``corrupt`` where the pixels are said to lie in the headers, ``unsupported``
-            for run lengths, in which damage would not be told.
+        UnreadableImageError: ``truncated``, ``corrupt`` where the pixels are said to lie in the headers,
+            ``unsupported`` for run lengths, in which damage would not be told.
     """
     if len(data) < _DIB + 26:
         raise UnreadableImageError("truncated")

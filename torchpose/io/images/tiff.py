@@ -1,9 +1,9 @@
 """TIFF: directories and what they say of their pictures, read strictly.
 
-OpenCV reads 8-bit files leniently: strips that libtiff cannot decode stay black, compressions that it does not know give
-a black frame, and the orientation tag turns the rows (docs/decisions/0089-damaged-pictures.md). Here every strip or tile
-has to lie in the file and to decode to just the bytes that it should hold; what is not known is refused. Orientation,
-resolution and all other tags are of no matter.
+OpenCV reads 8-bit files leniently: strips that libtiff cannot decode stay black, compressions that it does not know
+give a black frame, and the orientation tag turns the rows (docs/decisions/0089-damaged-pictures.md). Here every strip
+or tile has to lie in the file and to decode to just the bytes that it should hold; what is not known is refused.
+Orientation, resolution and all other tags are of no matter.
 """
 
 import io
