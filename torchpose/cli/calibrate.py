@@ -16,6 +16,7 @@ from torchpose.cli.common import (
     check_robot_poses,
     cores,
     ended,
+    frames_of,
     interrupted,
     read_tone,
     with_tone,
@@ -73,14 +74,13 @@ def calibrate(
     from torchpose.calibration.session import parse_board
     from torchpose.camera import Camera
     from torchpose.cli.terminal import native_stderr_silenced
-    from torchpose.io.sources import find_sources
     from torchpose.target import Target
 
     if (target is None) == (board is None):
         raise ConfigError("--target: give either --target or --board, what the frames show")
     _check_files(out, hand_eye_out, camera, target_out)
     between, inputs = _distance(distance, inputs, target, target_out)
-    sources = find_sources(inputs)
+    sources = frames_of(inputs)
     if hand_eye_out is not None:
         check_robot_poses(sources)
     start = None if camera is None else with_tone(Camera.load(camera), tone)
@@ -199,11 +199,11 @@ class _Frames:
 
 
 def _first_size(sources: Sequence[Source]) -> tuple[int, int]:
-    from torchpose.io.images import UnreadableImageError, decode
+    from torchpose.io.images import UnreadableImageError
 
     for source in sources:
         try:
-            height, width = decode(source.path).shape
+            height, width = source.decode().shape
         except UnreadableImageError:
             continue
         return width, height

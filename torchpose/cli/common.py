@@ -33,6 +33,13 @@ Silent = Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar and
 Resume = Annotated[bool, typer.Option("--resume", help="Keep the frames that an earlier run finished.")]
 
 
+def frames_of(inputs: Sequence[Path]) -> list[Source]:
+    """Frames of the INPUTs; what is passed over is told on stderr."""
+    from torchpose.io.sources import find_sources
+
+    return find_sources(inputs, lambda line: typer.echo(f"torchpose: {line}", err=True))
+
+
 def check_outputs(
     inputs: Sequence[Path], sources: Sequence[Source], tables: Sequence[Path], overlay: Path | None
 ) -> None:
@@ -52,7 +59,7 @@ def check_outputs(
         )
     from torchpose.report.overlay import picture_path
 
-    frames = {source.path.resolve() for source in sources}
+    frames = {Path(os.path.realpath(source.path)) for source in sources}  # which takes a loop of links, too
     if any(picture_path(place, source.name) in frames for source in sources):
         raise ConfigError(f"{overlay}: --overlay: its pictures would overwrite the frames; choose another folder")
 

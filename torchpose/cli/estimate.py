@@ -19,6 +19,7 @@ from torchpose.cli.common import (
     check_robot_poses,
     cores,
     ended,
+    frames_of,
     interrupted,
     with_tone,
 )
@@ -78,14 +79,13 @@ def estimate(
     """
     from torchpose.camera import Camera
     from torchpose.cli.terminal import native_stderr_silenced
-    from torchpose.io.sources import find_sources
     from torchpose.io.writers import check_table_path
     from torchpose.target import Target
 
     for path, option in ((out, "--out"), (detections, "--detections")):
         if path is not None:
             check_table_path(path, option)
-    lens, targets, sources = Camera.load(camera), [Target.load(name) for name in target], find_sources(inputs)
+    lens, targets, sources = Camera.load(camera), [Target.load(name) for name in target], frames_of(inputs)
     lens = with_tone(lens, "srgb" if srgb and tone is None else tone)
     lens = lens if lens.tone is not None else _with_judged_tone(lens, targets[0], sources)
     _check_relative(relative_to, targets, hand_eye, instances)
@@ -97,7 +97,7 @@ def estimate(
 
 def _with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -> Camera:
     """The camera with the tone that the frames tell, where their kind of file makes one likely; says what it took."""
-    from torchpose.io.images import UnreadableImageError, decode, likely_encoded
+    from torchpose.io.images import UnreadableImageError, WrongSizeError, likely_encoded
 
     if not sources or not likely_encoded(sources[0].path):
         return lens
@@ -112,10 +112,10 @@ def _with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -
     images = []
     for source in sources[:: (len(sources) - 1) // _JUDGED + 1]:
         try:
-            image = decode(source.path)
-        except UnreadableImageError:
+            image = source.decode(size=(lens.width, lens.height))
+        except (UnreadableImageError, WrongSizeError):
             continue
-        if image.shape == (lens.height, lens.width) and image.dtype == np.uint8:
+        if image.dtype == np.uint8:
             images.append(image)
     tone, shift = None, None
     if images:

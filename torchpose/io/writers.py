@@ -23,7 +23,7 @@ def check_table_path(path: Path, option: str) -> None:
         raise ConfigError(f"{path}: {option}: is a folder; give a file")
     if not path.parent.is_dir():
         raise ConfigError(f"{path}: {option}: folder {path.parent} does not exist; create it or choose another")
-    probe = _temporary(path)
+    probe = _temporary(path.with_name(f"{path.name}.run.json"))  # the longest name of what a run writes
     try:
         probe.touch()
         probe.unlink()
@@ -153,7 +153,8 @@ def _write_parquet(path: Path, rows: Iterable[Row], schema: Schema) -> None:
     plain = {str: pa.string(), int: pa.int64(), float: number}
     arrow = pa.schema({c: nested[c] if kind is list else plain[kind] for c, kind in schema.items()})
     remaining = iter(rows)
-    with pq.ParquetWriter(path, arrow) as writer:
+    # opened here: pyarrow takes no path whose bytes are not UTF-8
+    with path.open("wb") as file, pq.ParquetWriter(file, arrow) as writer:
         while group := list(islice(remaining, _ROW_GROUP)):
             writer.write_table(pa.Table.from_pylist(group, arrow))
 
@@ -161,7 +162,7 @@ def _write_parquet(path: Path, rows: Iterable[Row], schema: Schema) -> None:
 def _read_parquet(path: Path) -> Iterator[Row]:
     import pyarrow.parquet as pq
 
-    with pq.ParquetFile(path) as file:
+    with path.open("rb") as opened, pq.ParquetFile(opened) as file:
         for group in file.iter_batches(_ROW_GROUP):
             yield from group.to_pylist()
 
