@@ -165,7 +165,7 @@ class Session:
         """Reads what an earlier run finished and closes its last line."""
         if not self.manifest.exists():
             raise ConfigError(f"{self.manifest}: --resume: does not exist; leave --resume out to start the session")
-        records = read_records(self.manifest)
+        records = list(read_records(self.manifest))
         for number, record in records:
             where = f"{self.manifest}: line {number}"
             if record.get("record") == "session" and self._earlier is None:
