@@ -31,6 +31,14 @@ def check_regular(path: Path, *, most: int | None = None) -> None:
         raise ConfigError(f"{path}: file: has {found.st_size / 1e6:.0f} MB; at most {most / 1e6:.0f} MB are read")
 
 
+def is_inside(path: Path, folder: Path) -> bool:
+    """Whether a path lies in a folder once all links and ``..`` are followed; what is not there counts as named."""
+    try:
+        return path.resolve().is_relative_to(folder.resolve())
+    except (OSError, ValueError, RuntimeError):  # names of no file, and links in a loop
+        return False
+
+
 def read_text(path: str | os.PathLike[str], *, most: int = MOST_BYTES) -> str:
     """The text of a file.
 

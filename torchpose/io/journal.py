@@ -9,6 +9,7 @@ import contextlib
 import errno
 import json
 import os
+import weakref
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from io import FileIO
@@ -45,14 +46,30 @@ def unseal(line: bytes) -> dict[str, Any] | None:
     return record if isinstance(record, dict) else None
 
 
-def locked(file: FileIO) -> bool:
-    """Whether the file is now this process's alone; so it counts where a file system has no locks."""
+def locked(descriptor: int) -> bool:
+    """Whether the open file is now this process's alone; so it counts where a file system has no locks."""
     try:
-        return lock_descriptor(file.fileno(), blocking=False)
+        return lock_descriptor(descriptor, blocking=False)
     except OSError as error:
         if error.errno != errno.ENOSYS:
             raise
         return True
+
+
+class Lock:
+    """Holds a file, made where it is missing, until it is released or the process ends, however it ends.
+
+    Raises:
+        BlockingIOError: another process holds it.
+        OSError: it cannot be opened.
+    """
+
+    def __init__(self, path: Path) -> None:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        self.release = weakref.finalize(self, os.close, descriptor)
+        if not locked(descriptor):
+            self.release()
+            raise BlockingIOError(errno.EWOULDBLOCK, "another process holds it", os.fspath(path))
 
 
 class Journal:
@@ -71,7 +88,7 @@ class Journal:
             # unbuffered: what a full disk refuses must not be tried again when the file is closed
             self._file: FileIO = path.open("a+b", buffering=0)
             try:
-                if not locked(self._file):
+                if not locked(self._file.fileno()):
                     raise ConfigError(f"{path}: --out: another run is writing it; wait for it or choose another file")
                 if self._is_at_its_path():
                     return

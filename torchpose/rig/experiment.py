@@ -166,7 +166,9 @@ def _join(manifest: Path, poses: Path) -> tuple[_Frames, tuple[str, ...], bool]:
     for number, record in read_records(manifest):
         emulated = emulated or bool(record.get("emulated"))
         image = record.get("image")
-        if record.get("record") != "frame" or image not in by_frame or not record.get("waypoint"):
+        if record.get("record") != "frame" or not isinstance(image, str) or image not in by_frame:
+            continue
+        if not record.get("waypoint"):
             continue
         label = validate(Label, record["waypoint"], f"{manifest}: line {number}: waypoint")
         if (label.kind, label.axis) not in _GROUPS:

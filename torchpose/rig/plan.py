@@ -21,6 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator,
 from torch import Tensor
 
 from torchpose.config import read_yaml, validate
+from torchpose.config.kinds import Length, Text
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.rig.poses import Pose, as_pose, from_transform, to_transform
@@ -137,10 +138,10 @@ class Label(BaseModel):
     """What a frame is for; part of its record in the manifest."""
 
     model_config = ConfigDict(frozen=True)
-    id: str = ""  # of the waypoint, in frame ids and image names
-    kind: str  # static, translation, rotation, handeye, calibration or pose
-    axis: str | None = None  # x, y, z, roll, pitch or yaw of a translation or rotation
-    value: float = 0.0  # along or about the axis, mm or deg
+    id: Text = ""  # of the waypoint, in frame ids and image names
+    kind: Text  # static, translation, rotation, handeye, calibration or pose
+    axis: Text | None = None  # x, y, z, roll, pitch or yaw of a translation or rotation
+    value: Length = 0.0  # along or about the axis, mm or deg
     origin: bool = False  # the reference of its axis, or a static frame
 
 
