@@ -4,13 +4,19 @@ _LONGEST = 1000  # characters of a message (convention): some lines of a termina
 _TAIL = 300  # of these, where the fix stands
 
 
-def plain(text: str) -> str:
-    """The text as a terminal may have it: one line of bounded length, what is not printable as an escape.
+def printable(text: str) -> str:
+    """The text as a terminal may have it: one line, what is not printable as an escape.
 
     A file's name may hold escape sequences, line ends and halves of surrogate pairs.
     """
-    if not text.isprintable():
-        text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+def plain(text: str) -> str:
+    """`printable` text of bounded length."""
+    text = printable(text)
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - _TAIL]} ... {text[-_TAIL:]}"
 
 

@@ -17,6 +17,7 @@ import torch
 
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
+from torchpose.io.journal import seal, unseal
 from torchpose.io.rows import (
     BASE_SCHEMA,
     DETECTION_SCHEMA,
@@ -26,7 +27,6 @@ from torchpose.io.rows import (
     fault_row,
     pose_rows,
 )
-from torchpose.io.journal import seal, unseal
 from torchpose.io.store import ResultStore
 from torchpose.io.writers import read_rows, read_table, write_rows
 from torchpose.results import Detections, Poses, Reason, Status

@@ -238,5 +238,5 @@ def test_an_image_outside_of_the_session_is_refused(tmp_path: Path) -> None:
     lines = records(tmp_path / "s")
     lines[1]["image"] = "../s2/0000.png"
     (tmp_path / "s" / "manifest.jsonl").write_text("".join(json.dumps(record) + "\n" for record in lines))
-    with pytest.raises(ConfigError, match="line 2: image: .* lies outside of the session"):
+    with pytest.raises(ConfigError, match=r"line 2: image: .* lies outside of the session"):
         opened(tmp_path / "s", resume=True)

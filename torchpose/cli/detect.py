@@ -9,7 +9,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchpose.cli.common import Overlay, Silent, Threads, Tone, check_outputs, cores, ended, interrupted, read_tone
+from torchpose.cli.common import (
+    Overlay,
+    Silent,
+    Threads,
+    Tone,
+    check_outputs,
+    cores,
+    ended,
+    interrupted,
+    read_tone,
+    use_threads,
+)
 
 if TYPE_CHECKING:  # imported where they are used: torch takes more than a second, which --help need not wait for
     import numpy as np
@@ -53,7 +64,7 @@ def detect(
     if overlay is not None:
         make_folder(overlay, "--overlay")
     cv2.setNumThreads(1)
-    torch.set_num_threads(threads or cores())
+    use_threads(threads)
     unreadable: dict[str, str] = {}
     rows: list[Row] = []
     show = FrameProgress(len(sources), 0, quiet=quiet)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from torchpose.cli.common import say
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -37,14 +38,14 @@ def evaluate(
     result = evaluate_poses(estimates, known)
     _show(result, estimates.full_covariance)
     if more:
-        typer.echo(f"{more} further rows with a pose are of copies that the truth does not have")
+        say(f"{more} further rows with a pose are of copies that the truth does not have")
     if out is not None:
         _write_errors(out, result, known, rows)
     if plots is not None:
         from torchpose.report.evaluation import save_plots
 
         for plot in save_plots(result, known, plots, poses.stem):
-            typer.echo(str(plot))
+            say(str(plot))
     return 0
 
 

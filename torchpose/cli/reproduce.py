@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from torchpose.cli.common import Quiet, interrupted
+from torchpose.cli.common import Quiet, interrupted, say
 
 _Full = Annotated[bool, typer.Option("--full", help="As many seeds and frames as the documented figures have: hours.")]
 
@@ -29,7 +29,7 @@ def reproduce(
         except KeyboardInterrupt:
             return interrupted(f"{out} keeps the finished studies; add --resume")
     for name, reason in failed.items():
-        typer.echo(f"torchpose: error: {name}: {reason}", err=True)
+        say(f"torchpose: error: {name}: {reason}", err=True)
     if not quiet:
-        typer.echo(str(out / REPORT))
+        say(str(out / REPORT))
     return 1 if failed else 0

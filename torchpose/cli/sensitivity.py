@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from torchpose.cli.common import say
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ def sensitivity(
     files = tabulate(cases, rings).save(out)
     _show(cases | rings, size)
     for line in (*_unstated(lens, printed), *files):
-        typer.echo(str(line))
+        say(str(line))
     return 0
 
 

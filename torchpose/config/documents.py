@@ -1,8 +1,8 @@
 """YAML and JSON text as plain values, within bounds of time, memory and depth whatever the text says.
 
-The parser's events are built into values here, without recursion. Aliases and merge keys are YAML's only way to say much
-in few words: what they stand for is counted as if it were written out, and a document that would be too large is refused
-at the event that makes it so.
+The parser's events are built into values here, without recursion. Aliases and merge keys are YAML's only way to say
+much in few words: what they stand for is counted as if it were written out, and a document that would be too large is
+refused at the event that makes it so.
 """
 
 import json
@@ -178,7 +178,7 @@ class _Builder:
             raise _wrong(event, f"lists and mappings lie in each other more than {MOST_DEPTH} deep; write it flatter")
         self._grow(1, event)
         value: list[Any] | dict[str, Any] = [] if isinstance(event, yaml.SequenceStartEvent) else {}
-        self._anchors.pop(event.anchor, None)
+        self._anchors.pop(event.anchor or "", None)
         self._open.append(_Open(value, event.anchor, self._size - 1))
 
     def _end(self, event: yaml.Event) -> None:
@@ -206,7 +206,7 @@ class _Builder:
         if not plain:
             raise _wrong(event, "a list or mapping stands where a key should; write a word")
         if key in holder.value and not merge:
-            raise _WrongError(f"{key}: given twice (line {event.start_mark.line + 1}); keep one")
+            raise _WrongError(f"{key}: given twice ({_line(event)}); keep one")
         holder.key = "" if merge else f"_{key}"  # told apart from the key "<<" in quotes
 
     def _add(self, value: Any, event: yaml.Event) -> None:
@@ -274,4 +274,8 @@ _MEANINGS: dict[str, Callable[[yaml.ScalarNode], Hashable]] = {
 
 
 def _wrong(event: yaml.Event, problem: str) -> _WrongError:
-    return _WrongError(f"line {event.start_mark.line + 1}: {problem}")
+    return _WrongError(f"{_line(event)}: {problem}")
+
+
+def _line(event: yaml.Event) -> str:
+    return f"line {event.start_mark.line + 1}" if event.start_mark else "file"

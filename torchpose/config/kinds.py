@@ -1,7 +1,7 @@
 """Kinds of fields with their ranges: what a number or a word of any file may be, in one place.
 
-A number beyond its range is a slip of the pen or of a program (a wrong unit, a lost decimal point): it is named where it
-is read, before arithmetic makes NaN, or hours, of it. All limits are conventions, far outside of what anybody measures.
+A number beyond its range is a slip of the pen or of a program (a wrong unit, a lost decimal point): it is named where
+it is read, before arithmetic makes NaN, or hours, of it. All limits are conventions, far outside of what is measured.
 """
 
 import unicodedata
@@ -19,7 +19,7 @@ _MOST_TEXT = 1000  # characters
 def _word(text: str) -> str:
     for character in text:
         if unicodedata.category(character) in ("Cc", "Cs", "Zl", "Zp"):
-            raise ValueError(f"has the character {ascii(character)}; write the text without it")
+            raise ValueError(f"has the character {character!a}; write the text without it")
     if len(text) > _MOST_TEXT:
         raise ValueError(f"has {len(text)} characters; give at most {_MOST_TEXT}")
     return text

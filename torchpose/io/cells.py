@@ -76,7 +76,9 @@ def _model(columns: tuple[tuple[str, type], ...]) -> type[BaseModel]:
     """The model of rows with these columns; cells may be None but for the names and the status."""
     of_poses = ("status", str) in columns
     fields: dict[str, Any] = {
-        column: (_NEEDED[column], ...) if column in _NEEDED else (_kind(column, plain, of_poses) | None, NEWER.get(column))
+        column: (_NEEDED[column], ...)
+        if column in _NEEDED
+        else (_kind(column, plain, of_poses) | None, NEWER.get(column))
         for column, plain in columns
     }
     return create_model("Row", __base__=_File, **fields)

@@ -2,10 +2,10 @@
 
 While a run goes on, each finished batch is appended to a journal beside the output (``poses.csv.partial``): one line a
 frame with its rows, its detections, and the size and time of its file, a batch in one write, then fsync. The first line
-says what the rows were made from. At the end the tables are written whole and moved into place, what they were made from
-and the frames' files are kept beside them (``poses.csv.run.json``), and the journal is removed. A killed run therefore
-leaves the journal, with at most its last line torn; a resumed one drops that line and goes on. A finished table is
-resumed by turning it into a journal again.
+says what the rows were made from. At the end the tables are written whole and moved into place, what they were made
+from and the frames' files are kept beside them (``poses.csv.run.json``), and the journal is removed. A killed run
+therefore leaves the journal, with at most its last line torn; a resumed one drops that line and goes on. A finished
+table is resumed by turning it into a journal again.
 
 A resumed run keeps the rows of a frame whose file is as it was. It does again what could not be read or had another
 size, what was changed since, and what a damaged line of the journal held.
@@ -25,6 +25,7 @@ from torchpose.io.cells import row_check
 from torchpose.io.journal import Journal, Place
 from torchpose.io.misfits import Misfits
 from torchpose.io.rows import DETECTION_SCHEMA, NEWER, Row, Schema
+from torchpose.io.whole_run import WholeRun
 from torchpose.io.writers import atomic_path, check_table_path, read_rows, write_rows
 from torchpose.results import Status
 
@@ -76,6 +77,7 @@ class ResultStore:
         crowded: frames that show more copies of a target than they have rows.
         most: by target, the most copies of it that one of these frames shows.
         misfits: by target, what its rows say together of target and camera file.
+        whole_run: what only all rows together show.
         damaged: lines of the journal that were not as they had been written.
 
     Raises:
@@ -123,6 +125,7 @@ class ResultStore:
         self.crowded: set[str] = set()
         self.most: dict[str, int] = {}
         self.misfits: dict[str, Misfits] = {}
+        self.whole_run = WholeRun()
         self._places: dict[str, Place] = {}
         self._made_from: dict[str, Stamp | None] = {}
 
@@ -198,6 +201,7 @@ class ResultStore:
         rows = Counter(row["target"] for row in record["rows"])
         for row in record["rows"]:
             self.misfits.setdefault(row["target"], Misfits()).add(row)
+            self.whole_run.add(row)
             if (row.get("copies") or 0) > rows[row["target"]]:
                 self.crowded.add(record["frame"])
                 self.most[row["target"]] = max(self.most.get(row["target"], 0), row["copies"])

@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import hashlib
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -17,6 +18,7 @@ TABLE_SUFFIXES = (".csv", ".jsonl", ".parquet")
 _WITH_POSE = ("ok", "ambiguous")
 # what the readers raise of files that are damaged: text that is none, another nesting, sizes that no memory holds
 _UNREADABLE = (ValueError, KeyError, TypeError, NotImplementedError, OSError, MemoryError, csv.Error)
+_LONG_NAME = 250  # bytes; file systems end at 255
 _LONGEST_LINE = 1 << 20  # bytes (convention): a row with the covariances of thousands of markers
 _ROW_GROUP = 4096
 
@@ -86,7 +88,7 @@ def read_table(path: Path, schema: Schema, needed: Sequence[str]) -> list[Row]:
     rows: list[Row] = []
     try:
         check_regular(path)
-        for number, row in enumerate(_READERS[path.suffix](path), 1):
+        for number, row in enumerate(_READERS[path.suffix](path), 1):  # noqa: B007  # counts on behind the loop
             if missing := [name for name in needed if name not in row]:
                 raise ConfigError(f"{path}: {missing[0]}: column is missing; give what torchpose estimate wrote")
             rows.append(check(row))
@@ -133,7 +135,9 @@ def atomic_path(
 
 
 def _temporary(path: Path) -> Path:
-    return path.with_name(f".{path.name}.tmp")
+    """A hidden name beside ``path``; a long one is cut, as there must be room for more."""
+    stem = path.name if len(os.fsencode(path.name)) < _LONG_NAME else hashlib.sha256(os.fsencode(path.name)).hexdigest()
+    return path.with_name(f".{stem}.tmp")
 
 
 def _cells(schema: Schema) -> list[str]:

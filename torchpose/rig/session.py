@@ -2,7 +2,7 @@
 
 An image is written under a temporary name, synced and renamed, then its line is appended to the manifest and synced:
 a line is there only for an image that is whole, with its digest. One process at a time writes a session: it holds the
-file ``.lock``, as long as it lives and no longer. ``torchpose.io.manifest`` describes what all manifests have in common.
+file ``.lock``, as long as it lives and no longer. ``torchpose.io.manifest`` says what all manifests have in common.
 """
 
 import contextlib
@@ -191,7 +191,7 @@ class Session:
     def _recover(self) -> None:
         """Reads what an earlier run finished and closes its last line."""
         last = 0
-        for last, record in read_records(self.manifest):  # noqa: B007  # counts on behind the loop
+        for last, record in read_records(self.manifest):  # counts on behind the loop
             where = f"{self.manifest}: line {last}"
             if record.get("record") == "session" and self._earlier is None:
                 self._earlier = validate(SessionRecord, record, where)
