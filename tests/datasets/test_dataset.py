@@ -217,7 +217,7 @@ def test_faults_are_in_the_truth(plan: Plan) -> None:
     ("section", "wanted", "words"),
     [
         ("imaging", {"haze_px": -0.1}, r"imaging\.haze_px: is -0.1; give px, 0 or more"),
-        ("imaging", {"speckle": [0.1, 1.5]}, r"imaging\.speckle: is 1.5; the contrast"),
+        ("imaging", {"speckle": [0.1, 1.5]}, r"imaging\.speckle: is 1.5; give a share"),
         ("imaging", {"haze_length": 0.5}, r"imaging\.haze_length"),
         ("processing", {"sharpen": 1, "sharpen_px": 100000.0}, r"processing\.sharpen_px"),
         ("print", {"texture": {"share": 0.02}}, r"print\.texture\.length"),

@@ -9,7 +9,7 @@ import traceback
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, NoReturn, TextIO
+from typing import Annotated, Any, NoReturn
 
 import typer
 
@@ -121,7 +121,7 @@ def _fail(message: str, code: int = 2) -> NoReturn:
     sys.exit(code)
 
 
-def _mute_if_full(stream: TextIO | None) -> None:
+def _mute_if_full(stream: Any) -> None:
     """What a stream cannot take is let go, so that Python does not try again at its end, and fail then."""
     try:
         if stream is not None:
@@ -129,7 +129,7 @@ def _mute_if_full(stream: TextIO | None) -> None:
     except OSError:
         with contextlib.suppress(OSError, ValueError):
             nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, stream.fileno() if stream is not None else 1)
+            os.dup2(nowhere, stream.fileno())
             os.close(nowhere)
 
 
