@@ -22,8 +22,8 @@ _EXAMPLES = (
 )
 # up to three digits a side and six a length: a thousand marks across, a kilometre
 _LENGTH = r"(\d{1,6}\.?\d{0,9}|\.\d{1,9})mm"
-_CHESSBOARD = re.compile(rf"chessboard:(\d{1, 4})x(\d{1, 4}):{_LENGTH}")
-_CHARUCO = re.compile(rf"charuco:(\d{1, 4})x(\d{1, 4}):{_LENGTH}:{_LENGTH}:(\w+)")
+_CHESSBOARD = re.compile(rf"chessboard:(\d{{1,3}})x(\d{{1,3}}):{_LENGTH}")
+_CHARUCO = re.compile(rf"charuco:(\d{{1,3}})x(\d{{1,3}}):{_LENGTH}:{_LENGTH}:(\w+)")
 _SUBPIX_WINDOW = 0.3  # of the distance between corners, half width
 _SUBPIX_RANGE = (3, 11)  # px
 # of OpenCV's older search: without the quick look for corners first a frame that has no board takes minutes

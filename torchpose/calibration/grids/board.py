@@ -19,7 +19,7 @@ GRID_EXAMPLES = (
 )
 # up to three digits a side and six a length: a thousand marks across, a kilometre
 _LENGTH = r"(\d{1,6}\.?\d{0,9}|\.\d{1,9})(?:mm)?"
-_GRID = re.compile(rf"(circles|acircles|rings):(\d{1, 4})x(\d{1, 4}):{_LENGTH}(?::{_LENGTH}:{_LENGTH})?")
+_GRID = re.compile(rf"(circles|acircles|rings):(\d{{1,3}})x(\d{{1,3}}):{_LENGTH}(?::{_LENGTH}:{_LENGTH})?")
 _LEAST_SIDE = 3  # marks across and down: fewer leave the tilt of a view open
 
 Kind = Literal["circles", "acircles", "rings"]

@@ -32,9 +32,8 @@ class TwinErrors(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
     repeatability_mm: _Deviation = 0.0  # standard deviation by axis of the true pose about the reported one, drawn
     repeatability_deg: _Deviation = 0.0  # anew for every move
-    scale: FiniteFloat = Field(
-        default=0.0, ge=-0.5, le=0.5
-    )  # how much longer true displacements from the start are than reported ones, relative
+    # how much longer true displacements from the start are than reported ones, relative
+    scale: FiniteFloat = Field(default=0.0, ge=-0.5, le=0.5)
     reading_noise_mm: _Deviation = 0.0  # standard deviation by axis of every reported position
 
 
