@@ -1,5 +1,6 @@
 """Files as slips of the pen, bad disks and bad will leave them: a few changes to one that is right."""
 
+import random
 import re
 from collections.abc import Callable
 
@@ -78,10 +79,20 @@ CHANGES: dict[str, Callable[[bytes, int, int, bytes], bytes]] = {
     "word": _replaced(_WORD),
     "line": _lines,
 }
-_PLACE = st.integers(0, 2**16)
+_PLACES, _MOST = 2**16, 4
+_PLACE = st.integers(0, _PLACES)
 changes = st.lists(
-    st.tuples(st.sampled_from(sorted(CHANGES)), _PLACE, _PLACE, st.sampled_from(TOKENS)), min_size=1, max_size=4
+    st.tuples(st.sampled_from(sorted(CHANGES)), _PLACE, _PLACE, st.sampled_from(TOKENS)), min_size=1, max_size=_MOST
 )
+
+
+def drawn(chance: random.Random) -> list[Change]:
+    """The same without hypothesis, which takes longer to draw a case than most readers to read it."""
+    names = sorted(CHANGES)
+    return [
+        (chance.choice(names), chance.randint(0, _PLACES), chance.randint(0, _PLACES), chance.choice(TOKENS))
+        for _ in range(chance.randint(1, _MOST))
+    ]
 
 
 def changed(text: bytes, several: list[Change]) -> bytes:

@@ -8,6 +8,7 @@ import contextlib
 import functools
 import json
 import os
+import random
 import re
 import resource
 import time
@@ -18,9 +19,9 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import HealthCheck, Phase, given, note, seed, settings
+from hypothesis import HealthCheck, given, note, settings
 
-from tests.fuzz.mutations import Change, changed, changes
+from tests.fuzz.mutations import Change, changed, changes, drawn
 from tests.io.test_store import ORIGIN, some_poses
 from tests.rig.test_session_folder import IMAGE, TAKEN, begun, opened
 from torchpose.analysis.evaluation import estimates_of, evaluate
@@ -43,7 +44,6 @@ from torchpose.target import Target
 
 ROOT = Path(__file__).parents[2]
 CASES = 40  # of a kind in a normal run
-ROUND = 1000  # cases that hypothesis draws at once in a long one
 MOST_S, MOST_BYTES = 1.0, 200 << 20
 FRAMES = ["a.png", "b.png", "c.png"]
 
@@ -267,26 +267,6 @@ def check(reader: Reader, path: Path, text: bytes) -> None:
         assert 0 < len(message) <= 1100
 
 
-def hunt(reader: Reader, path: Path, cases: int, number: int | None = None) -> None:
-    """Reads changed files; ``number``: of the round, for the same ones again."""
-    right = path.read_bytes()
-
-    @settings(
-        max_examples=cases,
-        deadline=None,
-        database=None,
-        suppress_health_check=list(HealthCheck),
-        phases=[Phase.generate, Phase.shrink],
-    )
-    @given(changes)
-    def one(several: list[Change]) -> None:
-        text = reader.after(changed(reader.before(right), several))
-        note(repr(text[:2000]))
-        check(reader, path, text)
-
-    (one if number is None else seed(number)(one))()
-
-
 @pytest.fixture
 def at_rest(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """No waiting for the disk, and one thread: each has a stack that counts as memory."""
@@ -310,12 +290,29 @@ def made(request: pytest.FixtureRequest, tmp_path: Path, at_rest: None) -> tuple
 
 
 def test_changed_files_end_in_one_line_or_are_read(made: tuple[Reader, Path]) -> None:
-    hunt(*made, CASES)
+    reader, path = made
+    right = reader.before(path.read_bytes())
+
+    @settings(max_examples=CASES, deadline=None, database=None, suppress_health_check=list(HealthCheck))
+    @given(changes)
+    def one(several: list[Change]) -> None:
+        text = reader.after(changed(right, several))
+        note(repr(text[:2000]))
+        check(reader, path, text)
+
+    one()
 
 
 @pytest.mark.fuzz
 @pytest.mark.timeout(0)
 def test_very_many_changed_files(made: tuple[Reader, Path]) -> None:
-    cases = int(os.environ.get("FUZZ_CASES", "100000"))
-    for number in range(-(-cases // ROUND)):
-        hunt(*made, min(ROUND, cases), number)
+    reader, path = made
+    right = reader.before(path.read_bytes())
+    faults: list[tuple[int, str]] = []
+    for number in range(int(os.environ.get("FUZZ_CASES", "100000"))):
+        text = reader.after(changed(right, drawn(random.Random(number))))
+        try:
+            check(reader, path, text)
+        except Exception as error:
+            faults.append((number, f"{type(error).__name__}: {error} of {text[:1000]!r}"))
+    assert not faults, f"{len(faults)}: {faults[:3]}"

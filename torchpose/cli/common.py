@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130  # as shells have it: 128 + SIGINT
 
+MOST_SEED = 2**63 - 1  # of torch's generators
 _MOST_THREADS = 256  # (convention) more than any machine of today gains from; thousands of stacks end the process
 _MOST_BATCH = 4096  # frames (convention): of 20 megapixels they fill 80 GB
 Threads = Annotated[int | None, typer.Option(min=1, max=_MOST_THREADS, help="Threads to use; by default one a core.")]

@@ -50,7 +50,7 @@ def design(
     plate: Annotated[str | None, typer.Option(metavar="WxH", help="Width and height of the plate, mm.")] = None,
     accuracy_um: _Need = None,
     accuracy_deg: Annotated[float | None, typer.Option(help=_ANGLE)] = None,
-    markers: Annotated[int | None, typer.Option(help=_MARKERS)] = None,
+    markers: Annotated[int | None, typer.Option(min=3, max=1000, help=_MARKERS)] = None,
     printing: Annotated[str | None, typer.Option("--print", metavar="CLASS", help=_PRINT)] = None,
     print_gain: Annotated[float | None, typer.Option(metavar="UM", help=_GAIN)] = None,
     blur: Annotated[float, typer.Option(help="Standard deviation of the lens's blur in focus, px.")] = 0.7,

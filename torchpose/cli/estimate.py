@@ -62,7 +62,7 @@ def estimate(
     out: Annotated[Path, typer.Option(help="Table of the poses: .csv, .jsonl or .parquet.")],
     detections: Annotated[Path | None, typer.Option(help=_DETECTIONS)] = None,
     overlay: Overlay = None,
-    instances: Annotated[int, typer.Option(min=1, metavar="K", help=_INSTANCES)] = 1,
+    instances: Annotated[int, typer.Option(min=1, max=1000, metavar="K", help=_INSTANCES)] = 1,
     resume: Annotated[bool, typer.Option("--resume", help=_RESUME)] = False,
     hand_eye: Annotated[Path | None, typer.Option(help=_HAND_EYE)] = None,
     relative_to: Annotated[str | None, typer.Option(metavar="NAME", help=_RELATIVE)] = None,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchpose.cli.common import say
+from torchpose.cli.common import MOST_SEED, say
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def sensitivity(
     blur: Annotated[float, typer.Option(help="Standard deviation of the lens's blur, px, with --noise.")] = 0.7,
     levels: Annotated[tuple[float, float], typer.Option(metavar="DARK LIGHT", help=_LEVELS)] = (30.0, 220.0),
     draws: Annotated[int, typer.Option(min=2, max=100000, help="Random draws at every distance.")] = 300,
-    seed: Annotated[int, typer.Option(min=0, help="Of the draws.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Of the draws.")] = 0,
 ) -> int:
     """Predict pose errors by source over the working distance, and check the prediction by Monte-Carlo.
 

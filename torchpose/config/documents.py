@@ -246,7 +246,7 @@ def _scalar(event: yaml.ScalarEvent) -> Any:
     tag = (event.tag or "").removeprefix(_TAG)
     if event.tag and tag in _UNREAD:
         raise _wrong(event, f"!!{tag} is a kind of value that no file of ours needs; leave the tag out")
-    if tag in ("str", "!") or (tag not in _MEANINGS and event.style):
+    if tag == "str" or (tag not in _MEANINGS and event.style):
         return text
     if tag not in _MEANINGS:
         rules = _Resolver.yaml_implicit_resolvers

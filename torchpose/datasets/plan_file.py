@@ -259,7 +259,9 @@ def _small(value: Any) -> bool:
     """Whether the arguments of a fault are such as fit into a moment and some megabytes."""
     if isinstance(value, list):
         return len(value) <= _MOST_ARGUMENT_LENGTH and all(map(_small, value))
-    return isinstance(value, str | bool | None) or abs(value) <= _MOST_ARGUMENT
+    if isinstance(value, int | float):
+        return abs(value) <= _MOST_ARGUMENT
+    return isinstance(value, str | None)
 
 
 class PlanFile(_Section):
@@ -283,7 +285,7 @@ class PlanFile(_Section):
     def _modest(cls, value: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
         for name, arguments in value.items():
             for key, argument in arguments.items():
-                if isinstance(argument, dict) or not _small(argument):
+                if not _small(argument):
                     limit = f"numbers up to {_MOST_ARGUMENT:g}, in short lists"
                     raise ValueError(f"has {name}.{key} = {shown(argument)}; give {limit}")
         return value
