@@ -201,7 +201,10 @@ TRAPS = {
     "id negative": (replaced("id: 3", "id: -3"), M.format(3) + "id: is -3; "),
     "id text": (replaced("id: 3", "id: a"), M.format(3) + "id: is not an integer; "),
     "id fraction": (replaced("id: 3", "id: 3.5"), M.format(3) + "id: is not an integer; "),
-    "id huge": (replaced("id: 3", "id: 99999999999999999999"), r"line 8: 99999999999999999999\.\.\. is a number of 20 digits"),
+    "id huge": (
+        replaced("id: 3", "id: 99999999999999999999"),
+        r"line 8: 99999999999999999999\.\.\. is a number of 20 digits",
+    ),
     "same code": (replaced("inner_radius: 2.0", "inner_radius: 1.7"), r"markers: ids 0 and 1 cannot be told apart \("),
     "inner outside": (replaced("2.5}", "5.5}"), M.format(2) + "inner_radius: 5.5 is not below the outer 5; "),
     "inner equal": (replaced("2.5}", "5.0}"), M.format(2) + "inner_radius: 5 is not below the outer 5; "),

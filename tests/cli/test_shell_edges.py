@@ -141,7 +141,7 @@ def test_a_damaged_line_of_the_journal_is_done_again(run: Callable[..., Any], mo
     journal.write_bytes(b"".join([*lines[:2], lines[2].replace(b'"tz": 1', b'"tz": 2'), lines[3]]))
     code, error = run(*ESTIMATE, "f", "--batch", "1", "--resume")
     assert code == 0
-    assert "torchpose: 1 damaged lines of p.csv.partial were left out, their frames done again\n" in error
+    assert "torchpose: 1 damaged lines of p.csv.partial left out, their frames done again\n" in error
     assert Path("p.csv").read_bytes() == whole
 
 

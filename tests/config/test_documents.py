@@ -111,7 +111,7 @@ def test_what_has_no_end_or_no_beginning_is_not_read(tmp_path: Path) -> None:
     (tmp_path / "loop.yaml").symlink_to("loop.yaml")
     with (tmp_path / "large.yaml").open("wb") as file:
         file.truncate(10**10)
-    for place, problem in {
+    places: dict[str | Path, str] = {
         "/dev/zero": "is a device or pipe",
         tmp_path / "pipe.yaml": "is a device or pipe",
         tmp_path / "loop.yaml": "cannot be read",
@@ -119,7 +119,8 @@ def test_what_has_no_end_or_no_beginning_is_not_read(tmp_path: Path) -> None:
         "a\0b": "cannot be read",
         "a\ud800b": "cannot be read|does not exist",
         "x" * 300: "cannot be read",
-    }.items():
+    }
+    for place, problem in places.items():
         with pytest.raises(ConfigError, match=problem) as caught:
             read_yaml(place)
         assert str(caught.value).isprintable()

@@ -13,8 +13,8 @@ from torchpose.camera import Camera
 from torchpose.datasets.dataset import analytic, bounds, plan_truth, simulated_frames, write_bop, write_dataset
 from torchpose.datasets.plan import Plan, load_plan
 from torchpose.errors import ConfigError
-from torchpose.io.truth import read_truth
 from torchpose.io.rows import Schema
+from torchpose.io.truth import read_truth
 from torchpose.io.writers import read_table
 from torchpose.sim import render
 from torchpose.target import Target

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 import torch
@@ -184,7 +184,11 @@ def read_capture_plan(path: Path) -> None:
     assert plan.digest
 
 
-def camera_text(form: str) -> Callable[[Path], None]:
+Form = Literal["json", "ros", "kalibr", "colmap"]
+FORMS: tuple[Form, ...] = ("json", "ros", "kalibr", "colmap")
+
+
+def camera_text(form: Form) -> Callable[[Path], None]:
     def make(path: Path) -> None:
         Camera.load(ROOT / "data/sample/camera.yaml").save(path, form)
 
@@ -245,7 +249,7 @@ READERS = [
     Reader("plan.yaml", with_camera(text=FULL_PLAN), load_plan),
     Reader("grid.yaml", with_camera(text=GRID_PLAN), load_plan),
     Reader("camera.yaml", copied(CAMERA), Camera.load),
-    *(Reader(f"camera_{form}", camera_text(form), Camera.load) for form in ("json", "ros", "kalibr", "colmap")),
+    *(Reader(f"camera_{form}", camera_text(form), Camera.load) for form in FORMS),
     Reader("target.yaml", copied("data/sample/target.yaml"), Target.load),
     Reader("hand_eye.yaml", copied(text=HAND_EYE), HandEye.load),
     Reader("twin.yaml", with_camera(text=TWIN), Scene.load),

@@ -32,6 +32,7 @@ if TYPE_CHECKING:  # imported where they are used: torch takes more than a secon
     from torchpose.io.misfits import Misfits
     from torchpose.io.rows import Row
     from torchpose.io.sources import Source
+    from torchpose.io.store import ResultStore
     from torchpose.pipeline import PoseEstimator
     from torchpose.report import overlay as pictures
     from torchpose.results import Poses
@@ -189,8 +190,6 @@ def _run(
     from torchpose.camera import LINEAR
     from torchpose.cli.terminal import FrameProgress
     from torchpose.io.reader import FrameReader, default_batch, in_batches
-    from torchpose.io.rows import BASE_SCHEMA, POSE_SCHEMA
-    from torchpose.io.store import ResultStore, stamp_of
     from torchpose.pipeline import PoseEstimator
     from torchpose.report.overlay import Overlay
 
@@ -204,11 +203,7 @@ def _run(
     # the reader hands on linear frames
     estimator = PoseEstimator(replace(camera, tone=None), targets, instances=work.instances, method=method)
     painter = None if overlay is None else Overlay(camera, targets, overlay, threads=threads)
-    schema = POSE_SCHEMA | (BASE_SCHEMA if work.hand_eye else {})
-    origin = work.origin(detections is not None)
-    files = {source.name: stamp_of(source.path) for source in sources}  # before they are read
-    kept: dict[str, Any] = {"schema": schema, "targets": len(work.rows_of), "origin": origin, "files": files}
-    store = ResultStore(out, detections, resume=resume, **kept)
+    store = _opened(work, out, detections, resume)
     # a resumed run works on the same batches as one that was not interrupted, so that rows agree to the last bit
     batches = in_batches(sources, batch or default_batch(camera.width, camera.height))
     pending = [one for one in batches if any(source.name not in store for source in one)]
@@ -226,17 +221,30 @@ def _run(
     finally:
         store.close()
     progress.summary(store.counts, out)
-    for line in store.whole_run.lines(f"{camera.width}x{camera.height}"):
-        say(f"torchpose: warning: {line}", err=True)
-    if store.damaged:
-        say(
-            f"torchpose: {store.damaged} damaged lines of {out}.partial were left out, their frames done again",
-            err=True,
-        )
+    _tell_mistakes(store, out, work)
     if not quiet:
         _tell_crowded(store.crowded, store.most, work)
         _tell_misfits(store.misfits, work)
     return ended(store.unreadable)
+
+
+def _opened(work: _Work, out: Path, detections: Path | None, resume: bool) -> ResultStore:
+    """Where the rows go, with those of an earlier run."""
+    from torchpose.io.rows import BASE_SCHEMA, POSE_SCHEMA
+    from torchpose.io.store import ResultStore, stamp_of
+
+    files = {source.name: stamp_of(source.path) for source in work.sources}  # before they are read
+    schema = POSE_SCHEMA | (BASE_SCHEMA if work.hand_eye else {})
+    kept: dict[str, Any] = {"schema": schema, "targets": len(work.rows_of), "files": files}
+    return ResultStore(out, detections, resume=resume, origin=work.origin(detections is not None), **kept)
+
+
+def _tell_mistakes(store: ResultStore, out: Path, work: _Work) -> None:
+    """Tells, on stderr, what is wrong with the run as a whole."""
+    for line in store.whole_run.lines(f"{work.camera.width}x{work.camera.height}"):
+        say(f"torchpose: warning: {line}", err=True)
+    if store.damaged:
+        say(f"torchpose: {store.damaged} damaged lines of {out}.partial left out, their frames done again", err=True)
 
 
 def _tell_crowded(frames: set[str], most: dict[str, int], work: _Work) -> None:
