@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
 
 from torchpose.config import shown
-from torchpose.config.kinds import MOST_LENGTH, Degrees, Length, Seed, Word
+from torchpose.config.kinds import MOST_LENGTH, Degrees, Length, Number, Seed, Word
 from torchpose.sim.prints import Warp
 
 MOST_FRAMES = 100_000  # of a plan (convention): two terabytes of 20 megapixels
@@ -30,7 +30,7 @@ def _range(value: Any) -> Any:
     return value
 
 
-Range = Annotated[list[Length], BeforeValidator(_range)]
+Range = Annotated[list[Number], BeforeValidator(_range)]
 """[low, high], from which every frame draws its own value; a plain number stands for both."""
 
 
@@ -47,6 +47,7 @@ def _within(low: float, high: float, fix: str, *, above: bool = False) -> AfterV
     return AfterValidator(check)
 
 
+Place = Annotated[Range, _within(-MOST_LENGTH, MOST_LENGTH, "give mm")]
 Turn = Annotated[Range, _within(-3600.0, 3600.0, "give degrees")]
 Blur = Annotated[Range, _within(0.0, 100.0, "the blur must be above 0 px, such as 0.3 for a sharp lens", above=True)]
 Move = Annotated[Range, _within(0.0, 1e4, "give the length of the move during the exposure, 0 or more")]
@@ -90,9 +91,9 @@ class Random(_Section):
     """A low-discrepancy (Halton) cover of position, tilt (any direction) and roll."""
 
     count: Annotated[int, Field(ge=1, le=MOST_FRAMES)]
-    x: Range
-    y: Range
-    z: Range
+    x: Place
+    y: Place
+    z: Place
     tilt_deg: Turn = [0.0, 45.0]
     roll_deg: Turn = [-180.0, 180.0]
 
