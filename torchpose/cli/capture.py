@@ -54,18 +54,19 @@ def capture(
         Scene.load(twin).check(settings, twin)
     status = LiveStatus.load(camera or [], target or [], settings.cameras)
     session = Session(out, plan=path.digest, images=image_origin(settings), resume=resume)
-    left = len(missing(path, settings, session.done))
-    if not quiet:
-        _show(path, settings, left, out)
-    if dry_run:
-        return 0
-    if left == 0:
-        say(f"{session.manifest}: complete, nothing is missing", err=True)
-        return 0
-    if not yes and not typer.confirm(f"Move the robot through {left} waypoints?", err=True):
-        raise ConfigError("capture: not confirmed, nothing has moved; add --yes to run without the question")
-    with session, status:
-        return _run(path, settings, session, twin, status, quiet)
+    with contextlib.closing(session):
+        left = len(missing(path, settings, session.done))
+        if not quiet:
+            _show(path, settings, left, out)
+        if dry_run:
+            return 0
+        if left == 0:
+            say(f"{session.manifest}: complete, nothing is missing", err=True)
+            return 0
+        if not yes and not typer.confirm(f"Move the robot through {left} waypoints?", err=True):
+            raise ConfigError("capture: not confirmed, nothing has moved; add --yes to run without the question")
+        with session, status:
+            return _run(path, settings, session, twin, status, quiet)
 
 
 def _run(plan: CapturePlan, rig: Rig, session: Session, twin: Path | None, status: LiveStatus, quiet: bool) -> int:

@@ -61,7 +61,11 @@ class Session:
                 problem = "does not exist; leave --resume out to start the session"
                 raise ConfigError(f"{self.manifest}: --resume: {problem}")
             self._hold()  # before a torn line is dropped, which may be one that is being written
-            self._recover()
+            try:
+                self._recover()
+            except BaseException:
+                self.close()
+                raise
         else:
             self._check_new()
 
@@ -97,6 +101,10 @@ class Session:
         if self._file is not None:
             os.close(self._file)
             self._file = None
+        self.close()
+
+    def close(self) -> None:
+        """Lets other processes write the session, where it has not been entered; leaving it does so too."""
         if self._lock is not None:
             self._lock.release()
             self._lock = None
