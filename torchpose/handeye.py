@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from pydantic import BaseModel, ConfigDict, FiniteFloat, model_validator
+from pydantic import BaseModel, ConfigDict, model_validator
 from torch import Tensor
 
 from torchpose.config import format_list, read_yaml, validate, write_text
+from torchpose.config.kinds import Number
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.geometry.covariance import covariance_fault
@@ -23,8 +24,8 @@ class _Pose(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
     rotation: Vector | None = None
     translation: Vector | None = None
-    matrix: list[list[FiniteFloat]] | None = None
-    covariance: list[list[FiniteFloat]] | None = None
+    matrix: list[list[Number]] | None = None
+    covariance: list[list[Number]] | None = None
 
     @model_validator(mode="after")
     def _one_form(self) -> _Pose:

@@ -14,6 +14,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat,
 from torch import Tensor
 
 from torchpose.config import format_list, format_number, read_yaml, validate, within, write_text
+from torchpose.config.kinds import Length, Number, Text
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.geometry.covariance import covariance_fault
@@ -23,8 +24,9 @@ RATIO_RANGE = (0.15, 0.9)  # inner/outer: a smaller hole or a thinner ring is no
 MAX_DEVIATION = 1e3  # mm, of a place or edge (convention): far beyond any part, and its square is still a number
 MIN_SPREAD = 1e-2  # second / first singular value of the centred marker centres; below, they count as collinear
 
+MOST_MARKERS = 1000  # of a target (convention): their ratios tell a dozen apart
 _FROZEN = ConfigDict(extra="forbid", frozen=True)
-Vector = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
+Vector = Annotated[list[Length], Field(min_length=3, max_length=3)]
 Deviation = Annotated[FiniteFloat, Field(ge=0, le=MAX_DEVIATION)]
 Deviations = Annotated[
     list[Deviation],
@@ -45,9 +47,9 @@ class RigidTransformFile(BaseModel):
 class _MarkerFile(BaseModel):
     model_config = _FROZEN
     id: Annotated[int, Field(le=2**63 - 1)]
-    center: list[FiniteFloat]
-    outer_radius: FiniteFloat
-    inner_radius: FiniteFloat
+    center: list[Length]
+    outer_radius: Length
+    inner_radius: Length
     normal: Vector = [0.0, 0.0, 1.0]
     center_sigma: Deviations | None = None
 
@@ -63,7 +65,7 @@ class _MatrixFile(BaseModel):
     model_config = _FROZEN
     rows: int
     cols: int
-    data: list[FiniteFloat]
+    data: list[Number]
 
 
 class _TargetFile(BaseModel):
@@ -71,14 +73,14 @@ class _TargetFile(BaseModel):
     name: str
     units: Literal["mm"]
     background: Literal["light", "dark"]
-    markers: list[_MarkerFile]
+    markers: Annotated[list[_MarkerFile], Field(max_length=MOST_MARKERS)]
     part_from_target: RigidTransformFile | None = None
     center_sigma: Deviations | None = None
-    edge_gain: FiniteFloat = 0.0
+    edge_gain: Length = 0.0
     edge_gain_sigma: Deviation | None = None
     centers_covariance: _MatrixFile | None = None
     scale_sigma: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.0
-    adjustment: str | None = None
+    adjustment: Text | None = None
     camera_cross_covariance: _MatrixFile | None = None
 
     @field_validator("units", mode="before")

@@ -19,6 +19,7 @@ from torchpose.cli.common import (
     frames_of,
     interrupted,
     read_tone,
+    say,
     with_tone,
 )
 from torchpose.errors import ConfigError
@@ -110,7 +111,7 @@ def calibrate(
                 from torchpose.report.calibration import save_calibration
 
                 for path in save_calibration(calibration, fit, plots, measured):
-                    typer.echo(str(path))
+                    say(str(path))
     except KeyboardInterrupt:
         return interrupted("nothing more was written; run again")
     return ended(frames.unreadable)
@@ -256,13 +257,13 @@ def _show(found: Calibration, frames: int, *, held: bool = False) -> None:
     if not held:
         _show_intrinsics(found)
     points = f"{len(found.views.view)} points{f', {found.left_out} points left out' if found.left_out else ''}"
-    typer.echo(f"{len(found.views)} of {frames} views, {points}, residual RMS {found.rms_px:.3g} px")
+    say(f"{len(found.views)} of {frames} views, {points}, residual RMS {found.rms_px:.3g} px")
     if found.common_sigma_px:
-        typer.echo(f"{found.common_sigma_px:.3g} px per axis, beyond the noise of the frames, in every point")
+        say(f"{found.common_sigma_px:.3g} px per axis, beyond the noise of the frames, in every point")
     if found.camera.tone is not None:
-        typer.echo(f"tone {found.camera.tone}")
+        say(f"tone {found.camera.tone}")
     for warning in found.warnings:
-        typer.echo(f"warning: {warning}", err=True)
+        say(f"warning: {warning}", err=True)
 
 
 def _show_target(found: Measurement) -> None:
@@ -274,10 +275,10 @@ def _show_target(found: Measurement) -> None:
     for name, of, known in zip("xyz", off.unbind(1), sigma.unbind(1), strict=True):
         rms, most = float(of.square().mean().sqrt()), float(of.abs().max())
         known_um = 1e3 * float(known.square().mean().sqrt())
-        typer.echo(f"places {name}: {1e3 * rms:.3g} um RMS off, {1e3 * most:.3g} at most; known to {known_um:.2g} um")
+        say(f"places {name}: {1e3 * rms:.3g} um RMS off, {1e3 * most:.3g} at most; known to {known_um:.2g} um")
     size = float((target.radii / nominal.radii).mean())
     gain, gain_sigma = 1e3 * target.edge_gain, 1e3 * float(target.covariance[-1, -1].sqrt())
-    typer.echo(f"edge gain {gain:.3g} +- {gain_sigma:.2g} um, rings {size:.5f} times as large as in the file")
+    say(f"edge gain {gain:.3g} +- {gain_sigma:.2g} um, rings {size:.5f} times as large as in the file")
 
 
 def _show_intrinsics(found: Calibration) -> None:
@@ -285,7 +286,7 @@ def _show_intrinsics(found: Calibration) -> None:
     values = [*matrix.diagonal()[:2].tolist(), *matrix[:2, 2].tolist(), *found.camera.distortion.tolist()]
     for name, value, sigma in zip(found.names, values, found.covariance.diagonal().sqrt().tolist(), strict=True):
         digits = max(0, 1 - math.floor(math.log10(sigma))) if sigma > 0 else 6
-        typer.echo(f"{name:>3} {value:14.{digits}f} +- {sigma:.2g}{' px' if name[0] in 'fc' else ''}")
+        say(f"{name:>3} {value:14.{digits}f} +- {sigma:.2g}{' px' if name[0] in 'fc' else ''}")
 
 
 def _show_hand_eye(fit: HandEyeFit) -> None:
@@ -294,9 +295,9 @@ def _show_hand_eye(fit: HandEyeFit) -> None:
     found = fit.hand_eye
     assert found.covariance is not None  # always there after a fit
     sigmas = found.covariance.diagonal().sqrt().tolist()
-    typer.echo(f"{found.mount}_from_camera, from {len(fit.residual)} poses")
+    say(f"{found.mount}_from_camera, from {len(fit.residual)} poses")
     for name, value, sigma in zip("xyz", found.translation.tolist(), sigmas[:3], strict=True):
-        typer.echo(f"{name:>3} {value:12.4f} +- {sigma:.2g} mm")
+        say(f"{name:>3} {value:12.4f} +- {sigma:.2g} mm")
     for name, value, sigma in zip("xyz", rotations.log(found.rotation).tolist(), sigmas[3:], strict=True):
-        typer.echo(f" r{name} {value:12.7f} +- {sigma:.2g} rad")
-    typer.echo(f"robot noise {fit.robot_sigma_mm:.2g} mm and {fit.robot_sigma_rad:.2g} rad per axis")
+        say(f" r{name} {value:12.7f} +- {sigma:.2g} rad")
+    say(f"robot noise {fit.robot_sigma_mm:.2g} mm and {fit.robot_sigma_rad:.2g} rad per axis")

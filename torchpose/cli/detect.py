@@ -20,6 +20,7 @@ from torchpose.cli.common import (
     frames_of,
     interrupted,
     read_tone,
+    use_threads,
 )
 
 if TYPE_CHECKING:  # imported where they are used: torch takes more than a second, which --help need not wait for
@@ -63,7 +64,7 @@ def detect(
     if overlay is not None:
         make_folder(overlay, "--overlay")
     cv2.setNumThreads(1)
-    torch.set_num_threads(threads or cores())
+    use_threads(threads)
     unreadable: dict[str, str] = {}
     rows: list[Row] = []
     show = FrameProgress(len(sources), 0, quiet=quiet)

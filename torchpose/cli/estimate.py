@@ -21,6 +21,8 @@ from torchpose.cli.common import (
     ended,
     frames_of,
     interrupted,
+    say,
+    use_threads,
     with_tone,
 )
 
@@ -31,6 +33,7 @@ if TYPE_CHECKING:  # imported where they are used: torch takes more than a secon
     from torchpose.io.misfits import Misfits
     from torchpose.io.rows import Row
     from torchpose.io.sources import Source
+    from torchpose.io.store import ResultStore
     from torchpose.pipeline import PoseEstimator
     from torchpose.report import overlay as pictures
     from torchpose.results import Poses
@@ -61,7 +64,7 @@ def estimate(
     out: Annotated[Path, typer.Option(help="Table of the poses: .csv, .jsonl or .parquet.")],
     detections: Annotated[Path | None, typer.Option(help=_DETECTIONS)] = None,
     overlay: Overlay = None,
-    instances: Annotated[int, typer.Option(min=1, metavar="K", help=_INSTANCES)] = 1,
+    instances: Annotated[int, typer.Option(min=1, max=1000, metavar="K", help=_INSTANCES)] = 1,
     resume: Annotated[bool, typer.Option("--resume", help=_RESUME)] = False,
     hand_eye: Annotated[Path | None, typer.Option(help=_HAND_EYE)] = None,
     relative_to: Annotated[str | None, typer.Option(metavar="NAME", help=_RELATIVE)] = None,
@@ -124,7 +127,7 @@ def _with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -
     told = (
         "too few rings to tell" if shift is None else f"as linear ones their edges would be {abs(shift.px):.2g} px off"
     )
-    typer.echo(
+    say(
         f"torchpose: {sources[0].name}: JPEG or colour, and neither the camera file nor --tone says its tone: taken as "
         f"{tone or LINEAR} ({told})",
         err=True,
@@ -187,24 +190,20 @@ def _run(
     from torchpose.camera import LINEAR
     from torchpose.cli.terminal import FrameProgress
     from torchpose.io.reader import FrameReader, default_batch, in_batches
-    from torchpose.io.rows import BASE_SCHEMA, POSE_SCHEMA
-    from torchpose.io.store import ResultStore
     from torchpose.pipeline import PoseEstimator
     from torchpose.report.overlay import Overlay
 
     cv2.setNumThreads(1)  # frames are decoded side by side; threads inside of one would only compete
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     # decoding is the larger part of the work; torch's threads wait actively and would take its cores away
-    torch.set_num_threads(max(1, threads // 2))
+    use_threads(threads, share=0.5)
     camera, targets, sources = work.camera, work.targets, work.sources
     method: Any = work.method  # it checks
     tone = camera.tone or LINEAR
     # the reader hands on linear frames
     estimator = PoseEstimator(replace(camera, tone=None), targets, instances=work.instances, method=method)
     painter = None if overlay is None else Overlay(camera, targets, overlay, threads=threads)
-    schema = POSE_SCHEMA | (BASE_SCHEMA if work.hand_eye else {})
-    origin = work.origin(detections is not None)
-    store = ResultStore(out, detections, schema=schema, targets=len(work.rows_of), origin=origin, resume=resume)
+    store = _opened(work, out, detections, resume)
     # a resumed run works on the same batches as one that was not interrupted, so that rows agree to the last bit
     batches = in_batches(sources, batch or default_batch(camera.width, camera.height))
     pending = [one for one in batches if any(source.name not in store for source in one)]
@@ -222,10 +221,30 @@ def _run(
     finally:
         store.close()
     progress.summary(store.counts, out)
+    _tell_mistakes(store, out, work)
     if not quiet:
         _tell_crowded(store.crowded, store.most, work)
         _tell_misfits(store.misfits, work)
     return ended(store.unreadable)
+
+
+def _opened(work: _Work, out: Path, detections: Path | None, resume: bool) -> ResultStore:
+    """Where the rows go, with those of an earlier run."""
+    from torchpose.io.rows import BASE_SCHEMA, POSE_SCHEMA
+    from torchpose.io.store import ResultStore, stamp_of
+
+    files = {source.name: stamp_of(source.path) for source in work.sources}  # before they are read
+    schema = POSE_SCHEMA | (BASE_SCHEMA if work.hand_eye else {})
+    kept: dict[str, Any] = {"schema": schema, "targets": len(work.rows_of), "files": files}
+    return ResultStore(out, detections, resume=resume, origin=work.origin(detections is not None), **kept)
+
+
+def _tell_mistakes(store: ResultStore, out: Path, work: _Work) -> None:
+    """Tells, on stderr, what is wrong with the run as a whole."""
+    for line in store.whole_run.lines(f"{work.camera.width}x{work.camera.height}"):
+        say(f"torchpose: warning: {line}", err=True)
+    if store.damaged:
+        say(f"torchpose: {store.damaged} damaged lines of {out}.partial left out, their frames done again", err=True)
 
 
 def _tell_crowded(frames: set[str], most: dict[str, int], work: _Work) -> None:
@@ -235,7 +254,7 @@ def _tell_crowded(frames: set[str], most: dict[str, int], work: _Work) -> None:
     seen = ", ".join(f"{count} of {target}" for target, count in most.items())
     more = max(most.values()) > work.instances
     fix = f"--instances {max(most.values())} looks for all" if more else "no pose explains the others"
-    typer.echo(
+    say(
         f"torchpose: {len(frames)} of {len(work.sources)} frames show more copies of a target than they have rows, "
         f"up to {seen}; {fix}",
         err=True,
@@ -248,22 +267,23 @@ def _tell_misfits(misfits: dict[str, Misfits], work: _Work) -> None:
     files = [f"target {', '.join(silent)} (center_sigma, edge_gain_sigma)"] if silent else []
     if work.camera.covariance is None and any(m.frames for m in misfits.values()):
         files.append("camera (intrinsics_covariance)")
+    stated = work.camera.covariance is not None or any(t.covariance is not None for t in work.rows_of)
     if files:
-        typer.echo(
-            f"torchpose: no uncertainty is stated of {' and '.join(files)}: s* counts the noise of the frames alone, "
-            "and what residuals show beyond it",
+        say(
+            f"torchpose: no uncertainty is stated of {' and '.join(files)}: s* counts the noise of the frames"
+            f"{', what the other files state' if stated else ' alone'}, and what residuals show beyond it",
             err=True,
         )
     mirrored = sum(m.mirrored for m in misfits.values())
     if mirrored:
-        typer.echo(
+        say(
             f"torchpose: {mirrored} rows show a target mirrored, from behind its printed side: turn the camera's "
             "mirroring off, or write normal: [0, 0, -1] for the markers of a target that is drawn y-up",
             err=True,
         )
     for target in work.rows_of:
         for line in misfits[target.name].lines(target.name, target.ids.tolist()) if target.name in misfits else ():
-            typer.echo(f"torchpose: {line}", err=True)
+            say(f"torchpose: {line}", err=True)
 
 
 def _records(batch: reader.Batch, estimator: PoseEstimator, work: _Work, painter: pictures.Overlay | None) -> list[Row]:

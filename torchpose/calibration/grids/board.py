@@ -17,8 +17,9 @@ GRID_EXAMPLES = (
     "circles:7x6:20mm (columns, rows, pitch), acircles:4x11:20mm (OpenCV's asymmetric grid) or "
     "rings:10x7:20mm:6mm:3mm (columns, rows, pitch, radii)"
 )
-_LENGTH = r"(\d+\.?\d*|\.\d+)(?:mm)?"
-_GRID = re.compile(rf"(circles|acircles|rings):(\d+)x(\d+):{_LENGTH}(?::{_LENGTH}:{_LENGTH})?")
+# up to three digits a side and six a length: a thousand marks across, a kilometre
+_LENGTH = r"(\d{1,6}\.?\d{0,9}|\.\d{1,9})(?:mm)?"
+_GRID = re.compile(rf"(circles|acircles|rings):(\d{{1,3}})x(\d{{1,3}}):{_LENGTH}(?::{_LENGTH}:{_LENGTH})?")
 _LEAST_SIDE = 3  # marks across and down: fewer leave the tilt of a view open
 
 Kind = Literal["circles", "acircles", "rings"]
