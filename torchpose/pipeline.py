@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from torchpose.camera import LINEAR, Camera, Tone
 from torchpose.camera.model import Model
-from torchpose.detect import Candidates, Wanted, find_candidates, find_coarse
+from torchpose.detect import Candidates, Wanted, find_candidates, find_coarse, merge_duplicates, reduction_factor
 from torchpose.errors import ConfigError, FrameError
 from torchpose.geometry import blur as blurs
 from torchpose.geometry.grey import grey
@@ -23,6 +23,7 @@ from torchpose.identify import (
     MarkerTable,
     Scene,
     identify,
+    identify_boards,
     indistinguishable,
     look_again,
 )
@@ -35,7 +36,9 @@ from torchpose.pose import (
     crossed_out,
     gather_evidence,
     outcome,
+    right_way_round,
     solve_poses,
+    still_open,
 )
 from torchpose.refine import METHODS, Recipe, Sight
 from torchpose.results import Poses, Reason, Status
@@ -62,6 +65,9 @@ class PoseEstimator(nn.Module):
             "centers" stops at the pose of the centres of their ellipses; "paper" is the paper's chain: Zernike edges as
             read, centres by eq. (7), PnP.
         float_range: grey value of white in floating-point frames: 1.0 or 255.0.
+        assume_upright: boards of equal marks that look the same after a turn have their rows to the right, within 90
+            degrees (square ones within 45); without, their rows are ambiguous unless the target's file has their
+            measured places.
         srgb: the grey values are sRGB-encoded, whatever the camera says of its tone. Frames that are not linear are
             taken back to linear ones first: edges are half-way in linear grey, so encoded frames that are taken as
             linear ones shift them (docs/precision.md).
@@ -69,7 +75,7 @@ class PoseEstimator(nn.Module):
 
     Raises:
         ConfigError: no target, two of one name, or two that cannot be told apart; ``instances`` below 1; an unknown
-            method; ``compile`` without a C++ compiler.
+            method, or one that has no use for discs; ``compile`` without a C++ compiler.
     """
 
     made_for: Tensor
@@ -82,6 +88,7 @@ class PoseEstimator(nn.Module):
         instances: int = 1,
         method: Method = "photometric",
         float_range: float = 1.0,
+        assume_upright: bool = False,
         srgb: bool = False,
         compile: bool = False,
     ) -> None:
@@ -95,7 +102,9 @@ class PoseEstimator(nn.Module):
             raise ConfigError(f"float_range: {float_range} is not positive; use 1.0 or 255.0")
         if method not in get_args(Method):
             raise ConfigError(f"method: {method!r} is not known; choose one of {', '.join(get_args(Method))}")
+        _check_boards(self.targets, method, instances)
         self.instances = instances
+        self.assume_upright = assume_upright
         self.method = method
         self.float_range = float_range
         self.tone = Tone("srgb") if srgb else camera.tone or LINEAR
@@ -166,6 +175,7 @@ class PoseEstimator(nn.Module):
             found = self._solved(scene, *again)
         if found.solvable.numel():
             found = found._replace(solutions=self._refined(scene, found))
+            found = found._replace(solutions=still_open(scene, found))
         return outcome(scene, found)
 
     def _checked(self, frames: Tensor) -> Tensor:
@@ -193,6 +203,8 @@ class PoseEstimator(nn.Module):
     def _found(self, scene: Scene) -> tuple[Scene, Found]:
         """What is found in all frames: at the coarse scale alone where that shows every target whole."""
         frames, wanted = scene.frames, Wanted.of(scene.table.polarity, _LEAST_CANDIDATE)
+        if not bool(scene.table.coded.all()):
+            return self._found_with_boards(scene)
         if self.instances > 1:  # a copy may be too small for the coarse scale
             candidates = find_candidates(frames, wanted=wanted)
             return self._read(scene, self._rings(scene, self._circles(scene, candidates)))
@@ -208,6 +220,19 @@ class PoseEstimator(nn.Module):
         finer = find_candidates(frames[rest], wanted=wanted, coarse=known)
         more = self._rings(scene, self._circles(scene, replace(finer, frame=rest[finer.frame])))
         return self._read(scene, Rings.cat([rings[settled[rings.frame]], more]), copies)
+
+    def _found_with_boards(self, scene: Scene) -> tuple[Scene, Found]:
+        """The same where there are boards among the targets: at finer and finer scales where they are not whole."""
+        factor = reduction_factor(*scene.frames.shape[-2:])
+        candidates = find_candidates(scene.frames, factor)
+        while True:
+            found = self._read(scene, self._rings(scene, self._circles(scene, candidates)), None, candidates)
+            rest = (~_settled(*found)).nonzero()[:, 0]
+            factor //= 2
+            if factor < 1 or rest.numel() == 0:
+                return found
+            more = find_candidates(scene.frames[rest], factor)
+            candidates = merge_duplicates(Candidates.cat([candidates, replace(more, frame=rest[more.frame])]))
 
     def _circles(self, scene: Scene, candidates: Candidates) -> Circles:
         candidates = candidates[torch.isin(candidates.polarity, scene.table.polarity)]
@@ -240,13 +265,27 @@ class PoseEstimator(nn.Module):
         others = self._rings(scene, sharp[named[: len(sharp)]], precise=precise)
         return Rings.cat([others, known[named[len(sharp) :]]]), likely.copies
 
-    def _read(self, scene: Scene, rings: Rings, copies: Tensor | None = None) -> tuple[Scene, Found]:
-        """Rows of the rings of all frames, identified and solved; at least so many ``copies`` (B T,) were seen."""
+    def _read(
+        self, scene: Scene, rings: Rings, copies: Tensor | None = None, marks: Candidates | None = None
+    ) -> tuple[Scene, Found]:
+        """Rows of the rings of all frames, identified and solved; at least so many ``copies`` (B T,) were seen.
+
+        ``marks``: what those of boards are among.
+        """
         identified = identify(rings, scene.table, scene.camera, len(scene.frames))
+        if marks is not None:
+            rings, identified = identify_boards(scene, rings, identified, marks, upright=self.assume_upright)
         if copies is not None:
             identified = replace(identified, copies=identified.copies.maximum(copies[identified.group]))
         scene = scene.of_rows(identified.group)
-        return best_copies(scene, self._solved(scene, rings, identified), self.instances)
+        found = self._solved(scene, rings, identified)
+        if marks is not None:
+
+            def solve(row: Tensor, ring: Tensor) -> Found:
+                return self._solved(scene.of_rows(scene.group[row]), rings, replace(identified[row], ring=ring))
+
+            found = right_way_round(scene, found, solve)
+        return best_copies(scene, found, self.instances)
 
     def _solved(self, scene: Scene, rings: Rings, identified: Identified) -> Found:
         """The evidence of every row, and the solutions of those rows that have enough of it."""
@@ -314,6 +353,15 @@ def _check_targets(targets: Sequence[Target]) -> None:
                 f"target: {one.name!r} and {other.name!r} cannot be told apart, their codes and layout agree; give one "
                 "of them and instances (--instances) for its copies, or change the ratios or places of its rings"
             )
+
+
+def _check_boards(targets: Sequence[Target], method: str, instances: int) -> None:
+    boards = [target.name for target in targets if target.grid is not None]
+    if boards and instances > 1:
+        raise ConfigError(f"instances: board {boards[0]!r} is looked for once in a frame; leave instances out")
+    discs = [target.name for target in targets if target.discs]
+    if discs and method != "photometric":
+        raise ConfigError(f"method: {method!r} takes both circles of rings, and {discs[0]!r} has discs; use photometric")
 
 
 def _doubted(scene: Scene, found: Found) -> Solutions:

@@ -32,6 +32,7 @@ from torchpose.calibration.rings import find_rings, measure_centers
 from torchpose.calibration.tone import judge_tone, sizes_of_target
 from torchpose.calibration.views import Views
 from torchpose.camera import LINEAR, Camera, Tone
+from torchpose.config import within
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.target import Target
@@ -53,7 +54,9 @@ def parse_board(text: str) -> Board | Grid:
     Raises:
         ConfigError: it names none.
     """
-    return Grid.parse(text) or Board.parse(text)
+    with within("--board: "):
+        grid = Grid.parse(text)
+    return grid or Board.parse(text)
 
 
 def calibrate_camera(

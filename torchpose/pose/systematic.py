@@ -338,7 +338,8 @@ def _rim_jacobian(evidence: Evidence, R: Tensor, t: Tensor) -> tuple[Tensor, Ten
     tangent = (by_point @ (along @ R.mT)[..., None]).squeeze(-1)  # px per rad
     length = torch.linalg.vector_norm(tangent, dim=-1)
     normal = torch.stack([-tangent[..., 1], tangent[..., 0]], -1) / length[..., None]
-    seen = evidence.mask.repeat_interleave(2 * _RIM_POINTS, 1)
+    # of a disc the inner edge is nowhere
+    seen = (evidence.mask[..., None] & (evidence.radii > 0)).flatten(1).repeat_interleave(_RIM_POINTS, 1)
     weight = normal[..., :, None] * normal[..., None, :] * (length * seen)[..., None, None]
     by_gain = by_point @ (grows @ R.mT)[..., None]
     return torch.cat([by_pose(by_point, arm), by_gain], -1), xy, weight

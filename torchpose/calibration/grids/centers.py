@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose import pnp
-from torchpose.calibration.grids.board import Grid
+from torchpose.grids import Grid
 from torchpose.calibration.grids.marks import Marks, find_marks
 from torchpose.calibration.intrinsics import MIN_POINTS
 from torchpose.calibration.tone import Sizes, scale_at
@@ -69,11 +69,11 @@ def mark_sight(frames: Tensor, marks: Marks, grid: Grid, camera: Camera) -> tupl
     radius = _radius(marks, grid, camera, R, t)
     known, view, point, start = _starts(marks, grid, camera, R, t)
     one = torch.ones_like(start[:, :1])
-    nominal = grid.radii[1] / grid.radii[0] if grid.radii else _DISC
-    measured = float(marks.ratio.nanmedian()) if grid.radii else _DISC
+    nominal = _DISC if grid.discs or grid.radii is None else grid.radii[1] / grid.radii[0]
+    measured = _DISC if grid.discs else float(marks.ratio.nanmedian())
     shape = torch.tensor([1.0, nominal if math.isnan(measured) else measured]).to(start)
     ellipse = _predicted(camera, R[view], start, radius)
-    inner = torch.cat([ellipse[:, :2], ellipse[:, 2:4] * shape[1], ellipse[:, 4:]], -1) if grid.radii else ellipse
+    inner = ellipse if grid.discs else torch.cat([ellipse[:, :2], ellipse[:, 2:4] * shape[1], ellipse[:, 4:]], -1)
     sight = Sight(
         view,
         one > 0,
@@ -98,7 +98,7 @@ def sizes_of_marks(frames: Tensor, names: Sequence[str], grid: Grid, camera: Cam
     scale = scale_at(camera, R[marks.view], at)
     outer = marks.ellipse[:, 2:4].prod(-1).sqrt()
     inner = torch.where(marks.ratio > 0, marks.ratio * outer, torch.nan)
-    if grid.radii is None and len(marks):
+    if grid.discs and len(marks):
         known, _, _, sight, start = mark_sight(frames, marks, grid, camera)
         some = known.nonzero()[:, 0]
         some = some[:: len(some) // _SIZED + 1]
