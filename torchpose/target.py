@@ -71,7 +71,6 @@ class _TargetFile(BaseModel):
     name: str
     units: Literal["mm"]
     background: Literal["light", "dark"]
-    board: str | None = None
     markers: list[_MarkerFile]
     part_from_target: RigidTransformFile | None = None
     center_sigma: Deviations | None = None
@@ -81,6 +80,7 @@ class _TargetFile(BaseModel):
     scale_sigma: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.0
     adjustment: str | None = None
     camera_cross_covariance: _MatrixFile | None = None
+    board: str | None = None
 
     @field_validator("units", mode="before")
     @classmethod
@@ -246,6 +246,17 @@ class Target:
         scale = offset.norm(dim=-1).max()
         one_normal = (self.normals - self.normals[0]).norm(dim=-1).max() < 1e-6
         return bool(one_normal & ((offset @ self.normals[0]).abs().max() < 1e-6 * scale))
+
+    def of_markers(self, kept: Tensor) -> Target:
+        """The board with some of its marks, by a mask (M,); as far as a file claims a perfect one.
+
+        Raises:
+            ConfigError: too few are left.
+        """
+        assert self.grid is not None  # of coded rings each counts
+        grid = self.grid.without(tuple(sorted({*self.grid.missing, *self.ids[~kept].tolist()})))
+        parts = {name: getattr(self, name)[kept] for name in ("ids", "centers", "normals", "radii")}
+        return replace(self, **parts, grid=grid, covariance=None, adjustment=None, cross_covariance=None)
 
     def to(self, *args: Any, **kwargs: Any) -> Target:
         """Same as `Tensor.to` on every tensor; ids keep their dtype."""

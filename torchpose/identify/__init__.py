@@ -4,7 +4,7 @@ from torchpose.identify.alike import indistinguishable
 from torchpose.identify.boards import identify_boards
 from torchpose.identify.copies import MIN_MARKERS
 from torchpose.identify.markers import Identified, identify
-from torchpose.identify.scene import MarkerTable, Scene
+from torchpose.identify.scene import MarkerTable, Scene, drawn_radii
 from torchpose.identify.second_look import look_again
 
 __all__ = [
@@ -12,6 +12,7 @@ __all__ = [
     "Identified",
     "MarkerTable",
     "Scene",
+    "drawn_radii",
     "identify",
     "identify_boards",
     "indistinguishable",

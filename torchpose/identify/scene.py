@@ -77,7 +77,7 @@ class MarkerTable(Rows):
             padded([t.ids for t in targets], -1),
             padded([t.centers for t in targets], 0.0),
             padded([t.normals for t in targets], 0.0),
-            padded([_radii(t) for t in targets], 1.0),
+            padded([drawn_radii(t) for t in targets], 1.0),
             padded([torch.ones(len(t), dtype=torch.bool) for t in targets], False),
             torch.tensor([1.0 if t.background == "light" else -1.0 for t in targets], dtype=torch.float64),
             torch.tensor([t.coplanar for t in targets]),
@@ -91,7 +91,7 @@ class MarkerTable(Rows):
         )
 
 
-def _radii(target: Target) -> Tensor:
+def drawn_radii(target: Target) -> Tensor:
     """(M, 2), see `MarkerTable.radii`."""
     outer, inner = target.printed_radii.unbind(-1)
     return torch.stack([outer, NOWHERE * outer if target.discs else inner], -1)

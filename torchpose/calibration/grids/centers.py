@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -21,6 +22,7 @@ from torchpose.geometry.least_squares import Pose
 from torchpose.geometry.projection import image_by_point
 from torchpose.refine import LEAST_KEPT, Refined, Sight, refine_photometric
 from torchpose.rings import mapped
+from torchpose.target import Target
 
 _HELD = 1e12  # information about the rotation of a mark: as good as known
 _SIZE = (
@@ -87,6 +89,28 @@ def mark_sight(frames: Tensor, marks: Marks, grid: Grid, camera: Camera) -> tupl
         marks.blur.nanmedian(0).values.expand(len(start), 1, 3),
     )
     return known, view, point, sight, Pose(R[view], start)
+
+
+def nominal_board(marks: Marks, grid: Grid, camera: Camera) -> Target:
+    """The board as it is named, of marks as large as they look, dark or light.
+
+    Args:
+        marks: of all views, whose ellipses are in linear frames.
+        grid: the board.
+        camera: about right.
+    """
+    R, t, posed = _poses(marks, grid, camera)
+    marks = marks[posed[marks.view]]
+    outer = float(_radius(marks, grid, camera, R, t))
+    ratio = 0.0 if grid.discs else float(marks.ratio.nanmedian())
+    if math.isnan(ratio) and grid.radii is not None:
+        ratio = grid.radii[1] / grid.radii[0]
+    target = Target.of_grid(replace(grid, radii=(outer, ratio * outer)), "light" if _dark(marks) else "dark")
+    return replace(target, grid=grid)
+
+
+def _dark(marks: Marks) -> bool:
+    return float(marks.polarity.nanmedian()) > 0
 
 
 def sizes_of_marks(frames: Tensor, names: Sequence[str], grid: Grid, camera: Camera) -> Sizes:
