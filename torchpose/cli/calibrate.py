@@ -277,7 +277,11 @@ def _show_target(found: Measurement) -> None:
         rms, most = float(of.square().mean().sqrt()), float(of.abs().max())
         known_um = 1e3 * float(known.square().mean().sqrt())
         typer.echo(f"places {name}: {1e3 * rms:.3g} um RMS off, {1e3 * most:.3g} at most; known to {known_um:.2g} um")
-    size = float((target.radii[:, 0] / nominal.radii[:, 0]).mean())
+    if target.grid is not None:
+        radii = [radius for radius in target.printed_radii.mean(0).tolist() if radius]
+        typer.echo(f"{len(target)} marks, radius {' and '.join(f'{radius:.5g}' for radius in radii)} mm")
+        return
+    size = float((target.radii / nominal.radii).mean())
     gain, gain_sigma = 1e3 * target.edge_gain, 1e3 * float(target.covariance[-1, -1].sqrt())
     typer.echo(f"edge gain {gain:.3g} +- {gain_sigma:.2g} um, rings {size:.5f} times as large as in the file")
 
