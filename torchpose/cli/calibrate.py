@@ -232,9 +232,9 @@ def _measured(
     *,
     held: bool,
 ) -> Measurement:
+    from torchpose.calibration.boards import Board
     from torchpose.calibration.intrinsics import start_cameras
     from torchpose.calibration.session import measure_target
-    from torchpose.calibration.boards import Board
 
     assert not isinstance(shown, Board)  # checked with the options
     first = start or start_cameras(frames.width, frames.height, model)[0]

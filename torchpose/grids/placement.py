@@ -9,9 +9,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
+from torchpose.geometry.segments import segment_mean, segment_sum
 from torchpose.grids.board import Grid
 from torchpose.grids.lattice import Lattice
-from torchpose.geometry.segments import segment_mean, segment_sum
 
 LEAST_MARKS = 6  # of a patch: 12 numbers for the 8 of a plane's image
 _MOST_PLACES = 64  # of a patch on the board that are looked at, those with the most marks first

@@ -91,9 +91,7 @@ def _identified(
 def _taken(candidates: Candidates, rings: Rings) -> Bool[Tensor, " M"]:
     """Candidates that were measured as rings."""
     reach = 0.5 * candidates.ellipse[:, 3]
-    one, ring = near_pairs(
-        candidates.ellipse[:, :2], rings.outer_raw[:, :2], reach, (candidates.frame, rings.frame)
-    )
+    one, ring = near_pairs(candidates.ellipse[:, :2], rings.outer_raw[:, :2], reach, (candidates.frame, rings.frame))
     away = torch.linalg.vector_norm(candidates.ellipse[one, :2] - rings.outer_raw[ring, :2], dim=-1)
     return marked(one[away < reach[one]], len(candidates))
 

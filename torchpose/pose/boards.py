@@ -32,8 +32,7 @@ def right_way_round(scene: Scene, found: Found, solve: Solve) -> Found:
     for target, grid in enumerate(scene.table.layouts):
         if grid is None or not len(grid.turns) or not bool(scene.table.by_print[target, :, :3].any()):
             continue
-        solved = found.solvable[found.solutions.status == Status.OK]
-        row = solved[(found.identified.turnable & (scene.target == target))[solved]]
+        row = found.solvable[(found.identified.turnable & (scene.target == target))[found.solvable]]
         if row.numel():
             found = _turned(scene, found, row, (target, grid), solve)
     return found

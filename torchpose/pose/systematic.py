@@ -180,7 +180,7 @@ class _Joint(NamedTuple):
         """
         columns = torch.cat([own, by_print], -1)
         matrix, right = _assembled(normals, columns)
-        by_lens = (columns.mT @ (normals.information @ by_camera)).sum(1)
+        by_lens = columns.flatten(1, 2).mT @ (normals.information @ by_camera).flatten(1, 2)
         k = own.shape[-1]
         alone, known = scaled_inverse(matrix[:, :k, :k])
         shift = alone @ matrix[:, :k, k:]  # of the own unknowns, found without the numbers, by these
@@ -309,8 +309,10 @@ def _remaining(normals: MarkerNormals, known: Tensor, excess: Tensor, count: int
 
 def _assembled(normals: MarkerNormals, columns: Tensor) -> tuple[Tensor, Tensor]:
     """Normal equations (N, k, k), (N, k) of unknowns with these columns (N, M, n, k)."""
-    matrix = (columns.mT @ (normals.information @ columns)).sum(1)
-    return matrix, (columns.mT @ normals.right[..., None]).sum(1)[..., 0]
+    # all markers in one product: with many of them single ones are large together
+    every = columns.flatten(1, 2).mT
+    matrix = every @ (normals.information @ columns).flatten(1, 2)
+    return matrix, (every @ normals.right.flatten(1)[..., None])[..., 0]
 
 
 def _among(by: Tensor, n: int) -> Tensor:

@@ -11,7 +11,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose import pnp
-from torchpose.grids import Grid
 from torchpose.calibration.grids.marks import Marks, find_marks
 from torchpose.calibration.intrinsics import MIN_POINTS
 from torchpose.calibration.tone import Sizes, scale_at
@@ -20,6 +19,7 @@ from torchpose.camera import Camera
 from torchpose.geometry import conics
 from torchpose.geometry.least_squares import Pose
 from torchpose.geometry.projection import image_by_point
+from torchpose.grids import Grid
 from torchpose.refine import LEAST_KEPT, Refined, Sight, refine_photometric
 from torchpose.rings import mapped
 from torchpose.target import Target

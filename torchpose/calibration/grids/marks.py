@@ -11,9 +11,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose.grids import Grid, order_marks, place_patches
-
-
 from torchpose.calibration.views import Views
 from torchpose.camera import Camera
 from torchpose.detect import Candidates, find_candidates
@@ -21,6 +18,7 @@ from torchpose.detect.reduce import reduction_factor
 from torchpose.geometry import blur as blurs
 from torchpose.geometry.rows import Rows, shared
 from torchpose.geometry.segments import marked, near_pairs
+from torchpose.grids import Grid, order_marks, place_patches
 from torchpose.pose import common_center, raw_centers
 from torchpose.rings import measure_rings
 
