@@ -113,6 +113,7 @@ def test_a_board_beside_a_coded_target() -> None:
     R, t = views(1)
     moved = board.centers - boards.middle(board.grid) + torch.tensor([14.0, 0, 0], dtype=F64)
     coded_marks = zip(coded.centers.tolist(), coded.radii.tolist(), strict=True)
+    coded_marks = zip(coded.centers.tolist(), coded.radii.tolist(), strict=True)
     marks = [*zip(moved.tolist(), board.radii.tolist(), strict=True)]
     marks += [((x - 14, y, z), radii) for (x, y, z), radii in coded_marks]
     drawn = Shapes.cat([ring((x, y), outer, inner) for (x, y, _), (outer, inner) in marks])

@@ -28,7 +28,7 @@ from torchpose.calibration.measured import (
     scale_sigma,
     scaled_by_distance,
 )
-from torchpose.calibration.plate import free_plate, stated_plate
+from torchpose.calibration.plate import Plate, free_plate, stated_plate
 from torchpose.calibration.rings import find_rings, measure_centers
 from torchpose.calibration.tone import judge_tone, sizes_of_target
 from torchpose.calibration.views import Views
@@ -164,10 +164,7 @@ def measure_target(
             views = views[torch.isin(views.point, target.ids)]
         check_seen(views, target)
         plate = free_plate(target.ids, target.centers, known.normals, discs=target.discs)
-        if held:
-            found = measure_plate(views, camera, plate)
-        else:
-            found = calibrate_intrinsics(views, [camera], lens=lens, plate=plate)
+        found = _with_plate(views, camera, plate, None if held else lens)
         if distance is not None:
             found = scaled_by_distance(found, distance)
         measured, camera_of = measured_target(found, known)
@@ -179,6 +176,13 @@ def measure_target(
     camera_of = camera_of if held else replace(camera_of, tone=tone)
     found = replace(found, camera=camera_of, warnings=[*found.warnings, *doubts(found, target)])
     return Measurement(found, target, measured, camera_of)
+
+
+def _with_plate(views: Views, camera: Camera, plate: Plate, lens: str | None) -> Calibration:
+    """The adjustment of a plate, and of a camera with such a lens unless it is held (None)."""
+    if lens is None:
+        return measure_plate(views, camera, plate)
+    return calibrate_intrinsics(views, [camera], lens=lens, plate=plate)
 
 
 def _rough_camera(

@@ -148,7 +148,7 @@ def _distance(
 
     if target_out is not None and isinstance(shown, Board):
         raise ConfigError(
-            "--measure-target: measures rings and discs; give --target, or --board circles:..., acircles:... or rings:..."
+            "--measure-target: measures rings and discs; give --target, or --board circles:, acircles: or rings:"
         )
     if given is None:
         return None, inputs

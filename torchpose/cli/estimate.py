@@ -50,8 +50,8 @@ _JUDGED = 16  # frames that the tone is judged by
 _RESUME = "Keep the frames that an earlier run finished and do the rest."
 _INSTANCES = "Most copies of a target in a frame (a tray of equal parts): up to as many rows, column instance."
 _TARGET = (
-    "Target file or name of a built-in target, or a board of equal marks: rings:10x7:20mm:6mm:3mm (columns, rows, pitch, "
-    "radii), circles:7x6:20mm:4mm, acircles:4x11:20mm:4mm (pitch, radius); repeat for several."
+    "Target file or name of a built-in target, or a board of equal marks: rings:10x7:20mm:6mm:3mm (columns, rows, "
+    "pitch, radii), circles:7x6:20mm:4mm, acircles:4x11:20mm:4mm (pitch, radius); repeat for several."
 )
 _UPRIGHT = (
     "Boards that look the same after a turn have their rows to the right. Without, they are ambiguous unless measured."

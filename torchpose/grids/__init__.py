@@ -1,4 +1,4 @@
-"""Boards of equal discs or rings on a grid: what they are, and which of the ellipses of a frame is which of its marks."""
+"""Boards of equal discs or rings on a grid: what they are, and which ellipse of a frame is which of the marks."""
 
 from torchpose.grids.board import GRID_EXAMPLES, Grid
 from torchpose.grids.lattice import Lattice, order_marks

@@ -15,8 +15,8 @@ from torchpose.grids.lattice import Lattice
 
 LEAST_MARKS = 6  # of a patch: 12 numbers for the 8 of a plane's image
 _MOST_PLACES = 64  # of a patch on the board that are looked at, those with the most marks first
-# the same of the board turned, where only marks that it lacks by design tell: one mark makes two (derived), and one stray
-# shape, or one mark not found, a tie
+# the same of the board turned, where only marks that it lacks by design tell: one of these makes two (derived), and one
+# stray shape, or one mark not found, a tie
 _TURNED = 2
 _MARGIN = 3  # marks that the second best place must explain less: one stray shape does not shift a board
 _CLEAR = 0.6  # of the lattice's spacing, from the border: a mark beyond may be cut off

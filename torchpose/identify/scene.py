@@ -63,7 +63,7 @@ class MarkerTable(Rows):
     @property
     def coded(self) -> Bool[Tensor, " T"]:
         """Whether the markers of each target are told apart by their codes."""
-        return torch.tensor([grid is None for grid in self.layouts], device=self.ids.device)
+        return torch.tensor([grid is None for grid in self.layouts], dtype=torch.bool, device=self.ids.device)
 
     @classmethod
     def of(cls, targets: Sequence[Target], camera: Camera | None = None) -> Self:

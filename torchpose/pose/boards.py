@@ -25,7 +25,7 @@ _OF_SHAPES = 4  # residuals of a ring's two ellipses
 
 
 def right_way_round(scene: Scene, found: Found, solve: Solve) -> Found:
-    """Rows whose boards may be turned, turned where that explains what was seen better; then they are not open any more.
+    """Rows whose boards may be turned, turned where that explains what was seen better; then no more `turnable`.
 
     Only boards of which the target's file says how well the places of their marks are known can be told.
     """
