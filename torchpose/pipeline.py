@@ -360,7 +360,7 @@ def _check_boards(targets: Sequence[Target], method: str, instances: int) -> Non
     if boards and instances > 1:
         raise ConfigError(f"instances: board {boards[0]!r} is looked for once in a frame; leave instances out")
     discs = [target.name for target in targets if target.discs]
-    if discs and method != "photometric":
+    if discs and method not in ("photometric", "centers"):
         raise ConfigError(
             f"method: {method!r} takes both circles of rings, and {discs[0]!r} has discs; use photometric"
         )

@@ -15,7 +15,7 @@ from torchpose.geometry.projection import by_pose, image_by_point
 from torchpose.geometry.robust import LEAST_KEPT
 from torchpose.geometry.rotations import plane_axes
 from torchpose.identify import MarkerTable, drawn_radii, identify
-from torchpose.pipeline import PoseEstimator
+from torchpose.pipeline import Method, PoseEstimator
 from torchpose.pose import common_center, raw_centers
 from torchpose.refine import Refined, Sight, refine_photometric
 from torchpose.results import Status
@@ -74,7 +74,9 @@ def measure_centers(
     Args:
         rims: what the rims tell is asked for, too, and the tilt of every marker is known to a few mrad only.
     """
-    poses = PoseEstimator(camera, target, assume_upright=True)(frames)
+    # a board's many centres tell its pose well enough to start from
+    method: Method = "photometric" if target.grid is None else "centers"
+    poses = PoseEstimator(camera, target, method=method, assume_upright=True)(frames)
     found = poses.detections
     usable = (poses.status == Status.OK) | (poses.status == Status.AMBIGUOUS)
     found = found[usable[found.frame]]

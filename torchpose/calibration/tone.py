@@ -117,7 +117,7 @@ def scale_at(camera: Camera, R: Tensor, points: Tensor) -> Tensor:
 
 def sizes_of_target(frames: Tensor, camera: Camera, target: Target) -> Sizes:
     """Sizes of the rings of a target in frames of a tone that the camera does not say any more."""
-    method: Method = "photometric" if target.discs else "edges"
+    method: Method = "centers" if target.discs else "edges"
     poses = PoseEstimator(camera, target, method=method, assume_upright=True)(frames)
     found = poses.detections
     found = found[(poses.status == Status.OK)[found.frame]]
