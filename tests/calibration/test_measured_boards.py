@@ -74,7 +74,8 @@ def test_a_board_is_measured_and_then_a_target(tmp_path: Path, text: str, radii:
     assert outer == pytest.approx(radii[0], rel=2e-3)
     assert inner == pytest.approx(radii[1], rel=2e-3, abs=1e-12)
 
-    assert run("estimate", tmp_path / "views", *known, "--target", tmp_path / "b.yaml", "--out", tmp_path / "p.csv") == 0
+    target_and_table = ("--target", tmp_path / "b.yaml", "--out", tmp_path / "p.csv")
+    assert run("estimate", tmp_path / "views", *known, *target_and_table) == 0
     with (tmp_path / "p.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["status"] for row in rows] == ["ok"] * VIEWS  # measured places tell which way round
