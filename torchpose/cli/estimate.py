@@ -191,8 +191,6 @@ def _run(
     quiet: bool,
 ) -> int:
     """Estimates what is not done yet and writes the tables; returns the exit code."""
-    from dataclasses import replace
-
     import cv2
     import torch
 
@@ -201,7 +199,6 @@ def _run(
     from torchpose.io.reader import FrameReader, default_batch, in_batches
     from torchpose.io.rows import BASE_SCHEMA, POSE_SCHEMA
     from torchpose.io.store import ResultStore
-    from torchpose.pipeline import PoseEstimator
     from torchpose.report.overlay import Overlay
 
     cv2.setNumThreads(1)  # frames are decoded side by side; threads inside of one would only compete
@@ -209,16 +206,7 @@ def _run(
     # decoding is the larger part of the work; torch's threads wait actively and would take its cores away
     torch.set_num_threads(max(1, threads // 2))
     camera, targets, sources = work.camera, work.targets, work.sources
-    method: Any = work.method  # it checks
-    tone = camera.tone or LINEAR
-    # the reader hands on linear frames
-    estimator = PoseEstimator(
-        replace(camera, tone=None),
-        targets,
-        instances=work.instances,
-        method=method,
-        assume_upright=work.upright,
-    )
+    tone, estimator = camera.tone or LINEAR, _estimator(work)
     painter = None if overlay is None else Overlay(camera, targets, overlay, threads=threads)
     schema = POSE_SCHEMA | (BASE_SCHEMA if work.hand_eye else {})
     origin = work.origin(detections is not None)
@@ -244,6 +232,17 @@ def _run(
         _tell_crowded(store.crowded, store.most, work)
         _tell_misfits(store.misfits, work)
     return ended(store.unreadable)
+
+
+def _estimator(work: _Work) -> PoseEstimator:
+    """Of linear frames: the reader hands on such ones."""
+    from dataclasses import replace
+
+    from torchpose.pipeline import PoseEstimator
+
+    method: Any = work.method  # it checks
+    lens = replace(work.camera, tone=None)
+    return PoseEstimator(lens, work.targets, instances=work.instances, method=method, assume_upright=work.upright)
 
 
 def _tell_crowded(frames: set[str], most: dict[str, int], work: _Work) -> None:
