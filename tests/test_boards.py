@@ -70,7 +70,7 @@ def test_poses_of_boards(text: str, status: tp.Status) -> None:
         torch.testing.assert_close(poses.R_alt, turned)
         middle = boards.middle(grid)
         torch.testing.assert_close(poses.R_alt @ middle + poses.t_alt, poses.R @ middle + poses.t)
-    upright = tp.PoseEstimator(CAMERA, target, assume_upright=True)(taken(target, R, t))
+    upright = tp.PoseEstimator(CAMERA, target.upright())(taken(target, R, t))
     assert upright.status.tolist() == [tp.Status.OK] * 3
     torch.testing.assert_close(upright.R, poses.R)
 
@@ -118,7 +118,7 @@ def test_a_board_beside_a_coded_target() -> None:
     marks += [((x - 14, y, z), radii) for (x, y, z), radii in coded_marks]
     drawn = Shapes.cat([ring((x, y), outer, inner) for (x, y, _), (outer, inner) in marks])
     frames = boards.photographs(CAMERA, drawn, R, t)
-    poses = tp.PoseEstimator(CAMERA, [coded, board], assume_upright=True)(frames)
+    poses = tp.PoseEstimator(CAMERA, [coded, board.upright()])(frames)
     assert poses.status.tolist() == [tp.Status.OK] * 2
     seen = (poses.R @ torch.stack([coded.centers[0], board.centers[0]])[..., None])[..., 0] + poses.t
     true = torch.stack([coded.centers[0] - torch.tensor([14.0, 0, 0], dtype=F64), moved[0]]) @ R[0].T + t

@@ -58,16 +58,14 @@ class PoseEstimator(nn.Module):
 
     Args:
         camera: intrinsics and distortion; frames must have its size.
-        target: one target or several; each gets a row for every frame.
+        target: one target or several; each gets a row for every frame. A board of equal marks that looks the same after
+            a turn is ambiguous, unless measured places tell or it is said to be upright (`Target.upright`).
         instances: most copies of a target that a frame is searched for. Every further copy that has a pose adds a row;
             without it the best-supported copy counts, and `Poses.copies` says how many were seen.
         method: "photometric" refines every pose on the grey values around its rings, "edges" on all their edge points;
             "centers" stops at the pose of the centres of their ellipses; "paper" is the paper's chain: Zernike edges as
             read, centres by eq. (7), PnP.
         float_range: grey value of white in floating-point frames: 1.0 or 255.0.
-        assume_upright: boards of equal marks that look the same after a turn have their rows to the right, within 90
-            degrees (square ones within 45); without, their rows are ambiguous unless the target's file has their
-            measured places.
         srgb: the grey values are sRGB-encoded, whatever the camera says of its tone. Frames that are not linear are
             taken back to linear ones first: edges are half-way in linear grey, so encoded frames that are taken as
             linear ones shift them (docs/precision.md).
@@ -88,7 +86,6 @@ class PoseEstimator(nn.Module):
         instances: int = 1,
         method: Method = "photometric",
         float_range: float = 1.0,
-        assume_upright: bool = False,
         srgb: bool = False,
         compile: bool = False,
     ) -> None:
@@ -104,7 +101,6 @@ class PoseEstimator(nn.Module):
             raise ConfigError(f"method: {method!r} is not known; choose one of {', '.join(get_args(Method))}")
         _check_boards(self.targets, method, instances)
         self.instances = instances
-        self.assume_upright = assume_upright
         self.method = method
         self.float_range = float_range
         self.tone = Tone("srgb") if srgb else camera.tone or LINEAR
@@ -274,7 +270,7 @@ class PoseEstimator(nn.Module):
         """
         identified = identify(rings, scene.table, scene.camera, len(scene.frames))
         if marks is not None:
-            rings, identified = identify_boards(scene, rings, identified, marks, upright=self.assume_upright)
+            rings, identified = identify_boards(scene, rings, identified, marks)
         if copies is not None:
             identified = replace(identified, copies=identified.copies.maximum(copies[identified.group]))
         scene = scene.of_rows(identified.group)

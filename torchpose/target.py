@@ -247,6 +247,10 @@ class Target:
         one_normal = (self.normals - self.normals[0]).norm(dim=-1).max() < 1e-6
         return bool(one_normal & ((offset @ self.normals[0]).abs().max() < 1e-6 * scale))
 
+    def upright(self) -> Target:
+        """The same where boards that look the same after a turn are taken to be upright (`Grid.upright`)."""
+        return self if self.grid is None else replace(self, grid=replace(self.grid, upright=True))
+
     def of_markers(self, kept: Tensor) -> Target:
         """The board with some of its marks, by a mask (M,); as far as a file claims a perfect one.
 

@@ -76,7 +76,7 @@ def measure_centers(
     """
     # a board's many centres tell its pose well enough to start from
     method: Method = "photometric" if target.grid is None else "centers"
-    poses = PoseEstimator(camera, target, method=method, assume_upright=True)(frames)
+    poses = PoseEstimator(camera, target.upright(), method=method)(frames)
     found = poses.detections
     usable = (poses.status == Status.OK) | (poses.status == Status.AMBIGUOUS)
     found = found[usable[found.frame]]

@@ -118,7 +118,7 @@ def scale_at(camera: Camera, R: Tensor, points: Tensor) -> Tensor:
 def sizes_of_target(frames: Tensor, camera: Camera, target: Target) -> Sizes:
     """Sizes of the rings of a target in frames of a tone that the camera does not say any more."""
     method: Method = "centers" if target.discs else "edges"
-    poses = PoseEstimator(camera, target, method=method, assume_upright=True)(frames)
+    poses = PoseEstimator(camera, target.upright(), method=method)(frames)
     found = poses.detections
     found = found[(poses.status == Status.OK)[found.frame]]
     marker = (found.marker[:, None] == target.ids).long().argmax(1)

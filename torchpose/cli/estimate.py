@@ -94,6 +94,8 @@ def estimate(
         if path is not None:
             check_table_path(path, option)
     lens, targets, sources = Camera.load(camera), [Target.load(name) for name in target], find_sources(inputs)
+    if assume_upright:
+        targets = [one.upright() for one in targets]
     lens = with_tone(lens, "srgb" if srgb and tone is None else tone)
     lens = lens if lens.tone is not None else _with_judged_tone(lens, targets[0], sources)
     _check_relative(relative_to, targets, hand_eye, instances)
@@ -242,7 +244,7 @@ def _estimator(work: _Work) -> PoseEstimator:
 
     method: Any = work.method  # it checks
     lens = replace(work.camera, tone=None)
-    return PoseEstimator(lens, work.targets, instances=work.instances, method=method, assume_upright=work.upright)
+    return PoseEstimator(lens, work.targets, instances=work.instances, method=method)
 
 
 def _tell_crowded(frames: set[str], most: dict[str, int], work: _Work) -> None:

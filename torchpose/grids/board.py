@@ -38,6 +38,8 @@ class Grid:
         radii: outer and inner, mm, of rings; outer and 0 of discs, None where their size is not said: it is not needed
             to find them.
         missing: numbers of marks that the board does not have.
+        upright: whether it is taken to have its rows to the right, within 90 degrees (a square one within 45), where it
+            looks the same after a turn; no file says so.
     """
 
     kind: Kind
@@ -46,6 +48,7 @@ class Grid:
     pitch: float
     radii: tuple[float, float] | None = None
     missing: tuple[int, ...] = ()
+    upright: bool = False
 
     @classmethod
     def parse(cls, text: str) -> Grid | None:

@@ -18,20 +18,19 @@ from torchpose.geometry import blur as blurs
 from torchpose.geometry.sectors import SECTORS
 from torchpose.geometry.segments import marked, near_pairs
 from torchpose.grids import LEAST_MARKS, Grid, order_marks, place_patches
+from torchpose.identify.hypotheses import SIZE_TOLERANCE
 from torchpose.identify.markers import Identified
 from torchpose.identify.scene import Scene
 from torchpose.rings import Rings
 from torchpose.rings.lens import ideal_pixels, mapped
 
-# of the radii, measured over nominal or the other way: dot gain and blur change it, another shape more (convention)
-RATIO_RANGE = 1.5
 ROUGH = 0.1  # px, of the centres and axes of small ellipses (measured: `scripts/board_statistics.py`)
 _UNKNOWN = 1e3  # px, of a circle that was not measured: its ellipse tells nothing
 _START_BLUR = 0.8  # px, of marks whose edges nothing has told yet
 
 
 def identify_boards(
-    scene: Scene, rings: Rings, identified: Identified, candidates: Candidates, *, upright: bool
+    scene: Scene, rings: Rings, identified: Identified, candidates: Candidates
 ) -> tuple[Rings, Identified]:
     """The rows of boards with their marks, and the rings with those that are marks by their place alone.
 
@@ -40,16 +39,15 @@ def identify_boards(
         rings: measured in all frames.
         identified: by codes; rows of boards have no ring.
         candidates: ellipses of all frames, of which the discs are taken, and rings that could not be measured.
-        upright: whether boards that look the same after a turn have their rows to the right.
     """
     for target, grid in enumerate(scene.table.layouts):
         if grid is not None:
-            rings, identified = _identified(scene, (rings, candidates), identified, (target, grid), upright)
+            rings, identified = _identified(scene, (rings, candidates), identified, (target, grid))
     return rings, identified
 
 
 def _identified(
-    scene: Scene, seen: tuple[Rings, Candidates], identified: Identified, board: tuple[int, Grid], upright: bool
+    scene: Scene, seen: tuple[Rings, Candidates], identified: Identified, board: tuple[int, Grid]
 ) -> tuple[Rings, Identified]:
     """The same for one target."""
     (rings, candidates), (target, grid), table = seen, board, scene.table
@@ -59,7 +57,8 @@ def _identified(
     if grid.discs:
         own &= False
     else:
-        own &= (rings.ratio < RATIO_RANGE * ratio) & (rings.ratio > ratio / RATIO_RANGE)
+        most = SIZE_TOLERANCE**2  # either circle may be off: gain and blur do that, another shape more
+        own &= (rings.ratio < most * ratio) & (rings.ratio > ratio / most)
     number_of = own.nonzero()[:, 0]
     rest = candidates[candidates.polarity == table.polarity[target]]
     rest = rest[~_taken(rest, rings[own])]
@@ -82,7 +81,7 @@ def _identified(
         ring=ring,
         R=torch.where(where[..., None], R, identified.R),
         t=torch.where(where, t, identified.t),
-        turnable=identified.turnable | (posed & turned[identified.group // len(table)] & (not upright)),
+        turnable=identified.turnable | (posed & turned[identified.group // len(table)] & (not grid.upright)),
         proposal=torch.cat([identified.proposal, torch.stack([group, marker, number_of[mark]], -1)]),
     )
     return Rings.cat([rings, marks[int(own.sum()) :]]), found

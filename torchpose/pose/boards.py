@@ -21,8 +21,6 @@ from torchpose.results import Reason, Status
 Solve = Callable[[Int[Tensor, " R"], Int[Tensor, "R M"]], Found]
 """Evidence and solutions of some of the rows, with other rings for their markers."""
 
-_OF_SHAPES = 4  # residuals of a ring's two ellipses
-
 
 def right_way_round(scene: Scene, found: Found, solve: Solve) -> Found:
     """Rows whose boards may be turned, turned where that explains what was seen better; then no more `turnable`.
@@ -47,7 +45,7 @@ def _turned(scene: Scene, found: Found, row: Tensor, board: tuple[int, Grid], so
     ways = [solve(row, other) for other in rings]
     chi2 = torch.stack([_chi2(way, len(row)) for way in ways])
     (best, second), which = chi2.topk(2, dim=0, largest=False)
-    freedom = (2 + _OF_SHAPES) * (ring >= 0).sum(-1) - 6
+    freedom = 6 * ((ring >= 0).sum(-1) - 1)  # of every centre two numbers, and four of a ring's shapes
     sure = (second - best > AMBIGUOUS_CHI2) & (best < freedom * of_chance(freedom))
     identified, evidence, solutions = found.identified, found.evidence, found.solutions
     turnable = identified.turnable.index_copy(0, row, identified.turnable[row] & ~sure)
