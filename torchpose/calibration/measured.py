@@ -47,9 +47,8 @@ class Distance:
 
     def check(self, target: Target | Grid) -> None:
         """Raises ConfigError where the target has no such markers, or the numbers are none."""
-        board = isinstance(target, Grid)
-        centers, name = (target.points if board else target.centers), target.name
-        known = list(range(len(centers))) if board else target.ids.tolist()
+        name, centers = target.name, target.points if isinstance(target, Grid) else target.centers
+        known = list(range(len(centers))) if isinstance(target, Grid) else target.ids.tolist()
         for marker in (self.first, self.second):
             if marker not in known:
                 raise ConfigError(f"--distance: target {name} has no marker {marker}; its ids are {known}")

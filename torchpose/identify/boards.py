@@ -111,14 +111,14 @@ def rough_marks(candidates: Candidates, camera: Camera, ratio: float) -> Rings:
     one = torch.ones_like(outer[:, 0])
     ideal = mapped(torch.cat([outer, inner]), lambda points: ideal_pixels(camera, points))
     eye = torch.eye(5, dtype=outer.dtype, device=outer.device).expand(len(outer), 5, 5)
-    fits = [
+    first, second = (
         EllipseFit(ellipses, sigma**2 * eye, sigma * one, one)
         for ellipses, sigma in zip((ideal[: len(outer)], ideal[len(outer) :]), (ROUGH, _UNKNOWN), strict=True)
-    ]
+    )
     blur = blurs.isotropic(_START_BLUR * one)
     clipped = torch.zeros_like(candidates.polarity, dtype=torch.bool)
     seen = torch.ones(len(outer), SECTORS, dtype=torch.bool, device=outer.device)
-    return Rings(candidates.frame, candidates.polarity, outer, seen_inner, *fits, blur, clipped, seen)
+    return Rings(candidates.frame, candidates.polarity, outer, seen_inner, first, second, blur, clipped, seen)
 
 
 def _poses(
