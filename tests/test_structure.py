@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1] / "torchpose"
 # each room may import those before it, and rooms of its own line none of each other
 FLOW = [
     ["errors", "geometry"],
-    ["config", "ellipse", "kernels"],
+    ["config", "ellipse", "grids", "kernels"],
     ["camera", "target"],
     ["handeye", "results", "pnp"],
     ["detect"],

@@ -80,13 +80,13 @@ def calibrate(
     if (target is None) == (board is None):
         raise ConfigError("--target: give either --target or --board, what the frames show")
     _check_files(out, hand_eye_out, camera, target_out)
-    between, inputs = _distance(distance, inputs, target, target_out)
+    shown = Target.load(target) if target is not None else parse_board(board or "")
+    between, inputs = _distance(distance, inputs, shown, target_out)
     sources = frames_of(inputs)
     if hand_eye_out is not None:
         check_robot_poses(sources)
     start = None if camera is None else with_tone(Camera.load(camera), tone)
     said = start.tone if start is not None else read_tone(tone)
-    shown = Target.load(target) if target is not None else parse_board(board or "")
     frames = _Frames(sources, start, threads=threads or cores(), quiet=quiet)
     calibration = fit = measured = None
     try:
@@ -141,22 +141,24 @@ def _check_files(
 
 
 def _distance(
-    given: tuple[int, int, float] | None, inputs: list[Path], target: str | None, target_out: Path | None
+    given: tuple[int, int, float] | None, inputs: list[Path], shown: Shown, target_out: Path | None
 ) -> tuple[Distance | None, list[Path]]:
     """The distance with its deviation, which the command line has among the INPUTs, and what is left of these."""
+    from torchpose.calibration.boards import Board
     from torchpose.calibration.measured import Distance
-    from torchpose.target import Target
 
-    if target_out is not None and target is None:
-        raise ConfigError("--measure-target: give --target, the file of the target that is measured")
+    if target_out is not None and isinstance(shown, Board):
+        raise ConfigError(
+            "--measure-target: measures rings and discs; give --target, or --board circles:, acircles: or rings:"
+        )
     if given is None:
         return None, inputs
-    if target_out is None or target is None:
+    if target_out is None or isinstance(shown, Board):
         raise ConfigError("--distance: scales a measured target; give --measure-target too")
     numbers = [path for path in inputs if not path.exists() and _is_number(str(path))]
     sigma = float(str(numbers[0])) if numbers else 0.0
     distance = Distance(*given, sigma)
-    distance.check(Target.load(target))
+    distance.check(shown)
     return distance, [path for path in inputs if path not in numbers[:1]]
 
 
@@ -231,11 +233,11 @@ def _measured(
     *,
     held: bool,
 ) -> Measurement:
+    from torchpose.calibration.boards import Board
     from torchpose.calibration.intrinsics import start_cameras
     from torchpose.calibration.session import measure_target
-    from torchpose.target import Target
 
-    assert isinstance(shown, Target)  # checked with the options
+    assert not isinstance(shown, Board)  # checked with the options
     first = start or start_cameras(frames.width, frames.height, model)[0]
     given: Literal["camera", "start", "size"] = "camera" if held else "start" if start is not None else "size"
     return measure_target(frames, shown, first, given=given, lens=model, distance=distance, tone=tone)
@@ -276,6 +278,10 @@ def _show_target(found: Measurement) -> None:
         rms, most = float(of.square().mean().sqrt()), float(of.abs().max())
         known_um = 1e3 * float(known.square().mean().sqrt())
         say(f"places {name}: {1e3 * rms:.3g} um RMS off, {1e3 * most:.3g} at most; known to {known_um:.2g} um")
+    if target.grid is not None:
+        radii = [radius for radius in target.printed_radii.mean(0).tolist() if radius]
+        say(f"{len(target)} marks, radius {' and '.join(f'{radius:.5g}' for radius in radii)} mm")
+        return
     size = float((target.radii / nominal.radii).mean())
     gain, gain_sigma = 1e3 * target.edge_gain, 1e3 * float(target.covariance[-1, -1].sqrt())
     say(f"edge gain {gain:.3g} +- {gain_sigma:.2g} um, rings {size:.5f} times as large as in the file")

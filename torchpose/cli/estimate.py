@@ -53,6 +53,13 @@ _HAND_EYE = "Calibrated camera-to-base or camera-to-tool transform; adds the pos
 _JUDGED = 16  # frames that the tone is judged by
 _RESUME = "Keep the frames that an earlier run finished and do the rest."
 _INSTANCES = "Most copies of a target in a frame (a tray of equal parts): up to as many rows, column instance."
+_TARGET = (
+    "Target file or name of a built-in target, or a board of equal marks: rings:10x7:20mm:6mm:3mm (columns, rows, "
+    "pitch, radii), circles:7x6:20mm:4mm, acircles:4x11:20mm:4mm (pitch, radius); repeat for several."
+)
+_UPRIGHT = (
+    "Boards that look the same after a turn have their rows to the right. Without, they are ambiguous unless measured."
+)
 _RELATIVE = "Name of a target: give the poses of the others (of their parts) in its frame (that of its part)."
 _DETECTIONS = "Table of the markers found: .csv, .jsonl or .parquet."
 
@@ -60,11 +67,12 @@ _DETECTIONS = "Table of the markers found: .csv, .jsonl or .parquet."
 def estimate(
     inputs: Annotated[list[Path], typer.Argument(metavar="INPUT...", help=_INPUTS)],
     camera: Annotated[str, typer.Option(help=_CAMERA)],
-    target: Annotated[list[str], typer.Option(help="Target file or name of a built-in target; repeat for several.")],
+    target: Annotated[list[str], typer.Option(help=_TARGET)],
     out: Annotated[Path, typer.Option(help="Table of the poses: .csv, .jsonl or .parquet.")],
     detections: Annotated[Path | None, typer.Option(help=_DETECTIONS)] = None,
     overlay: Overlay = None,
     instances: Annotated[int, typer.Option(min=1, max=1000, metavar="K", help=_INSTANCES)] = 1,
+    assume_upright: Annotated[bool, typer.Option("--assume-upright", help=_UPRIGHT)] = False,
     resume: Annotated[bool, typer.Option("--resume", help=_RESUME)] = False,
     hand_eye: Annotated[Path | None, typer.Option(help=_HAND_EYE)] = None,
     relative_to: Annotated[str | None, typer.Option(metavar="NAME", help=_RELATIVE)] = None,
@@ -89,10 +97,14 @@ def estimate(
         if path is not None:
             check_table_path(path, option)
     lens, targets, sources = Camera.load(camera), [Target.load(name) for name in target], frames_of(inputs)
+    if assume_upright:
+        targets = [one.upright() for one in targets]
     lens = with_tone(lens, "srgb" if srgb and tone is None else tone)
     lens = lens if lens.tone is not None else _with_judged_tone(lens, targets[0], sources)
     _check_relative(relative_to, targets, hand_eye, instances)
-    work = _Work(lens, targets, sources, _load_hand_eye(hand_eye, sources), method, instances, relative_to)
+    work = _Work(
+        lens, targets, sources, _load_hand_eye(hand_eye, sources), method, instances, relative_to, assume_upright
+    )
     check_outputs(inputs, sources, [p for p in (out, detections) if p is not None], overlay)
     with native_stderr_silenced():
         return _run(work, out, detections, overlay, resume=resume, batch=batch, threads=threads or cores(), quiet=quiet)
@@ -146,6 +158,7 @@ class _Work:
     method: str
     instances: int
     relative_to: str | None
+    upright: bool
 
     @property
     def rows_of(self) -> list[Target]:
@@ -165,6 +178,7 @@ class _Work:
             "--tone": str(self.camera.tone or "linear"),
             "--instances": self.instances,
             "--relative-to": self.relative_to,
+            "--assume-upright": self.upright,
             "--detections": detections,
             "INPUT": sorted({str(source.root) for source in self.sources}),
         }
@@ -182,15 +196,12 @@ def _run(
     quiet: bool,
 ) -> int:
     """Estimates what is not done yet and writes the tables; returns the exit code."""
-    from dataclasses import replace
-
     import cv2
     import torch
 
     from torchpose.camera import LINEAR
     from torchpose.cli.terminal import FrameProgress
     from torchpose.io.reader import FrameReader, default_batch, in_batches
-    from torchpose.pipeline import PoseEstimator
     from torchpose.report.overlay import Overlay
 
     cv2.setNumThreads(1)  # frames are decoded side by side; threads inside of one would only compete
@@ -198,10 +209,7 @@ def _run(
     # decoding is the larger part of the work; torch's threads wait actively and would take its cores away
     use_threads(threads, share=0.5)
     camera, targets, sources = work.camera, work.targets, work.sources
-    method: Any = work.method  # it checks
-    tone = camera.tone or LINEAR
-    # the reader hands on linear frames
-    estimator = PoseEstimator(replace(camera, tone=None), targets, instances=work.instances, method=method)
+    tone, estimator = camera.tone or LINEAR, _estimator(work)
     painter = None if overlay is None else Overlay(camera, targets, overlay, threads=threads)
     store = _opened(work, out, detections, resume)
     # a resumed run works on the same batches as one that was not interrupted, so that rows agree to the last bit
@@ -245,6 +253,17 @@ def _tell_mistakes(store: ResultStore, out: Path, work: _Work) -> None:
         say(f"torchpose: warning: {line}", err=True)
     if store.damaged:
         say(f"torchpose: {store.damaged} damaged lines of {out}.partial left out, their frames done again", err=True)
+
+
+def _estimator(work: _Work) -> PoseEstimator:
+    """Of linear frames: the reader hands on such ones."""
+    from dataclasses import replace
+
+    from torchpose.pipeline import PoseEstimator
+
+    method: Any = work.method  # it checks
+    lens = replace(work.camera, tone=None)
+    return PoseEstimator(lens, work.targets, instances=work.instances, method=method)
 
 
 def _tell_crowded(frames: set[str], most: dict[str, int], work: _Work) -> None:

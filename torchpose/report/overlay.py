@@ -1,5 +1,6 @@
 """Pictures that show at once what was found in a frame: fitted ellipses, ids, axes, status."""
 
+import math
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -120,8 +121,10 @@ class Overlay:
         columns = (found.outer, found.inner, found.center, found.marker, found.target)
         for outer, inner, center, marker, target in zip(*(column.tolist() for column in columns), strict=True):
             draw_ellipse(picture, outer, _OUTER)
-            draw_ellipse(picture, inner, _INNER)
-            _cross(picture, center, max(0.4 * inner[3], 3.0))
+            hole = math.isfinite(inner[3])  # discs have none
+            if hole:
+                draw_ellipse(picture, inner, _INNER)
+            _cross(picture, center, max(0.4 * inner[3], 3.0) if hole else 3.0)
             # a ring that two targets claim shows both ids, one below the other
             place = (center[0] + 0.75 * outer[2], center[1] - 0.75 * outer[2] + 32 * unit * target)
             draw_text(picture, str(marker), place, unit, _CENTRE)
