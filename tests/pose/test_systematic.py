@@ -12,11 +12,22 @@ import torchpose as tp
 from tests.exact import F64, exact_ellipses, pinhole, random_poses, rings_of
 from torchpose.geometry import rotations
 from torchpose.identify import MarkerTable
-from torchpose.pose import Evidence, MarkerNormals, Setting, center_normals, gather_evidence, on_print, solve_poses
-from torchpose.pose.excess import CAMERA, excess_of
+from torchpose.pose import (
+    PLACE,
+    Evidence,
+    MarkerNormals,
+    Setting,
+    center_normals,
+    gather_evidence,
+    on_print,
+    solve_poses,
+)
+from torchpose.pose.excess import CAMERA, OF_EDGES, OF_MARKER, excess_of
 from torchpose.target import Target
 
 CAMERA_FILE = pinhole()
+MARKERS = 2  # of `problem`
+ALONG = OF_MARKER * MARKERS + OF_EDGES
 QUAD = Target.load("quad40")
 
 
@@ -58,7 +69,7 @@ def test_places_are_unknowns_with_their_prior() -> None:
     target = uncertain(0.02, 0.0)
     e = evidence(target, r, t, 0.01)
     normals = center_normals(e, r, t)
-    joint = on_print(normals, Setting(e, r, t, CAMERA_FILE, False), torch.zeros(1, 4, 4, dtype=F64))
+    joint = on_print(normals, Setting(e, r, t, CAMERA_FILE, False), torch.zeros(1, 4, PLACE, dtype=F64))
     assert target.covariance is not None
     step, covariance = by_hand(normals, r, target.covariance[:-1, :-1])
     torch.testing.assert_close(joint.step[0], step, rtol=1e-6, atol=1e-10)
@@ -90,7 +101,7 @@ def test_the_camera_s_part_is_the_pose_s_own_response() -> None:
         known = dataclasses.replace(start)
         object.__setattr__(known, "covariance", one)  # of all parameters
         setting = Setting(e, s.R, s.t, known, False)
-        joint = on_print(center_normals(e, s.R, s.t), setting, torch.zeros(4, 4, 4, dtype=F64), estimate=False)
+        joint = on_print(center_normals(e, s.R, s.t), setting, torch.zeros(4, 4, PLACE, dtype=F64), estimate=False)
         torch.testing.assert_close(joint.systematic[..., 0].abs(), change.abs(), rtol=0.03, atol=2e-4)
 
 
@@ -109,7 +120,7 @@ def test_prints_of_many_rows_are_covered(place: float) -> None:
     e = gather_evidence(rings, torch.arange(1200).view(300, 4), table, CAMERA_FILE)
     s = solve_poses(e, (r, t))
     joint = on_print(
-        center_normals(e, s.R, s.t), Setting(e, s.R, s.t, CAMERA_FILE, False), torch.zeros(300, 4, 4, dtype=F64)
+        center_normals(e, s.R, s.t), Setting(e, s.R, s.t, CAMERA_FILE, False), torch.zeros(300, 4, PLACE, dtype=F64)
     )
     error = torch.cat([s.t + joint.step[:, :3] - t, rotations.log(rotations.exp(joint.step[:, 3:]) @ s.R @ r.mT)], -1)
     nees = (error[:, None] @ torch.linalg.solve(joint.covariance, error[..., None]))[:, 0, 0]
@@ -117,19 +128,26 @@ def test_prints_of_many_rows_are_covered(place: float) -> None:
 
 
 def problem(rows: int, seed: int, deviation: Tensor, factor: float = 1.0) -> tuple[Tensor, Tensor]:
-    """Information about 9 places, a gain and a camera, and right sides of true ones of these deviations, with noise."""
+    """Information about markers, edges and a camera, and right sides of true ones of these deviations, with noise."""
     g = torch.Generator().manual_seed(seed)
-    by = torch.randn(rows, 40, 10 + CAMERA, dtype=F64, generator=g) * 3000
-    by[..., 10:] *= 1e-3
-    true = deviation * torch.randn(rows, 10 + CAMERA, dtype=F64, generator=g)
+    by = torch.randn(rows, 40, ALONG + CAMERA, dtype=F64, generator=g) * 3000
+    by[..., ALONG:] *= 1e-3
+    true = deviation * torch.randn(rows, ALONG + CAMERA, dtype=F64, generator=g)
     noise = factor**0.5 * torch.randn(rows, 40, dtype=F64, generator=g)
     measured = (by @ true[..., None])[..., 0] + noise
     return by.mT @ by, (by.mT @ measured[..., None])[..., 0]
 
 
+def of_places(size: float) -> Tensor:
+    """Deviations of places, all three ways."""
+    marker = torch.tensor([size] * 3 + [0.0] * (OF_MARKER - 3), dtype=F64)
+    return torch.cat([marker.repeat(MARKERS), torch.zeros(OF_EDGES + CAMERA, dtype=F64)])
+
+
 def test_noise_alone_is_explained() -> None:
-    found = excess_of(*problem(500, 0, torch.zeros(14, dtype=F64)))
+    found = excess_of(*problem(500, 0, of_places(0.0)))
     assert found.explained.all()
+    assert abs(found.chi2.mean() - found.freedom.double().mean()) < 1
     widened = (found.factor > 1) | (found.deviation > 0).any(-1)
     assert widened.double().mean() < 0.02
 
@@ -137,11 +155,9 @@ def test_noise_alone_is_explained() -> None:
 @pytest.mark.parametrize("kind", ["print", "camera", "scatter"])
 def test_what_is_off_is_told_and_measured(kind: str) -> None:
     """Each explanation where it is the right one, and how large: to a factor of 1.5 in the median."""
-    deviation = torch.zeros(14, dtype=F64)
-    if kind == "print":
-        deviation[:9] = 0.02
+    deviation = of_places(0.02 if kind == "print" else 0.0)
     if kind == "camera":
-        deviation[10:] = 0.5
+        deviation[ALONG:] = 0.5
     found = excess_of(*problem(200, 1, deviation, 20.0 if kind == "scatter" else 1.0))
     size = {"print": found.deviation[:, 0], "camera": found.deviation[:, -1], "scatter": found.factor}
     true = {"print": 0.02, "camera": 0.5, "scatter": 20.0}[kind]
@@ -153,9 +169,7 @@ def test_what_is_off_is_told_and_measured(kind: str) -> None:
 
 
 def test_what_no_print_may_have_is_not_explained() -> None:
-    deviation = torch.zeros(14, dtype=F64)
-    deviation[:9] = 30.0
-    assert not excess_of(*problem(20, 2, deviation)).explained.any()
+    assert not excess_of(*problem(20, 2, of_places(30.0))).explained.any()
 
 
 def test_a_target_measured_by_the_same_camera_shares_its_errors() -> None:
@@ -192,7 +206,7 @@ def test_a_target_measured_by_the_same_camera_shares_its_errors() -> None:
     every = dataclasses.replace(every, center=raw)
     s = solve_poses(every, (r.expand(draws, -1, -1), t.expand(draws, -1)))
     setting = Setting(every, s.R, s.t, camera, False)
-    found = on_print(center_normals(every, s.R, s.t), setting, torch.zeros(draws, 4, 4, dtype=F64))
+    found = on_print(center_normals(every, s.R, s.t), setting, torch.zeros(draws, 4, PLACE, dtype=F64))
     turned = rotations.exp(found.step[:, 3:]) @ s.R
     error = torch.cat([s.t + found.step[:, :3] - t, rotations.log(turned @ r.mT)], -1)
     nees = (error[:, None] @ torch.linalg.solve(found.covariance, error[..., None]))[:, 0, 0]
@@ -206,7 +220,7 @@ def test_an_uncertain_scale_is_an_uncertain_distance() -> None:
     target = dataclasses.replace(QUAD, scale_sigma=1e-3)
     r, t = random_poses(1, 30, (150, 190))
     e = evidence(target, r, t, 1e-3)
-    joint = on_print(center_normals(e, r, t), Setting(e, r, t, CAMERA_FILE, False), torch.zeros(1, 4, 4, dtype=F64))
+    joint = on_print(center_normals(e, r, t), Setting(e, r, t, CAMERA_FILE, False), torch.zeros(1, 4, PLACE, dtype=F64))
     assert joint.systematic.shape[-1] == 1
     torch.testing.assert_close(joint.systematic[0, :3, 0].abs(), 1e-3 * t[0].abs(), rtol=1e-4, atol=1e-7)
     assert joint.systematic[0, 3:].abs().max() < 1e-8

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from tests.exact import F64, exact_ellipses, pinhole, random_poses
-from torchpose.pose import Evidence, Solutions
+from torchpose.pose import PLACE, Evidence, Solutions
 from torchpose.refine import Sight, decide_on_grey
 from torchpose.results import Reason, Status
 from torchpose.sim import add_noise, render
@@ -60,7 +60,7 @@ def solutions(r: Tensor, t: Tensor, r_alt: Tensor, t_alt: Tensor, status: Status
     mask = torch.ones(len(r), len(QUAD), dtype=torch.bool)
     covariance = torch.eye(6, dtype=F64).repeat(len(r), 1, 1)
     parts = (covariance, covariance, covariance[..., :0])
-    rest = (torch.zeros(*mask.shape, 4, dtype=F64), torch.zeros_like(codes))
+    rest = (torch.zeros(*mask.shape, PLACE, dtype=F64), 0 * codes, 0 * one, 0 * codes)
     return Solutions(r, t, *parts, one, 10 * one, r_alt, t_alt, 2 * one, 20 * one, codes, reasons, mask, *rest)
 
 

@@ -56,7 +56,7 @@ def one_pose(
         covariance=1e-6 * torch.eye(6, dtype=torch.float64)[None],
         noise=1e-6 * torch.eye(6, dtype=torch.float64)[None],
         systematic=torch.zeros(1, 6, 0, dtype=torch.float64),
-        place=torch.zeros(1, 4, 4, dtype=torch.float64),
+        place=torch.zeros(1, 4, 5, dtype=torch.float64),
         misfit=torch.zeros(1, dtype=torch.int64),
         residual_chi2=torch.zeros(1, dtype=torch.float64),
         freedom=torch.zeros(1, dtype=torch.int64),

@@ -2,7 +2,19 @@
 
 from torchpose.detect.candidates import find_candidates, find_coarse
 from torchpose.detect.lines import Segments
+from torchpose.detect.reduce import reduction_factor
 from torchpose.detect.shapes import Shapes, find_shapes
-from torchpose.detect.validation import Candidates, Verdict, Wanted
+from torchpose.detect.validation import Candidates, Verdict, Wanted, merge_duplicates
 
-__all__ = ["Candidates", "Segments", "Shapes", "Verdict", "Wanted", "find_candidates", "find_coarse", "find_shapes"]
+__all__ = [
+    "Candidates",
+    "Segments",
+    "Shapes",
+    "Verdict",
+    "Wanted",
+    "find_candidates",
+    "find_coarse",
+    "find_shapes",
+    "merge_duplicates",
+    "reduction_factor",
+]

@@ -149,28 +149,24 @@ def _print(modes: _Modes) -> _Family:
     markers, edges, _ = modes.by.tensor_split([-CAMERA - OF_EDGES, -CAMERA], -1)
     markers = markers.unflatten(-1, (-1, OF_MARKER))
     values = _values(_PRINT, modes, _COARSE).square()
-    place, bend, edge = torch.cartesian_prod(values, values, values).unbind(-1)
-    off = edge.new_tensor(_EDGES_OFF).T  # (OF_EDGES, S)
-    several = off.shape[1]
-    variances = torch.cat([torch.stack([place, bend]).repeat(1, several), (off[..., None] * edge).flatten(1)])
-    by = (markers[..., :3].flatten(-2), markers[..., 2:].flatten(-2), *edges.split(1, -1))
-    evidence, weight, chi2 = _weighed(modes, tuple(zip(by, variances, strict=True)))
-    every, bent, *of_edges = (weight @ variances.T).split(1, -1)
+    places = torch.cartesian_prod(values, values)  # along, across
+    parts = tuple(zip((markers[..., :3].flatten(-2), markers[..., 2:].flatten(-2)), places.T, strict=True))
+    of_edges = (values.new_tensor(_EDGES_OFF)[:, None] * values[:, None]).flatten(0, 1)
+    evidence, weight, chi2 = _weighed(modes, edges, of_edges, parts)
+    every, bent = (weight.sum(-1) @ places).split(1, -1)
     of_marker = torch.cat([every, every, every + bent, bent, bent], -1).repeat(1, markers.shape[-2])
     none = torch.zeros_like(modes.by[:, 0, -CAMERA:])
-    deviation = torch.cat([of_marker, *of_edges, none], -1).sqrt()
+    deviation = torch.cat([of_marker, weight.sum(1) @ of_edges, none], -1).sqrt()
     return _Family(evidence, deviation, torch.ones_like(evidence), chi2)
 
 
 def _camera(modes: _Modes) -> _Family:
     """One thing may be off, or all: of another focal length alone the mean over all tells too little."""
     variance = _values(_CAMERA, modes).square()
-    off = variance.new_tensor(_OFF)  # (S, CAMERA)
-    every = (off[:, None] * variance[:, None]).flatten(0, 1)  # (S G, CAMERA)
-    parts = tuple((modes.by[..., k - CAMERA, None], every[:, k]) for k in range(CAMERA))
-    evidence, weight, chi2 = _weighed(modes, parts)
+    every = (variance.new_tensor(_OFF)[:, None] * variance[:, None]).flatten(0, 1)  # (S G, CAMERA)
+    evidence, weight, chi2 = _weighed(modes, modes.by[..., -CAMERA:], every)
     deviation = torch.zeros_like(modes.by[:, 0])
-    deviation[:, -CAMERA:] = (weight @ every).sqrt()
+    deviation[:, -CAMERA:] = (weight[:, 0] @ every).sqrt()
     return _Family(evidence, deviation, torch.ones_like(evidence), chi2)
 
 
@@ -182,29 +178,49 @@ def _scatter(modes: _Modes) -> _Family:
     return _Family(_mean(likelihood), torch.zeros_like(modes.by[:, 0]), mean, square[:, 0] / mean)
 
 
-def _weighed(modes: _Modes, parts: tuple[tuple[Tensor, Tensor], ...]) -> tuple[Tensor, Tensor, Tensor]:
-    """Log evidence (N,) of unknowns with derivatives (N, r, e) and G variances each, their weights (N, G), and the mean
-    chi-squared (N,).
+_Part = tuple[Tensor, Tensor]
+"""Derivatives (N, r, e) by some of the further unknowns, and G variances that each of these may have."""
+
+
+def _weighed(
+    modes: _Modes, few: Tensor, of_few: Tensor, parts: tuple[_Part, ...] = ()
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Log evidence (N,) of unknowns, weights (N, G, V) of their variances, and the mean chi-squared (N,).
+
+    Args:
+        modes: the residuals.
+        few: derivatives (N, r, e) by some unknowns, whose variances cost little to try (Woodbury 1950).
+        of_few: (V, e) variances of these.
+        parts: further unknowns; each of the G is combined with each of the V.
     """
     rows, r = modes.residual.shape
-    some = max(1, _AT_ONCE // (len(parts[0][1]) * r * r))
-    likelihood, square = (
-        torch.cat(x)
-        for x in zip(*(_likelihood(modes, parts, slice(k, k + some)) for k in range(0, rows, some)), strict=True)
-    )
-    weight = torch.softmax(likelihood, -1)
-    return _mean(likelihood), weight, (weight * square).sum(-1)
+    grid = len(parts[0][1]) if parts else 1
+    some = max(1, _AT_ONCE // (grid * max(r * r, of_few.numel() * of_few.shape[1])))
+    found = [_likelihood(modes, few, of_few, parts, slice(k, k + some)) for k in range(0, rows, some)]
+    likelihood, square = (torch.cat(x) for x in zip(*found, strict=True))
+    weight = torch.softmax(likelihood.flatten(1), -1).view_as(likelihood)
+    return _mean(likelihood.flatten(1)), weight, (weight * square).sum((1, 2))
 
 
-def _likelihood(modes: _Modes, parts: tuple[tuple[Tensor, Tensor], ...], rows: slice) -> tuple[Tensor, Tensor]:
-    """Logarithm (n, G) under each of the variances, and chi-squared (n, G), of some rows."""
-    spread = torch.eye(modes.residual.shape[-1], dtype=modes.by.dtype, device=modes.by.device)
+def _likelihood(
+    modes: _Modes, few: Tensor, of_few: Tensor, parts: tuple[_Part, ...], rows: slice
+) -> tuple[Tensor, Tensor]:
+    """Logarithm (n, G, V) under each of the variances, and chi-squared (n, G, V), of some rows."""
+    columns = torch.cat([modes.residual[..., None], few], -1)[rows, None]
+    spread = torch.eye(columns.shape[-2], dtype=modes.by.dtype, device=modes.by.device)
     for by, variance in parts:
         spread = spread + variance[:, None, None] * (by[rows] @ by[rows].mT)[:, None]
-    factor = torch.linalg.cholesky(spread)
-    whitened = torch.linalg.solve_triangular(factor, modes.residual[rows, None, :, None], upper=False)
-    square = whitened.square().sum((-1, -2))
-    return -0.5 * square - factor.diagonal(dim1=-2, dim2=-1).log().sum(-1), square
+    factor = torch.linalg.cholesky(spread).expand(len(columns), -1, -1, -1) if parts else None
+    whitened = columns if factor is None else torch.linalg.solve_triangular(factor, columns, upper=False)
+    alone = 0.0 if factor is None else factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)[..., None]
+    products = whitened.mT @ whitened  # (n, G, 1 + e, 1 + e)
+    scale = of_few.sqrt()
+    pull = scale * products[..., None, 1:, 0]
+    held = scale[:, :, None] * products[..., None, 1:, 1:] * scale[:, None]
+    held = torch.linalg.cholesky(held + torch.eye(scale.shape[1], dtype=held.dtype, device=held.device))
+    taken = torch.linalg.solve_triangular(held, pull[..., None], upper=False).square().sum((-1, -2))
+    square = products[..., :1, 0] - taken
+    return -0.5 * square - alone - held.diagonal(dim1=-2, dim2=-1).log().sum(-1), square
 
 
 def _values(ends: tuple[float, float], modes: _Modes, count: int = _GRID) -> Tensor:
