@@ -52,7 +52,11 @@ class _Loader(SourceFileLoader):
         for name, value in list(vars(module).items()):
             if getattr(value, "__module__", None) != module.__name__:
                 continue  # of another module, which has been through here
-            if isinstance(value, FunctionType):
+            if getattr(value, "checks_arguments", False):
+                value.__wrapped__ = checked(
+                    value.__wrapped__
+                )  # after the function's own checks, whose errors are public
+            elif isinstance(value, FunctionType):
                 setattr(module, name, checked(value))
             elif isinstance(value, type):
                 _check_methods(value)

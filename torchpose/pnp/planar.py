@@ -15,8 +15,15 @@ from torchpose.pnp.candidates import Candidates, batch_last, rank, weighted_mean
 
 # thickness over extent (standard deviations) above which points are no plane
 _FLATNESS = 1e-2
+# below which they are an exact plane but for rounding in float32 (derived)
+_EVENNESS = 1e-6
+# and above which they have no second pose that resembles the first (convention)
+_THINNESS = 0.15
 # width over length (standard deviations) below which points are a line
 _COLLINEARITY = 1e-4
+# least curvature of the products of places and images, over their scatters, that fixes a homography: it is 0 where all
+# points but one lie on a line or only three are distinct, 4 for a square, and 0.03 in the median of random fours
+_FIXED = 1e-3
 
 
 class Frame(NamedTuple):
@@ -36,6 +43,16 @@ class Frame(NamedTuple):
     def flat(self) -> Tensor:
         """(B,) bool, do the points lie in a plane?"""
         return self.extent[0] <= _FLATNESS * self.extent[2]
+
+    @property
+    def even(self) -> Tensor:
+        """(B,) bool, are they a plane to rounding in float32?"""
+        return self.extent[0] <= _EVENNESS * self.extent[2]
+
+    @property
+    def thin(self) -> Tensor:
+        """(B,) bool, may a second pose explain them nearly as well, as it does for a plane?"""
+        return self.extent[0] <= _THINNESS * self.extent[2]
 
     @property
     def wide(self) -> Tensor:
@@ -61,7 +78,7 @@ def planar(object_points: Tensor, image_points: Tensor, mask: Tensor | None = No
         or not in front of the camera in that solution.
 
     Raises:
-        ValueError: the shapes do not fit.
+        ArgumentError: the shapes do not fit.
     """
     points, xy, weight = batch_last(object_points, image_points, mask)
     frame = plane_frame(points, weight)
@@ -90,7 +107,8 @@ def plane_frame(points: Tensor, weight: Tensor | None) -> Frame:
 def ippe(points: Tensor, xy: Tensor, weight: Tensor | None, frame: Tensor, center: Tensor) -> tuple[Tensor, Tensor]:
     """R (3, 3, 2, B) and t (3, 2, B) of the points (3, N, B) of the plane ``frame`` (3, 3, B) about ``center`` (3, B).
 
-    The two solutions come unsorted; both reproduce the homography to first order about the centre.
+    The two solutions come unsorted; both reproduce the homography to first order about the centre. NaN where the points
+    fix no homography, which takes four of which no three lie on a line.
     """
     offset = points - center[:, None]
     if weight is not None:
@@ -114,6 +132,8 @@ def ippe(points: Tensor, xy: Tensor, weight: Tensor | None, frame: Tensor, cente
     a, b, c = residual.unflatten(0, (2, 3)).transpose(0, 1).flatten(1, 2)  # (2N, B) each
     aa, ab, bb, ac, bc = (a * a).sum(0), (a * b).sum(0), (b * b).sum(0), (a * c).sum(0), (b * c).sum(0)
     determinant = aa * bb - ab * ab
+    scatter = coefficients[:2, 2::3].square().sum((0, 1)) * lengths[0].square() / lengths[2] ** 4
+    determinant = torch.where(determinant > _FIXED * scatter * (aa + bb), determinant, torch.nan)
     p = torch.stack([ab * bc - bb * ac, ab * ac - aa * bc]) / determinant  # (2, B): h3 = (p, 1)
 
     # rows 1 and 2 of H in the basis, then in x, y, 1

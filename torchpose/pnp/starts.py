@@ -64,5 +64,10 @@ def _in_space(problem: Problem, rows: Tensor) -> Tensor:
             solutions = [
                 Candidates(torch.where(reflected[..., None, None], torch.inf, s.R), s.t, s.rms) for s in solutions
             ]
+    return as_poses(solutions)
+
+
+def as_poses(solutions: list[Candidates]) -> Tensor:
+    """All solutions as poses (3, 4, S, B)."""
     r, t = torch.cat([s.R for s in solutions], 1), torch.cat([s.t for s in solutions], 1)
     return torch.cat([r, t[..., None]], 3).permute(2, 3, 1, 0)
