@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 def checked(function: Callable[P, T]) -> Callable[P, T]:
     """The function, with its arguments checked. What torch compiles or traces is not: there are no numbers to check."""
-    parameters = signature(function)
+    parameters, annotations = signature(function), dict(function.__annotations__)
     hints: dict[str, Any] = {}
 
     @functools.wraps(function)
@@ -35,7 +35,7 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
         if torch.compiler.is_compiling():
             return inner(*args, **kwargs)
         if not hints:
-            hints.update({name: _resolved(hint, function) for name, hint in function.__annotations__.items()})
+            hints.update({name: _resolved(hint, function) for name, hint in annotations.items()})
         try:
             bound = parameters.bind(*args, **kwargs)
         except TypeError as error:
@@ -128,6 +128,8 @@ def _wrong(value: Any, hint: Any, sizes: dict[str, int]) -> str:
             return " "
         parts = (parts[0],) * len(value) if parts[-1:] == (Ellipsis,) else parts
         return _all_right(value, parts, sizes)
+    if isinstance(origin, type):
+        return "" if isinstance(value, origin) else " "
     if not isinstance(hint, type):
         return ""
     if issubclass(hint, AbstractArray):

@@ -22,8 +22,10 @@ _THINNESS = 0.15
 # width over length (standard deviations) below which points are a line
 _COLLINEARITY = 1e-4
 # least curvature of the products of places and images, over their scatters, that fixes a homography: it is 0 where all
-# points but one lie on a line or only three are distinct, 4 for a square, and 0.03 in the median of random fours
-_FIXED = 1e-3
+# points but one lie on a line or only three are distinct, about 4 for a square seen from afar: in exact images
+# (rounding), and for a start that noise must not spoil (convention; what fails it is looked at by `third_pass`)
+_FIXED = 1e-12
+FIXED_FIRMLY = 1e-3
 
 
 class Frame(NamedTuple):
@@ -104,11 +106,13 @@ def plane_frame(points: Tensor, weight: Tensor | None) -> Frame:
     return Frame(frame, center, extent)
 
 
-def ippe(points: Tensor, xy: Tensor, weight: Tensor | None, frame: Tensor, center: Tensor) -> tuple[Tensor, Tensor]:
+def ippe(
+    points: Tensor, xy: Tensor, weight: Tensor | None, frame: Tensor, center: Tensor, fixed: float = _FIXED
+) -> tuple[Tensor, Tensor]:
     """R (3, 3, 2, B) and t (3, 2, B) of the points (3, N, B) of the plane ``frame`` (3, 3, B) about ``center`` (3, B).
 
     The two solutions come unsorted; both reproduce the homography to first order about the centre. NaN where the points
-    fix no homography, which takes four of which no three lie on a line.
+    fix no homography (less than ``fixed``), which takes four of which no three lie on a line.
     """
     offset = points - center[:, None]
     if weight is not None:
@@ -133,7 +137,7 @@ def ippe(points: Tensor, xy: Tensor, weight: Tensor | None, frame: Tensor, cente
     aa, ab, bb, ac, bc = (a * a).sum(0), (a * b).sum(0), (b * b).sum(0), (a * c).sum(0), (b * c).sum(0)
     determinant = aa * bb - ab * ab
     scatter = coefficients[:2, 2::3].square().sum((0, 1)) * lengths[0].square() / lengths[2] ** 4
-    determinant = torch.where(determinant > _FIXED * scatter * (aa + bb), determinant, torch.nan)
+    determinant = torch.where(determinant > fixed * scatter * (aa + bb), determinant, torch.nan)
     p = torch.stack([ab * bc - bb * ac, ab * ac - aa * bc]) / determinant  # (2, B): h3 = (p, 1)
 
     # rows 1 and 2 of H in the basis, then in x, y, 1

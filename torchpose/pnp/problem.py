@@ -22,7 +22,7 @@ class Body(NamedTuple):
         center: (3, B), centroid. unit: (B,), extent.
         flat, line: (B,) bool, do the points lie in a plane, on a line (or in a spot)?
         thin: (B,) bool, are they so nearly a plane that a second pose may explain them?
-        warped: (B,) bool, the same, of points that are not quite a plane.
+        warped: (B,) bool, do they lie in a plane, but not quite?
     """
 
     points: Tensor
@@ -190,7 +190,7 @@ def _body(points: Tensor, weight: Tensor | None) -> Body:
         frame.flat,
         ~frame.wide | spot,
         frame.thin,
-        frame.thin & ~frame.even,
+        frame.flat & ~frame.even,
     )
 
 

@@ -23,7 +23,7 @@ from torchpose.pnp.normal_equations import COST, normal_equations
 from torchpose.pnp.p3p import p3p
 from torchpose.pnp.planar import planar
 from torchpose.pnp.posit import posit
-from torchpose.pnp.problem import Inputs, Problem, prepare
+from torchpose.pnp.problem import Body, Inputs, Problem, prepare
 from torchpose.pnp.result import PnPCode, PnPError, PnPResult
 from torchpose.pnp.second_pass import second_pass
 from torchpose.pnp.starts import as_poses, batch_first, of_planes, planes, starts
@@ -201,8 +201,8 @@ def _solve(
 
 def _look_further(inputs: Inputs, which: Tensor, table: Table, max_iterations: int, compile: bool) -> None:
     """Third pass of the poses ``which`` (L,), of which ``table`` has one minimum or none."""
-    alone = table.integers[1, which] <= PnPCode.AMBIGUOUS
-    which = which[~(alone & firm(prepare(inputs.rows(which))))] if len(which) else which
+    if len(which):
+        which = which[(table.integers[1, which] > PnPCode.AMBIGUOUS) | ~firm(*_outline(inputs, which))]
     if len(which) == 0:
         return
     which = padded(which) if compile else which
@@ -212,7 +212,17 @@ def _look_further(inputs: Inputs, which: Tensor, table: Table, max_iterations: i
     minima = third_pass(problem, poses, chi2, max_iterations, compile)
     bad = (*verdicts(problem, minima, code > PnPCode.AMBIGUOUS), *_bad(problem, poses, _LEAST["iterative"]))
     _finish(problem, minima, bad, columns, compile)
-    table.replace(which, columns)
+    # with nothing to start from, the verdict of the passes before stands
+    found = poses[0, 0].isnan().logical_not().any(0).nonzero().squeeze(1)
+    table.replace(which[found], Table(columns.floats[:, found], columns.integers[:, found]))
+
+
+def _outline(inputs: Inputs, which: Tensor) -> tuple[Body, Tensor | None]:
+    """The object points of poses (L,), and their weights."""
+    if inputs.body is not None:
+        return inputs.body, None
+    problem = prepare(inputs.rows(which))
+    return problem.body, problem.weight
 
 
 def _centred(problem: Problem, pose: Tensor) -> Tensor:

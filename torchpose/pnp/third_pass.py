@@ -13,7 +13,7 @@ from torchpose.pnp.first_pass import upright
 from torchpose.pnp.iterative import minimise
 from torchpose.pnp.normal_equations import COST, camera_points
 from torchpose.pnp.p3p import of_three, widest_triple
-from torchpose.pnp.problem import Problem
+from torchpose.pnp.problem import Body, Problem
 from torchpose.pnp.result import PnPCode
 from torchpose.pnp.starts import of_planes, planes, starts
 from torchpose.pnp.verdict import Bad, Found, Minima, choose, relevant
@@ -34,13 +34,12 @@ def start_roughly(problem: Problem) -> Tensor:
     return problem.body.warped & (problem.seen < _ENOUGH)
 
 
-def firm(problem: Problem) -> Tensor:
+def firm(body: Body, weight: Tensor | None) -> Tensor:
     """(B|1,) bool: do points in a plane fix a homography so firmly that its two starts find what there is to find?
 
     By the least eigenvalue of the curvature that `ippe` divides by, were the image a drawing of the plane: with r the
     residuals of x^2, x y and y^2 after the best linear function, that of [[xx.xx + xy.xy, .], [., xy.xy + yy.yy]].
     """
-    body, weight = problem.body, problem.weight
     x, y = ((axis[:, None] * body.points).sum(0) for axis in body.frame[:2])  # missing points are at the centre
     ones = torch.ones_like(x) if weight is None else weight.expand_as(x)
     basis = torch.stack([ones, x, y])
