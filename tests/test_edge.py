@@ -62,7 +62,7 @@ def test_candidates_are_the_same_in_any_form_of_a_frame() -> None:
             "a byte is rounded when it is reduced"
         )
     assert len(tp.detect.find_candidates(IMAGE / 255, 4, float_range=255.0)) == 0, "as it says, all of it is black"
-    for frames in (IMAGE.astype(np.int64), IMAGE[0], "picture"):
+    for frames in (torch.from_numpy(IMAGE).cfloat(), IMAGE[0], "picture"):
         with pytest.raises(tp.TorchposeError, match="frames: "):
             tp.detect.find_candidates(frames)
     with pytest.raises(tp.ArgumentError, match="factor: is 0"):

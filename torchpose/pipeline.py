@@ -17,7 +17,7 @@ from torchpose.camera.model import Model
 from torchpose.detect import Candidates, Wanted, find_candidates, find_coarse
 from torchpose.errors import ConfigError, FrameError
 from torchpose.geometry import blur as blurs
-from torchpose.geometry.grey import as_frames
+from torchpose.geometry.grey import FRAME_TYPES, as_frames
 from torchpose.geometry.segments import marked
 from torchpose.identify import (
     MIN_MARKERS,
@@ -183,6 +183,8 @@ class PoseEstimator(nn.Module):
 
     def _checked(self, frames: Tensor | NDArray[Any]) -> Tensor:
         frames = as_frames(frames)
+        if frames.dtype not in FRAME_TYPES:
+            raise FrameError(f"frames: dtype {frames.dtype}; pass uint8, uint16 or floating point")
         size = (self.camera.height, self.camera.width)
         if tuple(frames.shape[1:]) != size:
             got, need = f"{frames.shape[2]} x {frames.shape[1]}", f"{size[1]} x {size[0]}"

@@ -31,7 +31,7 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
 
     @functools.wraps(function)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> T:
-        inner: Callable[..., T] = wrapper.__wrapped__  # type: ignore[attr-defined]  # tests check this one in turn
+        inner: Callable[..., T] = wrapper.__wrapped__  # tests check this one in turn
         if torch.compiler.is_compiling():
             return inner(*args, **kwargs)
         if not hints:

@@ -34,8 +34,8 @@ def as_frames(frames: Any) -> Tensor:
             f"frames: shape {tuple(frames.shape)}; pass grey frames (H, W), (B, H, W) or (B, 1, H, W), or RGB "
             "(B, 3, H, W)"
         )
-    if frames.dtype not in FRAME_TYPES:
-        raise FrameError(f"frames: dtype {frames.dtype}; pass uint8, uint16 or floating point")
+    if frames.is_complex():
+        raise FrameError(f"frames: dtype {frames.dtype}; pass real numbers")
     return frames
 
 

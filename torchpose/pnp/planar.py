@@ -111,14 +111,13 @@ def ippe(
 ) -> tuple[Tensor, Tensor]:
     """R (3, 3, 2, B) and t (3, 2, B) of the points (3, N, B) of the plane ``frame`` (3, 3, B) about ``center`` (3, B).
 
-    The two solutions come unsorted; both reproduce the homography to first order about the centre. NaN where the points
-    fix no homography (less than ``fixed``), which takes four of which no three lie on a line.
+    The two solutions come unsorted; both reproduce the homography to first order about the centre. NaN where it is not
+    ``fixed``, which takes four points of which no three lie on a line.
     """
     offset = points - center[:, None]
     if weight is not None:
         offset = offset * weight
-    # orthonormal basis of the columns 1, x, y of the plane coordinates: x and y are uncorrelated by the choice of axes
-    # as long as no point is missing, and made so otherwise
+    # orthonormal basis of 1, x, y: x and y are uncorrelated by the choice of axes as long as no point is missing
     ones = torch.ones_like(offset[0]) if weight is None else weight
     x, y = (frame[0, :, None] * offset).sum(0), (frame[1, :, None] * offset).sum(0)
     plane = torch.stack([x, y, ones])  # (3, N, B)
@@ -143,8 +142,7 @@ def ippe(
     # rows 1 and 2 of H in the basis, then in x, y, 1
     h = coefficients.unflatten(1, (2, 3))  # (basis, row, column, B)
     h = h[:, :, 0] * p[0] + h[:, :, 1] * p[1] + h[:, :, 2]  # (3, 2, B)
-    hy = h[1] / (y_norm * lengths[1])
-    hx = (h[0] - skewness * h[1] / y_norm) / lengths[0]
+    hx, hy = (h[0] - skewness * h[1] / y_norm) / lengths[0], h[1] / (y_norm * lengths[1])
     q = h[2] / lengths[2]  # (2, B): image of the centroid
     jx, jy = hx - q * p[0], hy - q * p[1]  # columns of the Jacobian of the projection at the centroid
 
