@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -62,7 +63,8 @@ def test_candidates_are_the_same_in_any_form_of_a_frame() -> None:
             "a byte is rounded when it is reduced"
         )
     assert len(tp.detect.find_candidates(IMAGE / 255, 4, float_range=255.0)) == 0, "as it says, all of it is black"
-    for frames in (torch.from_numpy(IMAGE).cfloat(), IMAGE[0], "picture"):
+    wrong: list[Any] = [tensor.to(torch.complex64), IMAGE[0], "picture"]
+    for frames in wrong:
         with pytest.raises(tp.TorchposeError, match="frames: "):
             tp.detect.find_candidates(frames)
     with pytest.raises(tp.ArgumentError, match="factor: is 0"):

@@ -135,7 +135,7 @@ def test_messages_say_what_was_given_and_what_is_wanted() -> None:
     ],
 )
 def test_ranges_of_ellipse_fits(change: dict[str, Any], message: str) -> None:
-    good = {"points": torch.rand(9, 2), "index": torch.zeros(9, dtype=torch.int64), "count": 2}
+    good: dict[str, Any] = {"points": torch.rand(9, 2), "index": torch.zeros(9, dtype=torch.int64), "count": 2}
     tp.ellipse.fit(**good)
     with pytest.raises(tp.ArgumentError, match=message):
         tp.ellipse.fit(**{**good, **change})
