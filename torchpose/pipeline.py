@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, replace
 from itertools import combinations
+from os import PathLike
 from typing import Any, Literal, get_args
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from torchpose.camera import LINEAR, Camera, Tone
@@ -16,7 +18,7 @@ from torchpose.camera.plausible import check_intrinsics
 from torchpose.detect import Candidates, Wanted, find_candidates, find_coarse, merge_duplicates, reduction_factor
 from torchpose.errors import ConfigError, FrameError
 from torchpose.geometry import blur as blurs
-from torchpose.geometry.grey import grey
+from torchpose.geometry.grey import FRAME_TYPES, as_frames
 from torchpose.geometry.segments import marked
 from torchpose.identify import (
     MIN_MARKERS,
@@ -50,7 +52,7 @@ _LEAST_CANDIDATE = (
     3.0  # px of semi-minor axis: rings below 4 are refused (`rings.measure`); candidates of covered ones err
 )
 _LEGIBLE = 1.8  # px, of blur, up to which the mean profile of a ring tells its code (measured: decisions/0059)
-_FRAME_TYPES = (torch.uint8, torch.uint16, torch.float16, torch.bfloat16, torch.float32, torch.float64)
+_LAYOUT = ("ids", "centers", "normals", "radii", "valid", "polarity")  # of the table: what makes a target
 Method = Literal["photometric", "edges", "centers", "paper"]
 
 
@@ -59,8 +61,9 @@ class PoseEstimator(nn.Module):
 
     Args:
         camera: intrinsics and distortion; frames must have its size.
-        target: one target or several; each gets a row for every frame. A board of equal marks that looks the same after
-            a turn is ambiguous, unless measured places tell or it is said to be upright (`Target.upright`).
+        target: one target or several, as `Target`, name or path; each gets a row for every frame. A board of equal marks
+            that looks the same after a turn is ambiguous, unless measured places tell or it is said to be upright
+            (`Target.upright`).
         instances: most copies of a target that a frame is searched for. Every further copy that has a pose adds a row;
             without it the best-supported copy counts, and `Poses.copies` says how many were seen.
         method: "photometric" refines every pose on the grey values around its rings, "edges" on all their edge points;
@@ -83,7 +86,7 @@ class PoseEstimator(nn.Module):
     def __init__(
         self,
         camera: Camera,
-        target: Target | Sequence[Target],
+        target: Target | str | PathLike[str] | Sequence[Target | str | PathLike[str]],
         *,
         instances: int = 1,
         method: Method = "photometric",
@@ -92,9 +95,11 @@ class PoseEstimator(nn.Module):
         compile: bool = False,
     ) -> None:
         super().__init__()
+        if not isinstance(camera, Camera):
+            raise ConfigError(f"camera: is of type {type(camera).__name__}; pass a Camera, such as Camera.load(path)")
         check_intrinsics(camera.matrix, camera.width, camera.height, camera.model)
         self.camera = camera
-        self.targets = (target,) if isinstance(target, Target) else tuple(target)
+        self.targets = _targets(target)
         _check_targets(self.targets)
         if instances < 1:
             raise ConfigError(f"instances: {instances} given; give the most copies of a target in a frame, 1 or more")
@@ -114,8 +119,7 @@ class PoseEstimator(nn.Module):
         for owner in ("camera", "table"):
             for name, value in _tensors(getattr(self, owner)).items():
                 self.register_buffer(f"{owner}_{name}", value.detach().clone())  # the caller's own stays the caller's
-        lens = get_args(Model).index(self.camera.model)
-        self.register_buffer("made_for", torch.tensor([self.camera.width, self.camera.height, lens]))
+        self.register_buffer("made_for", self._of_camera())
         self._from_buffers()
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> PoseEstimator:
@@ -128,15 +132,25 @@ class PoseEstimator(nn.Module):
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any) -> None:
         """
         Raises:
-            ConfigError: the state is of a camera of another size or lens model.
+            ConfigError: the state is of a camera of another size or lens model, or of another target.
         """
-        made_for = state_dict.get(f"{prefix}made_for", self.made_for)
-        if not torch.equal(made_for.to(self.made_for), self.made_for):
+        # from what was given, not from the buffers: these may be on the device meta, without numbers
+        made_for, table = self._of_camera(), MarkerTable.of(self.targets)
+        given = state_dict.get(f"{prefix}made_for", made_for)
+        if not torch.equal(given.to(made_for), made_for):
             raise ConfigError(
                 "state_dict: made for a camera of another size or lens model; make the estimator for that one"
             )
+        for name in _LAYOUT:
+            own, other = getattr(table, name), state_dict.get(f"{prefix}table_{name}")
+            if other is not None and not other.is_meta and not torch.equal(other.to(own), own):
+                raise ConfigError("state_dict: made for another target; make the estimator for that one")
         super()._load_from_state_dict(state_dict, prefix, *args)
         self._from_buffers()
+
+    def _of_camera(self) -> Tensor:
+        """(3,) what a camera is beside its numbers."""
+        return torch.tensor([self.camera.width, self.camera.height, get_args(Model).index(self.camera.model)])
 
     def _from_buffers(self) -> None:
         for owner in ("camera", "table"):
@@ -152,12 +166,12 @@ class PoseEstimator(nn.Module):
         return f"camera={self.camera.width}x{self.camera.height}, targets=[{names}]"
 
     @torch.no_grad()
-    def forward(self, frames: Tensor) -> Poses:
+    def forward(self, frames: Tensor | NDArray[Any]) -> Poses:
         """Poses of every target in every frame.
 
         Args:
-            frames: (B, H, W) or (B, 1, H, W) grey, or (B, 3, H, W) RGB, of which the luma counts; uint8, uint16, or
-                floating point with white at ``float_range``.
+            frames: (H, W), (B, H, W) or (B, 1, H, W) grey, or (B, 3, H, W) RGB, of which the luma counts; tensors or
+                NumPy arrays of uint8, uint16, or floating point with white at ``float_range``.
 
         Returns:
             Rows sorted by frame, target and instance, on the device of the frames: B * T of them with
@@ -177,16 +191,9 @@ class PoseEstimator(nn.Module):
             found = found._replace(solutions=still_open(scene, found))
         return outcome(scene, found)
 
-    def _checked(self, frames: Tensor) -> Tensor:
-        if frames.ndim == 4 and frames.shape[1] == 1:
-            frames = frames[:, 0]
-        if frames.ndim == 4 and frames.shape[1] == 3 and frames.dtype in _FRAME_TYPES:
-            frames = grey(frames)
-        if frames.ndim != 3:
-            raise FrameError(
-                f"frames: shape {tuple(frames.shape)}; pass grey frames (B, H, W) or (B, 1, H, W), or RGB (B, 3, H, W)"
-            )
-        if frames.dtype not in _FRAME_TYPES:
+    def _checked(self, frames: Tensor | NDArray[Any]) -> Tensor:
+        frames = as_frames(frames)
+        if frames.dtype not in FRAME_TYPES:
             raise FrameError(f"frames: dtype {frames.dtype}; pass uint8, uint16 or floating point")
         size = (self.camera.height, self.camera.width)
         if tuple(frames.shape[1:]) != size:
@@ -205,9 +212,9 @@ class PoseEstimator(nn.Module):
         if not bool(scene.table.coded.all()):
             return self._found_with_boards(scene)
         if self.instances > 1:  # a copy may be too small for the coarse scale
-            candidates = find_candidates(frames, wanted=wanted)
+            candidates = find_candidates(frames, wanted=wanted, float_range=255.0)
             return self._read(scene, self._rings(scene, self._circles(scene, candidates)))
-        coarse = find_coarse(frames, wanted=wanted)
+        coarse = find_coarse(frames, wanted=wanted, float_range=255.0)
         rings, copies = self._likely(scene, coarse)
         first = self._read(scene, rings, copies)
         settled = _settled(*first)
@@ -216,7 +223,7 @@ class PoseEstimator(nn.Module):
         rest, number = (~settled).nonzero()[:, 0], (~settled).cumsum(0) - 1
         known = coarse[~settled[coarse.frame]]
         known = replace(known, frame=number[known.frame])
-        finer = find_candidates(frames[rest], wanted=wanted, coarse=known)
+        finer = find_candidates(frames[rest], wanted=wanted, coarse=known, float_range=255.0)
         more = self._rings(scene, self._circles(scene, replace(finer, frame=rest[finer.frame])))
         return self._read(scene, Rings.cat([rings[settled[rings.frame]], more]), copies)
 
@@ -337,6 +344,16 @@ def _settled(scene: Scene, found: Found) -> Tensor:
     missing = scene.table.valid[scene.target] & (found.identified.ring < 0)
     good = marked(agreed, len(scene.frame)) & ~missing.any(1)
     return marked(scene.group[good], scene.groups).view(len(scene.frames), len(scene.table)).all(1)
+
+
+def _targets(given: Any) -> tuple[Target, ...]:
+    """Targets given as such, by their names or by the paths of their files, one or several."""
+    several = [given] if isinstance(given, Target | str | PathLike) or not isinstance(given, Iterable) else given
+    loaded = tuple(Target.load(each) if isinstance(each, str | PathLike) else each for each in several)
+    for each in loaded:
+        if not isinstance(each, Target):
+            raise ConfigError(f"target: is of type {type(each).__name__}; pass a Target, or its name or path")
+    return loaded
 
 
 def _check_targets(targets: Sequence[Target]) -> None:

@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose import ellipse
@@ -41,7 +41,10 @@ from torchpose.detect.validation import (
     score,
     without_known,
 )
+from torchpose.errors import ArgumentError
 from torchpose.geometry import conics
+from torchpose.geometry.arguments import checked
+from torchpose.geometry.grey import Frames, as_frames, levels
 from torchpose.geometry.segments import marked, members, positions, segment_mean
 
 _MIN_CRESTS = 7  # of cells that are left where edges are thinned
@@ -55,26 +58,35 @@ _RING_SETTLE = 2  # fits of a ring to what agrees: its edges are measured later
 _LENGTH = 1.5  # of a place: semi-major axis over the least semi-minor one wanted (measured: docs/tried.md, cost)
 
 
+@checked
 def find_candidates(
-    frames: Shaped[Tensor, "B H W"],
+    frames: Frames,
     factor: int | None = None,
     *,
     explain: bool = False,
     wanted: Wanted = ANYTHING,
     coarse: Candidates | None = None,
+    float_range: float | None = None,
 ) -> Candidates:
     """Ellipses in grey frames, one pass for the whole batch.
 
     Args:
-        frames: in grey levels: 0..255 for float frames, up to 65535 for uint16. Steps below 1.5 levels are taken for
-            quantisation. NaN pixels are ignored.
+        frames: (H, W), (B, H, W) or (B, 1, H, W) grey, or (B, 3, H, W) RGB; uint8, uint16 or floating point, tensors
+            or NumPy arrays. Steps below 1.5 levels, of 255 in floating-point frames, are taken for quantisation. NaN
+            pixels are ignored.
         factor: integer reduction before the search; by default the smallest that gives at most 1.3 megapixels. The
             smallest semi-minor axis found is 2 reduced pixels. The same is looked for once more at twice the
             reduction, where blurred and noisy edges stand out four times as much.
         explain: also return what was looked at and rejected, see `Candidates.verdict`.
         wanted: what is asked for; of other ellipses only whole ones are found, and left out.
         coarse: what `find_coarse` found in these frames, if it is known.
+        float_range: white in floating-point frames; by default 1.0 where none of their values exceeds it, else 255.0.
+
+    Raises:
+        FrameError: frames of another shape or dtype. ArgumentError: another argument is wrong.
     """
+    frames = levels(as_frames(frames), float_range)
+    _expect_factor(factor)
     factor = reduction_factor(*frames.shape[-2:]) if factor is None else factor
     reduced = area_reduce(frames, factor)
     grad = gradient(reduced)
@@ -91,16 +103,23 @@ def find_candidates(
     return merge_duplicates(every if explain else accepted(every), explain=explain)
 
 
-def find_coarse(frames: Shaped[Tensor, "B H W"], *, wanted: Wanted = ANYTHING) -> Candidates:
+@checked
+def find_coarse(frames: Frames, *, wanted: Wanted = ANYTHING, float_range: float | None = None) -> Candidates:
     """What `find_candidates` finds at the coarser of its scales, at a fraction of its cost, and without its exclusion.
 
     Large rings are seen whole there, and texture, letters and noise are not seen at all.
     """
+    frames = levels(as_frames(frames), float_range)
     factor = reduction_factor(*frames.shape[-2:])
     reduced = area_reduce(area_reduce(frames, factor), 2, exact=True)
     found = accepted(find_ellipses(gradient(reduced), wanted.reduced(2 * factor)))
     found = replace(found, ellipse=conics.rescaled(found.ellipse, 2 * factor))
     return found[wanted.admits(found)]
+
+
+def _expect_factor(factor: int | None) -> None:
+    if factor is not None and factor < 1:
+        raise ArgumentError(f"factor: is {factor}; give an integer from 1")
 
 
 def find_finer(

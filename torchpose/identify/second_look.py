@@ -13,6 +13,7 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.detect import Candidates, Verdict
 from torchpose.geometry import conics
+from torchpose.geometry.arguments import checked
 from torchpose.identify.assignments import Codes, Marks
 from torchpose.identify.copies import MIN_MARKERS
 from torchpose.identify.hypotheses import PLACE_TOLERANCE
@@ -21,6 +22,7 @@ from torchpose.identify.scene import MarkerTable, Scene
 from torchpose.rings import Rings, mapped, measure_predicted
 
 
+@checked
 def look_again(
     scene: Scene, rings: Rings, identified: Identified, seen: Tensor, R: Tensor, t: Tensor, *, correct: bool = True
 ) -> tuple[Rings, Identified]:

@@ -14,6 +14,7 @@ from torchpose.detect.reduce import only_reduced, reduction_for
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.blurred_edge import LEAST, MOST
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.sectors import SECTORS, clear_of_ends, sector_about
@@ -70,6 +71,7 @@ class Rings(Rows):
         return (i[:, 2] * i[:, 3] / (o[:, 2] * o[:, 3])).sqrt()
 
 
+@checked
 def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera, *, correct: bool = True) -> Rings:
     """Measures outer and inner circle of every candidate that has both, each fitted separately.
 
@@ -97,6 +99,7 @@ class Circles(Rows):
         return len(self.outer)
 
 
+@checked
 def find_circles(frames: Tensor, candidates: Candidates, camera: Camera) -> Circles:
     """Those of the candidates that have a circle inside; arguments as for `measure_rings`."""
     if len(candidates) == 0:  # frames without any cost nothing here
@@ -107,6 +110,7 @@ def find_circles(frames: Tensor, candidates: Candidates, camera: Camera) -> Circ
     return Circles(candidates, inside)[inside.found]
 
 
+@checked
 def rough_rings(circles: Circles, camera: Camera) -> Rings:
     """The circles as rings of the accuracy that they have now: good to name them, at a hundredth of the cost."""
     outer, inner = circles.outer.ellipse, circles.inside.ellipse
@@ -122,6 +126,7 @@ def rough_rings(circles: Circles, camera: Camera) -> Rings:
     return Rings(circles.outer.frame, circles.outer.polarity, outer, inner, first, second, *known)
 
 
+@checked
 def measure_circles(
     frames: Tensor, circles: Circles, camera: Camera, *, correct: bool = True, precise: bool = True
 ) -> Rings:
@@ -139,6 +144,7 @@ def _no_rings(candidates: Candidates) -> Rings:
     return Rings(frame, polarity, none, none, fit, fit, none[:, :3], frame > 0, seen)
 
 
+@checked
 def measure_predicted(
     frames: Tensor, candidates: Candidates, inner: Tensor, camera: Camera, *, correct: bool = True
 ) -> tuple[Rings, Tensor]:
@@ -147,6 +153,7 @@ def measure_predicted(
     return _measured(frames, Circles(candidates, inside), camera, _How(correct))
 
 
+@checked
 def measure_exactly(frames: Tensor, rings: Rings, camera: Camera) -> Rings:
     """Rings measured before, those whose blur is wide for their size again, by the exact model of `fit_small_rings`."""
     blurred = blurs.axes(rings.blur)[1].sqrt() > BLURRED * rings.inner_raw[:, 3]
