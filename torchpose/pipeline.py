@@ -61,8 +61,8 @@ class PoseEstimator(nn.Module):
 
     Args:
         camera: intrinsics and distortion; frames must have its size.
-        target: one target or several, as `Target`, name or path; each gets a row for every frame. A board of equal marks
-            that looks the same after a turn is ambiguous, unless measured places tell or it is said to be upright
+        target: one target or several, as `Target`, name or path; each gets a row for every frame. A board of equal
+            marks that looks the same after a turn is ambiguous, unless measured places tell or it is said to be upright
             (`Target.upright`).
         instances: most copies of a target that a frame is searched for. Every further copy that has a pose adds a row;
             without it the best-supported copy counts, and `Poses.copies` says how many were seen.
