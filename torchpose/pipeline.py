@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from itertools import combinations
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor, nn
 
 from torchpose.camera import LINEAR, Camera, Tone
 from torchpose.camera.model import Model
-from torchpose.detect import Candidates, Wanted, find_candidates, find_coarse
+from torchpose.detect import Candidates, Wanted, find_candidates, find_coarse, same_ellipses
 from torchpose.errors import ConfigError, FrameError
 from torchpose.geometry import blur as blurs
 from torchpose.geometry.grey import grey
@@ -23,8 +23,10 @@ from torchpose.identify import (
     MarkerTable,
     Scene,
     identify,
+    in_company,
     indistinguishable,
     look_again,
+    named,
 )
 from torchpose.kernels import find_compiler
 from torchpose.pose import (
@@ -48,6 +50,17 @@ _LEAST_CANDIDATE = (
 _LEGIBLE = 1.8  # px, of blur, up to which the mean profile of a ring tells its code (measured: decisions/0059)
 _FRAME_TYPES = (torch.uint8, torch.uint16, torch.float16, torch.bfloat16, torch.float32, torch.float64)
 Method = Literal["photometric", "edges", "centers", "paper"]
+
+
+class _Tried(NamedTuple):
+    """Blurred rings (K,) that were measured before their frames were searched at all scales.
+
+    outer: the circles that they were measured from. exact: whether by the exact model.
+    """
+
+    outer: Candidates
+    rings: Rings
+    exact: Tensor
 
 
 class PoseEstimator(nn.Module):
@@ -194,10 +207,10 @@ class PoseEstimator(nn.Module):
         """What is found in all frames: at the coarse scale alone where that shows every target whole."""
         frames, wanted = scene.frames, Wanted.of(scene.table.polarity, _LEAST_CANDIDATE)
         if self.instances > 1:  # a copy may be too small for the coarse scale
-            candidates = find_candidates(frames, wanted=wanted)
-            return self._read(scene, self._rings(scene, self._circles(scene, candidates)))
+            circles = self._useful(scene, find_candidates(frames, wanted=wanted))
+            return self._read(scene, self._rings(scene, circles)[0])
         coarse = find_coarse(frames, wanted=wanted)
-        rings, copies = self._likely(scene, coarse)
+        rings, copies, tried = self._likely(scene, coarse)
         first = self._read(scene, rings, copies)
         settled = _settled(*first)
         if bool(settled.all()):
@@ -206,39 +219,65 @@ class PoseEstimator(nn.Module):
         known = coarse[~settled[coarse.frame]]
         known = replace(known, frame=number[known.frame])
         finer = find_candidates(frames[rest], wanted=wanted, coarse=known)
-        more = self._rings(scene, self._circles(scene, replace(finer, frame=rest[finer.frame])))
-        return self._read(scene, Rings.cat([rings[settled[rings.frame]], more]), copies)
+        circles = self._useful(scene, replace(finer, frame=rest[finer.frame]))
+        more = self._rest(scene, circles, tried)
+        return self._read(scene, Rings.cat([rings[settled[rings.frame]], *more]), copies)
 
     def _circles(self, scene: Scene, candidates: Candidates) -> Circles:
         candidates = candidates[torch.isin(candidates.polarity, scene.table.polarity)]
         return find_circles(scene.frames, candidates, scene.camera)
 
-    def _rings(self, scene: Scene, circles: Circles, *, precise: bool = True) -> Rings:
+    def _useful(self, scene: Scene, candidates: Candidates) -> Circles:
+        """The circles that may be of a pose, and those that tell by their code alone that a target is there."""
+        circles = self._circles(scene, candidates)
+        rough, at = rough_rings(circles, scene.camera), (scene.table, scene.camera.matrix)
+        return circles[in_company(rough, *at) | (_legible(circles) & named(rough, *at))]
+
+    def _rings(self, scene: Scene, circles: Circles, *, precise: bool = True) -> tuple[Rings, Tensor]:
         return measure_circles(scene.frames, circles, scene.camera, correct=self._recipe.correct, precise=precise)
 
-    def _likely(self, scene: Scene, candidates: Candidates) -> tuple[Rings, Tensor]:
+    def _rest(self, scene: Scene, circles: Circles, tried: _Tried) -> tuple[Rings, Rings, Rings]:
+        """The rings of all circles, of which those that were tried before are not measured from the start again."""
+        now, before = same_ellipses(circles.outer, tried.outer)
+        equal = (circles.outer.ellipse[now] == tried.outer.ellipse[before]).all(1)
+        now, old = now[equal], marked(before[equal], len(tried.rings))
+        done, begun = tried.rings[old & tried.exact], tried.rings[old & ~tried.exact]
+        fresh, _ = self._rings(scene, circles[~marked(now, len(circles))])
+        return done, measure_exactly(scene.frames, begun, scene.camera)[0], fresh
+
+    def _likely(self, scene: Scene, candidates: Candidates) -> tuple[Rings, Tensor, _Tried]:
         """The rings that the best copy of every target has by its circles' rough places and codes, measured.
 
-        Also how many copies (B T,) were seen.
+        Also how many copies (B T,) were seen, and what was measured for that.
         """
+        circles, count, least = self._circles(scene, candidates), len(scene.frames), int(scene.table.valid.sum())
         # frames with fewer circles than markers are searched at all scales anyway
-        circles = _of_full_frames(self._circles(scene, candidates), int(scene.table.valid.sum()))
-        precise = not self._recipe.on_rims
+        rough = rough_rings(circles, scene.camera)
+        some = in_company(rough, scene.table, scene.camera.matrix)
+        some &= (torch.bincount(rough.frame[some], minlength=count) >= least)[rough.frame]
+        circles, rough = circles[some], rough[some]
+        quick = self._recipe.on_rims
         # the code of a much blurred ring is not to be read off its profile
-        blurred = blurs.axes(circles.inside.blur)[1] > _LEGIBLE**2
-        sharp, known = circles[~blurred], self._rings(scene, circles[blurred], precise=precise)
-        rough = Rings.cat([rough_rings(sharp, scene.camera), known])
-        likely = identify(rough, scene.table, scene.camera, len(scene.frames), instances=1)
-        lacking = _lacking(scene, likely)[known.frame]
-        if not precise and bool(lacking.any()):
+        legible = _legible(circles)
+        sharp, blurred = circles[legible], circles[~legible]
+        known, of = self._rings(scene, blurred, precise=not quick)
+        exact = torch.full_like(of, not quick, dtype=torch.bool)
+        clear = rough[legible]
+        every = Rings.cat([clear, known])
+        likely = identify(every, scene.table, scene.camera, count, instances=1)
+        full = torch.bincount(every.frame, minlength=count) >= least
+        lacking = (_lacking(scene, likely) & full)[known.frame] & ~exact
+        if bool(lacking.any()):
             # of a blurred ring the quicker model reads most codes; the dearer one reads those that are missing
-            again = measure_exactly(scene.frames, known[lacking], scene.camera)
+            again, which = measure_exactly(scene.frames, known[lacking], scene.camera)
             known = Rings.cat([known[~lacking], again])
-            rough = Rings.cat([rough[torch.arange(len(sharp), device=again.frame.device)], known])
-            likely = identify(rough, scene.table, scene.camera, len(scene.frames), instances=1)
-        named = marked(likely.ring[likely.ring >= 0], len(rough))
-        others = self._rings(scene, sharp[named[: len(sharp)]], precise=precise)
-        return Rings.cat([others, known[named[len(sharp) :]]]), likely.copies
+            of = torch.cat([of[~lacking], of[lacking][which]])
+            exact = torch.cat([exact[~lacking], torch.ones_like(which, dtype=torch.bool)])
+            likely = identify(Rings.cat([clear, known]), scene.table, scene.camera, count, instances=1)
+        chosen = marked(likely.ring[likely.ring >= 0], len(clear) + len(known))
+        others, _ = self._rings(scene, sharp[chosen[: len(clear)]], precise=not quick)
+        tried = _Tried(blurred.outer[of], known, exact)
+        return Rings.cat([others, known[chosen[len(clear) :]]]), likely.copies, tried
 
     def _read(self, scene: Scene, rings: Rings, copies: Tensor | None = None) -> tuple[Scene, Found]:
         """Rows of the rings of all frames, identified and solved; at least so many ``copies`` (B T,) were seen."""
@@ -281,10 +320,9 @@ class PoseEstimator(nn.Module):
         return solutions
 
 
-def _of_full_frames(circles: Circles, least: int) -> Circles:
-    """Those of frames that have at least so many."""
-    frame = circles.outer.frame
-    return circles[(torch.bincount(frame) >= least)[frame]]
+def _legible(circles: Circles) -> Tensor:
+    """Circles (K,) bool whose profile tells their code."""
+    return blurs.axes(circles.inside.blur)[1] <= _LEGIBLE**2
 
 
 def _lacking(scene: Scene, identified: Identified) -> Tensor:

@@ -3,6 +3,16 @@
 from torchpose.detect.candidates import find_candidates, find_coarse
 from torchpose.detect.lines import Segments
 from torchpose.detect.shapes import Shapes, find_shapes
-from torchpose.detect.validation import Candidates, Verdict, Wanted
+from torchpose.detect.validation import Candidates, Verdict, Wanted, same_ellipses
 
-__all__ = ["Candidates", "Segments", "Shapes", "Verdict", "Wanted", "find_candidates", "find_coarse", "find_shapes"]
+__all__ = [
+    "Candidates",
+    "Segments",
+    "Shapes",
+    "Verdict",
+    "Wanted",
+    "find_candidates",
+    "find_coarse",
+    "find_shapes",
+    "same_ellipses",
+]

@@ -37,6 +37,7 @@ from torchpose.detect.validation import (
     Wanted,
     accepted,
     explain_once,
+    glance,
     merge_duplicates,
     score,
     without_known,
@@ -168,8 +169,8 @@ def find_ellipses(grad: Gradient, wanted: Wanted = ANYTHING, known: Candidates |
     moved = positions((freed != some.ellipse).any(-1) & (plausible(grad, freed) == Verdict.ACCEPTED))
     if moved.numel():
         again = score(grad, some.frame[moved], freed[moved], some.polarity[moved])
-        found = found.replaced(valid[moved], again)
-    return explain_once(grad, merge_duplicates(found, explain=True), known)
+        found = merge_duplicates(found.replaced(valid[moved], again), explain=True)
+    return explain_once(grad, found, known)
 
 
 def fit_regions(grad: Gradient, regions: Regions, wanted: Wanted = ANYTHING) -> tuple[Candidates, Tensor]:
@@ -204,8 +205,7 @@ def fit_regions(grad: Gradient, regions: Regions, wanted: Wanted = ANYTHING) -> 
     whole = marked(good[(found.verdict == Verdict.ACCEPTED) & (found.cover > WHOLE)], count)
     explained = along & whole.index_select(0, regions.region)
     bad = positions((verdict != Verdict.ACCEPTED) & params.isfinite().all(-1))
-    unknown = torch.full((bad.numel(),), torch.nan, dtype=params.dtype, device=params.device)
-    rejected = Candidates(regions.frame[bad], params[bad], polarity[bad], unknown, unknown, verdict[bad])
+    rejected = Candidates.unscored(regions.frame[bad], params[bad], polarity[bad], verdict[bad])
     return Candidates.cat([found, rejected]), explained
 
 
@@ -250,10 +250,11 @@ def fit_arcs(grad: Gradient, arcs: Regions, wanted: Wanted = ANYTHING) -> Candid
     r = ellipse.distance(xy, index, params)
     rms = segment_mean(r.square(), index, len(pair), weight.double()).sqrt()
     good = positions(rms < ON_EDGE)
-    frame, polarity = about.frame[pair[good, 0]], about.curvature[pair[good, 0]].sign()
-    mine = wanted.admits_ellipses(frame, params[good], polarity)
-    found = score(grad, frame[mine], params[good][mine], polarity[mine])
-    found = found[asked_for(grad, found, wanted, found.cover > 0.5)]
+    first = pair[good, 0]
+    some = Candidates.unscored(about.frame[first], params[good], about.curvature[first].sign())
+    some = some[asked_for(grad, some, wanted, glance(grad, some))]
+    found = score(grad, some.frame, some.ellipse, some.polarity)
+    found = found[found.cover > 0.5]
     found, _ = _followed(grad, merge_duplicates(found, 2 * SAME), _ARC_ROUNDS)
     return accepted(found)
 

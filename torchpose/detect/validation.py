@@ -28,6 +28,9 @@ _ROUNDS = 4
 # 22.5 degrees in units of pi: a sample with a smaller error is on the arc, in noise one of eight (convention)
 _COVER_ERROR = 0.125
 
+_GLANCE = 48  # samples
+_GLANCE_COVER = 0.3  # of them: three deviations below the half that is wanted (derived: sqrt(0.5 * 0.5 / 48) = 0.07)
+
 
 class Verdict(IntEnum):
     """What became of an ellipse that was looked at."""
@@ -63,6 +66,12 @@ class Candidates(Rows):
     log10_nfa: Float[Tensor, " M"]
     cover: Float[Tensor, " M"]
     verdict: Int[Tensor, " M"]
+
+    @classmethod
+    def unscored(cls, frame: Tensor, ellipse: Tensor, polarity: Tensor, verdict: Tensor | int = 0) -> "Candidates":
+        """Ellipses whose false alarms nobody has counted; accepted, unless another verdict is given."""
+        unknown = torch.full_like(ellipse[:, 0], torch.nan)
+        return cls(frame, ellipse, polarity, unknown, unknown, torch.zeros_like(frame) + verdict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,9 +152,11 @@ class Samples(Rows):
     error: Float[Tensor, " S"]  # angle between gradient and normal, divided by pi; 0.5 beyond the frame
 
 
-def sample_edges(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> Samples:
-    """Samples of ellipses (M, 5), cells, of frames (M,) int64 and polarities (M,) +1 or -1."""
-    at = perimeter_samples(ellipses)
+def sample_edges(
+    grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor, most: int | None = None
+) -> Samples:
+    """Samples of ellipses (M, 5), cells, of frames (M,) int64 and polarities (M,) +1 or -1; ``most`` of each."""
+    at = perimeter_samples(ellipses, most)
     return edges_at(grad, frame, at.of, at.xy, at.normal * polarity.index_select(0, at.of)[:, None])
 
 
@@ -157,6 +168,12 @@ def edges_at(grad: Gradient, frame: Tensor, of: Tensor, xy: Tensor, normal: Tens
     cos = (gx * nx + gy * ny) / (gx * gx + gy * gy).sqrt().clamp_min(1e-6)
     error = torch.where(on_frame, cos.clamp(-1, 1).acos() / torch.pi, 0.5)  # 0.5: neither for nor against
     return Samples(of, xy, torch.stack([gx, gy]).mT, error)
+
+
+def glance(grad: Gradient, some: Candidates) -> Bool[Tensor, " M"]:
+    """Whether half of the perimeter of each ellipse may be there, by a few samples."""
+    samples = sample_edges(grad, some.frame, some.ellipse, some.polarity, _GLANCE)
+    return false_alarms(grad, samples.error, samples.of, len(some))[1] > _GLANCE_COVER
 
 
 def score(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> Candidates:

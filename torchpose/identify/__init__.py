@@ -1,6 +1,7 @@
 """Stage: which ring is which marker of which copy, and a second look for those that were not found."""
 
 from torchpose.identify.alike import indistinguishable
+from torchpose.identify.company import in_company, named
 from torchpose.identify.copies import MIN_MARKERS
 from torchpose.identify.markers import Identified, identify
 from torchpose.identify.scene import MarkerTable, Scene
@@ -12,6 +13,8 @@ __all__ = [
     "MarkerTable",
     "Scene",
     "identify",
+    "in_company",
     "indistinguishable",
     "look_again",
+    "named",
 ]

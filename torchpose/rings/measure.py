@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchpose import ellipse
 from torchpose.camera import Camera
-from torchpose.detect import Candidates, Verdict
+from torchpose.detect import Candidates
 from torchpose.detect.reduce import only_reduced, reduction_for
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import blur as blurs
@@ -78,7 +78,7 @@ def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera, *, cor
         camera: its distortion is taken off the sub-pixel points before the final fit.
         correct: free the edges from what blur and curvature do to them; False leaves them as the moments read them.
     """
-    return measure_circles(frames, find_circles(frames, candidates, camera), camera, correct=correct)
+    return measure_circles(frames, find_circles(frames, candidates, camera), camera, correct=correct)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,11 +124,9 @@ def rough_rings(circles: Circles, camera: Camera) -> Rings:
 
 def measure_circles(
     frames: Tensor, circles: Circles, camera: Camera, *, correct: bool = True, precise: bool = True
-) -> Rings:
-    """`measure_rings` of circles that were found before; ``precise`` as for `fit_small_rings`."""
-    if len(circles) == 0:
-        return _no_rings(circles.outer)
-    return _measured(frames, circles, camera, _How(correct, precise))[0]
+) -> tuple[Rings, Tensor]:
+    """`measure_rings` of circles found before, and which circle each ring is of; ``precise`` as for `fit_small_rings`."""
+    return _measured(frames, circles, camera, _How(correct, precise))
 
 
 def _no_rings(candidates: Candidates) -> Rings:
@@ -147,17 +145,20 @@ def measure_predicted(
     return _measured(frames, Circles(candidates, inside), camera, _How(correct))
 
 
-def measure_exactly(frames: Tensor, rings: Rings, camera: Camera) -> Rings:
-    """Rings measured before, those whose blur is wide for their size again, by the exact model of `fit_small_rings`."""
+def measure_exactly(frames: Tensor, rings: Rings, camera: Camera) -> tuple[Rings, Tensor]:
+    """Rings measured before, those whose blur is wide for their size again, by the exact model of `fit_small_rings`.
+
+    Also which of the rings each is.
+    """
     blurred = blurs.axes(rings.blur)[1].sqrt() > BLURRED * rings.inner_raw[:, 3]
-    some = rings[blurred]
+    left, index = (part.nonzero()[:, 0] for part in (~blurred, blurred))
+    some = rings[index]
     if len(some) == 0:
-        return rings
-    unknown, verdict = torch.full_like(some.polarity, torch.nan), torch.full_like(some.frame, int(Verdict.ACCEPTED))
-    candidates = Candidates(some.frame, some.outer_raw, some.polarity, unknown, unknown, verdict)
+        return rings, left
+    candidates = Candidates.unscored(some.frame, some.outer_raw, some.polarity)
     inside = replace(find_inner(frames, candidates, camera), ellipse=some.inner_raw, blur=some.blur)
-    again, _ = _measured(frames, Circles(candidates, inside), camera, _How(correct=True, begun=True))
-    return Rings.cat([rings[~blurred], again])
+    again, of = _measured(frames, Circles(candidates, inside), camera, _How(correct=True, begun=True))
+    return Rings.cat([rings[left], again]), torch.cat([left, index[of]])
 
 
 class _How(NamedTuple):
