@@ -208,7 +208,7 @@ class PoseEstimator(nn.Module):
         frames, wanted = scene.frames, Wanted.of(scene.table.polarity, _LEAST_CANDIDATE)
         if self.instances > 1:  # a copy may be too small for the coarse scale
             circles = self._useful(scene, find_candidates(frames, wanted=wanted))
-            return self._read(scene, self._rings(scene, circles)[0])
+            return self._read(scene, self._measured(scene, circles))
         coarse = find_coarse(frames, wanted=wanted)
         rings, copies, tried = self._likely(scene, coarse)
         first = self._read(scene, rings, copies)
@@ -220,8 +220,8 @@ class PoseEstimator(nn.Module):
         known = replace(known, frame=number[known.frame])
         finer = find_candidates(frames[rest], wanted=wanted, coarse=known)
         circles = self._useful(scene, replace(finer, frame=rest[finer.frame]))
-        more = self._rest(scene, circles, tried)
-        return self._read(scene, Rings.cat([rings[settled[rings.frame]], *more]), copies)
+        more = self._measured(scene, circles, tried)
+        return self._read(scene, Rings.cat([rings[settled[rings.frame]], more]), copies)
 
     def _circles(self, scene: Scene, candidates: Candidates) -> Circles:
         candidates = candidates[torch.isin(candidates.polarity, scene.table.polarity)]
@@ -231,19 +231,27 @@ class PoseEstimator(nn.Module):
         """The circles that may be of a pose, and those that tell by their code alone that a target is there."""
         circles = self._circles(scene, candidates)
         rough, at = rough_rings(circles, scene.camera), (scene.table, scene.camera.matrix)
-        return circles[in_company(rough, *at) | (_legible(circles) & named(rough, *at))]
+        return circles[in_company(rough, *at) | (_legible(circles.inside.blur) & named(rough, *at))]
 
-    def _rings(self, scene: Scene, circles: Circles, *, precise: bool = True) -> tuple[Rings, Tensor]:
-        return measure_circles(scene.frames, circles, scene.camera, correct=self._recipe.correct, precise=precise)
+    def _rings(self, scene: Scene, circles: Circles, *, hopeful: bool = False) -> tuple[Rings, Tensor]:
+        return measure_circles(scene.frames, circles, scene.camera, correct=self._recipe.correct, hopeful=hopeful)
 
-    def _rest(self, scene: Scene, circles: Circles, tried: _Tried) -> tuple[Rings, Rings, Rings]:
-        """The rings of all circles, of which those that were tried before are not measured from the start again."""
-        now, before = same_ellipses(circles.outer, tried.outer)
-        equal = (circles.outer.ellipse[now] == tried.outer.ellipse[before]).all(1)
-        now, old = now[equal], marked(before[equal], len(tried.rings))
-        done, begun = tried.rings[old & tried.exact], tried.rings[old & ~tried.exact]
-        fresh, _ = self._rings(scene, circles[~marked(now, len(circles))])
-        return done, measure_exactly(scene.frames, begun, scene.camera)[0], fresh
+    def _measured(self, scene: Scene, circles: Circles, tried: _Tried | None = None) -> Rings:
+        """The rings of all circles; those that were tried before are not measured from the start again."""
+        fresh = torch.ones_like(circles.outer.frame, dtype=torch.bool)
+        parts = []
+        if tried is not None:
+            now, before = same_ellipses(circles.outer, tried.outer)
+            equal = (circles.outer.ellipse[now] == tried.outer.ellipse[before]).all(1)
+            fresh[now[equal]] = False
+            old = marked(before[equal], len(tried.rings))
+            parts = [tried.rings[old & tried.exact], tried.rings[old & ~tried.exact]]
+        every = Rings.cat([*parts, self._rings(scene, circles[fresh], hopeful=True)[0]])
+        # a blurred ring that is alone now is none that could be named
+        kept = in_company(every, scene.table, scene.camera.matrix) | _legible(every.blur)
+        done = len(parts[0]) if parts else 0
+        again, _ = measure_exactly(scene.frames, every[done:][kept[done:]], scene.camera)
+        return Rings.cat([every[:done], again])
 
     def _likely(self, scene: Scene, candidates: Candidates) -> tuple[Rings, Tensor, _Tried]:
         """The rings that the best copy of every target has by its circles' rough places and codes, measured.
@@ -251,33 +259,30 @@ class PoseEstimator(nn.Module):
         Also how many copies (B T,) were seen, and what was measured for that.
         """
         circles, count, least = self._circles(scene, candidates), len(scene.frames), int(scene.table.valid.sum())
-        # frames with fewer circles than markers are searched at all scales anyway
         rough = rough_rings(circles, scene.camera)
+        # frames with fewer circles than markers are searched at all scales anyway
         some = in_company(rough, scene.table, scene.camera.matrix)
-        some &= (torch.bincount(rough.frame[some], minlength=count) >= least)[rough.frame]
-        circles, rough = circles[some], rough[some]
-        quick = self._recipe.on_rims
+        some &= _full(rough.frame[some], count, least)[rough.frame]
         # the code of a much blurred ring is not to be read off its profile
-        legible = _legible(circles)
-        sharp, blurred = circles[legible], circles[~legible]
-        known, of = self._rings(scene, blurred, precise=not quick)
-        exact = torch.full_like(of, not quick, dtype=torch.bool)
-        clear = rough[legible]
-        every = Rings.cat([clear, known])
-        likely = identify(every, scene.table, scene.camera, count, instances=1)
-        full = torch.bincount(every.frame, minlength=count) >= least
-        lacking = (_lacking(scene, likely) & full)[known.frame] & ~exact
-        if bool(lacking.any()):
-            # of a blurred ring the quicker model reads most codes; the dearer one reads those that are missing
-            again, which = measure_exactly(scene.frames, known[lacking], scene.camera)
-            known = Rings.cat([known[~lacking], again])
-            of = torch.cat([of[~lacking], of[lacking][which]])
-            exact = torch.cat([exact[~lacking], torch.ones_like(which, dtype=torch.bool)])
-            likely = identify(Rings.cat([clear, known]), scene.table, scene.camera, count, instances=1)
-        chosen = marked(likely.ring[likely.ring >= 0], len(clear) + len(known))
-        others, _ = self._rings(scene, sharp[chosen[: len(clear)]], precise=not quick)
+        clear = _legible(rough.blur)
+        sharp, blurred, rough = circles[some & clear], circles[some & ~clear], rough[some & clear]
+        known, of = self._rings(scene, blurred)
+        likely = identify(Rings.cat([rough, known]), scene.table, scene.camera, count, instances=1)
+        # of a blurred ring the quicker model reads most codes; the dearer one reads those that are missing
+        full = _full(torch.cat([rough.frame, known.frame]), count, least)
+        exact = ((_lacking(scene, likely) & full) | (not self._recipe.on_rims))[known.frame]
+        if bool(exact.any()):
+            again, which = measure_exactly(scene.frames, known[exact], scene.camera)
+            of = torch.cat([of[~exact], of[exact][which]])
+            known = Rings.cat([known[~exact], again])
+            exact = torch.arange(len(known), device=of.device) >= len(known) - len(again)
+            likely = identify(Rings.cat([rough, known]), scene.table, scene.camera, count, instances=1)
+        chosen = marked(likely.ring[likely.ring >= 0], len(rough) + len(known))
+        others, _ = self._rings(scene, sharp[chosen[: len(rough)]])
+        if not self._recipe.on_rims:
+            others, _ = measure_exactly(scene.frames, others, scene.camera)
         tried = _Tried(blurred.outer[of], known, exact)
-        return Rings.cat([others, known[chosen[len(clear) :]]]), likely.copies, tried
+        return Rings.cat([others, known[chosen[len(rough) :]]]), likely.copies, tried
 
     def _read(self, scene: Scene, rings: Rings, copies: Tensor | None = None) -> tuple[Scene, Found]:
         """Rows of the rings of all frames, identified and solved; at least so many ``copies`` (B T,) were seen."""
@@ -320,9 +325,14 @@ class PoseEstimator(nn.Module):
         return solutions
 
 
-def _legible(circles: Circles) -> Tensor:
-    """Circles (K,) bool whose profile tells their code."""
-    return blurs.axes(circles.inside.blur)[1] <= _LEGIBLE**2
+def _legible(blur: Tensor) -> Tensor:
+    """Rings (K,) bool of these blurs (K, 3) whose profile tells their code."""
+    return blurs.axes(blur)[1] <= _LEGIBLE**2
+
+
+def _full(frame: Tensor, frames: int, least: int) -> Tensor:
+    """Frames (B,) bool that have at least so many of the items of frames (K,)."""
+    return torch.bincount(frame, minlength=frames) >= least
 
 
 def _lacking(scene: Scene, identified: Identified) -> Tensor:

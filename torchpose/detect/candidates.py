@@ -251,9 +251,9 @@ def fit_arcs(grad: Gradient, arcs: Regions, wanted: Wanted = ANYTHING) -> Candid
     rms = segment_mean(r.square(), index, len(pair), weight.double()).sqrt()
     good = positions(rms < ON_EDGE)
     first = pair[good, 0]
-    some = Candidates.unscored(about.frame[first], params[good], about.curvature[first].sign())
-    some = some[asked_for(grad, some, wanted, glance(grad, some))]
-    found = score(grad, some.frame, some.ellipse, some.polarity)
+    likely = Candidates.unscored(about.frame[first], params[good], about.curvature[first].sign())
+    likely = likely[asked_for(grad, likely, wanted, glance(grad, likely))]
+    found = score(grad, likely.frame, likely.ellipse, likely.polarity)
     found = found[found.cover > 0.5]
     found, _ = _followed(grad, merge_duplicates(found, 2 * SAME), _ARC_ROUNDS)
     return accepted(found)

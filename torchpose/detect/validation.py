@@ -152,9 +152,7 @@ class Samples(Rows):
     error: Float[Tensor, " S"]  # angle between gradient and normal, divided by pi; 0.5 beyond the frame
 
 
-def sample_edges(
-    grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor, most: int | None = None
-) -> Samples:
+def sample_edges(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor, most: int | None = None) -> Samples:
     """Samples of ellipses (M, 5), cells, of frames (M,) int64 and polarities (M,) +1 or -1; ``most`` of each."""
     at = perimeter_samples(ellipses, most)
     return edges_at(grad, frame, at.of, at.xy, at.normal * polarity.index_select(0, at.of)[:, None])

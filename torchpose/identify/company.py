@@ -1,7 +1,7 @@
 """Rings that could be markers beside other ones, whatever their codes are: before any of them is measured.
 
-The size of a ring tells how far away it is, and so two rings tell how far apart they are in space: at any pose no
-farther than two markers of a target. What has no such ring beside it is in no pose.
+The size of a ring tells how far away it is, and so two rings tell how far apart they are in space: at any pose as far
+as two markers of a target. What has no such ring beside it is in no pose.
 """
 
 import torch
@@ -18,14 +18,14 @@ _ANYWHERE = 1e6  # px, beyond any frame
 
 
 def in_company(rings: Rings, table: MarkerTable, matrix: Tensor) -> Bool[Tensor, " K"]:
-    """Which rings have another of their frame and polarity as near as the markers of a target are at any pose.
+    """Which rings have another of their frame and polarity as far away as the markers of a target are from each other.
 
     Args:
         rings: rough ones will do.
         table: the targets.
         matrix: of the camera.
     """
-    widest, radius = _extents(table)
+    (narrowest, widest), radius = _extents(table)
     outer, focal = rings.outer.params, matrix[0, 0]
     ray = torch.nn.functional.pad(outer[:, :2], (0, 1), value=1.0) @ torch.linalg.inv(matrix).mT
     length = torch.linalg.vector_norm(ray, dim=-1, keepdim=True)  # of a ray that is 1 deep
@@ -40,12 +40,14 @@ def in_company(rings: Rings, table: MarkerTable, matrix: Tensor) -> Bool[Tensor,
     other = (i != j) & (rings.polarity[i] == rings.polarity[j])
     i, j = i[other], j[other]
     cos = (ray[i] * ray[j]).sum(-1, keepdim=True) / (length[i] * length[j])
-    # the nearest points of the two stretches: one of them is a near end
-    one, two = nearest[i], nearest[j]
+    one, two, far_one, far_two = nearest[i], nearest[j], farthest[i], farthest[j]
+    # the nearest points of the two stretches have a near end among them, the farthest ones are ends
     least = torch.minimum(
-        _apart(one, (one * cos).clamp(two, farthest[j]), cos), _apart((two * cos).clamp(one, farthest[i]), two, cos)
+        _apart(one, (one * cos).clamp(two, far_two), cos), _apart((two * cos).clamp(one, far_one), two, cos)
     )
-    return marked(i[(least < widest).any(1)], len(rings))
+    ends = ((one, far_two), (far_one, two), (far_one, far_two))
+    most = torch.stack([_apart(*pair, cos) for pair in ends]).amax(0)
+    return marked(i[((least < widest) & (most > narrowest)).any(1)], len(rings))
 
 
 def named(rings: Rings, table: MarkerTable, matrix: Tensor) -> Bool[Tensor, " K"]:
@@ -54,12 +56,14 @@ def named(rings: Rings, table: MarkerTable, matrix: Tensor) -> Bool[Tensor, " K"
 
 
 def _extents(table: MarkerTable) -> tuple[Tensor, Tensor]:
-    """Largest distance (T,) of two markers, and least and largest outer radius (2, T), mm."""
+    """Least and largest distance of two markers (2, T), and least and largest outer radius (2, T), mm."""
     both = table.valid[:, :, None] & table.valid[:, None]
-    widest = torch.where(both, torch.cdist(table.centers, table.centers), 0.0).amax((1, 2))
-    outer = table.radii[..., 0]
-    least, most = outer.where(table.valid, torch.inf).amin(1), outer.where(table.valid, 0.0).amax(1)
-    return widest, torch.stack([least, most])
+    both &= ~torch.eye(both.shape[1], dtype=torch.bool, device=both.device)
+    each = (torch.cdist(table.centers, table.centers).flatten(1), both.flatten(1)), (table.radii[..., 0], table.valid)
+    distances, radii = (
+        torch.stack([mm.where(valid, torch.inf).amin(1), mm.where(valid, 0.0).amax(1)]) for mm, valid in each
+    )
+    return distances, radii
 
 
 def _apart(one: Tensor, other: Tensor, cos: Tensor) -> Tensor:

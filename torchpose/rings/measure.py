@@ -78,7 +78,7 @@ def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera, *, cor
         camera: its distortion is taken off the sub-pixel points before the final fit.
         correct: free the edges from what blur and curvature do to them; False leaves them as the moments read them.
     """
-    return measure_circles(frames, find_circles(frames, candidates, camera), camera, correct=correct)[0]
+    return _both(frames, find_circles(frames, candidates, camera), camera, correct)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,10 +123,14 @@ def rough_rings(circles: Circles, camera: Camera) -> Rings:
 
 
 def measure_circles(
-    frames: Tensor, circles: Circles, camera: Camera, *, correct: bool = True, precise: bool = True
+    frames: Tensor, circles: Circles, camera: Camera, *, correct: bool = True, hopeful: bool = False
 ) -> tuple[Rings, Tensor]:
-    """`measure_rings` of circles found before, and which circle each ring is of; ``precise`` as for `fit_small_rings`."""
-    return _measured(frames, circles, camera, _How(correct, precise))
+    """`measure_rings` of circles found before, and which circle each ring is of.
+
+    Rings of a wide blur are measured by the quicker model of `fit_small_rings` alone; with ``hopeful`` those are among
+    them that only the exact one may explain.
+    """
+    return _measured(frames, circles, camera, _How(correct, hopeful))
 
 
 def _no_rings(candidates: Candidates) -> Rings:
@@ -142,7 +146,14 @@ def measure_predicted(
 ) -> tuple[Rings, Tensor]:
     """The same where the inner ellipses (M, 5) are known, about; also which candidate each ring is of, (K,) int64."""
     inside = replace(find_inner(frames, candidates, camera), ellipse=inner)
-    return _measured(frames, Circles(candidates, inside), camera, _How(correct))
+    return _both(frames, Circles(candidates, inside), camera, correct)
+
+
+def _both(frames: Tensor, circles: Circles, camera: Camera, correct: bool) -> tuple[Rings, Tensor]:
+    """Rings of circles by both models, and whose they are."""
+    rings, of = measure_circles(frames, circles, camera, correct=correct, hopeful=True)
+    rings, which = measure_exactly(frames, rings, camera)
+    return rings, of[which]
 
 
 def measure_exactly(frames: Tensor, rings: Rings, camera: Camera) -> tuple[Rings, Tensor]:
@@ -162,10 +173,10 @@ def measure_exactly(frames: Tensor, rings: Rings, camera: Camera) -> tuple[Rings
 
 
 class _How(NamedTuple):
-    """correct: as for `measure_rings`. precise, begun: as for `fit_small_rings`."""
+    """correct, hopeful: as for `measure_circles`. begun: as for `fit_small_rings`."""
 
     correct: bool
-    precise: bool = True
+    hopeful: bool = False
     begun: bool = False
 
 
@@ -300,10 +311,10 @@ def _as_a_whole(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> 
     """The same for rings whose circles are too close to each other, or too small, to be measured one by one."""
     focal = camera.matrix.diagonal()[:2].mean()
     candidates = circles.outer
-    found = fit_small_rings(frames, candidates, circles.inside, focal, precise=how.precise, begun=how.begun)
+    found = fit_small_rings(frames, candidates, circles.inside, focal, begun=how.begun)
     least_outer, least_inner = _LEAST_SEMI_MINOR
     large = (found.outer.params[:, 3] > least_outer) & (found.inner.params[:, 3] > least_inner)
-    index = (found.good & large).nonzero()[:, 0]
+    index = ((found.good & large) | (found.promising & how.hopeful)).nonzero()[:, 0]
     outer, inner = found.outer[index], found.inner[index]
 
     both = torch.cat([outer.params, inner.params])
