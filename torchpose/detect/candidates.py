@@ -9,9 +9,9 @@ from torch import Tensor
 
 from torchpose import ellipse
 from torchpose.detect.arcs import chain_pairs, describe_arcs, fit_pairs, follow
-from torchpose.detect.finer import MIN_ASPECT, MIN_SEMI_MINOR, SHIFT, SIDE, cut_outs, promising_places
+from torchpose.detect.finer import MIN_ASPECT, MIN_SEMI_MINOR, SIDE, cut_outs, promising_places
 from torchpose.detect.partial import SETTLE, free_of_stumps
-from torchpose.detect.prospects import crests, hints, rings, sorted_out
+from torchpose.detect.prospects import crests, rings, sorted_out
 from torchpose.detect.reduce import area_reduce, reduction_factor
 from torchpose.detect.regions import (
     AGREE_COS,
@@ -32,7 +32,6 @@ from torchpose.detect.validation import (
     SAME,
     WHOLE,
     Candidates,
-    Place,
     Verdict,
     Wanted,
     accepted,
@@ -52,8 +51,6 @@ _MIN_CELLS = 0.35
 _ARC_ROUNDS = 3  # of following the ellipse of a pair of arcs
 _PART_ROUNDS = 2  # of following the ellipse of a region that is only a part of it
 _RING_SETTLE = 2  # fits of a ring to what agrees: its edges are measured later
-
-_LENGTH = 1.5  # of a place: semi-major axis over the least semi-minor one wanted (measured: docs/tried.md, cost)
 
 
 def find_candidates(
@@ -80,7 +77,8 @@ def find_candidates(
     reduced = area_reduce(frames, factor)
     grad = gradient(reduced)
     sharp = find_ellipses(grad, wanted.reduced(factor))
-    found = [find_finer(frames, factor, grad, sharp, wanted)] if factor > 1 else []
+    # rings are found without (docs/tried.md)
+    found = [find_finer(frames, factor, grad, sharp, wanted)] if factor > 1 and not wanted.concentric else []
     found.append(replace(sharp, ellipse=conics.rescaled(sharp.ellipse, factor)))
     if coarse is None:
         known = accepted(sharp)
@@ -113,11 +111,7 @@ def find_finer(
     """
     fine = factor // 2
     whole = (found.verdict == Verdict.ACCEPTED) & (found.cover > WHOLE)
-    # an arc of what is wanted turns as it does, though its own ellipse may be flatter
-    asked = (found.polarity * wanted.polarity >= 0) & (found.ellipse[:, 2] >= _LENGTH * wanted.semi_minor / factor)
-    place = promising_places(found.frame, found.ellipse, whole, asked)
-    if wanted.concentric:
-        place = place[hints(sharp, found[place])]
+    place = promising_places(found.frame, found.ellipse, whole)
     height, width = frames.shape[-2:]
     if place.numel() == 0 or min(height, width) < SIDE * fine:
         return found[place[:0]]
@@ -126,10 +120,7 @@ def find_finer(
     grad = gradient(cut)
     # where edges fill most of a cut-out, the noise of the whole frame tells more than the median of their gradients
     grad = replace(grad, threshold=torch.minimum(grad.threshold, factor / fine * sharp.threshold[frame]))
-    if wanted is not ANYTHING:  # what lies elsewhere in a cut-out is a place of its own
-        reach = SHIFT + factor / fine * found.ellipse[place, 2]
-        wanted = replace(wanted.reduced(fine), place=Place((middle - corner - 0.5 * (fine - 1)) / fine, SHIFT, reach))
-    finer = accepted(find_ellipses(grad, wanted))
+    finer = accepted(find_ellipses(grad, wanted.reduced(fine)))
     ellipses = conics.rescaled(finer.ellipse, fine)
     ellipses = torch.cat([ellipses[:, :2] + corner[finer.frame], ellipses[:, 2:]], -1)
     # the ellipses that might have been tried are those of the frame, not those of the cut-out
@@ -144,8 +135,7 @@ def find_ellipses(grad: Gradient, wanted: Wanted = ANYTHING, known: Candidates |
     What is not ``wanted`` is among them where it is seen whole, and explains its edges.
     ``known`` are accepted ellipses of a finer scale in the pixels of this one, which may explain edges better.
     """
-    cell = wanted.within_reach(grad, strong_cells(grad))
-    least = MIN_CELLS
+    cell, least = strong_cells(grad), MIN_CELLS
     if wanted.concentric:
         cell, least = crests(grad, cell), _MIN_CRESTS
     regions = level_line_regions(grad, cell, least)

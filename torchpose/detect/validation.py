@@ -75,28 +75,17 @@ class Candidates(Rows):
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
-    """Where an ellipse is looked for in each of B frames, in their px."""
-
-    center: Float[Tensor, "B 2"]
-    shift: float  # how far off its centre may be
-    reach: Float[Tensor, " B"]  # how far from there its edge may run
-
-
-@dataclass(frozen=True, eq=False)
 class Wanted:
     """What is asked for: by default every ellipse. The rest costs little, and need not be found.
 
     Attributes:
         polarity: +1 dark inside, -1 light inside, 0 either.
         semi_minor: px, the least.
-        place: where in each frame; None for anywhere.
         concentric: outer circles of rings only.
     """
 
     polarity: float = 0.0
     semi_minor: float = 0.0
-    place: Place | None = None
     concentric: bool = False
 
     @classmethod
@@ -106,32 +95,12 @@ class Wanted:
         return cls(float(each) if each.numel() == 1 else 0.0, semi_minor, concentric=True)
 
     def reduced(self, factor: int) -> "Wanted":
-        """The same in a frame reduced by a factor, anywhere in it."""
-        return replace(self, semi_minor=self.semi_minor / factor, place=None)
+        """The same in a frame reduced by a factor."""
+        return replace(self, semi_minor=self.semi_minor / factor)
 
     def admits(self, found: Candidates) -> Bool[Tensor, " M"]:
         """Which candidates are asked for, by their ellipses alone."""
-        return self.admits_ellipses(found.frame, found.ellipse, found.polarity)
-
-    def admits_ellipses(self, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> Bool[Tensor, " M"]:
-        """Which ellipses (M, 5) of frames (M,) and polarities (M,) are asked for."""
-        good = ellipses[:, 3] >= self.semi_minor
-        if self.polarity:
-            good &= polarity == self.polarity
-        if self.place is not None:
-            away = ellipses[:, :2] - self.place.center[frame]
-            good &= torch.linalg.vector_norm(away, dim=-1) < self.place.shift
-        return good
-
-    def within_reach(self, grad: Gradient, cells: Int[Tensor, " P"]) -> Int[Tensor, " Q"]:
-        """Those of the cells that an ellipse of the place may run through."""
-        if self.place is None:
-            return cells
-        frame = torch.div(cells, grad.shape[1] * grad.shape[2], rounding_mode="floor")
-        (column, row), center = grad.grid(cells), self.place.center.mT.float().contiguous()
-        x = column.float() + 0.5 - center[0].index_select(0, frame)
-        y = row.float() + 0.5 - center[1].index_select(0, frame)
-        return cells[positions(x * x + y * y < self.place.reach.float().square().index_select(0, frame))]
+        return (found.ellipse[:, 3] >= self.semi_minor) & (found.polarity * self.polarity >= 0)
 
 
 ANYTHING = Wanted()
