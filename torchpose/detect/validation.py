@@ -28,8 +28,7 @@ _ROUNDS = 4
 # 22.5 degrees in units of pi: a sample with a smaller error is on the arc, in noise one of eight (convention)
 _COVER_ERROR = 0.125
 
-_GLANCE = 48  # samples
-_GLANCE_COVER = 0.3  # of them: three deviations below the half that is wanted (derived: sqrt(0.5 * 0.5 / 48) = 0.07)
+_GLANCE = 48  # samples of an ellipse: of half a perimeter they tell to a fifteenth (convention)
 
 
 class Verdict(IntEnum):
@@ -137,10 +136,12 @@ def edges_at(grad: Gradient, frame: Tensor, of: Tensor, xy: Tensor, normal: Tens
     return Samples(of, xy, torch.stack([gx, gy]).mT, error)
 
 
-def glance(grad: Gradient, some: Candidates) -> Bool[Tensor, " M"]:
-    """Whether half of the perimeter of each ellipse may be there, by a few samples."""
+def glance(grad: Gradient, some: Candidates, least: float) -> Bool[Tensor, " M"]:
+    """Whether such a cover of each ellipse is not yet ruled out by a few samples, at three of their deviations."""
     samples = sample_edges(grad, some.frame, some.ellipse, some.polarity, _GLANCE)
-    return false_alarms(grad, samples.error, samples.of, len(some))[1] > _GLANCE_COVER
+    _, cover = false_alarms(grad, samples.error, samples.of, len(some))
+    deviation = math.sqrt(least * (1 - least) / _GLANCE)
+    return cover > least - 3 * deviation
 
 
 def score(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> Candidates:

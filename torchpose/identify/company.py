@@ -14,8 +14,6 @@ from torchpose.identify.hypotheses import PLACE_TOLERANCE, SIZE_TOLERANCE
 from torchpose.identify.scene import MarkerTable
 from torchpose.rings import Rings
 
-_ANYWHERE = 1e6  # px, beyond any frame
-
 
 def in_company(rings: Rings, table: MarkerTable, matrix: Tensor) -> Bool[Tensor, " K"]:
     """Which rings have another of their frame and polarity as far away as the markers of a target are from each other.
@@ -25,6 +23,8 @@ def in_company(rings: Rings, table: MarkerTable, matrix: Tensor) -> Bool[Tensor,
         table: the targets.
         matrix: of the camera.
     """
+    if len(rings) == 0:
+        return rings.polarity > 0
     (narrowest, widest), radius = _extents(table)
     outer, focal = rings.outer.params, matrix[0, 0]
     ray = torch.nn.functional.pad(outer[:, :2], (0, 1), value=1.0) @ torch.linalg.inv(matrix).mT
@@ -34,9 +34,10 @@ def in_company(rings: Rings, table: MarkerTable, matrix: Tensor) -> Bool[Tensor,
     nearest = focal * radius[0] / (SIZE_TOLERANCE * (outer[:, 2:3] + spare)) * length
     farthest = focal * radius[1] * SIZE_TOLERANCE / (outer[:, 2:3] - spare).clamp_min(spare) * length.square()
     # a point `widest` away from one of the depth z is seen at most so far from it, in px
-    depth = nearest / length
-    reach = torch.where(depth > widest, focal * widest * length / (depth - widest), _ANYWHERE).amax(1)
-    i, j = near_pairs(outer[:, :2], outer[:, :2], reach.clamp_max(_ANYWHERE), (rings.frame, rings.frame))
+    reach = focal * widest * length / (nearest / length - widest).clamp_min(0)
+    extent = (outer[:, :2].amax(0) - outer[:, :2].amin(0)).sum()
+    reach = reach.amax(1).minimum(extent)
+    i, j = near_pairs(outer[:, :2], outer[:, :2], reach, (rings.frame, rings.frame))
     other = (i != j) & (rings.polarity[i] == rings.polarity[j])
     i, j = i[other], j[other]
     cos = (ray[i] * ray[j]).sum(-1, keepdim=True) / (length[i] * length[j])
