@@ -230,6 +230,8 @@ class PoseEstimator(nn.Module):
     def _useful(self, scene: Scene, candidates: Candidates) -> Circles:
         """The circles that may be of a pose, and those that tell by their code alone that a target is there."""
         circles = self._circles(scene, candidates)
+        if len(circles) == 0:
+            return circles
         rough, at = rough_rings(circles, scene.camera), (scene.table, scene.camera.matrix)
         return circles[in_company(rough, *at) | (_legible(circles.inside.blur) & named(rough, *at))]
 
@@ -238,6 +240,8 @@ class PoseEstimator(nn.Module):
 
     def _measured(self, scene: Scene, circles: Circles, tried: _Tried | None = None) -> Rings:
         """The rings of all circles; those that were tried before are not measured from the start again."""
+        if len(circles) == 0:
+            return self._rings(scene, circles)[0]
         fresh = torch.ones_like(circles.outer.frame, dtype=torch.bool)
         parts = []
         if tried is not None:

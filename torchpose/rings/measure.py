@@ -130,6 +130,8 @@ def measure_circles(
     Rings of a wide blur are measured by the quicker model of `fit_small_rings` alone; with ``hopeful`` those are among
     them that only the exact one may explain.
     """
+    if len(circles) == 0:
+        return _no_rings(circles.outer), circles.outer.frame
     return _measured(frames, circles, camera, _How(correct, hopeful))
 
 
