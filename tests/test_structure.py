@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1] / "torchpose"
 # each room may import those before it, and rooms of its own line none of each other
 FLOW = [
     ["errors", "geometry"],
-    ["config", "ellipse", "kernels"],
+    ["config", "ellipse", "grids", "kernels"],
     ["camera", "target"],
     ["handeye", "results", "pnp"],
     ["detect"],
@@ -122,3 +122,14 @@ def test_a_threshold_without_origin_is_found(tmp_path: Path) -> None:
     )
     found = [(c.name, c.decides, c.has_origin) for c in thresholds().constants(tmp_path)]
     assert found == [("_MOST", True, False), ("_LEAST", True, True), ("_SIZE", False, False)]
+
+
+def test_text_is_read_and_printed_in_one_place() -> None:
+    """Text of others goes through the bounds of `config`, and reaches a terminal without what would steer it."""
+    own = {"config/documents.py", "rig/child.py", "rig/twin/wire.py", "studies/study.py", "io/store.py"}  # own data
+    for path in MODULES:
+        name, text = path.relative_to(ROOT).as_posix(), path.read_text()
+        if name not in own:
+            assert not re.search(r"json\.loads?\(|yaml\.(safe_)?load|yaml\.parse", text), name
+        if name not in ("cli/common.py", "cli/main.py"):
+            assert "typer.echo(" not in text, f"{name}: say() of cli/common.py"

@@ -7,12 +7,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from pydantic import BaseModel, ConfigDict, FiniteFloat, model_validator
+from pydantic import BaseModel, ConfigDict, model_validator
 from torch import Tensor
 
 from torchpose.config import format_list, read_yaml, validate, write_text
+from torchpose.config.kinds import Number
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
+from torchpose.geometry.covariance import covariance_fault
 from torchpose.target import Vector
 
 _ORTHONORMAL = 1e-6  # largest entry of R^T R - I that a file may have
@@ -22,8 +24,8 @@ class _Pose(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
     rotation: Vector | None = None
     translation: Vector | None = None
-    matrix: list[list[FiniteFloat]] | None = None
-    covariance: list[list[FiniteFloat]] | None = None
+    matrix: list[list[Number]] | None = None
+    covariance: list[list[Number]] | None = None
 
     @model_validator(mode="after")
     def _one_form(self) -> _Pose:
@@ -66,12 +68,8 @@ def _check_covariance(rows: list[list[float]]) -> None:
     if len(rows) != 6 or any(len(row) != 6 for row in rows):
         raise ValueError("covariance is not 6 x 6; give that of translation (mm), then rotation (rad)")
     c = torch.tensor(rows, dtype=torch.float64)
-    size = c.diagonal().abs().sqrt().clamp_min(1e-300)
-    unit = c / size / size[:, None]
-    if bool(((unit - unit.T).abs() > 1e-9).any()):
-        raise ValueError("covariance is not symmetric; give that of translation (mm), then rotation (rad)")
-    if bool(torch.linalg.eigvalsh(unit)[0] < -1e-9):
-        raise ValueError("covariance has a negative eigenvalue; give that of translation (mm), then rotation (rad)")
+    if fault := covariance_fault(c):
+        raise ValueError(f"covariance {fault}; give that of translation (mm), then rotation (rad)")
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,16 @@ from torch import Tensor, nn
 
 from torchpose.camera import LINEAR, Camera, Tone
 from torchpose.camera.model import Model
-from torchpose.detect import Candidates, Wanted, find_candidates, find_coarse, same_ellipses
+from torchpose.camera.plausible import check_intrinsics
+from torchpose.detect import (
+    Candidates,
+    Wanted,
+    find_candidates,
+    find_coarse,
+    merge_duplicates,
+    reduction_factor,
+    same_ellipses,
+)
 from torchpose.errors import ConfigError, FrameError
 from torchpose.geometry import blur as blurs
 from torchpose.geometry.grey import grey
@@ -23,6 +32,7 @@ from torchpose.identify import (
     MarkerTable,
     Scene,
     identify,
+    identify_boards,
     in_company,
     indistinguishable,
     look_again,
@@ -37,7 +47,9 @@ from torchpose.pose import (
     crossed_out,
     gather_evidence,
     outcome,
+    right_way_round,
     solve_poses,
+    still_open,
 )
 from torchpose.refine import METHODS, Recipe, Sight
 from torchpose.results import Poses, Reason, Status
@@ -68,7 +80,8 @@ class PoseEstimator(nn.Module):
 
     Args:
         camera: intrinsics and distortion; frames must have its size.
-        target: one target or several; each gets a row for every frame.
+        target: one target or several; each gets a row for every frame. A board of equal marks that looks the same after
+            a turn is ambiguous, unless measured places tell or it is said to be upright (`Target.upright`).
         instances: most copies of a target that a frame is searched for. Every further copy that has a pose adds a row;
             without it the best-supported copy counts, and `Poses.copies` says how many were seen.
         method: "photometric" refines every pose on the grey values around its rings, "edges" on all their edge points;
@@ -81,8 +94,9 @@ class PoseEstimator(nn.Module):
         compile: solve small problems in compiled loops (`torchpose.kernels`), on the CPU; the first call takes seconds.
 
     Raises:
-        ConfigError: no target, two of one name, or two that cannot be told apart; ``instances`` below 1; an unknown
-            method; ``compile`` without a C++ compiler.
+        ConfigError: intrinsics that no camera of such frames has; no target, two of one name, or two that cannot be
+            told apart; ``instances`` below 1; an unknown method, or one that has no use for discs; ``compile`` without
+            a C++ compiler.
     """
 
     made_for: Tensor
@@ -99,6 +113,7 @@ class PoseEstimator(nn.Module):
         compile: bool = False,
     ) -> None:
         super().__init__()
+        check_intrinsics(camera.matrix, camera.width, camera.height, camera.model)
         self.camera = camera
         self.targets = (target,) if isinstance(target, Target) else tuple(target)
         _check_targets(self.targets)
@@ -108,6 +123,7 @@ class PoseEstimator(nn.Module):
             raise ConfigError(f"float_range: {float_range} is not positive; use 1.0 or 255.0")
         if method not in get_args(Method):
             raise ConfigError(f"method: {method!r} is not known; choose one of {', '.join(get_args(Method))}")
+        _check_boards(self.targets, method, instances)
         self.instances = instances
         self.method = method
         self.float_range = float_range
@@ -179,6 +195,7 @@ class PoseEstimator(nn.Module):
             found = self._solved(scene, *again)
         if found.solvable.numel():
             found = found._replace(solutions=self._refined(scene, found))
+            found = found._replace(solutions=still_open(scene, found))
         return outcome(scene, found)
 
     def _checked(self, frames: Tensor) -> Tensor:
@@ -206,6 +223,8 @@ class PoseEstimator(nn.Module):
     def _found(self, scene: Scene) -> tuple[Scene, Found]:
         """What is found in all frames: at the coarse scale alone where that shows every target whole."""
         frames, wanted = scene.frames, Wanted.of(scene.table.polarity, _LEAST_CANDIDATE)
+        if not bool(scene.table.coded.all()):
+            return self._found_with_boards(scene)
         if self.instances > 1:  # a copy may be too small for the coarse scale
             circles = self._useful(scene, find_candidates(frames, wanted=wanted))
             return self._read(scene, self._measured(scene, circles))
@@ -222,6 +241,19 @@ class PoseEstimator(nn.Module):
         circles = self._useful(scene, replace(finer, frame=rest[finer.frame]))
         more = self._measured(scene, circles, tried)
         return self._read(scene, Rings.cat([rings[settled[rings.frame]], more]), copies)
+
+    def _found_with_boards(self, scene: Scene) -> tuple[Scene, Found]:
+        """The same where there are boards among the targets: at finer and finer scales where they are not whole."""
+        factor = reduction_factor(*scene.frames.shape[-2:])
+        candidates = find_candidates(scene.frames, factor)
+        while True:
+            found = self._read(scene, self._measured(scene, self._circles(scene, candidates)), None, candidates)
+            rest = (~_settled(*found)).nonzero()[:, 0]
+            factor //= 2
+            if factor < 1 or rest.numel() == 0:
+                return found
+            more = find_candidates(scene.frames[rest], factor)
+            candidates = merge_duplicates(Candidates.cat([candidates, replace(more, frame=rest[more.frame])]))
 
     def _circles(self, scene: Scene, candidates: Candidates) -> Circles:
         candidates = candidates[torch.isin(candidates.polarity, scene.table.polarity)]
@@ -288,13 +320,27 @@ class PoseEstimator(nn.Module):
         tried = _Tried(blurred.outer[of], known, exact)
         return Rings.cat([others, known[chosen[len(rough) :]]]), likely.copies, tried
 
-    def _read(self, scene: Scene, rings: Rings, copies: Tensor | None = None) -> tuple[Scene, Found]:
-        """Rows of the rings of all frames, identified and solved; at least so many ``copies`` (B T,) were seen."""
+    def _read(
+        self, scene: Scene, rings: Rings, copies: Tensor | None = None, marks: Candidates | None = None
+    ) -> tuple[Scene, Found]:
+        """Rows of the rings of all frames, identified and solved; at least so many ``copies`` (B T,) were seen.
+
+        ``marks``: what those of boards are among.
+        """
         identified = identify(rings, scene.table, scene.camera, len(scene.frames))
+        if marks is not None:
+            rings, identified = identify_boards(scene, rings, identified, marks)
         if copies is not None:
             identified = replace(identified, copies=identified.copies.maximum(copies[identified.group]))
         scene = scene.of_rows(identified.group)
-        return best_copies(scene, self._solved(scene, rings, identified), self.instances)
+        found = self._solved(scene, rings, identified)
+        if marks is not None:
+
+            def solve(row: Tensor, ring: Tensor) -> Found:
+                return self._solved(scene.of_rows(scene.group[row]), rings, replace(identified[row], ring=ring))
+
+            found = right_way_round(scene, found, solve)
+        return best_copies(scene, found, self.instances)
 
     def _solved(self, scene: Scene, rings: Rings, identified: Identified) -> Found:
         """The evidence of every row, and the solutions of those rows that have enough of it."""
@@ -366,6 +412,17 @@ def _check_targets(targets: Sequence[Target]) -> None:
                 f"target: {one.name!r} and {other.name!r} cannot be told apart, their codes and layout agree; give one "
                 "of them and instances (--instances) for its copies, or change the ratios or places of its rings"
             )
+
+
+def _check_boards(targets: Sequence[Target], method: str, instances: int) -> None:
+    boards = [target.name for target in targets if target.grid is not None]
+    if boards and instances > 1:
+        raise ConfigError(f"instances: board {boards[0]!r} is looked for once in a frame; leave instances out")
+    discs = [target.name for target in targets if target.discs]
+    if discs and method not in ("photometric", "centers"):
+        raise ConfigError(
+            f"method: {method!r} takes both circles of rings, and {discs[0]!r} has discs; use photometric"
+        )
 
 
 def _doubted(scene: Scene, found: Found) -> Solutions:

@@ -1,4 +1,4 @@
-"""The target: coded concentric rings on a part, and its file."""
+"""The target: coded concentric rings on a part, or equal marks on a grid, and its file."""
 
 from __future__ import annotations
 
@@ -14,16 +14,20 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat,
 from torch import Tensor
 
 from torchpose.config import format_list, format_number, read_yaml, validate, within, write_text
+from torchpose.config.kinds import Length, Number, Text
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
+from torchpose.geometry.covariance import covariance_fault
+from torchpose.grids import GRID_EXAMPLES, Grid
 
 MIN_RATIO_GAP = 0.05  # smallest difference between the inner/outer ratios of two markers that can be told apart
 RATIO_RANGE = (0.15, 0.9)  # inner/outer: a smaller hole or a thinner ring is not readable
 MAX_DEVIATION = 1e3  # mm, of a place or edge (convention): far beyond any part, and its square is still a number
 MIN_SPREAD = 1e-2  # second / first singular value of the centred marker centres; below, they count as collinear
 
+MOST_MARKERS = 1000  # of a target (convention): their ratios tell a dozen apart
 _FROZEN = ConfigDict(extra="forbid", frozen=True)
-Vector = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
+Vector = Annotated[list[Length], Field(min_length=3, max_length=3)]
 Deviation = Annotated[FiniteFloat, Field(ge=0, le=MAX_DEVIATION)]
 Deviations = Annotated[
     list[Deviation],
@@ -44,9 +48,9 @@ class RigidTransformFile(BaseModel):
 class _MarkerFile(BaseModel):
     model_config = _FROZEN
     id: Annotated[int, Field(le=2**63 - 1)]
-    center: list[FiniteFloat]
-    outer_radius: FiniteFloat
-    inner_radius: FiniteFloat
+    center: list[Length]
+    outer_radius: Length
+    inner_radius: Length
     normal: Vector = [0.0, 0.0, 1.0]
     center_sigma: Deviations | None = None
 
@@ -62,7 +66,7 @@ class _MatrixFile(BaseModel):
     model_config = _FROZEN
     rows: int
     cols: int
-    data: list[FiniteFloat]
+    data: list[Number]
 
 
 class _TargetFile(BaseModel):
@@ -70,15 +74,16 @@ class _TargetFile(BaseModel):
     name: str
     units: Literal["mm"]
     background: Literal["light", "dark"]
-    markers: list[_MarkerFile]
+    markers: Annotated[list[_MarkerFile], Field(max_length=MOST_MARKERS)]
     part_from_target: RigidTransformFile | None = None
     center_sigma: Deviations | None = None
-    edge_gain: FiniteFloat = 0.0
+    edge_gain: Length = 0.0
     edge_gain_sigma: Deviation | None = None
     centers_covariance: _MatrixFile | None = None
     scale_sigma: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.0
-    adjustment: str | None = None
+    adjustment: Text | None = None
     camera_cross_covariance: _MatrixFile | None = None
+    board: Text | None = None
 
     @field_validator("units", mode="before")
     @classmethod
@@ -90,7 +95,7 @@ class _TargetFile(BaseModel):
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """M concentric-ring markers in the target's frame. Their ids are told apart by (inner/outer)^2.
+    """M concentric-ring markers in the target's frame. Their ids are told apart by (inner/outer)^2, or by their places.
 
     Attributes:
         name: goes into result tables and file names.
@@ -111,6 +116,9 @@ class Target:
         adjustment: name of the adjustment that measured the target and a camera together, None where there was none.
         cross_covariance: (3 M + 1, 4 + n) float64, of the same and that camera's fx, fy, cx, cy and distortion; it
             holds for a `Camera` of the same ``adjustment``.
+        grid: of a board of equal rings or discs, that are told apart by their places on it: ids are the numbers of its
+            marks, row by row, and marks whose numbers are not among them are not on the board. Discs have the inner
+            radius 0. None for coded rings.
 
     Raises:
         ConfigError: duplicate ids, rings that cannot be told apart or read, overlapping markers, fewer than 3 markers,
@@ -130,6 +138,7 @@ class Target:
     adjustment: str | None = None
     cross_covariance: Tensor | None = None
     scale_sigma: float = 0.0
+    grid: Grid | None = None
 
     def __post_init__(self) -> None:
         _check_name(self.name)
@@ -147,7 +156,7 @@ class Target:
         if self.cross_covariance is not None:
             _check_cross(self.cross_covariance, 3 * m + 1, self.adjustment)
         printed = self.printed_radii
-        if not bool((printed > 0).all() & (printed[:, 1] < printed[:, 0]).all()):
+        if not bool((printed[:, 0] > 0).all() & (self.discs | (printed[:, 1] > 0)).all() & (printed.diff() < 0).all()):
             raise ConfigError(
                 f"edge_gain: {self.edge_gain:g} mm leaves a ring without width or hole; give an edge shift in mm"
             )
@@ -165,13 +174,13 @@ class Target:
             raise ConfigError("markers: NaN or infinity; write finite numbers")
         for i, (outer, inner) in enumerate(self.radii.tolist()):
             for field, radius in (("outer_radius", outer), ("inner_radius", inner)):
-                if radius <= 0:
+                if radius <= 0 and not (field == "inner_radius" and radius == 0 and self.discs):
                     raise ConfigError(f"markers[{i}].{field}: is {radius:g}; give a positive length in mm")
             if inner >= outer:
                 raise ConfigError(
                     f"markers[{i}].inner_radius: {inner:g} is not below the outer {outer:g}; swap or shrink"
                 )
-            if not RATIO_RANGE[0] - 1e-6 <= inner / outer <= RATIO_RANGE[1] + 1e-6:
+            if not self.discs and not RATIO_RANGE[0] - 1e-6 <= inner / outer <= RATIO_RANGE[1] + 1e-6:
                 raise ConfigError(
                     f"markers[{i}].inner_radius: inner/outer is {inner / outer:.3g}; "
                     f"rings are readable from {RATIO_RANGE[0]} to {RATIO_RANGE[1]}"
@@ -182,7 +191,9 @@ class Target:
                 raise ConfigError(f"markers[{i}].normal: has length {length:.3g}; give a unit vector")
         ratio, order = (self.radii[:, 1] / self.radii[:, 0]).sort()
         gap, k = ratio.diff().min(0)
-        if float(gap) < MIN_RATIO_GAP - 1e-6:
+        if self.grid is not None:
+            _check_board(self.grid, ids)
+        elif float(gap) < MIN_RATIO_GAP - 1e-6:
             a, b = sorted((ids[int(order[k])], ids[int(order[k + 1])]))
             raise ConfigError(
                 f"markers: ids {a} and {b} cannot be told apart (inner/outer differ by {float(gap):.3g}); "
@@ -209,6 +220,11 @@ class Target:
         return len(self.ids)
 
     @property
+    def discs(self) -> bool:
+        """Whether its marks are discs, without a hole."""
+        return self.grid is not None and self.grid.discs
+
+    @property
     def codes(self) -> Tensor:
         """(M,) float64 ring codes (inner/outer)^2, the ratio of the areas of the two circles."""
         return (self.radii[:, 1] / self.radii[:, 0]).square()
@@ -217,7 +233,7 @@ class Target:
     def printed_radii(self) -> Tensor:
         """(M, 2) radii on the part, mm: a dark ring's edges lie outwards by the edge gain, a light one's inwards."""
         outwards = self.edge_gain if self.background == "light" else -self.edge_gain
-        return self.radii + outwards * self.radii.new_tensor([1.0, -1.0])
+        return self.radii + outwards * self.radii.new_tensor([1.0, 0.0 if self.discs else -1.0])
 
     @property
     def part_from_target(self) -> tuple[Tensor, Tensor] | None:
@@ -234,6 +250,21 @@ class Target:
         one_normal = (self.normals - self.normals[0]).norm(dim=-1).max() < 1e-6
         return bool(one_normal & ((offset @ self.normals[0]).abs().max() < 1e-6 * scale))
 
+    def upright(self) -> Target:
+        """The same where boards that look the same after a turn are taken to be upright (`Grid.upright`)."""
+        return self if self.grid is None else replace(self, grid=replace(self.grid, upright=True))
+
+    def of_markers(self, kept: Tensor) -> Target:
+        """The board with some of its marks, by a mask (M,); as far as a file claims a perfect one.
+
+        Raises:
+            ConfigError: too few are left.
+        """
+        assert self.grid is not None  # of coded rings each counts
+        grid = self.grid.without(tuple(sorted({*self.grid.missing, *self.ids[~kept].tolist()})))
+        parts = {name: getattr(self, name)[kept] for name in ("ids", "centers", "normals", "radii")}
+        return replace(self, **parts, grid=grid, covariance=None, adjustment=None, cross_covariance=None)
+
     def to(self, *args: Any, **kwargs: Any) -> Target:
         """Same as `Tensor.to` on every tensor; ids keep their dtype."""
 
@@ -248,8 +279,27 @@ class Target:
         return sorted(Path(f.name).stem for f in folder.iterdir() if f.name.endswith(".yaml"))
 
     @classmethod
+    def of_grid(cls, grid: Grid, background: Literal["light", "dark"] = "light") -> Target:
+        """A board of equal marks as it is named, flat and regular, its first mark at the origin.
+
+        Raises:
+            ConfigError: the board does not say how large its discs are.
+        """
+        if grid.radii is None:
+            raise ConfigError(
+                f"{grid}: does not say the radius of its discs, which a pose needs; write {grid}:4mm, or measure the "
+                "board: torchpose calibrate --board ... --measure-target"
+            )
+        ids = torch.tensor([k for k in range(len(grid.points)) if k not in grid.missing])
+        centers = grid.points[ids]
+        radii = centers.new_tensor(grid.radii).repeat(len(ids), 1)
+        return cls(_board_name(grid), background, ids, centers, _facing(centers), radii, grid=grid)
+
+    @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Target:
-        """Reads a target file, or a built-in target by its name where no such file exists.
+        """Reads a target file, or a built-in target by its name where no such file exists, or a board by what it is.
+
+        A board, such as ``rings:10x7:20mm:6mm:3mm`` (`Grid.parse`), is dark on light.
 
         Raises:
             ConfigError: one line ``FILE: FIELD: what is wrong; the fix``.
@@ -259,6 +309,8 @@ class Target:
             if os.fspath(path) in cls.builtin_names():
                 with resources.as_file(resources.files("torchpose") / "targets" / f"{os.fspath(path)}.yaml") as builtin:
                     return cls._read(builtin)
+            if (grid := Grid.parse(os.fspath(path))) is not None:
+                return cls.of_grid(grid)
             if source.suffix == "" and source.parent == Path():
                 known = ", ".join(cls.builtin_names())
                 raise ConfigError(f"{path}: target: is neither a file nor built in; give a path or one of {known}")
@@ -277,6 +329,7 @@ class Target:
         pose = data.part_from_target
         with within(f"{path}: "):
             covariance = _covariance(data)
+            grid = None if data.board is None else _board(data.board, [m.id for m in data.markers])
             return cls(
                 name=data.name,
                 background=data.background,
@@ -291,6 +344,7 @@ class Target:
                 scale_sigma=data.scale_sigma,
                 adjustment=data.adjustment,
                 cross_covariance=_cross_covariance(data),
+                grid=grid,
             )
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -299,7 +353,8 @@ class Target:
         Raises:
             ConfigError: the folder does not exist or cannot be written.
         """
-        lines = [f'name: "{self.name}"', "units: mm", f"background: {self.background}", "markers:"]
+        board = [] if self.grid is None else [f'board: "{self.grid}"']
+        lines = [f'name: "{self.name}"', "units: mm", f"background: {self.background}", *board, "markers:"]
         markers = zip(self.ids.tolist(), self.centers.tolist(), self.radii.tolist(), self.normals.tolist(), strict=True)
         for marker, center, (outer, inner), normal in markers:
             facing = "" if normal == [0, 0, 1] else f", normal: {format_list(normal)}"
@@ -325,6 +380,36 @@ class Target:
             (rows, cols), data = self.cross_covariance.shape, format_list(self.cross_covariance.flatten().tolist())
             lines.append(f"camera_cross_covariance: {{rows: {rows}, cols: {cols}, data: {data}}}")
         write_text(path, "\n".join(lines) + "\n")
+
+
+def _board(text: str, ids: list[int]) -> Grid:
+    """The board of a file with the markers that it has.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    with within("board: "):
+        grid = Grid.parse(text)
+    if grid is None:
+        raise ConfigError(f"board: {text!r} is no grid; write {GRID_EXAMPLES}")
+    return grid.without(tuple(k for k in range(len(grid.points)) if k not in ids))
+
+
+def _check_board(grid: Grid, ids: list[int]) -> None:
+    count = len(grid.points)
+    if max(ids) >= count:
+        raise ConfigError(f"markers: id {max(ids)} is not on the board {grid.name}, whose marks are 0 to {count - 1}")
+    if sorted(ids) != [k for k in range(count) if k not in grid.missing]:
+        raise ConfigError("markers: are not those of the board; leave marks out of its grid, too")
+
+
+def _board_name(grid: Grid) -> str:
+    return f"{grid.kind}-{grid.columns}x{grid.rows}"
+
+
+def _facing(centers: Tensor) -> Tensor:
+    """Normals (M, 3) of markers seen along the z axis."""
+    return centers.new_tensor([0.0, 0.0, 1.0]).expand_as(centers)
 
 
 def _covariance(data: _TargetFile) -> Tensor | None:
@@ -393,10 +478,8 @@ def _check_covariance(covariance: Tensor, size: int) -> None:
     scale = covariance.diagonal().abs().max().clamp_min(1e-30)
     if bool(scale > MAX_DEVIATION**2):
         raise ConfigError(f"{field}: has a variance of {float(scale):.3g} mm^2; write it in mm^2, up to 1e6")
-    if bool(((covariance - covariance.mT).abs() > 1e-6 * scale).any()):
-        raise ConfigError(f"{field}: is not symmetric; write the whole table")
-    if bool(torch.linalg.eigvalsh(covariance)[0] < -1e-9 * scale):
-        raise ConfigError(f"{field}: has a negative variance in some direction; it is no covariance")
+    if fault := covariance_fault(covariance):
+        raise ConfigError(f"{field}: {fault}; write the whole table as it was measured")
 
 
 def _floats(values: Any) -> Tensor:

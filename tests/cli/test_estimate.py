@@ -179,7 +179,10 @@ def test_bad_files_have_rows_of_their_own_and_the_good_ones_beside_them_are_solv
 
 def test_a_wrong_size_alone_is_no_failure(run: Callable[..., Any]) -> None:
     png(Path("f/small.png"), np.zeros((10, 20), np.uint8))
-    assert run("f") == (0, "")
+    code, error = run("f")
+    assert code == 0
+    assert "no frame has the size of the camera file, 640x480: all frames are 20x10; give" in error
+    assert error.count("\n") == 1
     (row,) = table()
     assert (row["status"], row["reason"], row["tx"], row["markers"]) == ("wrong_size", "20x10", "", "0")
 
@@ -425,7 +428,7 @@ def test_a_mistake_ends_in_one_clear_line_and_exit_code_2(run: Callable[..., Any
 def test_a_camera_of_another_image_size_gives_wrong_size_rows(run: Callable[..., Any], pictures: np.ndarray) -> None:
     png(Path("f/x.png"), pictures[0])
     Path("c.yaml").write_text(CAMERA_TEXT.format(matrix=MATRIX).replace("480", "500"))
-    assert run("f", camera="c.yaml") == (0, "")
+    assert run("f", camera="c.yaml")[0] == 0
     (row,) = table()
     assert (row["status"], row["reason"]) == ("wrong_size", "640x480")
 

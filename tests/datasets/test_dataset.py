@@ -13,12 +13,15 @@ from torchpose.camera import Camera
 from torchpose.datasets.dataset import analytic, bounds, plan_truth, simulated_frames, write_bop, write_dataset
 from torchpose.datasets.plan import Plan, load_plan
 from torchpose.errors import ConfigError
+from torchpose.io.rows import Schema
 from torchpose.io.truth import read_truth
 from torchpose.io.writers import read_table
 from torchpose.sim import render
 from torchpose.target import Target
 
 F64 = torch.float64
+NUMBERS = ("x", "y", "z", "nx", "ny", "nz", "outer_radius", "inner_radius")
+PRINTS: Schema = {"frame": str, "id": int} | dict.fromkeys(NUMBERS, float)
 
 
 @pytest.fixture
@@ -111,11 +114,11 @@ def test_one_print_is_that_of_all_frames(plan: Plan, tmp_path: Path) -> None:
     torch.testing.assert_close(made.printed_radii[:, 0], 1.01 * meant.radii[:, 0] + gain[0])
     torch.testing.assert_close(made.printed_radii[:, 1], 1.01 * meant.radii[:, 1] - gain[0])
     assert 0.05 < float((made.centers - 1.01 * meant.centers).square().mean().sqrt()) < 0.4
-    rows = read_table(out / "prints.csv")
-    assert [(row["frame"], int(str(row["id"]))) for row in rows[3:5]] == [("0000.png", 3), ("0001.png", 0)]
+    rows = read_table(out / "prints.csv", PRINTS, ())
+    assert [(row["frame"], row["id"]) for row in rows[3:5]] == [("0000.png", 3), ("0001.png", 0)]
     for number, row in enumerate(rows):
-        assert [float(str(row[name])) for name in "xyz"] == made.centers[number % 4].tolist()
-        assert float(str(row["inner_radius"])) == pytest.approx(float(made.printed_radii[number % 4, 1]), rel=1e-12)
+        assert [row[name] for name in "xyz"] == made.centers[number % 4].tolist()
+        assert row["inner_radius"] == pytest.approx(float(made.printed_radii[number % 4, 1]), rel=1e-12)
     # the frames show it: bent rings and all
     frames = analytic(other)(torch.arange(4))
     look = plan_truth(other).extra
@@ -132,8 +135,8 @@ def test_every_frame_may_have_a_print(plan: Plan, tmp_path: Path) -> None:
     assert len(other.prints.gain.unique()) == 4
     write_dataset(other, tmp_path / "set")
     assert not (tmp_path / "set" / "print.yaml").exists()
-    rows = read_table(tmp_path / "set" / "prints.csv")
-    assert [float(str(row["x"])) for row in rows] == other.prints.centers[..., 0].flatten().tolist()
+    rows = read_table(tmp_path / "set" / "prints.csv", PRINTS, ())
+    assert [row["x"] for row in rows] == other.prints.centers[..., 0].flatten().tolist()
     part = other[torch.tensor([2])]
     torch.testing.assert_close(analytic(part)(torch.tensor([0])), analytic(other)(torch.tensor([2])), rtol=0, atol=1e-3)
 
@@ -214,7 +217,7 @@ def test_faults_are_in_the_truth(plan: Plan) -> None:
     ("section", "wanted", "words"),
     [
         ("imaging", {"haze_px": -0.1}, r"imaging\.haze_px: is -0.1; give px, 0 or more"),
-        ("imaging", {"speckle": [0.1, 1.5]}, r"imaging\.speckle: is 1.5; the contrast"),
+        ("imaging", {"speckle": [0.1, 1.5]}, r"imaging\.speckle: is 1.5; give a share"),
         ("imaging", {"haze_length": 0.5}, r"imaging\.haze_length"),
         ("processing", {"sharpen": 1, "sharpen_px": 100000.0}, r"processing\.sharpen_px"),
         ("print", {"texture": {"share": 0.02}}, r"print\.texture\.length"),

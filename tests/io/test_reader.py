@@ -2,6 +2,7 @@
 
 import threading
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -9,7 +10,6 @@ import pytest
 import torch
 
 from torchpose.io import images
-from torchpose.io import reader as reader_module
 from torchpose.io.reader import Fault, FrameReader, default_batch, in_batches
 from torchpose.io.sources import find_sources
 from torchpose.results import Status
@@ -77,14 +77,14 @@ def test_decoding_runs_one_batch_ahead_and_no_further(tmp_path: Path, monkeypatc
     lock = threading.Lock()
     decode = images.decode
 
-    def counting(path: Path, threads: int) -> np.ndarray:
+    def counting(path: Path, **options: Any) -> np.ndarray:
         nonlocal count
         with lock:
             count += 1
         started.release()
-        return decode(path, threads=threads)
+        return decode(path, **options)
 
-    monkeypatch.setattr(reader_module, "decode", counting)
+    monkeypatch.setattr(images, "decode", counting)
     steps = iter(FrameReader(in_batches(find_sources([tmp_path]), 5), SIZE[1], SIZE[0], threads=2))
     for done in range(1, 4):
         next(steps)

@@ -3,6 +3,8 @@
 import os
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -95,3 +97,48 @@ def test_unusable_inputs_are_refused_in_one_line_that_names_them(tmp_path: Path,
 def test_natural_order_sorts_equal_prefixes_by_the_value_of_the_number(pairs: list[tuple[str, int]]) -> None:
     ordered = sorted(pairs, key=lambda pair: natural_key(f"{pair[0]}{pair[1]}.png"))
     assert ordered == sorted(pairs, key=lambda pair: (pair[0].casefold(), pair[1], f"{pair[0]}{pair[1]}"))
+
+
+def test_each_page_of_a_tiff_file_is_a_frame_of_its_own_name(tmp_path: Path) -> None:
+    frames = [np.full((4, 6), value, np.uint8) for value in (1, 2, 3)]
+    cv2.imwritemulti(str(tmp_path / "stack.tif"), frames)
+    cv2.imwrite(str(tmp_path / "single.tiff"), frames[0])
+    (tmp_path / "broken.tif").write_bytes(b"II*\0")
+    sources = find_sources([tmp_path])
+    assert [s.name for s in sources] == ["broken.tif", "single.tiff", "stack.tif", "stack.tif#2", "stack.tif#3"]
+    assert [int(s.decode()[0, 0]) for s in sources[2:]] == [1, 2, 3]
+    assert names(tmp_path / "stack.tif") == ["stack.tif", "stack.tif#2", "stack.tif#3"]
+
+
+def test_pictures_that_are_not_read_are_counted_in_one_line(tmp_path: Path) -> None:
+    touch(*(tmp_path / name for name in ("a.png", "b.webp", "c/d.WEBP", "e.jp2", "f.heic", ".g.webp", "h.txt")))
+    os.mkfifo(tmp_path / "pipe.png")
+    lines: list[str] = []
+    (source,) = find_sources([tmp_path], lines.append)
+    (line,) = lines
+    assert source.name == "a.png"
+    assert "passed over 2 .webp, 1 .heic, 1 .jp2, 1 pipes or devices;" in line
+    (tmp_path / "a.png").unlink()
+    with pytest.raises(ConfigError, match=r"holds no image but 2 \.webp"):
+        find_sources([tmp_path], lines.append)
+
+
+def test_pages_behind_that_of_a_record_are_counted(tmp_path: Path) -> None:
+    cv2.imwritemulti(str(tmp_path / "stack.tif"), [np.zeros((4, 6), np.uint8)] * 3)
+    (tmp_path / "run.jsonl").write_text('{"record": "frame", "id": 1, "image": "stack.tif"}\n')
+    lines: list[str] = []
+    assert [s.name for s in find_sources([tmp_path / "run.jsonl"], lines.append)] == ["stack.tif"]
+    assert "passed over 2 pages behind the first" in lines[0]
+
+
+def test_pipes_devices_and_loops_as_input_are_refused_at_once(tmp_path: Path) -> None:
+    for name in ("pipe.png", "pipe.jsonl", "pipe"):
+        os.mkfifo(tmp_path / name)
+    (tmp_path / "loop.png").symlink_to(tmp_path / "loop.png")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    given = [
+        tmp_path / n for n in ("pipe.png", "pipe.jsonl", "pipe", "loop.png", "loop", "a" * 300 + ".png", "a\0.png")
+    ]
+    for path in [*given, Path("/dev/zero"), Path("/dev/null")]:
+        with pytest.raises(ConfigError, match=r"^[^\n]+: INPUT: [^\n]+$"):
+            find_sources([path])

@@ -17,6 +17,7 @@ import torch
 
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
+from torchpose.io.journal import seal, unseal
 from torchpose.io.rows import (
     BASE_SCHEMA,
     DETECTION_SCHEMA,
@@ -148,7 +149,7 @@ def test_tables_read_back_to_the_same_bits(tmp_path: Path, suffix: str) -> None:
 def test_a_row_with_another_number_of_cells_is_refused(tmp_path: Path, row: str) -> None:
     (tmp_path / "t.csv").write_text(f"frame,target\n{row}\n")
     with pytest.raises(ConfigError, match=r"t\.csv: POSES: cannot be read \(a row has another number of cells"):
-        read_table(tmp_path / "t.csv")
+        read_table(tmp_path / "t.csv", POSE_SCHEMA, ())
 
 
 def test_csv_has_the_columns_of_the_contract(tmp_path: Path) -> None:
@@ -371,7 +372,7 @@ def test_places_without_locks_are_written_unguarded(tmp_path: Path, monkeypatch:
     def missing(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSYS, "Function not implemented")
 
-    monkeypatch.setattr("torchpose.io.store.lock_descriptor", missing)
+    monkeypatch.setattr("torchpose.io.journal.lock_descriptor", missing)
     assert complete(tmp_path) == []
 
 
@@ -386,10 +387,28 @@ def test_a_journal_of_another_program_is_one_clear_line(tmp_path: Path, line: st
         store(tmp_path, resume=True)
 
 
-def test_cells_of_another_kind_in_a_journal_are_one_clear_line(tmp_path: Path) -> None:
-    row = {"frame": "0.png", "target": "quad40", "status": "ok", "reason": None, "place": 5}
-    record = {"frame": "0.png", "rows": [row], "detections": []}
-    (tmp_path / "p.csv.partial").write_text(json.dumps({"origin": ORIGIN}) + "\n" + json.dumps(record) + "\n")
+ROW = {"frame": "0.png", "target": "quad40", "status": "ok", "reason": None}
+
+
+@pytest.mark.parametrize(
+    "cell",
+    [
+        {"place": 5},
+        {"nx": "abc"},
+        {"sx": -1.0},
+        {"instance": -1},
+        {"instance": 10**12},
+        {"status": "[/x]"},
+        {"frame": "1.png"},
+        {"target": None},
+        {"covariance": [[1.0]]},
+        {"solutions": [{"translation": "x"}]},
+    ],
+    ids=str,
+)
+def test_cells_of_another_kind_in_a_journal_are_one_clear_line(tmp_path: Path, cell: dict[str, Any]) -> None:
+    record = {"frame": "0.png", "rows": [{**ROW, **cell}], "detections": []}
+    (tmp_path / "p.csv.partial").write_bytes(seal({"origin": ORIGIN}) + seal(record))
     with pytest.raises(ConfigError, match="--resume: not written by torchpose"):
         store(tmp_path, resume=True)
 
@@ -410,15 +429,15 @@ def test_a_journal_from_before_there_were_instances_is_resumed(tmp_path: Path, w
     first.append([record(name) for name in NAMES[:3]])
     first.close()
     journal = tmp_path / "p.csv.partial"
-    lines = [json.loads(line) for line in journal.read_text().splitlines()]
+    lines = [unseal(line) or {} for line in journal.read_bytes().splitlines(keepends=True)]
     for line in lines[1:]:
         for row in [*line["rows"], *line["detections"]]:
             row.pop("instance")
             row.pop("copies", None)
-    journal.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    journal.write_bytes(b"".join(map(seal, lines)))
     assert complete(tmp_path, resume=True, origin=ORIGIN | {"--instances": 1}) == NAMES[:3]
-    rows = read_table(tmp_path / "p.csv")
-    assert [(row["instance"], row["copies"]) for row in rows] == [("0", None)] * 5
+    rows = read_rows(tmp_path / "p.csv", POSE_SCHEMA)
+    assert [(row["instance"], row["copies"]) for row in rows] == [(0, None)] * 5
 
 
 def test_copies_without_a_row_are_counted(tmp_path: Path) -> None:

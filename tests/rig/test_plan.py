@@ -109,7 +109,14 @@ def test_a_waypoint_out_of_the_workspace(tmp_path: Path) -> None:
     [
         ([], "steps"),
         ([{}], "steps[0]: holds 0 kinds"),
-        ([{"static": {"repeats": 1}, "poses": []}], "steps[0]: holds 2 kinds"),
+        ([{"static": {"repeats": 1}, "poses": [[0.0] * 6]}], "steps[0]: holds 2 kinds"),
+        ([{"poses": []}], "steps[0].poses: is empty; give at least 1"),
+        ([{"static": None}], "steps[0]: holds 1 kinds"),
+        ([{"static": {"repeats": 10000}}] * 3, "steps: has 30000 waypoints; give at most 20000"),
+        (
+            [{"translation": {"values_mm": [1e9]}}],
+            "values_mm[0]: is 1000000000.0; give at most 1e+07",
+        ),
         ([{"static": {"repeats": 0}}], "steps[0].static.repeats"),
         ([{"rotation": {"axes": ["x"], "values_deg": [1]}}], "steps[0].rotation.axes[0]: is 'x'"),
         ([{"translation": {"values_mm": [float("nan")]}}], "is not finite"),

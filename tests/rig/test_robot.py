@@ -93,8 +93,8 @@ def wait_for_motion(twin: TwinController) -> None:
     ("change", "message"),
     [
         ({"hosts": "a"}, r"^rig.yaml: hosts: unknown key; did you mean host\?"),
-        ({"speed_mm_s": 251.0}, "^rig.yaml: speed_mm_s: Input should be less than or equal to 250"),
-        ({"acceleration_mm_s2": 0.0}, "^rig.yaml: acceleration_mm_s2: Input should be greater than 0"),
+        ({"speed_mm_s": 251.0}, "^rig.yaml: speed_mm_s: is 251.0; give at most 250"),
+        ({"acceleration_mm_s2": 0.0}, "^rig.yaml: acceleration_mm_s2: is 0.0; give more than 0"),
         ({"workspace": {"min": [0, 0, 0.0], "max": [1, 0, 1.0]}}, "^rig.yaml: workspace: is empty along y .*; give"),
         ({"workspace": {"min": [0, 0, float("nan")], "max": [1, 1, 1]}}, "workspace.min.*is not finite"),
         ({"tcp": [0, 0, 100.0, 0, 0]}, "^rig.yaml: tcp: has 5 entries; give 6"),

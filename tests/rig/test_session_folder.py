@@ -6,6 +6,8 @@ import errno
 import hashlib
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -177,3 +179,64 @@ def test_a_session_that_cannot_begin(tmp_path: Path) -> None:
         session.check_space(2**62)
     session.end("disk_full")
     assert not session.begun
+
+
+def test_two_captures_cannot_write_one_session(tmp_path: Path) -> None:
+    with begun(tmp_path) as session:
+        session.write("0000", IMAGE, **TAKEN)
+        before = (tmp_path / "manifest.jsonl").read_bytes()
+        with pytest.raises(ConfigError, match="--out: another capture is writing this session; wait for it"):
+            opened(tmp_path, resume=True)
+        assert (tmp_path / "manifest.jsonl").read_bytes() == before
+    with begun(tmp_path, resume=True) as session:
+        assert session.done == {"0000"}
+
+
+def test_a_session_that_began_meanwhile_is_not_begun_again(tmp_path: Path) -> None:
+    late = opened(tmp_path)
+    with begun(tmp_path), pytest.raises(ConfigError, match="another capture is writing"):
+        late.__enter__()
+    with pytest.raises(ConfigError, match="holds a session already"):
+        late.__enter__()
+
+
+def test_a_killed_capture_holds_no_lock(tmp_path: Path) -> None:
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "from tests.rig.test_session_folder import IMAGE, TAKEN, Path, begun\n"
+        "one = begun(Path(sys.argv[2])); one.write('0000', IMAGE, **TAKEN); print('held', flush=True); sys.stdin.read()"
+    )
+    command = [sys.executable, "-c", code, str(Path(__file__).parents[2]), str(tmp_path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "held\n"
+        with pytest.raises(ConfigError, match="another capture is writing"):
+            opened(tmp_path, resume=True)
+        other.kill()
+    with begun(tmp_path, resume=True) as session:
+        assert session.done == {"0000"}
+
+
+def test_an_image_that_is_not_the_one_written_is_refused(tmp_path: Path) -> None:
+    with begun(tmp_path) as session:
+        session.write("0000", IMAGE, **TAKEN)
+    image = tmp_path / "images" / "0000.png"
+    whole = image.read_bytes()
+    image.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    with pytest.raises(ConfigError, match=r"0000\.png: --resume: is not the image that was written"):
+        opened(tmp_path, resume=True)
+    image.write_bytes(whole)
+    manifest = tmp_path / "manifest.jsonl"
+    manifest.write_bytes(manifest.read_bytes() + manifest.read_bytes().splitlines(keepends=True)[1])
+    with pytest.raises(ConfigError, match="line 3: id: '0000' occurs twice"):
+        opened(tmp_path, resume=True)
+
+
+def test_an_image_outside_of_the_session_is_refused(tmp_path: Path) -> None:
+    with begun(tmp_path / "s") as session:
+        session.write("0000", IMAGE, **TAKEN)
+    lines = records(tmp_path / "s")
+    lines[1]["image"] = "../s2/0000.png"
+    (tmp_path / "s" / "manifest.jsonl").write_text("".join(json.dumps(record) + "\n" for record in lines))
+    with pytest.raises(ConfigError, match=r"line 2: image: .* lies outside of the session"):
+        opened(tmp_path / "s", resume=True)

@@ -120,7 +120,7 @@ def match_copies(
     for key, numbers in wanted.items():
         found = [row for row in table[key] if row["tx"] is not None]
         others = iter([row for row in table[key] if row["tx"] is None])
-        at = torch.tensor([[float(str(row[name])) for name in ("tx", "ty", "tz")] for row in found], dtype=places.dtype)
+        at = torch.tensor([[row[name] for name in ("tx", "ty", "tz")] for row in found], dtype=places.dtype)
         apart = torch.cdist(places[numbers], at.reshape(-1, 3))
         for _ in range(min(apart.shape)):
             i, j = divmod(int(apart.argmin()), apart.shape[1])
@@ -136,7 +136,7 @@ def estimates_of(rows: Sequence[Row]) -> Estimates:
     """Estimates from rows of a result table; cells may be None."""
 
     def cells(names: Sequence[str]) -> Tensor:
-        values = [[math.nan if row[name] is None else float(str(row[name])) for name in names] for row in rows]
+        values = [[math.nan if row[name] is None else row[name] for name in names] for row in rows]
         return torch.tensor(values, dtype=torch.float64).reshape(-1, len(names))
 
     pose, std = cells(("tx", "ty", "tz", "rx", "ry", "rz")), cells(BOUND)

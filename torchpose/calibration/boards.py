@@ -20,9 +20,10 @@ _EXAMPLES = (
     "chessboard:9x6:5mm (inner corners, square), charuco:8x5:10mm:7mm:4X4_50 (squares, square, marker), "
     "circles:7x6:20mm, acircles:4x11:20mm (pitch) or rings:10x7:20mm:6mm:3mm (pitch, radii)"
 )
-_LENGTH = r"(\d+\.?\d*|\.\d+)mm"
-_CHESSBOARD = re.compile(rf"chessboard:(\d+)x(\d+):{_LENGTH}")
-_CHARUCO = re.compile(rf"charuco:(\d+)x(\d+):{_LENGTH}:{_LENGTH}:(\w+)")
+# up to three digits a side and six a length: a thousand marks across, a kilometre
+_LENGTH = r"(\d{1,6}\.?\d{0,9}|\.\d{1,9})mm"
+_CHESSBOARD = re.compile(rf"chessboard:(\d{{1,3}})x(\d{{1,3}}):{_LENGTH}")
+_CHARUCO = re.compile(rf"charuco:(\d{{1,3}})x(\d{{1,3}}):{_LENGTH}:{_LENGTH}:(\w+)")
 _SUBPIX_WINDOW = 0.3  # of the distance between corners, half width
 _SUBPIX_RANGE = (3, 11)  # px
 # of OpenCV's older search: without the quick look for corners first a frame that has no board takes minutes

@@ -181,7 +181,7 @@ class _Problem:
             return segment_sum(values, views.view, len(views))
 
         normal = Normal(
-            (own.mT @ own).sum(0, keepdim=True),
+            (own.flatten(0, 1).mT @ own.flatten(0, 1))[None],
             (own.mT @ residual).sum(0)[None, :, 0],
             torch.where(possible, residual.square().sum(), torch.inf)[None],
             Eliminated(

@@ -23,6 +23,7 @@ from torchpose.camera import Camera
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.geometry.segments import segment_mean
+from torchpose.grids import Grid
 from torchpose.target import Target
 
 _LEAST_VIEWS = 3  # of a marker: two give a place, without anything to check it by
@@ -44,21 +45,22 @@ class Distance:
     length: float
     sigma: float = 0.0
 
-    def check(self, target: Target) -> None:
+    def check(self, target: Target | Grid) -> None:
         """Raises ConfigError where the target has no such markers, or the numbers are none."""
-        known = target.ids.tolist()
+        name, centers = target.name, target.points if isinstance(target, Grid) else target.centers
+        known = list(range(len(centers))) if isinstance(target, Grid) else target.ids.tolist()
         for marker in (self.first, self.second):
             if marker not in known:
-                raise ConfigError(f"--distance: target {target.name} has no marker {marker}; its ids are {known}")
+                raise ConfigError(f"--distance: target {name} has no marker {marker}; its ids are {known}")
         if self.first == self.second or not 0 < self.length < math.inf or not 0 <= self.sigma < self.length:
             raise ConfigError(
                 "--distance: give two different markers, a length above 0 mm and a deviation from 0 mm, below that"
             )
-        ends = [target.centers[known.index(marker)] for marker in (self.first, self.second)]
+        ends = [centers[known.index(marker)] for marker in (self.first, self.second)]
         nominal = float((ends[0] - ends[1]).norm())
         if not 1 / _SCALE < self.length / nominal < _SCALE:
             raise ConfigError(
-                f"--distance: markers {self.first} and {self.second} of target {target.name} are {nominal:.6g} mm "
+                f"--distance: markers {self.first} and {self.second} of target {name} are {nominal:.6g} mm "
                 f"apart, not {self.length:.6g}; give their distance in mm, or correct the target file"
             )
 
@@ -169,6 +171,13 @@ def check_seen(views: Views, target: Target) -> None:
         raise ConfigError(
             f"INPUT: marker {few} of target {target.name} is in fewer than {_LEAST_VIEWS} views; add views that show it"
         )
+
+
+def of_seen(target: Target, views: Views) -> Target:
+    """The board without the marks that are in too few views, in turn."""
+    counts = (views.point[:, None] == target.ids).sum(0)
+    kept = counts >= _LEAST_VIEWS
+    return target if bool(kept.all()) else target.of_markers(kept)
 
 
 def doubts(calibration: Calibration, target: Target) -> list[str]:

@@ -54,8 +54,8 @@ class Plate:
 
     @property
     def rims(self) -> bool:
-        """Whether gain and sizes of the rings are among the unknowns."""
-        return bool(self.gain.any())
+        """Whether sizes and tilts of the rings are among the unknowns, and the gain but for discs."""
+        return bool(self.sizes.any())
 
     def index(self, ids: Tensor) -> Tensor:
         """Which of the points each of these ids (K,) is."""
@@ -87,7 +87,9 @@ def motions(places: Float[Tensor, "M 3"]) -> Float[Tensor, "D 7"]:
     return torch.cat([eye, -rotations.skew(arm), arm[..., None]], -1).flatten(0, 1)
 
 
-def free_plate(ids: Tensor, nominal: Float[Tensor, "M 3"], normals: Float[Tensor, "M 3"] | None = None) -> Plate:
+def free_plate(
+    ids: Tensor, nominal: Float[Tensor, "M 3"], normals: Float[Tensor, "M 3"] | None = None, *, discs: bool = False
+) -> Plate:
     """A plate of which only the frame is held, by inner constraints: it fits the nominal places best.
 
     Least squares of the distances to the nominal places over shift, turn and scale have their least where the
@@ -96,13 +98,15 @@ def free_plate(ids: Tensor, nominal: Float[Tensor, "M 3"], normals: Float[Tensor
 
     Args:
         normals: of the rings of the points; None where the points have none, or nothing is asked of them.
+        discs: the points are those of discs, whose gain is no other thing than their size.
     """
     count = len(ids)
     shape = torch.linalg.qr(motions(nominal), mode="complete").Q[:, 7:]
     parts = [shape]
     if normals is not None:
         tilts = torch.stack(plane_axes(normals), -1) * _TURNED  # (M, 3, 2)
-        parts += [torch.eye(count + 1).to(shape), torch.block_diag(*tilts)]
+        # the gain, and the size of every ring
+        parts += [torch.eye(count + 1).to(shape)[:, int(discs) :], torch.block_diag(*tilts)]
     places, *of_rims = _side_by_side(parts)
     k = places.shape[1]
     rims, turns = of_rims or (places.new_zeros(count + 1, k), places.new_zeros(3 * count, k))

@@ -14,8 +14,8 @@ from torchpose.geometry.least_squares import solve_scaled
 from torchpose.geometry.projection import by_pose, image_by_point
 from torchpose.geometry.robust import LEAST_KEPT
 from torchpose.geometry.rotations import plane_axes
-from torchpose.identify import MarkerTable, identify
-from torchpose.pipeline import PoseEstimator
+from torchpose.identify import MarkerTable, drawn_radii, identify
+from torchpose.pipeline import Method, PoseEstimator
 from torchpose.pose import common_center, raw_centers
 from torchpose.refine import Refined, Sight, refine_photometric
 from torchpose.results import Status
@@ -74,22 +74,26 @@ def measure_centers(
     Args:
         rims: what the rims tell is asked for, too, and the tilt of every marker is known to a few mrad only.
     """
-    poses = PoseEstimator(camera, target)(frames)
+    # a board's many centres tell its pose well enough to start from
+    method: Method = "photometric" if target.grid is None else "centers"
+    poses = PoseEstimator(camera, target.upright(), method=method)(frames)
     found = poses.detections
     usable = (poses.status == Status.OK) | (poses.status == Status.AMBIGUOUS)
     found = found[usable[found.frame]]
     marker = (found.marker[:, None] == target.ids).long().argmax(1)
     points, rotation = target.centers[marker], poses.R[found.frame]
     arm = (rotation @ points[..., None])[..., 0]
-    radii = target.printed_radii[marker]
-    gain = _GAIN_OPEN if rims else (_GAIN_SIGMA * (radii[:, 0] - radii[:, 1])) ** -2
+    radii = drawn_radii(target)[marker]
+    gain: Tensor | float = _GAIN_OPEN if rims else (_GAIN_SIGMA * (radii[:, 0] - radii[:, 1])) ** -2
+    if target.discs:  # a larger disc, or a nearer one
+        gain = _HELD
     prior = points.new_zeros(len(points), 7)
     prior[:, 3:6], prior[:, 6] = _TURNED**-2 if rims else _HELD, gain
     one = torch.ones_like(points[:, :1])
     sight = Sight(
         found.frame,
         one > 0,
-        torch.stack([found.outer, found.inner], 1)[:, None],
+        torch.stack([found.outer, found.outer if target.discs else found.inner], 1)[:, None],
         one if target.background == "light" else -one,
         torch.zeros_like(points)[:, None],
         target.normals[marker][:, None],

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchpose.calibration.boards import Board, find_corners
 from torchpose.calibration.bundle import Bundle
-from torchpose.calibration.grids import Grid, Marks, find_marks, measure_marks, sizes_of_marks
+from torchpose.calibration.grids import Grid, Marks, find_marks, measure_marks, nominal_board, sizes_of_marks
 from torchpose.calibration.hand_eye import HandEyeFit, Mount, calibrate_hand_eye
 from torchpose.calibration.intrinsics import (
     Calibration,
@@ -24,14 +24,16 @@ from torchpose.calibration.measured import (
     check_seen,
     doubts,
     measured_target,
+    of_seen,
     scale_sigma,
     scaled_by_distance,
 )
-from torchpose.calibration.plate import free_plate, stated_plate
+from torchpose.calibration.plate import Plate, free_plate, stated_plate
 from torchpose.calibration.rings import find_rings, measure_centers
 from torchpose.calibration.tone import judge_tone, sizes_of_target
 from torchpose.calibration.views import Views
 from torchpose.camera import LINEAR, Camera, Tone
+from torchpose.config import within
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.target import Target
@@ -53,7 +55,9 @@ def parse_board(text: str) -> Board | Grid:
     Raises:
         ConfigError: it names none.
     """
-    return Grid.parse(text) or Board.parse(text)
+    with within("--board: "):
+        grid = Grid.parse(text)
+    return grid or Board.parse(text)
 
 
 def calibrate_camera(
@@ -80,16 +84,12 @@ def calibrate_camera(
     if isinstance(shown, Board):
         return calibrate_intrinsics(_all_corners(frames, shown), starts, lens=lens)
     if isinstance(shown, Grid):
-        marks = _all_marks(frames, shown, starts[0])
-        camera = calibrate_intrinsics(marks.views(shown), starts, lens=lens).camera
-        tone = tone or frames_tone(stored, shown, camera)
+        camera, tone = _rough_camera(stored, shown, starts, lens, tone)
         frames = linear_frames(stored, tone)
-        if tone != LINEAR:
-            marks = _all_marks(frames, shown, camera)
+        marks = _all_marks(frames, shown, camera)
         found = calibrate_intrinsics(_all_mark_centers(frames, shown, camera, marks), [camera], lens=lens)
         return replace(found, camera=replace(found.camera, tone=tone))
-    camera = _rough(frames, shown, starts, lens)
-    tone = tone or frames_tone(stored, shown, camera)
+    camera, tone = _rough_camera(stored, shown, starts, lens, tone)
     plate = None
     if shown.covariance is not None:
         plate = stated_plate(shown.ids, shown.centers, shown.covariance[:-1, :-1])
@@ -120,7 +120,7 @@ class Measurement:
 
 def measure_target(
     frames: Frames,
-    target: Target,
+    shown: Target | Grid,
     start: Camera,
     *,
     given: Literal["camera", "start", "size"] = "start",
@@ -131,10 +131,12 @@ def measure_target(
     """Places, edge gain and sizes of a target's rings, and the camera with them unless it is known.
 
     The grey values are fitted twice: with the target as its file has it, then as it was measured, so that neither the
-    tilt at which a ring is fitted nor the pixels that are taken depend on the print's errors.
+    tilt at which a ring is fitted nor the pixels that are taken depend on the print's errors. A board has marks as
+    large as they look at first, and in the end those that are in views enough.
 
     Args:
-        frames: read twice where the camera is given, else three times.
+        frames: read some times: two of them where the target is coded and the camera given.
+        shown: the target, or a board.
         given: what ``start`` is: the camera, whose covariance is carried through, a camera to start from, or the size
             of the frames alone.
         lens: see `calibrate_camera`.
@@ -144,28 +146,25 @@ def measure_target(
     Raises:
         ConfigError: nothing in view, a marker that is in too few views, or as `calibrate_intrinsics`.
     """
-    # frames are taken for linear below: the camera's tone would count twice
-    camera, known, stored = replace(start, tone=None), target, frames
     held = given == "camera"
+    # frames are taken for linear below: the camera's tone would count twice
+    camera, stored = replace(start, tone=None), frames
     tone = start.tone or LINEAR if held else tone
-    frames = linear_frames(stored, tone or LINEAR)
     if not held:
-        starts = (
-            start_cameras(start.width, start.height, lens)
-            if given == "size"
-            else [with_lens(replace(start, tone=None), lens)]
-        )
-        camera = _rough(frames, target, starts, lens)
-        tone = tone or frames_tone(stored, target, camera)
-        frames = linear_frames(stored, tone)
+        guess = given == "size"
+        starts = start_cameras(start.width, start.height, lens) if guess else [with_lens(camera, lens)]
+        camera, tone = _rough_camera(stored, shown, starts, lens, tone)
+    frames = linear_frames(stored, tone or LINEAR)
+    target = nominal_board(_all_marks(frames, shown, camera), shown, camera) if isinstance(shown, Grid) else shown
+    known = target
     for _ in range(_MEASURED):
         views = _all_centers(frames, known, camera, rims=True)
+        if isinstance(shown, Grid):
+            known, target = of_seen(known, views), of_seen(target, views)
+            views = views[torch.isin(views.point, target.ids)]
         check_seen(views, target)
-        plate = free_plate(target.ids, target.centers, known.normals)
-        if held:
-            found = measure_plate(views, camera, plate)
-        else:
-            found = calibrate_intrinsics(views, [camera], lens=lens, plate=plate)
+        plate = free_plate(target.ids, target.centers, known.normals, discs=target.discs)
+        found = _with_plate(views, camera, plate, None if held else lens)
         if distance is not None:
             found = scaled_by_distance(found, distance)
         measured, camera_of = measured_target(found, known)
@@ -177,6 +176,26 @@ def measure_target(
     camera_of = camera_of if held else replace(camera_of, tone=tone)
     found = replace(found, camera=camera_of, warnings=[*found.warnings, *doubts(found, target)])
     return Measurement(found, target, measured, camera_of)
+
+
+def _with_plate(views: Views, camera: Camera, plate: Plate, lens: str | None) -> Calibration:
+    """The adjustment of a plate, and of a camera with such a lens unless it is held (None)."""
+    if lens is None:
+        return measure_plate(views, camera, plate)
+    return calibrate_intrinsics(views, [camera], lens=lens, plate=plate)
+
+
+def _rough_camera(
+    stored: Frames, shown: Target | Grid, starts: Sequence[Camera], lens: str, tone: Tone | None
+) -> tuple[Camera, Tone]:
+    """The camera from the ellipses of a target or board that is taken as exact, and the tone of the frames."""
+    frames = linear_frames(stored, tone or LINEAR)
+    if isinstance(shown, Grid):
+        marks = _all_marks(frames, shown, starts[0])
+        camera = calibrate_intrinsics(marks.views(shown), list(starts), lens=lens).camera
+    else:
+        camera = _rough(frames, shown, starts, lens)
+    return camera, tone or frames_tone(stored, shown, camera)
 
 
 def linear_frames(frames: Frames, tone: Tone) -> Frames:

@@ -23,7 +23,7 @@ from torchpose.camera import LINEAR, Camera, Tone
 from torchpose.geometry.least_squares import geman_mcclure
 from torchpose.geometry.projection import image_by_point
 from torchpose.geometry.rows import Rows
-from torchpose.pipeline import PoseEstimator
+from torchpose.pipeline import Method, PoseEstimator
 from torchpose.results import Status
 from torchpose.target import Target
 
@@ -117,7 +117,8 @@ def scale_at(camera: Camera, R: Tensor, points: Tensor) -> Tensor:
 
 def sizes_of_target(frames: Tensor, camera: Camera, target: Target) -> Sizes:
     """Sizes of the rings of a target in frames of a tone that the camera does not say any more."""
-    poses = PoseEstimator(camera, target, method="edges")(frames)
+    method: Method = "centers" if target.discs else "edges"
+    poses = PoseEstimator(camera, target.upright(), method=method)(frames)
     found = poses.detections
     found = found[(poses.status == Status.OK)[found.frame]]
     marker = (found.marker[:, None] == target.ids).long().argmax(1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Sequence
 from copy import copy
@@ -15,8 +14,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchpose.camera.fold import polynomial_fold, rational_fold
 from torchpose.camera.tone import Tone
 from torchpose.errors import ConfigError
+from torchpose.geometry.covariance import covariance_fault
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
@@ -206,7 +207,7 @@ class Camera:
         return cls(width, height, camera.camera_matrix[index].double(), [])
 
     @property
-    def _distorts(self) -> bool:
+    def distorts(self) -> bool:
         """Whether any coefficient moves a point, or might (while it is being estimated)."""
         return self.model == "kannala_brandt" or self.distortion.requires_grad or self._any_coefficient
 
@@ -221,23 +222,15 @@ class Camera:
 
     @cached_property
     def fold_radius(self) -> float:
-        """Largest normalised radius r up to which the radial distortion grows with r (inf where it always does).
+        """Largest normalised radius r up to which the radial distortion has one inverse (inf where it always has).
 
-        Beyond it the model folds back onto the image and has no inverse.
+        Beyond it the model folds back onto the image, or a pole of the rational model is near (`camera.fold`).
         """
         d = np.zeros(8)
         d[: len(self.distortion)] = self.distortion.tolist()
         if self.model == "kannala_brandt":
-            # derivative of theta (1 + k1 theta^2 + ...) as a polynomial in theta^2
-            growth = np.polynomial.Polynomial([1.0, *(d[:4] * [3, 5, 7, 9])])
-            theta = math.sqrt(_first_positive_root(growth))
-            return math.tan(theta) if theta < math.pi / 2 else math.inf
-        n = np.polynomial.Polynomial([1.0, d[0], d[1], d[4]])
-        q = np.polynomial.Polynomial([1.0, *d[5:8]])
-        u = np.polynomial.Polynomial([0.0, 1.0])
-        # numerator of d/dr of r n(r^2) / q(r^2), and the pole
-        growth = n * q + 2 * u * (n.deriv() * q - n * q.deriv())
-        return math.sqrt(min(_first_positive_root(growth), _first_positive_root(q)))
+            return polynomial_fold(d[:4])
+        return rational_fold(d[[0, 1, 4]], d[5:8])
 
     def project(self, points_camera: Tensor) -> Tensor:
         """Pixels (..., 2) of points (..., 3) in the camera frame, mm. NaN where Z <= 0: there is no image."""
@@ -267,11 +260,11 @@ class Camera:
 
         Newton's method with the analytic Jacobian; steps are halved where the residual does not fall or the iterate
         would pass `fold_radius`. The gradient follows from the implicit function theorem (first derivatives only).
-        NaN where there is no valid inverse: the pixel lies beyond the image of the fold, or is not finite.
+        NaN where there is no valid inverse: the pixel lies beyond the image of `fold_radius`, or is not finite.
         """
         focal, center = self._intrinsics(uv)
         xy_distorted = (uv - center) / focal
-        if not self._distorts:
+        if not self.distorts:
             return xy_distorted
         u, v = xy_distorted.unbind(-1)
         with torch.no_grad():
@@ -356,22 +349,8 @@ def _check_covariance(covariance: Tensor, coefficients: int) -> None:
     elif covariance.shape != (4, 4):
         of_all = f", or {whole} x {whole} with the distortion" if coefficients else ""
         raise ConfigError(f"{field}: has shape {tuple(covariance.shape)}; give 4 x 4 for fx fy cx cy{of_all}")
-    slack = 1e-9 if covariance.dtype == torch.float64 else 1e-5
-    # units differ by orders between the intrinsics: each counts in its own deviation
-    scale = covariance.diagonal().clamp_min(0).sqrt()
-    scale = torch.where(scale > 0, scale, covariance.abs().max().sqrt()).clamp_min(1e-30)
-    scaled = covariance / (scale[:, None] * scale)
-    if bool((scaled - scaled.T).abs().max() > slack):
-        raise ConfigError(f"{field}: is not symmetric; {fix}")
-    if bool((covariance.diagonal() < 0).any() | (torch.linalg.eigvalsh(scaled)[0] < -slack)):
-        raise ConfigError(f"{field}: has a negative eigenvalue; {fix}")
-
-
-def _first_positive_root(polynomial: np.polynomial.Polynomial) -> float:
-    # its constant term is 1, so the reciprocals of the roots are those of a monic polynomial, however small the others
-    roots = np.roots(polynomial.coef)
-    positive = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0)]
-    return 1 / float(positive.max()) if positive.size else math.inf
+    if fault := covariance_fault(covariance):
+        raise ConfigError(f"{field}: {fault}; {fix}")
 
 
 def _newton_step(ex: Tensor, ey: Tensor, j_xx: Tensor, j_xy: Tensor, j_yy: Tensor) -> tuple[Tensor, Tensor]:

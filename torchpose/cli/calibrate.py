@@ -16,8 +16,10 @@ from torchpose.cli.common import (
     check_robot_poses,
     cores,
     ended,
+    frames_of,
     interrupted,
     read_tone,
+    say,
     with_tone,
 )
 from torchpose.errors import ConfigError
@@ -73,19 +75,18 @@ def calibrate(
     from torchpose.calibration.session import parse_board
     from torchpose.camera import Camera
     from torchpose.cli.terminal import native_stderr_silenced
-    from torchpose.io.sources import find_sources
     from torchpose.target import Target
 
     if (target is None) == (board is None):
         raise ConfigError("--target: give either --target or --board, what the frames show")
     _check_files(out, hand_eye_out, camera, target_out)
-    between, inputs = _distance(distance, inputs, target, target_out)
-    sources = find_sources(inputs)
+    shown = Target.load(target) if target is not None else parse_board(board or "")
+    between, inputs = _distance(distance, inputs, shown, target_out)
+    sources = frames_of(inputs)
     if hand_eye_out is not None:
         check_robot_poses(sources)
     start = None if camera is None else with_tone(Camera.load(camera), tone)
     said = start.tone if start is not None else read_tone(tone)
-    shown = Target.load(target) if target is not None else parse_board(board or "")
     frames = _Frames(sources, start, threads=threads or cores(), quiet=quiet)
     calibration = fit = measured = None
     try:
@@ -110,7 +111,7 @@ def calibrate(
                 from torchpose.report.calibration import save_calibration
 
                 for path in save_calibration(calibration, fit, plots, measured):
-                    typer.echo(str(path))
+                    say(str(path))
     except KeyboardInterrupt:
         return interrupted("nothing more was written; run again")
     return ended(frames.unreadable)
@@ -140,22 +141,24 @@ def _check_files(
 
 
 def _distance(
-    given: tuple[int, int, float] | None, inputs: list[Path], target: str | None, target_out: Path | None
+    given: tuple[int, int, float] | None, inputs: list[Path], shown: Shown, target_out: Path | None
 ) -> tuple[Distance | None, list[Path]]:
     """The distance with its deviation, which the command line has among the INPUTs, and what is left of these."""
+    from torchpose.calibration.boards import Board
     from torchpose.calibration.measured import Distance
-    from torchpose.target import Target
 
-    if target_out is not None and target is None:
-        raise ConfigError("--measure-target: give --target, the file of the target that is measured")
+    if target_out is not None and isinstance(shown, Board):
+        raise ConfigError(
+            "--measure-target: measures rings and discs; give --target, or --board circles:, acircles: or rings:"
+        )
     if given is None:
         return None, inputs
-    if target_out is None or target is None:
+    if target_out is None or isinstance(shown, Board):
         raise ConfigError("--distance: scales a measured target; give --measure-target too")
     numbers = [path for path in inputs if not path.exists() and _is_number(str(path))]
     sigma = float(str(numbers[0])) if numbers else 0.0
     distance = Distance(*given, sigma)
-    distance.check(Target.load(target))
+    distance.check(shown)
     return distance, [path for path in inputs if path not in numbers[:1]]
 
 
@@ -199,11 +202,11 @@ class _Frames:
 
 
 def _first_size(sources: Sequence[Source]) -> tuple[int, int]:
-    from torchpose.io.images import UnreadableImageError, decode
+    from torchpose.io.images import UnreadableImageError
 
     for source in sources:
         try:
-            height, width = decode(source.path).shape
+            height, width = source.decode().shape
         except UnreadableImageError:
             continue
         return width, height
@@ -230,11 +233,11 @@ def _measured(
     *,
     held: bool,
 ) -> Measurement:
+    from torchpose.calibration.boards import Board
     from torchpose.calibration.intrinsics import start_cameras
     from torchpose.calibration.session import measure_target
-    from torchpose.target import Target
 
-    assert isinstance(shown, Target)  # checked with the options
+    assert not isinstance(shown, Board)  # checked with the options
     first = start or start_cameras(frames.width, frames.height, model)[0]
     given: Literal["camera", "start", "size"] = "camera" if held else "start" if start is not None else "size"
     return measure_target(frames, shown, first, given=given, lens=model, distance=distance, tone=tone)
@@ -256,13 +259,13 @@ def _show(found: Calibration, frames: int, *, held: bool = False) -> None:
     if not held:
         _show_intrinsics(found)
     points = f"{len(found.views.view)} points{f', {found.left_out} points left out' if found.left_out else ''}"
-    typer.echo(f"{len(found.views)} of {frames} views, {points}, residual RMS {found.rms_px:.3g} px")
+    say(f"{len(found.views)} of {frames} views, {points}, residual RMS {found.rms_px:.3g} px")
     if found.common_sigma_px:
-        typer.echo(f"{found.common_sigma_px:.3g} px per axis, beyond the noise of the frames, in every point")
+        say(f"{found.common_sigma_px:.3g} px per axis, beyond the noise of the frames, in every point")
     if found.camera.tone is not None:
-        typer.echo(f"tone {found.camera.tone}")
+        say(f"tone {found.camera.tone}")
     for warning in found.warnings:
-        typer.echo(f"warning: {warning}", err=True)
+        say(f"warning: {warning}", err=True)
 
 
 def _show_target(found: Measurement) -> None:
@@ -274,10 +277,14 @@ def _show_target(found: Measurement) -> None:
     for name, of, known in zip("xyz", off.unbind(1), sigma.unbind(1), strict=True):
         rms, most = float(of.square().mean().sqrt()), float(of.abs().max())
         known_um = 1e3 * float(known.square().mean().sqrt())
-        typer.echo(f"places {name}: {1e3 * rms:.3g} um RMS off, {1e3 * most:.3g} at most; known to {known_um:.2g} um")
+        say(f"places {name}: {1e3 * rms:.3g} um RMS off, {1e3 * most:.3g} at most; known to {known_um:.2g} um")
+    if target.grid is not None:
+        radii = [radius for radius in target.printed_radii.mean(0).tolist() if radius]
+        say(f"{len(target)} marks, radius {' and '.join(f'{radius:.5g}' for radius in radii)} mm")
+        return
     size = float((target.radii / nominal.radii).mean())
     gain, gain_sigma = 1e3 * target.edge_gain, 1e3 * float(target.covariance[-1, -1].sqrt())
-    typer.echo(f"edge gain {gain:.3g} +- {gain_sigma:.2g} um, rings {size:.5f} times as large as in the file")
+    say(f"edge gain {gain:.3g} +- {gain_sigma:.2g} um, rings {size:.5f} times as large as in the file")
 
 
 def _show_intrinsics(found: Calibration) -> None:
@@ -285,7 +292,7 @@ def _show_intrinsics(found: Calibration) -> None:
     values = [*matrix.diagonal()[:2].tolist(), *matrix[:2, 2].tolist(), *found.camera.distortion.tolist()]
     for name, value, sigma in zip(found.names, values, found.covariance.diagonal().sqrt().tolist(), strict=True):
         digits = max(0, 1 - math.floor(math.log10(sigma))) if sigma > 0 else 6
-        typer.echo(f"{name:>3} {value:14.{digits}f} +- {sigma:.2g}{' px' if name[0] in 'fc' else ''}")
+        say(f"{name:>3} {value:14.{digits}f} +- {sigma:.2g}{' px' if name[0] in 'fc' else ''}")
 
 
 def _show_hand_eye(fit: HandEyeFit) -> None:
@@ -294,9 +301,9 @@ def _show_hand_eye(fit: HandEyeFit) -> None:
     found = fit.hand_eye
     assert found.covariance is not None  # always there after a fit
     sigmas = found.covariance.diagonal().sqrt().tolist()
-    typer.echo(f"{found.mount}_from_camera, from {len(fit.residual)} poses")
+    say(f"{found.mount}_from_camera, from {len(fit.residual)} poses")
     for name, value, sigma in zip("xyz", found.translation.tolist(), sigmas[:3], strict=True):
-        typer.echo(f"{name:>3} {value:12.4f} +- {sigma:.2g} mm")
+        say(f"{name:>3} {value:12.4f} +- {sigma:.2g} mm")
     for name, value, sigma in zip("xyz", rotations.log(found.rotation).tolist(), sigmas[3:], strict=True):
-        typer.echo(f" r{name} {value:12.7f} +- {sigma:.2g} rad")
-    typer.echo(f"robot noise {fit.robot_sigma_mm:.2g} mm and {fit.robot_sigma_rad:.2g} rad per axis")
+        say(f" r{name} {value:12.7f} +- {sigma:.2g} rad")
+    say(f"robot noise {fit.robot_sigma_mm:.2g} mm and {fit.robot_sigma_rad:.2g} rad per axis")

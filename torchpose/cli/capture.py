@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchpose.cli.common import INTERRUPTED
+from torchpose.cli.common import INTERRUPTED, say
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -54,18 +54,19 @@ def capture(
         Scene.load(twin).check(settings, twin)
     status = LiveStatus.load(camera or [], target or [], settings.cameras)
     session = Session(out, plan=path.digest, images=image_origin(settings), resume=resume)
-    left = len(missing(path, settings, session.done))
-    if not quiet:
-        _show(path, settings, left, out)
-    if dry_run:
-        return 0
-    if left == 0:
-        typer.echo(f"{session.manifest}: complete, nothing is missing", err=True)
-        return 0
-    if not yes and not typer.confirm(f"Move the robot through {left} waypoints?", err=True):
-        raise ConfigError("capture: not confirmed, nothing has moved; add --yes to run without the question")
-    with session, status:
-        return _run(path, settings, session, twin, status, quiet)
+    with contextlib.closing(session):
+        left = len(missing(path, settings, session.done))
+        if not quiet:
+            _show(path, settings, left, out)
+        if dry_run:
+            return 0
+        if left == 0:
+            say(f"{session.manifest}: complete, nothing is missing", err=True)
+            return 0
+        if not yes and not typer.confirm(f"Move the robot through {left} waypoints?", err=True):
+            raise ConfigError("capture: not confirmed, nothing has moved; add --yes to run without the question")
+        with session, status:
+            return _run(path, settings, session, twin, status, quiet)
 
 
 def _run(plan: CapturePlan, rig: Rig, session: Session, twin: Path | None, status: LiveStatus, quiet: bool) -> int:
@@ -99,11 +100,11 @@ def _run(plan: CapturePlan, rig: Rig, session: Session, twin: Path | None, statu
     if ended:
         kept = f"{session.folder} keeps {len(session.done)} of {total} frames"
         more = "; add --resume to go on" if session.begun else ""
-        typer.echo(f"torchpose: error: {ended} ({kept}{more})", err=True)
+        say(f"torchpose: error: {ended} ({kept}{more})", err=True)
     elif not quiet:
         status.wait()
         found = ", ".join(f"{name} {count}" for name, count in status.counts.most_common())
-        typer.echo(f"{len(session.done)} frames in {session.manifest}{found and f': {found}'}", err=True)
+        say(f"{len(session.done)} frames in {session.manifest}{found and f': {found}'}", err=True)
     return code
 
 
@@ -111,9 +112,9 @@ def _show(plan: CapturePlan, rig: Rig, left: int, out: Path) -> None:
     """Prints what the robot will do and where; draws it too."""
     from torchpose.report.path import draw_path
 
-    typer.echo(f"{plan.name}: {len(plan.waypoints)} waypoints, {left} to take, {len(rig.cameras)} camera(s)", err=True)
+    say(f"{plan.name}: {len(plan.waypoints)} waypoints, {left} to take, {len(rig.cameras)} camera(s)", err=True)
     for line in plan.summary(rig.robot.workspace):
-        typer.echo(line, err=True)
+        say(line, err=True)
     out.mkdir(parents=True, exist_ok=True)
     draw_path(plan, rig.robot.workspace, out / "path.svg")
-    typer.echo(f"path drawn in {out / 'path.svg'}", err=True)
+    say(f"path drawn in {out / 'path.svg'}", err=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchpose.errors import ConfigError
+from torchpose.errors import ConfigError, printable
 
 if TYPE_CHECKING:
     from torchpose import camera as cameras
@@ -17,20 +17,46 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130  # as shells have it: 128 + SIGINT
 
-Threads = Annotated[int | None, typer.Option(min=1, help="Threads to use; by default one a core.")]
+MOST_SEED = 2**63 - 1  # of torch's generators
+_MOST_THREADS = 256  # (convention) more than any machine of today gains from; thousands of stacks end the process
+_MOST_BATCH = 4096  # frames (convention): of 20 megapixels they fill 80 GB
+Threads = Annotated[int | None, typer.Option(min=1, max=_MOST_THREADS, help="Threads to use; by default one a core.")]
 Tone = Annotated[
     str | None,
     typer.Option(
         metavar="linear|srgb|gamma:G", help="How grey values follow light; goes before `tone` in the camera file."
     ),
 ]
-Batch = Annotated[int | None, typer.Option(min=1, help="Frames at once; by default chosen by their size.")]
+Batch = Annotated[
+    int | None, typer.Option(min=1, max=_MOST_BATCH, help="Frames at once; by default chosen by their size.")
+]
 Overlay = Annotated[
     Path | None, typer.Option(metavar="DIR", help="Folder for pictures of what was found, one a frame.")
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar.")]
 Silent = Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar and no summary.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Keep the frames that an earlier run finished.")]
+
+
+def say(text: str, *, err: bool = False) -> None:
+    """Prints a line; names of files in it cannot steer the terminal."""
+    typer.echo(printable(text), err=err)
+
+
+def use_threads(threads: int | None, *, share: float = 1.0) -> int:
+    """Has torch use a share of the threads; how many there are in all. More than cores would only wait."""
+    import torch
+
+    wanted = threads or cores()
+    torch.set_num_threads(max(1, min(int(share * wanted), cores())))
+    return wanted
+
+
+def frames_of(inputs: Sequence[Path]) -> list[Source]:
+    """Frames of the INPUTs; what is passed over is told on stderr."""
+    from torchpose.io.sources import find_sources
+
+    return find_sources(inputs, lambda line: say(f"torchpose: {line}", err=True))
 
 
 def check_outputs(
@@ -52,8 +78,9 @@ def check_outputs(
         )
     from torchpose.report.overlay import picture_path
 
-    frames = {source.path.resolve() for source in sources}
-    if any(picture_path(place, source.name) in frames for source in sources):
+    frames = {Path(os.path.realpath(source.path)) for source in sources}  # which takes a loop of links, too
+    places = [picture_path(place, source.name) for source in sources]  # refuses those that lie outside
+    if any(path in frames for path in places):
         raise ConfigError(f"{overlay}: --overlay: its pictures would overwrite the frames; choose another folder")
 
 
@@ -88,7 +115,7 @@ def cores() -> int:
 
 def interrupted(what: str) -> int:
     """Tells what an interruption has left; the exit code."""
-    typer.echo(f"torchpose: error: interrupted: {what}", err=True)
+    say(f"torchpose: error: interrupted: {what}", err=True)
     return INTERRUPTED
 
 
@@ -98,7 +125,7 @@ def ended(unreadable: dict[str, str]) -> int:
         return 0
     shown = [f"{frame} ({reason})" for frame, reason in list(unreadable.items())[:5]]
     more = [f"and {len(unreadable) - 5} more"] if len(unreadable) > 5 else []
-    typer.echo(
+    say(
         f"torchpose: error: {', '.join(shown + more)}: INPUT: {len(unreadable)} could not be read; "
         "replace the files and run again",
         err=True,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from torchpose.cli.common import say
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:  # imported where they are used: torch takes more than a second, which --help need not wait for
@@ -49,7 +50,7 @@ def design(
     plate: Annotated[str | None, typer.Option(metavar="WxH", help="Width and height of the plate, mm.")] = None,
     accuracy_um: _Need = None,
     accuracy_deg: Annotated[float | None, typer.Option(help=_ANGLE)] = None,
-    markers: Annotated[int | None, typer.Option(help=_MARKERS)] = None,
+    markers: Annotated[int | None, typer.Option(min=3, max=1000, help=_MARKERS)] = None,
     printing: Annotated[str | None, typer.Option("--print", metavar="CLASS", help=_PRINT)] = None,
     print_gain: Annotated[float | None, typer.Option(metavar="UM", help=_GAIN)] = None,
     blur: Annotated[float, typer.Option(help="Standard deviation of the lens's blur in focus, px.")] = 0.7,
@@ -95,7 +96,7 @@ def design(
     if scene is not None and promise is not None:
         written += _tell_precision(chosen, scene, promise, need, out)
     for path in written:
-        typer.echo(str(path))
+        say(str(path))
     return 0
 
 
@@ -189,7 +190,7 @@ def _new_target(
 
     made = design_target(scene.camera, scene.volume, plate, need, scene.imaging, **choice)
     ratios = ", ".join(f"{ratio:.2f}" for ratio in sorted(made.target.codes.sqrt().tolist()))
-    typer.echo(
+    say(
         f"{len(made.target)} rings of {2 * made.radius:g} mm, semi-minor axis at least {made.semi_minor:.0f} px; "
         f"inner/outer {ratios}, neighbours {made.code_gap:.1f} tolerances of reading apart"
     )
@@ -208,8 +209,8 @@ def _tell_precision(target: Target, scene: _Scene, promise: _Promise, need: Need
     rows = promise.printed.rows(need, promise.measured)
     columns = [column.replace("_", " ") for column in rows[0]]
     print_table(f"{target.name}: predicted standard deviations", columns, [list(row.values()) for row in rows])
-    typer.echo(_print_told(target, promise, need))
-    typer.echo(_focus(scene))
+    say(_print_told(target, promise, need))
+    say(_focus(scene))
     table, picture = out / f"{target.name}_precision.csv", out / f"{target.name}_map.png"
     write_rows(table, rows, {column: str if column in ("axis", "unit") else float for column in rows[0]})
     save_plot(precision_map(scene.camera, target, scene.volume, scene.imaging), target.name, picture)

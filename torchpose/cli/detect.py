@@ -9,7 +9,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchpose.cli.common import Overlay, Silent, Threads, Tone, check_outputs, cores, ended, interrupted, read_tone
+from torchpose.cli.common import (
+    Overlay,
+    Silent,
+    Threads,
+    Tone,
+    check_outputs,
+    cores,
+    ended,
+    frames_of,
+    interrupted,
+    read_tone,
+    use_threads,
+)
 
 if TYPE_CHECKING:  # imported where they are used: torch takes more than a second, which --help need not wait for
     import numpy as np
@@ -43,17 +55,16 @@ def detect(
 
     from torchpose.cli.terminal import FrameProgress, native_stderr_silenced
     from torchpose.io.shape_rows import SHAPE_SCHEMA
-    from torchpose.io.sources import find_sources
     from torchpose.io.writers import check_table_path, write_rows
     from torchpose.report.files import make_folder
 
     check_table_path(out, "--out")
-    sources = find_sources(inputs)
+    sources = frames_of(inputs)
     check_outputs(inputs, sources, [out], overlay)
     if overlay is not None:
         make_folder(overlay, "--overlay")
     cv2.setNumThreads(1)
-    torch.set_num_threads(threads or cores())
+    use_threads(threads)
     unreadable: dict[str, str] = {}
     rows: list[Row] = []
     show = FrameProgress(len(sources), 0, quiet=quiet)
@@ -103,12 +114,12 @@ def _decoded(
     from concurrent.futures import ThreadPoolExecutor
 
     from torchpose.camera import LINEAR
-    from torchpose.io.images import UnreadableImageError, decode
+    from torchpose.io.images import UnreadableImageError
     from torchpose.io.reader import linear_image
 
     def load(source: Source) -> np.ndarray | str:
         try:
-            return linear_image(decode(source.path, threads=threads), tone or LINEAR)
+            return linear_image(source.decode(threads=threads), tone or LINEAR)
         except UnreadableImageError as error:
             return error.reason
 

@@ -19,7 +19,10 @@ from torchpose.cli.common import (
     check_robot_poses,
     cores,
     ended,
+    frames_of,
     interrupted,
+    say,
+    use_threads,
     with_tone,
 )
 
@@ -30,6 +33,7 @@ if TYPE_CHECKING:  # imported where they are used: torch takes more than a secon
     from torchpose.io.misfits import Misfits
     from torchpose.io.rows import Row
     from torchpose.io.sources import Source
+    from torchpose.io.store import ResultStore
     from torchpose.pipeline import PoseEstimator
     from torchpose.report import overlay as pictures
     from torchpose.results import Poses
@@ -40,8 +44,8 @@ _INPUTS = (
     "taken in natural order, or capture manifests (.jsonl)."
 )
 _CAMERA = (
-    "Camera file: OpenCV YAML or JSON, ROS camera_info, Kalibr camchain, COLMAP cameras.txt. FILE#cam1 or FILE#2 picks "
-    "one of several."
+    "Camera file: OpenCV YAML, JSON or XML, ROS camera_info, Kalibr camchain, COLMAP cameras.txt and others "
+    "(docs/cameras.md). FILE#cam1 or FILE#2 picks one of several."
 )
 _METHODS = "photometric|edges|centers|paper"  # torchpose.pipeline.Method, which takes a second to import
 _METHOD = "Last stage: grey values, edge points, ring centres, or the paper's own chain."
@@ -49,6 +53,13 @@ _HAND_EYE = "Calibrated camera-to-base or camera-to-tool transform; adds the pos
 _JUDGED = 16  # frames that the tone is judged by
 _RESUME = "Keep the frames that an earlier run finished and do the rest."
 _INSTANCES = "Most copies of a target in a frame (a tray of equal parts): up to as many rows, column instance."
+_TARGET = (
+    "Target file or name of a built-in target, or a board of equal marks: rings:10x7:20mm:6mm:3mm (columns, rows, "
+    "pitch, radii), circles:7x6:20mm:4mm, acircles:4x11:20mm:4mm (pitch, radius); repeat for several."
+)
+_UPRIGHT = (
+    "Boards that look the same after a turn have their rows to the right. Without, they are ambiguous unless measured."
+)
 _RELATIVE = "Name of a target: give the poses of the others (of their parts) in its frame (that of its part)."
 _DETECTIONS = "Table of the markers found: .csv, .jsonl or .parquet."
 
@@ -56,11 +67,12 @@ _DETECTIONS = "Table of the markers found: .csv, .jsonl or .parquet."
 def estimate(
     inputs: Annotated[list[Path], typer.Argument(metavar="INPUT...", help=_INPUTS)],
     camera: Annotated[str, typer.Option(help=_CAMERA)],
-    target: Annotated[list[str], typer.Option(help="Target file or name of a built-in target; repeat for several.")],
+    target: Annotated[list[str], typer.Option(help=_TARGET)],
     out: Annotated[Path, typer.Option(help="Table of the poses: .csv, .jsonl or .parquet.")],
     detections: Annotated[Path | None, typer.Option(help=_DETECTIONS)] = None,
     overlay: Overlay = None,
-    instances: Annotated[int, typer.Option(min=1, metavar="K", help=_INSTANCES)] = 1,
+    instances: Annotated[int, typer.Option(min=1, max=1000, metavar="K", help=_INSTANCES)] = 1,
+    assume_upright: Annotated[bool, typer.Option("--assume-upright", help=_UPRIGHT)] = False,
     resume: Annotated[bool, typer.Option("--resume", help=_RESUME)] = False,
     hand_eye: Annotated[Path | None, typer.Option(help=_HAND_EYE)] = None,
     relative_to: Annotated[str | None, typer.Option(metavar="NAME", help=_RELATIVE)] = None,
@@ -78,18 +90,21 @@ def estimate(
     """
     from torchpose.camera import Camera
     from torchpose.cli.terminal import native_stderr_silenced
-    from torchpose.io.sources import find_sources
     from torchpose.io.writers import check_table_path
     from torchpose.target import Target
 
     for path, option in ((out, "--out"), (detections, "--detections")):
         if path is not None:
             check_table_path(path, option)
-    lens, targets, sources = Camera.load(camera), [Target.load(name) for name in target], find_sources(inputs)
+    lens, targets, sources = Camera.load(camera), [Target.load(name) for name in target], frames_of(inputs)
+    if assume_upright:
+        targets = [one.upright() for one in targets]
     lens = with_tone(lens, "srgb" if srgb and tone is None else tone)
     lens = lens if lens.tone is not None else _with_judged_tone(lens, targets[0], sources)
     _check_relative(relative_to, targets, hand_eye, instances)
-    work = _Work(lens, targets, sources, _load_hand_eye(hand_eye, sources), method, instances, relative_to)
+    work = _Work(
+        lens, targets, sources, _load_hand_eye(hand_eye, sources), method, instances, relative_to, assume_upright
+    )
     check_outputs(inputs, sources, [p for p in (out, detections) if p is not None], overlay)
     with native_stderr_silenced():
         return _run(work, out, detections, overlay, resume=resume, batch=batch, threads=threads or cores(), quiet=quiet)
@@ -97,7 +112,7 @@ def estimate(
 
 def _with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -> Camera:
     """The camera with the tone that the frames tell, where their kind of file makes one likely; says what it took."""
-    from torchpose.io.images import UnreadableImageError, decode, likely_encoded
+    from torchpose.io.images import UnreadableImageError, WrongSizeError, likely_encoded
 
     if not sources or not likely_encoded(sources[0].path):
         return lens
@@ -112,10 +127,10 @@ def _with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -
     images = []
     for source in sources[:: (len(sources) - 1) // _JUDGED + 1]:
         try:
-            image = decode(source.path)
-        except UnreadableImageError:
+            image = source.decode(size=(lens.width, lens.height))
+        except (UnreadableImageError, WrongSizeError):
             continue
-        if image.shape == (lens.height, lens.width) and image.dtype == np.uint8:
+        if image.dtype == np.uint8:
             images.append(image)
     tone, shift = None, None
     if images:
@@ -124,7 +139,7 @@ def _with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -
     told = (
         "too few rings to tell" if shift is None else f"as linear ones their edges would be {abs(shift.px):.2g} px off"
     )
-    typer.echo(
+    say(
         f"torchpose: {sources[0].name}: JPEG or colour, and neither the camera file nor --tone says its tone: taken as "
         f"{tone or LINEAR} ({told})",
         err=True,
@@ -143,6 +158,7 @@ class _Work:
     method: str
     instances: int
     relative_to: str | None
+    upright: bool
 
     @property
     def rows_of(self) -> list[Target]:
@@ -162,6 +178,7 @@ class _Work:
             "--tone": str(self.camera.tone or "linear"),
             "--instances": self.instances,
             "--relative-to": self.relative_to,
+            "--assume-upright": self.upright,
             "--detections": detections,
             "INPUT": sorted({str(source.root) for source in self.sources}),
         }
@@ -179,32 +196,22 @@ def _run(
     quiet: bool,
 ) -> int:
     """Estimates what is not done yet and writes the tables; returns the exit code."""
-    from dataclasses import replace
-
     import cv2
     import torch
 
     from torchpose.camera import LINEAR
     from torchpose.cli.terminal import FrameProgress
     from torchpose.io.reader import FrameReader, default_batch, in_batches
-    from torchpose.io.rows import BASE_SCHEMA, POSE_SCHEMA
-    from torchpose.io.store import ResultStore
-    from torchpose.pipeline import PoseEstimator
     from torchpose.report.overlay import Overlay
 
     cv2.setNumThreads(1)  # frames are decoded side by side; threads inside of one would only compete
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     # decoding is the larger part of the work; torch's threads wait actively and would take its cores away
-    torch.set_num_threads(max(1, threads // 2))
+    use_threads(threads, share=0.5)
     camera, targets, sources = work.camera, work.targets, work.sources
-    method: Any = work.method  # it checks
-    tone = camera.tone or LINEAR
-    # the reader hands on linear frames
-    estimator = PoseEstimator(replace(camera, tone=None), targets, instances=work.instances, method=method)
+    tone, estimator = camera.tone or LINEAR, _estimator(work)
     painter = None if overlay is None else Overlay(camera, targets, overlay, threads=threads)
-    schema = POSE_SCHEMA | (BASE_SCHEMA if work.hand_eye else {})
-    origin = work.origin(detections is not None)
-    store = ResultStore(out, detections, schema=schema, targets=len(work.rows_of), origin=origin, resume=resume)
+    store = _opened(work, out, detections, resume)
     # a resumed run works on the same batches as one that was not interrupted, so that rows agree to the last bit
     batches = in_batches(sources, batch or default_batch(camera.width, camera.height))
     pending = [one for one in batches if any(source.name not in store for source in one)]
@@ -222,10 +229,41 @@ def _run(
     finally:
         store.close()
     progress.summary(store.counts, out)
+    _tell_mistakes(store, out, work)
     if not quiet:
         _tell_crowded(store.crowded, store.most, work)
         _tell_misfits(store.misfits, work)
     return ended(store.unreadable)
+
+
+def _opened(work: _Work, out: Path, detections: Path | None, resume: bool) -> ResultStore:
+    """Where the rows go, with those of an earlier run."""
+    from torchpose.io.rows import BASE_SCHEMA, POSE_SCHEMA
+    from torchpose.io.store import ResultStore, stamp_of
+
+    files = {source.name: stamp_of(source.path) for source in work.sources}  # before they are read
+    schema = POSE_SCHEMA | (BASE_SCHEMA if work.hand_eye else {})
+    kept: dict[str, Any] = {"schema": schema, "targets": len(work.rows_of), "files": files}
+    return ResultStore(out, detections, resume=resume, origin=work.origin(detections is not None), **kept)
+
+
+def _tell_mistakes(store: ResultStore, out: Path, work: _Work) -> None:
+    """Tells, on stderr, what is wrong with the run as a whole."""
+    for line in store.whole_run.lines(f"{work.camera.width}x{work.camera.height}"):
+        say(f"torchpose: warning: {line}", err=True)
+    if store.damaged:
+        say(f"torchpose: {store.damaged} damaged lines of {out}.partial left out, their frames done again", err=True)
+
+
+def _estimator(work: _Work) -> PoseEstimator:
+    """Of linear frames: the reader hands on such ones."""
+    from dataclasses import replace
+
+    from torchpose.pipeline import PoseEstimator
+
+    method: Any = work.method  # it checks
+    lens = replace(work.camera, tone=None)
+    return PoseEstimator(lens, work.targets, instances=work.instances, method=method)
 
 
 def _tell_crowded(frames: set[str], most: dict[str, int], work: _Work) -> None:
@@ -235,7 +273,7 @@ def _tell_crowded(frames: set[str], most: dict[str, int], work: _Work) -> None:
     seen = ", ".join(f"{count} of {target}" for target, count in most.items())
     more = max(most.values()) > work.instances
     fix = f"--instances {max(most.values())} looks for all" if more else "no pose explains the others"
-    typer.echo(
+    say(
         f"torchpose: {len(frames)} of {len(work.sources)} frames show more copies of a target than they have rows, "
         f"up to {seen}; {fix}",
         err=True,
@@ -248,22 +286,23 @@ def _tell_misfits(misfits: dict[str, Misfits], work: _Work) -> None:
     files = [f"target {', '.join(silent)} (center_sigma, edge_gain_sigma)"] if silent else []
     if work.camera.covariance is None and any(m.frames for m in misfits.values()):
         files.append("camera (intrinsics_covariance)")
+    stated = work.camera.covariance is not None or any(t.covariance is not None for t in work.rows_of)
     if files:
-        typer.echo(
-            f"torchpose: no uncertainty is stated of {' and '.join(files)}: s* counts the noise of the frames alone, "
-            "and what residuals show beyond it",
+        say(
+            f"torchpose: no uncertainty is stated of {' and '.join(files)}: s* counts the noise of the frames"
+            f"{', what the other files state' if stated else ' alone'}, and what residuals show beyond it",
             err=True,
         )
     mirrored = sum(m.mirrored for m in misfits.values())
     if mirrored:
-        typer.echo(
+        say(
             f"torchpose: {mirrored} rows show a target mirrored, from behind its printed side: turn the camera's "
             "mirroring off, or write normal: [0, 0, -1] for the markers of a target that is drawn y-up",
             err=True,
         )
     for target in work.rows_of:
         for line in misfits[target.name].lines(target.name, target.ids.tolist()) if target.name in misfits else ():
-            typer.echo(f"torchpose: {line}", err=True)
+            say(f"torchpose: {line}", err=True)
 
 
 def _records(batch: reader.Batch, estimator: PoseEstimator, work: _Work, painter: pictures.Overlay | None) -> list[Row]:

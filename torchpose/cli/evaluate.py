@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from dataclasses import astuple
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from torchpose.cli.common import say
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:
     from torchpose.analysis.evaluation import Evaluation
-    from torchpose.io.rows import Schema
+    from torchpose.io.rows import Row, Schema
     from torchpose.io.truth import Truth
 
 _POSES = "Table of torchpose estimate: .csv, .jsonl, .parquet."
@@ -37,36 +38,30 @@ def evaluate(
     result = evaluate_poses(estimates, known)
     _show(result, estimates.full_covariance)
     if more:
-        typer.echo(f"{more} further rows with a pose are of copies that the truth does not have")
+        say(f"{more} further rows with a pose are of copies that the truth does not have")
     if out is not None:
         _write_errors(out, result, known, rows)
     if plots is not None:
         from torchpose.report.evaluation import save_plots
 
         for plot in save_plots(result, known, plots, poses.stem):
-            typer.echo(str(plot))
+            say(str(plot))
     return 0
 
 
-def _rows_of(path: Path, truth: Truth) -> tuple[list[dict[str, Any]], int]:
+def _rows_of(path: Path, truth: Truth) -> tuple[list[Row], int]:
     """Rows of the table in the order of the truth, and how many with a pose are left over.
 
     Names of frames may have a folder before them, as they do where the data set itself was the input. Of several copies
     of a target in a frame those that lie nearest belong together.
     """
     from torchpose.analysis.evaluation import match_copies
+    from torchpose.io.rows import POSE, POSE_SCHEMA, STD
     from torchpose.io.writers import read_table
 
-    rows = read_table(path)
-    table: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    try:
-        for row in rows:
-            table.setdefault((str(row["frame"]), str(row["target"])), []).append(row)
-        missing = [name for name in ("status", "tx", "rz", "sx", "srz") if rows and name not in rows[0]]
-    except (KeyError, TypeError) as error:
-        raise ConfigError(f"{path}: POSES: cannot be read ({error!r}); give what torchpose estimate wrote") from None
-    if missing:
-        raise ConfigError(f"{path}: {missing[0]}: column is missing; give what torchpose estimate wrote")
+    table: dict[tuple[str, str], list[Row]] = {}
+    for row in read_table(path, POSE_SCHEMA, ("frame", "target", "status", *POSE, *STD)):
+        table.setdefault((row["frame"], row["target"]), []).append(row)
     keys = list(zip(truth.frame, truth.target, strict=True))
     if not any(key in table for key in keys):
         table = {(frame.rsplit("/", 1)[-1], target): copies for (frame, target), copies in table.items()}
@@ -94,7 +89,7 @@ def _show(result: Evaluation, full_covariance: bool) -> None:
     console.print(f"mean NEES {result.nees:.2f}; {low:.2f} to {high:.2f} where the covariances are right{note}")
 
 
-def _write_errors(path: Path, result: Evaluation, truth: Truth, rows: list[dict[str, Any]]) -> None:
+def _write_errors(path: Path, result: Evaluation, truth: Truth, rows: list[Row]) -> None:
     import torch
 
     from torchpose.analysis.evaluation import AXES, UNITS

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from torchpose.cli.common import Quiet, interrupted
+from torchpose.cli.common import MOST_SEED, Quiet, interrupted, say
 
 _Full = Annotated[bool, typer.Option("--full", help="As many seeds and frames as the documented figures have: hours.")]
 
@@ -15,7 +15,7 @@ def reproduce(
     full: _Full = False,
     only: Annotated[list[str] | None, typer.Option(metavar="STUDY", help="This study alone; may be repeated.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Keep the studies that an earlier run finished.")] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Of everything random.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Of everything random.")] = 0,
     quiet: Quiet = False,
 ) -> int:
     """Compute every table and figure of the paper: its number, ours and the bound side by side, with plots."""
@@ -29,7 +29,7 @@ def reproduce(
         except KeyboardInterrupt:
             return interrupted(f"{out} keeps the finished studies; add --resume")
     for name, reason in failed.items():
-        typer.echo(f"torchpose: error: {name}: {reason}", err=True)
+        say(f"torchpose: error: {name}: {reason}", err=True)
     if not quiet:
-        typer.echo(str(out / REPORT))
+        say(str(out / REPORT))
     return 1 if failed else 0

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from torchpose.cli.common import MOST_SEED, say
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ _Sigmas = Annotated[
     list[float] | None,
     typer.Option(help="Standard deviation of a marker centre on each axis; may be repeated. By default 0.2 and 1."),
 ]
+_MOST = 1e6  # of an error, a distance or a noise (convention), in the units of the options
 _Distances = Annotated[tuple[float, float], typer.Option(metavar="NEAR FAR", help="Working distances, mm.")]
 _NOISE = (
     "Standard deviation of the noise, grey levels of 255: adds the budget of the rings' edges, as estimate claims it."
@@ -50,7 +52,7 @@ def sensitivity(
     blur: Annotated[float, typer.Option(help="Standard deviation of the lens's blur, px, with --noise.")] = 0.7,
     levels: Annotated[tuple[float, float], typer.Option(metavar="DARK LIGHT", help=_LEVELS)] = (30.0, 220.0),
     draws: Annotated[int, typer.Option(min=2, max=100000, help="Random draws at every distance.")] = 300,
-    seed: Annotated[int, typer.Option(min=0, help="Of the draws.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Of the draws.")] = 0,
 ) -> int:
     """Predict pose errors by source over the working distance, and check the prediction by Monte-Carlo.
 
@@ -89,7 +91,7 @@ def sensitivity(
     files = tabulate(cases, rings).save(out)
     _show(cases | rings, size)
     for line in (*_unstated(lens, printed), *files):
-        typer.echo(str(line))
+        say(str(line))
     return 0
 
 
@@ -103,12 +105,12 @@ def _lens(path: Path | None) -> Camera:
 def _check(sizes: dict[str, float], sigmas: list[float], distance: tuple[float, float], tilt_deg: float) -> None:
     """Refuses numbers that are no sizes of errors, distances or angles."""
     for option, value in sizes.items():
-        if not 0 <= value < math.inf:
-            raise ConfigError(f"sensitivity: {option}: is {value}; give a number from 0")
+        if not 0 <= value <= _MOST:
+            raise ConfigError(f"sensitivity: {option}: is {value}; give a number from 0 to {_MOST:g}")
     for value in sigmas:
-        if not 0 < value < math.inf:
-            raise ConfigError(f"sensitivity: --sigma-px: is {value}; give a number above 0")
-    if not (0 < distance[0] < distance[1] < math.inf):
+        if not 0 < value <= _MOST:
+            raise ConfigError(f"sensitivity: --sigma-px: is {value}; give a number above 0, at most {_MOST:g}")
+    if not (0 < distance[0] < distance[1] <= _MOST):
         raise ConfigError(f"sensitivity: --distance: is {distance[0]} {distance[1]}; give NEAR above 0 and FAR beyond")
     if not abs(tilt_deg) < 85:
         raise ConfigError(f"sensitivity: --tilt-deg: is {tilt_deg}; give an angle between -85 and 85")
@@ -119,8 +121,8 @@ def _of_edges(noise: float, levels: tuple[float, float], blur: float) -> float:
     from torchpose.analysis.sensitivity import edge_noise
 
     for option, value in (("--noise", noise), ("--blur", blur)):
-        if not 0 < value < math.inf:
-            raise ConfigError(f"sensitivity: {option}: is {value}; give a number above 0")
+        if not 0 < value <= _MOST:
+            raise ConfigError(f"sensitivity: {option}: is {value}; give a number above 0, at most {_MOST:g}")
     dark, light = levels
     if not 0 <= dark < light <= 255:
         raise ConfigError(f"sensitivity: --levels: is {dark:g} {light:g}; give 0 <= DARK < LIGHT <= 255")

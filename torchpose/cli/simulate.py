@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from torchpose.cli.common import Batch, Quiet, Resume, Threads, cores, interrupted
+from torchpose.cli.common import Batch, Quiet, Resume, Threads, cores, interrupted, say, use_threads
 
 _BACKEND = "Who renders: the analytic renderer, or Blender Cycles (extra: blender)."
 
@@ -33,14 +33,13 @@ def simulate(
     from collections import Counter
 
     import cv2
-    import torch
 
     from torchpose.cli.terminal import FrameProgress
     from torchpose.datasets.dataset import write_bop, write_dataset
     from torchpose.datasets.plan import load_plan
 
     cv2.setNumThreads(1)
-    torch.set_num_threads(max(1, (threads or cores()) // 2))
+    use_threads(threads, share=0.5)
     read = load_plan(plan)
     with FrameProgress(len(read), 0, quiet=quiet) as progress:
         try:
@@ -59,7 +58,7 @@ def simulate(
             return interrupted(f"{out} keeps its frames; add --resume to go on")
     if not quiet:
         marked = int((read.seen < len(read.target)).sum())
-        typer.echo(f"{len(read)} frames in {out / 'frames'}, truth in {out / 'truth.csv'}", err=True)
+        say(f"{len(read)} frames in {out / 'frames'}, truth in {out / 'truth.csv'}", err=True)
         if marked:
-            typer.echo(f"{marked} of them without the whole target in view, marked in the truth", err=True)
+            say(f"{marked} of them without the whole target in view, marked in the truth", err=True)
     return 0

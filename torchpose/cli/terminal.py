@@ -11,6 +11,9 @@ from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
+
+from torchpose.errors import printable
 
 STATUS_STYLE = {"ok": "green", "ambiguous": "yellow"}  # all others are red
 
@@ -56,9 +59,9 @@ class FrameProgress(_Bar):
         """Shows the rows by status and where they are."""
         if not self._shown:
             return
-        table = Table("status", "rows", title=str(out), title_justify="left")
+        table = Table("status", "rows", title=Text(printable(str(out))), title_justify="left")
         for status, count in counts.most_common():
-            table.add_row(f"[{STATUS_STYLE.get(status, 'red')}]{status}[/]", str(count))
+            table.add_row(Text(status, STATUS_STYLE.get(status, "red")), str(count))
         self._console.print(table)
 
 
@@ -84,13 +87,22 @@ class StudyProgress(_Bar):
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str | float | None]]) -> Console:
     """Prints a table, its numbers with three digits; the console, for what comes below."""
     console = Console(width=max(Console().width, 100))  # a pipe counts as 80 columns, which would cut the numbers
-    table = Table(box=box.SIMPLE_HEAD, title=title)
+    # as text: names in brackets are no markup
+    table = Table(box=box.SIMPLE_HEAD, title=Text(printable(title)))
     for name in columns:
         table.add_column(name, justify="left" if name in ("axis", "unit", "source") else "right")
     for row in rows:
-        table.add_row(*(v if isinstance(v, str) else "-" if v is None or v != v else f"{v:.3g}" for v in row))
+        table.add_row(
+            *(Text(printable(v)) if isinstance(v, str) else "-" if v is None or v != v else f"{v:.3g}" for v in row)
+        )
     console.print(table)
     return console
+
+
+def _cell(value: str | float | None) -> Text:
+    if isinstance(value, str):
+        return Text(printable(value))
+    return Text("-" if value is None or value != value else f"{value:.3g}")
 
 
 def _coloured(counts: Counter[str]) -> list[str]:

@@ -28,7 +28,7 @@ from torch import Tensor
 
 from torchpose.analysis.crlb import pose_crlb
 from torchpose.camera import Camera
-from torchpose.config import write_text
+from torchpose.config import parse_json, read_text, write_text
 from torchpose.datasets.plan import Plan
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
@@ -290,9 +290,9 @@ def _check_origin(out: Path, origin: dict[str, object], resume: bool) -> None:
     if not resume:
         raise ConfigError(f"{out}: --out: holds frames; add --resume to go on with them or choose another folder")
     try:
-        before = json.loads((out / "plan.json").read_text(encoding="utf-8"))
+        before = parse_json(read_text(out / "plan.json"))
         changed = [name for name in origin if before.get(name) != origin[name]]
-    except (OSError, ValueError, AttributeError):
+    except (ConfigError, ValueError, AttributeError):
         raise ConfigError(f"{out / 'plan.json'}: --resume: missing or damaged; choose another folder") from None
     if changed:
         raise ConfigError(

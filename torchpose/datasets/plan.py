@@ -5,27 +5,17 @@ from __future__ import annotations
 import itertools
 import math
 import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    FiniteFloat,
-    field_validator,
-    model_validator,
-)
 from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.config import beside, read_yaml, validate, within
+from torchpose.datasets.plan_file import MOST_FRAMES, PlanFile, Random
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.geometry.rotations import plane_axes
@@ -34,251 +24,12 @@ from torchpose.io.sources import find_sources
 from torchpose.io.truth import read_truth
 from torchpose.sim import Disturbances, PrintErrors, Prints, Texture, faults_of, printed
 from torchpose.sim.fields import keys_of
-from torchpose.sim.prints import Warp
 from torchpose.target import Target
 
 _HALTON_BASES = (2, 3, 5, 7, 11, 13)
+_CHUNK = 2000  # poses whose markers are looked for at once: some 10 MB
+_HOPELESS = 20_000  # poses without one in view, after which no more are drawn
 _TRIES = 50  # random poses drawn for one that keeps the target in view
-
-Vector = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
-Pair = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
-
-
-def _range(value: Any) -> Any:
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        return [value, value]
-    if not isinstance(value, list) or len(value) != 2 or not all(isinstance(v, int | float) for v in value):
-        raise ValueError(f"is {value!r}; give a number or [low, high]")
-    if value[0] > value[1]:
-        raise ValueError(f"has the limits {value[0]:g} > {value[1]:g}; swap them")
-    return value
-
-
-def _from(low: Callable[[float], bool], fix: str) -> AfterValidator:
-    """Refuses a range whose lower limit is not as ``low`` wants it."""
-
-    def check(value: list[float]) -> list[float]:
-        if not low(value[0]):
-            raise ValueError(f"is {value[0]:g}; {fix}")
-        return value
-
-    return AfterValidator(check)
-
-
-Range = Annotated[list[FiniteFloat], BeforeValidator(_range)]
-"""[low, high], from which every frame draws its own value; a plain number stands for both."""
-
-
-Blur = Annotated[Range, _from(lambda s: s > 0, "the blur must be above 0 px, such as 0.3 for a very sharp lens")]
-Move = Annotated[Range, _from(lambda s: s >= 0, "give the length of the move during the exposure, 0 or more")]
-Ratio = Annotated[Range, _from(lambda s: s >= 1, "give the larger standard deviation over the smaller, 1 or more")]
-Share = Annotated[Range, _from(lambda s: s >= 0, "give a share of the mean, 0 or more, such as 0.02")]
-Grey = Annotated[Range, _from(lambda s: s >= 0, "give grey levels of 0..255, 0 or more")]
-Extent = Annotated[Range, _from(lambda s: s >= 0, "give px, 0 or more")]
-Height = Annotated[Range, _from(lambda s: s >= 0, "give half of the plate's height in mm, 0 or more")]
-Scale = Annotated[Range, _from(lambda s: s > -1, "give the relative error of lengths, such as 0.001")]
-Noise = Annotated[Range, _from(lambda s: s >= 0, "give the standard deviation in grey levels, 0 or more")]
-Positive = Annotated[FiniteFloat, Field(gt=0)]
-NotNegative = Annotated[FiniteFloat, Field(ge=0)]
-
-
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Grid(_Section):
-    """All combinations of pitch, yaw and roll with every position: R = Rz(roll) Ry(yaw) Rx(pitch)."""
-
-    distance: FiniteFloat
-    angles_deg: Annotated[list[FiniteFloat], Field(min_length=1)]
-    positions: Annotated[list[Vector], Field(min_length=1)] = [[0.0, 0.0, 0.0]]
-
-
-class Random(_Section):
-    """A low-discrepancy (Halton) cover of position, tilt (any direction) and roll."""
-
-    count: Annotated[int, Field(ge=1)]
-    x: Range
-    y: Range
-    z: Range
-    tilt_deg: Range = [0.0, 45.0]
-    roll_deg: Range = [-180.0, 180.0]
-
-
-class Axes(_Section):
-    """Moves along and turns about one camera axis at a time, from one start."""
-
-    start: Vector
-    rotation_deg: Vector = [0.0, 0.0, 0.0]
-    translations: list[FiniteFloat] = []
-    turns_deg: list[FiniteFloat] = []
-
-    @model_validator(mode="after")
-    def _moves(self) -> Axes:
-        if not self.translations and not self.turns_deg:
-            raise ValueError("moves nothing; give translations or turns_deg")
-        return self
-
-
-class Poses(_Section):
-    """One of the ways to say where the target is; ``file`` names a truth file."""
-
-    grid: Grid | None = None
-    random: Random | None = None
-    axes: Axes | None = None
-    file: str | None = None
-
-    @model_validator(mode="after")
-    def _one(self) -> Poses:
-        if len(self.model_fields_set) != 1:
-            raise ValueError(f"holds {len(self.model_fields_set)} kinds; give one of grid, random, axes and file")
-        return self
-
-
-class Lens(_Section):
-    """See `torchpose.sim.Defocus`."""
-
-    f_number: Positive
-    focal_length: Positive
-    focus_distance: Positive
-
-
-class Light(_Section):
-    """See `torchpose.sim.Lighting`."""
-
-    gradient: Pair = [0.0, 0.0]
-    point: Vector | None = None
-    vignetting: Annotated[FiniteFloat, Field(ge=0)] = 0.0
-
-
-class Imaging(_Section):
-    """Conditions of the picture, before the sensor."""
-
-    psf_sigma: Blur = [0.7, 0.7]
-    psf_ratio: Ratio = [1.0, 1.0]
-    psf_deg: Range = [0.0, 180.0]
-    smear_px: Extent = [0.0, 0.0]
-    smear_deg: Range = [0.0, 180.0]
-    disc_px: Extent = [0.0, 0.0]
-    dark: Range = [30.0, 30.0]
-    light: Range = [220.0, 220.0]
-    surround: Range = [90.0, 90.0]
-    plate: Pair | None = None
-    background: str | None = None
-    motion_mm: Move = [0.0, 0.0]
-    motion_deg: Move = [0.0, 0.0]
-    clutter: Annotated[int, Field(ge=0)] = 0
-    covered: Annotated[FiniteFloat, Field(ge=0, le=1)] = 0.0
-    defocus: Lens | None = None
-    lighting: Light | None = None
-    coma_px: Extent = [0.0, 0.0]
-    coma_deg: Range = [0.0, 360.0]
-    haze_px: Extent = [0.0, 0.0]
-    haze_length: Annotated[FiniteFloat, Field(ge=1.5)] = 40.0
-    ghost: Grey = [0.0, 0.0]
-    speckle: Share = [0.0, 0.0]
-    speckle_px: Annotated[FiniteFloat, Field(ge=1.5)] = 3.0
-    flicker: Share = [0.0, 0.0]
-    flicker_px: Positive = 90.0
-
-    @field_validator("plate")
-    @classmethod
-    def _plate(cls, value: list[float] | None) -> list[float] | None:
-        if value is not None and min(value) <= 0:
-            raise ValueError("has a side that is not above 0; give its width and height in mm")
-        return value
-
-    @model_validator(mode="after")
-    def _one_disc(self) -> Imaging:
-        if self.defocus is not None and self.disc_px[1] > 0:
-            raise ValueError("has both defocus and disc_px; give one of them")
-        return self
-
-    @field_validator("speckle")
-    @classmethod
-    def _contrast(cls, value: list[float]) -> list[float]:
-        if value[1] > 1:
-            raise ValueError(f"is {value[1]:g}; the contrast of speckle is 1 at the most")
-        return value
-
-    @model_validator(mode="after")
-    def _behind(self) -> Imaging:
-        if self.background is not None and self.plate is None:
-            raise ValueError("has a background and no plate, which would hide it; add plate: [width, height]")
-        return self
-
-
-def _three(value: Any) -> Any:
-    return [value] * 3 if isinstance(value, int | float) and not isinstance(value, bool) else value
-
-
-class Paper(_Section):
-    """See `torchpose.sim.Texture`."""
-
-    share: NotNegative
-    length: Positive
-
-
-class Print(_Section):
-    """How the print differs from the target file, see `torchpose.sim.PrintErrors`."""
-
-    each: Literal["set", "frame"] = "set"
-    seed: int | None = None
-    center_sigma: Annotated[list[Annotated[FiniteFloat, Field(ge=0)]], BeforeValidator(_three)] = [0.0, 0.0, 0.0]
-    gain: Range = [0.0, 0.0]
-    scale: Scale = [0.0, 0.0]
-    warp: Height = [0.0, 0.0]
-    warp_shape: Warp = "twist"
-    warp_deg: Range = [0.0, 180.0]
-    texture: Paper | None = None
-    dpi: Positive | None = None
-
-    @field_validator("center_sigma")
-    @classmethod
-    def _axes(cls, value: list[float]) -> list[float]:
-        if len(value) != 3:
-            raise ValueError(f"has {len(value)} entries; give a number or [x, y, z] in mm")
-        return value
-
-
-class Sensor(_Section):
-    """Noise after EMVA 1288 and the stored depth; patterns as `torchpose.sim.SensorPattern`."""
-
-    noise: Noise = [1.0, 1.0]
-    full_well: Positive | None = None
-    bits: Literal[8, 10, 12, 16] = 8
-    gamma: Positive | Literal["srgb"] = 1.0
-    prnu: NotNegative = 0.0
-    column_noise: NotNegative = 0.0
-    line_jitter: NotNegative = 0.0
-    seed: int | None = None
-
-
-class Processing(_Section):
-    """See `torchpose.sim.Processing`."""
-
-    bayer: bool = False
-    denoise: NotNegative = 0.0
-    sharpen: NotNegative = 0.0
-    sharpen_px: Annotated[Positive, Field(le=16)] = 1.5  # px (convention): a wider one is no sharpening
-    jpeg: Annotated[int, Field(ge=1, le=100)] | None = None
-
-
-class PlanFile(_Section):
-    """A plan file, see docs/simulation.md."""
-
-    camera: str
-    target: str
-    seed: int = 0
-    poses: Poses
-    print: Print | None = None
-    imaging: Imaging = Imaging()
-    sensor: Sensor = Sensor()
-    processing: Processing = Processing()
-    faults: dict[str, dict[str, Any]] = {}
-    depth_range: Pair | None = None
-    out_of_view: Literal["error", "mark"] = "error"
-    bounds: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -454,6 +205,13 @@ def markers_in_view(
     camera: Camera, target: Target, R: Float[Tensor, "N 3 3"], t: Float[Tensor, "N 3"]
 ) -> Int[Tensor, " N"]:
     """How many markers lie before the camera and in the frame as a whole."""
+    parts = zip(R.split(_CHUNK), t.split(_CHUNK), strict=True)
+    seen = [_some_in_view(camera, target, *part) for part in parts]
+    return torch.cat([torch.zeros(0, dtype=torch.int64, device=t.device), *seen])
+
+
+def _some_in_view(camera: Camera, target: Target, R: Float[Tensor, "N 3 3"], t: Float[Tensor, "N 3"]) -> Tensor:
+    """The same of few enough poses for one go."""
     e1, e2 = plane_axes(target.normals)
     angle = torch.arange(36, dtype=t.dtype) * (2 * math.pi / 36)
     rim = angle.cos()[:, None, None] * e1 + angle.sin()[:, None, None] * e2
@@ -500,13 +258,36 @@ def _poses(path: Path, file: PlanFile, camera: Camera, target: Target) -> tuple[
         shift, turn = torch.stack(moves + [still] * len(turns)), torch.stack([still] * len(moves) + turns)
         return rotations.exp(turn) @ _euler(_floats([axes.rotation_deg]).deg2rad())[0], _floats(axes.start) + shift
     listed = read_truth(beside(path, str(file.poses.file)))
+    if len(listed) > MOST_FRAMES:
+        raise ConfigError(f"{path}: poses.file: has {len(listed)} frames; give at most {MOST_FRAMES}")
     return listed.R, listed.t
 
 
 def _random_poses(path: Path, poses: Random, file: PlanFile, camera: Camera, target: Target) -> tuple[Tensor, Tensor]:
     """Halton poses; those that do not keep the target in view are passed over unless the plan marks them."""
-    tries = poses.count if file.out_of_view == "mark" else poses.count * _TRIES
-    u = torch.stack([_halton(tries, base, file.seed) for base in _HALTON_BASES])
+    if file.out_of_view == "mark":
+        return _drawn(poses, file.seed, 0, poses.count)
+    parts, found, tries = [], 0, poses.count * _TRIES
+    for start in range(0, tries, _CHUNK):
+        R, t = _drawn(poses, file.seed, start, min(start + _CHUNK, tries))
+        use = markers_in_view(camera, target, R, t) == len(target)
+        parts.append((R[use], t[use]))
+        found += int(use.sum())
+        if found >= poses.count or (found == 0 and start + _CHUNK >= _HOPELESS):
+            break
+    if found < poses.count:
+        tried = min(start + _CHUNK, tries)
+        raise ConfigError(
+            f"{path}: poses: only {found} of {tried} random poses keep the target in view, {poses.count} are "
+            "wanted; narrow x, y and tilt_deg or widen z"
+        )
+    R, t = (torch.cat(columns)[: poses.count] for columns in zip(*parts, strict=True))
+    return R, t
+
+
+def _drawn(poses: Random, seed: int, start: int, stop: int) -> tuple[Tensor, Tensor]:
+    """R and t of some of the Halton poses, by their numbers from 0."""
+    u = torch.stack([_halton(start, stop, base, seed) for base in _HALTON_BASES])
     x, y, z, tilt, roll = (
         _spread(value, row)
         for value, row in zip((poses.x, poses.y, poses.z, poses.tilt_deg, poses.roll_deg), u, strict=False)
@@ -514,22 +295,13 @@ def _random_poses(path: Path, poses: Random, file: PlanFile, camera: Camera, tar
     azimuth, zero = u[5] * 2 * math.pi, torch.zeros_like(x)
     lean = torch.stack([azimuth.cos(), azimuth.sin(), zero], 1) * tilt.deg2rad()[:, None]
     R = rotations.exp(lean) @ rotations.exp(torch.stack([zero, zero, roll.deg2rad()], 1))
-    t = torch.stack([x, y, z], 1)
-    if file.out_of_view == "mark":
-        return R, t
-    use = (markers_in_view(camera, target, R, t) == len(target)).nonzero().flatten()[: poses.count]
-    if len(use) < poses.count:
-        raise ConfigError(
-            f"{path}: poses: only {len(use)} of {tries} random poses keep the target in view, {poses.count} are "
-            "wanted; narrow x, y and tilt_deg or widen z"
-        )
-    return R[use], t[use]
+    return R, torch.stack([x, y, z], 1)
 
 
-def _halton(count: int, base: int, seed: int) -> Tensor:
-    """(count,) van der Corput sequence (Halton 1960), shifted by the seed modulo 1 (Cranley and Patterson 1976)."""
-    number = torch.arange(1, count + 1)
-    value, fraction = torch.zeros(count, dtype=torch.float64), 1.0
+def _halton(start: int, stop: int, base: int, seed: int) -> Tensor:
+    """Van der Corput sequence (Halton 1960), shifted by the seed modulo 1 (Cranley and Patterson 1976), or a part."""
+    number = torch.arange(start + 1, stop + 1)
+    value, fraction = torch.zeros(stop - start, dtype=torch.float64), 1.0
     while bool((number > 0).any()):
         fraction /= base
         value += fraction * (number % base).double()

@@ -1,10 +1,11 @@
 """Stage: which ring is which marker of which copy, and a second look for those that were not found."""
 
 from torchpose.identify.alike import indistinguishable
+from torchpose.identify.boards import identify_boards
 from torchpose.identify.company import in_company, named
 from torchpose.identify.copies import MIN_MARKERS
 from torchpose.identify.markers import Identified, identify
-from torchpose.identify.scene import MarkerTable, Scene
+from torchpose.identify.scene import MarkerTable, Scene, drawn_radii
 from torchpose.identify.second_look import look_again
 
 __all__ = [
@@ -12,7 +13,9 @@ __all__ = [
     "Identified",
     "MarkerTable",
     "Scene",
+    "drawn_radii",
     "identify",
+    "identify_boards",
     "in_company",
     "indistinguishable",
     "look_again",

@@ -164,7 +164,11 @@ def propose(rings: Rings, table: MarkerTable, matrix: Tensor) -> Assignments:
     outer_mm, inner_mm = table.radii.unbind(-1)
     marks = Marks(outer_mm[None], inner_mm[None], table.half_gap[None, :, None], table.gain_scale[None, :, None])
     codes = Codes.of(rings, marks)
-    fits = (codes.mismatch < 1) & table.valid & (rings.polarity[:, None, None] == table.polarity[:, None])
+    fits = (
+        (codes.mismatch < 1)
+        & (table.valid & table.coded[:, None])
+        & (rings.polarity[:, None, None] == table.polarity[:, None])
+    )
     ring, target, marker = fits.nonzero().unbind(-1)
     row = rings.frame[ring] * len(table) + target
     order = torch.argsort(row, stable=True)

@@ -41,6 +41,7 @@ class Identified(Rows):
         t: the same, mm.
         copies: how many copies the rings of the row's frame show, each by three markers or more.
         gain: mm, the edge gain of the plate as the codes tell it and the target's file allows; 0 where nothing tells.
+        turnable: whether the marks of a board may be those of the board turned as well.
         proposal: group, marker and ring of every ring with the code of a marker, whether or not it fits.
     """
 
@@ -50,6 +51,7 @@ class Identified(Rows):
     t: Float[Tensor, "N 3"]
     copies: Int[Tensor, " N"]
     gain: Float[Tensor, " N"]
+    turnable: Bool[Tensor, " N"]
     proposal: Int[Tensor, "A 3"] = shared()
 
     def proposed(self, unclaimed: Bool[Tensor, " K"]) -> Tensor:
@@ -194,6 +196,7 @@ def _empty(group: Tensor, markers: int, copies: Tensor, proposal: Tensor) -> Ide
         nowhere.repeat(count, 3),
         copies,
         torch.zeros(count, dtype=torch.float64, device=group.device),
+        torch.zeros(count, dtype=torch.bool, device=group.device),
         proposal,
     )
 

@@ -10,9 +10,11 @@ from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.geometry.least_squares import covariance_factor
-from torchpose.geometry.rows import Rows
+from torchpose.geometry.rows import Rows, shared
+from torchpose.grids import Grid
 from torchpose.target import MIN_RATIO_GAP, Target
 
+NOWHERE = -3.0  # inner radius of a disc over its outer one: no pixel is as far from an edge
 MOST_GAIN = 3.0  # deviations of the edge gain that a file states, up to which codes are read (a convention)
 # mm, of prints of which nothing is said: laser printers and copiers spread ink by 60 to 100 um
 _OFFICE_GAIN = 0.1
@@ -26,7 +28,8 @@ class MarkerTable(Rows):
         ids: of the markers.
         centers: target frame, mm.
         normals: the same.
-        radii: outer and inner, mm, as printed (`Target.printed_radii`).
+        radii: outer and inner, mm, as printed (`Target.printed_radii`); of a disc the inner one is `NOWHERE` times the
+            outer one: its inner edge is nowhere.
         valid: False where padded.
         polarity: +1 dark rings, -1 light ones.
         coplanar: whether all markers lie in one plane.
@@ -39,6 +42,7 @@ class MarkerTable(Rows):
         by_camera: the same with each of the C uncertain numbers of a camera that was calibrated together with the
             target (`Target.cross_covariance`); 0 with any other.
         scale_sigma: `Target.scale_sigma`, the last of the Q numbers where any target has one.
+        layouts: of the T targets that are boards of equal marks, None for others.
     """
 
     ids: Int[Tensor, "T M"]
@@ -54,6 +58,12 @@ class MarkerTable(Rows):
     by_print: Float[Tensor, "T M 4 Q"]
     by_camera: Float[Tensor, "T M 4 C"]
     scale_sigma: Float[Tensor, " T"]
+    layouts: tuple[Grid | None, ...] = shared(())
+
+    @property
+    def coded(self) -> Bool[Tensor, " T"]:
+        """Whether the markers of each target are told apart by their codes."""
+        return torch.tensor([grid is None for grid in self.layouts], dtype=torch.bool, device=self.ids.device)
 
     @classmethod
     def of(cls, targets: Sequence[Target], camera: Camera | None = None) -> Self:
@@ -67,7 +77,7 @@ class MarkerTable(Rows):
             padded([t.ids for t in targets], -1),
             padded([t.centers for t in targets], 0.0),
             padded([t.normals for t in targets], 0.0),
-            padded([t.printed_radii for t in targets], 1.0),
+            padded([drawn_radii(t) for t in targets], 1.0),
             padded([torch.ones(len(t), dtype=torch.bool) for t in targets], False),
             torch.tensor([1.0 if t.background == "light" else -1.0 for t in targets], dtype=torch.float64),
             torch.tensor([t.coplanar for t in targets]),
@@ -77,7 +87,14 @@ class MarkerTable(Rows):
             by_print,
             by_camera,
             torch.tensor([t.scale_sigma for t in targets], dtype=torch.float64),
+            tuple(t.grid for t in targets),
         )
+
+
+def drawn_radii(target: Target) -> Tensor:
+    """(M, 2), see `MarkerTable.radii`."""
+    outer, inner = target.printed_radii.unbind(-1)
+    return torch.stack([outer, NOWHERE * outer if target.discs else inner], -1)
 
 
 def _gain_sigma(target: Target) -> Tensor:
@@ -95,7 +112,8 @@ def _gain_scale(target: Target) -> Tensor:
     radii = target.printed_radii
     by_half = (_half_gap(radii) * radii[:, 0].square() / radii.sum(-1)).amin()
     stated = _gain_sigma(target)
-    room = torch.minimum(radii[:, 1], 0.5 * (radii[:, 0] - radii[:, 1])).amin()  # or neither hole nor ring is left
+    inside = torch.where(radii[:, 1] > 0, radii[:, 1], radii[:, 0])
+    room = torch.minimum(inside, 0.5 * (radii[:, 0] - radii[:, 1])).amin()  # or neither hole nor ring is left
     most = torch.where(stated > 0, (MOST_GAIN * stated).minimum(0.9 * room), by_half.clamp_max(_OFFICE_GAIN))
     return most / MOST_GAIN
 

@@ -36,7 +36,8 @@ def look_again(
         correct: as for `rings.measure_rings`.
     """
     markers, camera = scene.table[scene.target], scene.camera
-    wanted = markers.valid & ~seen & (seen.sum(-1) >= MIN_MARKERS - 1)[:, None]
+    rings_of = markers.valid & (markers.radii[..., 1] > 0)  # discs have no codes, and one circle
+    wanted = rings_of & ~seen & (seen.sum(-1) >= MIN_MARKERS - 1)[:, None]
     row, option, marker = (wanted[:, None] & R.isfinite().all(-1).all(-1)[..., None]).nonzero().unbind(-1)
     if row.numel() == 0:
         return rings, identified

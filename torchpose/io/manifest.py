@@ -15,12 +15,17 @@ stopped; it is dropped unless it is whole. Image and robot pose are joined by th
 """
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 
+from torchpose.config import check_regular, parse_json, shown
+from torchpose.config.kinds import Length, Radians, Text, Word
 from torchpose.errors import ConfigError
+
+_LONGEST_LINE = 1 << 20  # bytes (convention): a record has one or two thousand
 
 
 class _Record(BaseModel):
@@ -41,17 +46,24 @@ class _Session(_Record):
 class ManifestFrame(_Record):
     """One image of a manifest: path relative to its folder, and the tool in the robot base (mm, rad) if recorded."""
 
-    id: int | str
-    image: Annotated[str, Field(min_length=1)]
-    camera: Annotated[str, BeforeValidator(str)] = ""
-    robot_pose: Annotated[tuple[FiniteFloat, ...], Field(min_length=6, max_length=6, strict=False)] | None = None
+    id: int | Text
+    image: Word
+    camera: Annotated[Text, BeforeValidator(lambda name: str(name) if isinstance(name, int) else name)] = ""
+    robot_pose: (
+        Annotated[
+            tuple[Length, Length, Length, Radians, Radians, Radians],
+            BeforeValidator(lambda numbers: tuple(numbers) if isinstance(numbers, list) else numbers),
+        ]
+        | None
+    ) = None
 
 
 _WRONG = {
-    "units": '{!r} is not known; write {{"length": "mm"}} or {{"length": "m"}}',
-    "id": "missing or not a number or a text; give every frame its own",
-    "image": "missing or not a text; give the image's path relative to the manifest",
-    "robot_pose": "{!r}; give six finite numbers x, y, z, rx, ry, rz",
+    "units": '{} is not known; write {{"length": "mm"}} or {{"length": "m"}}',
+    "id": "missing or not a number or a text of one line; give every frame its own",
+    "image": "missing or not a text of one line; give the image's path relative to the manifest",
+    "camera": "{} is not a text of one line; give the camera's name",
+    "robot_pose": "{}; give six finite numbers x, y, z, rx, ry, rz",
 }
 
 
@@ -78,9 +90,9 @@ def read_manifest(path: Path, camera: str | None = None) -> list[ManifestFrame]:
             continue
         frame = _checked(ManifestFrame, record, where)
         if frame.id in ids:
-            raise ConfigError(f"{where}: id: {frame.id!r} occurs twice; give every frame its own")
+            raise ConfigError(f"{where}: id: {shown(frame.id)} occurs twice; give every frame its own")
         if frame.image in images:
-            raise ConfigError(f"{where}: image: {frame.image!r} occurs twice; one record for every image")
+            raise ConfigError(f"{where}: image: {shown(frame.image)} occurs twice; one record for every image")
         ids.add(frame.id)
         images.add(frame.image)
         if frame.robot_pose is not None:
@@ -99,30 +111,43 @@ def read_manifest(path: Path, camera: str | None = None) -> list[ManifestFrame]:
     return [frame for frame in frames if camera in (None, frame.camera)]
 
 
-def read_records(path: Path) -> list[tuple[int, dict[str, Any]]]:
+def read_records(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
     """Line numbers and objects of a file of JSON lines, without a torn last line.
 
     Raises:
         ConfigError: the file cannot be read, or a line is not a JSON object.
     """
     try:
-        lines = path.read_bytes().split(b"\n")
-    except OSError as error:
-        raise ConfigError(f"{path}: INPUT: {error.strerror}; give a readable capture manifest") from None
-    records = []
-    for number, line in enumerate(lines, start=1):
-        if not line.strip():
-            continue
-        try:
-            record = json.loads(line)
-        except ValueError:
-            if number == len(lines):  # no newline behind it: it was being written
-                break
-            raise ConfigError(f"{path}: line {number}: not JSON; a manifest has one JSON object a line") from None
-        if not isinstance(record, dict):
-            raise ConfigError(f"{path}: line {number}: not an object; a manifest has one JSON object a line")
-        records.append((number, record))
-    return records
+        check_regular(path)
+        with path.open("rb") as lines:
+            number = 0
+            while line := lines.readline(_LONGEST_LINE + 1):
+                number += 1
+                record = _record(line, f"{path}: line {number}")
+                if record is not None:
+                    yield number, record
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise ConfigError(f"{path}: INPUT: {reason}; give a readable capture manifest") from None
+
+
+def _record(line: bytes, where: str) -> dict[str, Any] | None:
+    """The object of a line; None for one that is blank, or that has no end: it was being written."""
+    if not line.strip():
+        return None
+    if len(line) > _LONGEST_LINE:
+        raise ConfigError(f"{where}: has more than {_LONGEST_LINE} bytes; a manifest has one JSON object a line")
+    try:
+        record = parse_json(line)
+    except ValueError as error:
+        if not line.endswith(b"\n"):
+            return None
+        syntax = isinstance(error, json.JSONDecodeError | UnicodeDecodeError)
+        problem = "not JSON; a manifest has one JSON object a line" if syntax else str(error).removeprefix("file: ")
+        raise ConfigError(f"{where}: {problem}") from None
+    if not isinstance(record, dict):
+        raise ConfigError(f"{where}: not an object; a manifest has one JSON object a line")
+    return record
 
 
 def _checked(model: type[RecordT], record: dict[str, Any], where: str) -> RecordT:
@@ -131,4 +156,4 @@ def _checked(model: type[RecordT], record: dict[str, Any], where: str) -> Record
         return model.model_validate(record)
     except ValidationError as caught:
         field = str(caught.errors()[0]["loc"][0])
-        raise ConfigError(f"{where}: {field}: {_WRONG[field].format(record.get(field))}") from None
+        raise ConfigError(f"{where}: {field}: {_WRONG[field].format(shown(record.get(field)))}") from None

@@ -34,6 +34,8 @@ class Misfits:
         place = np.array([marker or [np.nan] * 4 for marker in row["place"]], dtype=float)
         seen = np.isfinite(place)
         place = np.where(seen, place, 0.0)
+        if np.ndim(self._sum) and np.shape(self._sum) != place.shape:  # rows of another target file of that name
+            return
         self._count, self._sum, self._square = self._count + seen, self._sum + place, self._square + place**2
 
     def lines(self, name: str, ids: Sequence[int]) -> list[str]:

@@ -12,7 +12,8 @@ from jaxtyping import Shaped
 from torch import Tensor
 
 from torchpose.camera import LINEAR, Tone
-from torchpose.io.images import UnreadableImageError, decode
+from torchpose.errors import ConfigError
+from torchpose.io.images import UnreadableImageError, WrongSizeError
 from torchpose.io.sources import Source
 from torchpose.results import Status
 
@@ -120,17 +121,26 @@ class _Buffer:
     def load(self, slot: int, source: Source) -> Fault | np.dtype:
         """Decodes a source into a slot; returns its pixel type, or what is wrong with it."""
         try:
-            image = decode(source.path, threads=self._threads)
+            image = source.decode(threads=self._threads, size=(self._size[2], self._size[1]))
         except UnreadableImageError as error:
             return Fault(Status.UNREADABLE, error.reason)
-        if image.shape != self._size[1:]:
-            return Fault(Status.WRONG_SIZE, f"{image.shape[1]}x{image.shape[0]}")
+        except WrongSizeError as error:
+            return Fault(Status.WRONG_SIZE, str(error))
         image = linear_image(image, self._tone)
         with self._lock:
             if image.dtype not in self._planes:
-                self._planes[image.dtype] = torch.empty(self._size, dtype=_TORCH_DTYPE[image.dtype])
+                self._planes[image.dtype] = self._allocated(_TORCH_DTYPE[image.dtype])
         np.copyto(self._planes[image.dtype][slot].numpy(), image)
         return image.dtype
+
+    def _allocated(self, dtype: torch.dtype) -> Tensor:
+        """Memory of one batch. ConfigError: there is none."""
+        frames, height, width = self._size
+        try:
+            return torch.empty(self._size, dtype=dtype)
+        except RuntimeError:
+            fix = "give a smaller --batch" if frames > 1 else "free some memory"
+            raise ConfigError(f"--batch: no memory for {frames} frames of {width}x{height}; {fix}") from None
 
     def batch(self, sources: Sequence[Source], outcomes: Sequence[Fault | np.dtype]) -> Batch:
         faults = {i: outcome for i, outcome in enumerate(outcomes) if isinstance(outcome, Fault)}

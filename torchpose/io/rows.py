@@ -14,15 +14,15 @@ Row = dict[str, Any]
 Schema = dict[str, type]
 """Column name to str, int or float (a cell) or list (numbers or objects that only JSON lines and Parquet hold)."""
 
-_POSE = ("tx", "ty", "tz", "rx", "ry", "rz")
-_STD = ("sx", "sy", "sz", "srx", "sry", "srz")
+POSE = ("tx", "ty", "tz", "rx", "ry", "rz")
+STD = ("sx", "sy", "sz", "srx", "sry", "srz")
 _NOISE = ("nx", "ny", "nz", "nrx", "nry", "nrz")
 
 POSE_SCHEMA: Schema = {
     "frame": str,
     "target": str,
     "status": str,
-    **dict.fromkeys((*_POSE, *_STD, "rms_px"), float),
+    **dict.fromkeys((*POSE, *STD, "rms_px"), float),
     "markers": int,
     **dict.fromkeys(_NOISE, float),
     "reason": str,
@@ -45,7 +45,7 @@ rotation), systematic and place as in `Poses`, quaternion w, x, y, z, and the on
 """
 
 BASE_SCHEMA: Schema = {
-    **dict.fromkeys(tuple(f"base_{c}" for c in (*_POSE, *_STD)), float),
+    **dict.fromkeys(tuple(f"base_{c}" for c in (*POSE, *STD)), float),
     "base_covariance": list,
 }
 """Further columns with a hand-eye calibration: the same pose in the robot base."""
@@ -132,7 +132,7 @@ def finite(value: float) -> float | None:
 def _pose_cells(poses: Poses, prefix: str) -> list[Row]:
     """Pose, standard deviations and covariance of each pose as cells."""
     numbers = torch.cat([poses.t, poses.rotation_vector, poses.std], 1)
-    columns = {f"{prefix}{name}": column for name, column in zip((*_POSE, *_STD), _columns(numbers), strict=True)}
+    columns = {f"{prefix}{name}": column for name, column in zip((*POSE, *STD), _columns(numbers), strict=True)}
     whole = poses.covariance.isfinite().flatten(1).all(1).tolist()
     covariance = [c if ok else None for c, ok in zip(poses.covariance.tolist(), whole, strict=True)]
     return table(**columns, **{f"{prefix}covariance": covariance})

@@ -2,16 +2,30 @@
 
 import os
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+import stat
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from torchpose.errors import ConfigError
+from torchpose.io import images
 from torchpose.io.manifest import read_manifest
 
 IMAGE_SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg", ".pgm")
 MANIFEST_SUFFIX = ".jsonl"
-
+_STACKS = (".tif", ".tiff")  # that may have several pages
+# pictures and films in a folder that are not read, so that a user is told: raw files of cameras among them
+_OTHERS = frozenset(
+    (  # noqa: SIM905  # a list would be five times as long
+        ".apng .arw .avi .avif .cr2 .cr3 .dib .dng .exr .fit .fits .gif .hdr .heic .heif .ico .j2c .j2k .jfif "
+        ".jif .jng .jp2 .jpc .jpe .jpf .jpx .jxl .jxr .mkv .mov .mp4 .nef .npy .npz .orf .pam .pbm .pcx .pfm "
+        ".pgx .pic .pnm .ppm .psd .raf .ras .raw .rw2 .sr .svg .tga .webp"
+    ).split()
+)
+_PIPE = "is a pipe or a device, no file"
 _DIGITS = re.compile(r"(\d+)", re.ASCII)
 
 
@@ -24,12 +38,22 @@ class Source:
         path: where the image lies.
         root: the folder that ``name`` is relative to, resolved.
         robot_pose: tool in the robot base, mm and rad, if a manifest recorded it.
+        directory: of a TIFF file with several pages, see `images.pages`.
     """
 
     name: str
     path: Path
     root: Path
     robot_pose: tuple[float, ...] | None = None
+    directory: int = 0
+
+    def decode(self, *, threads: int = 1, size: tuple[int, int] | None = None) -> np.ndarray:
+        """Grey values, see `images.decode`."""
+        return images.decode(self.path, threads=threads, directory=self.directory, size=size)
+
+
+def _silent(line: str) -> None:
+    pass
 
 
 def natural_key(name: str) -> tuple[tuple[tuple[str | int, ...], ...], str]:
@@ -41,11 +65,16 @@ def natural_key(name: str) -> tuple[tuple[tuple[str | int, ...], ...], str]:
     return parts, name
 
 
-def find_sources(inputs: Sequence[Path]) -> list[Source]:
+def find_sources(inputs: Sequence[Path], tell: Callable[[str], None] = _silent) -> list[Source]:
     """Frames of image files, folders (searched recursively, in natural order) and capture manifests, input by input.
 
     In folders, hidden files and folders and everything without an image's suffix are passed over. A file with an
-    image's suffix is listed whatever it holds: that it cannot be read is a result of its own.
+    image's suffix is listed whatever it holds: that it cannot be read is a result of its own. Every page of a TIFF file
+    is a frame; from the second on ``#2``, ``#3``, ... stands behind the file's name. A manifest has one frame a record.
+
+    Args:
+        inputs: files, folders and manifests.
+        tell: is given a line for pictures that are passed over.
 
     Raises:
         ConfigError: an input is missing, holds no image or is of another kind, or two frames have the same name.
@@ -53,9 +82,17 @@ def find_sources(inputs: Sequence[Path]) -> list[Source]:
     sources: list[Source] = []
     seen: dict[str, Source] = {}
     for given in inputs:
-        found = list(_sources_of(given))
+        passed: Counter[str] = Counter()  # what, and how many of it
+        found = list(_sources_of(given, passed))
         if not found:
-            raise ConfigError(f"{given}: INPUT: holds no image; give files that end in {', '.join(IMAGE_SUFFIXES)}")
+            also = f" but {_summary(passed)}" if passed.total() else ""
+            raise ConfigError(
+                f"{given}: INPUT: holds no image{also}; give files that end in {', '.join(IMAGE_SUFFIXES)}"
+            )
+        if passed.total():
+            tell(
+                f"{_text(str(given))}: passed over {_summary(passed)}; what is read ends in {', '.join(IMAGE_SUFFIXES)}"
+            )
         for source in found:
             twin = seen.setdefault(source.name, source)
             if twin is not source:
@@ -67,29 +104,69 @@ def find_sources(inputs: Sequence[Path]) -> list[Source]:
     return sources
 
 
-def _sources_of(given: Path) -> Iterator[Source]:
-    if given.is_dir():
+def _summary(passed: Counter[str]) -> str:
+    kinds = sorted(passed.items(), key=lambda item: (-item[1], item[0]))
+    return ", ".join(f"{count} {kind}" for kind, count in kinds if count)
+
+
+def _sources_of(given: Path, passed: Counter[str]) -> Iterator[Source]:
+    """Frames of an input; pictures that are not read are counted in ``passed``."""
+    if _state(given) == "folder":
         root = given.resolve()
-        pairs = [(_text(path.relative_to(given).as_posix()), path) for path in _walk(given)]
-        yield from (Source(name, path, root) for name, path in sorted(pairs, key=lambda pair: natural_key(pair[0])))
+        pairs = [(_text(path.relative_to(given).as_posix()), path) for path in _walk(given, passed)]
+        for name, path in sorted(pairs, key=lambda pair: natural_key(pair[0])):
+            yield from _pages(name, path, root)
         return
     name, _, camera = given.name.partition(f"{MANIFEST_SUFFIX}#")  # FILE#CAMERA
     path = given.with_name(f"{name}{MANIFEST_SUFFIX}") if camera else given
-    if not path.exists():
-        raise ConfigError(f"{path}: INPUT: does not exist; give image files, folders or a capture manifest")
+    state, suffixes = _state(path), (*IMAGE_SUFFIXES, MANIFEST_SUFFIX)
+    if path.suffix.lower() not in suffixes and state in ("file", _PIPE):
+        raise ConfigError(
+            f"{given}: INPUT: of an unknown kind; give a folder or a file that ends in {', '.join(suffixes)}"
+        )
+    if state != "file":
+        raise ConfigError(f"{path}: INPUT: {state}; give image files, folders or a capture manifest")
     if path.suffix.lower() == MANIFEST_SUFFIX:
-        root = given.parent.resolve()
-        for frame in read_manifest(path, camera or None):
-            yield Source(frame.image, given.parent / frame.image, root, frame.robot_pose)
-    elif given.suffix.lower() in IMAGE_SUFFIXES:
-        yield Source(_text(given.name), given, given.parent.resolve())
+        yield from _recorded(path, camera or None, passed)
     else:
-        known = ", ".join((*IMAGE_SUFFIXES, MANIFEST_SUFFIX))
-        raise ConfigError(f"{given}: INPUT: of an unknown kind; give a folder or a file that ends in {known}")
+        yield from _pages(_text(given.name), given, given.parent.resolve())
 
 
-def _walk(folder: Path) -> Iterator[Path]:
-    """Regular files below a folder that end like images. Linked folders are followed, each real folder once."""
+def _recorded(manifest: Path, camera: str | None, passed: Counter[str]) -> Iterator[Source]:
+    """The frames of a manifest: one a record, so what a file holds behind its first page is passed over."""
+    root = manifest.parent.resolve()
+    for frame in read_manifest(manifest, camera):
+        path = manifest.parent / frame.image
+        pages = list(_pages(frame.image, path, root))
+        passed["pages behind the first"] += len(pages) - 1
+        yield replace(pages[0], robot_pose=frame.robot_pose)
+
+
+def _pages(name: str, path: Path, root: Path) -> Iterator[Source]:
+    """The frames of a file."""
+    places = images.pages(path) if path.suffix.lower() in _STACKS else [0]
+    for number, place in enumerate(places, start=1):
+        yield Source(name if number == 1 else f"{name}#{number}", path, root, directory=place)
+
+
+def _state(path: Path) -> str:
+    """``folder``, ``file``, or what is in the way of reading."""
+    try:
+        mode = path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError, ValueError):
+        return "does not exist"
+    except OSError as error:  # a loop of links, a name that is too long, no permission
+        return f"cannot be read ({error.strerror})"
+    if stat.S_ISDIR(mode):
+        return "folder"
+    return "file" if stat.S_ISREG(mode) else _PIPE
+
+
+def _walk(folder: Path, passed: Counter[str]) -> Iterator[Path]:
+    """Files below a folder that end like images. Linked folders are followed, each real folder once.
+
+    A link to nothing is a frame that cannot be read; pipes and devices are none.
+    """
 
     def refuse(error: OSError) -> None:
         raise ConfigError(f"{error.filename}: INPUT: {error.strerror}; make the folder readable")
@@ -104,9 +181,14 @@ def _walk(folder: Path) -> Iterator[Path]:
         folders[:] = sorted(f for f in folders if not f.startswith("."))
         for file in files:
             path = Path(base, file)
-            if file.startswith(".") or path.suffix.lower() not in IMAGE_SUFFIXES:
+            suffix = path.suffix.lower()
+            if file.startswith(".") or suffix not in _OTHERS.union(IMAGE_SUFFIXES):
                 continue
-            if path.is_file() or not path.exists():  # a dangling link is a frame that cannot be read; a pipe is none
+            if suffix in _OTHERS:
+                passed[suffix] += 1
+            elif _state(path) == _PIPE:
+                passed["pipes or devices"] += 1
+            else:
                 yield path
 
 

@@ -1,34 +1,52 @@
 """The rows of a run, safe against being killed at any moment.
 
-While a run goes on, each finished batch is appended to a journal beside the output (``poses.csv.partial``): one JSON
-line a frame with its rows and its detections, a batch in one write, then fsync. The first line says what the rows were
-made from. At the end the tables are written whole and moved into place, what they were made from is kept beside them
-(``poses.csv.run.json``), and the journal is removed. A killed run therefore leaves the journal, with at most its last
-line torn; a resumed one drops that line and goes on. A finished table is resumed by turning it into a journal again.
+While a run goes on, each finished batch is appended to a journal beside the output (``poses.csv.partial``): one line a
+frame with its rows, its detections, and the size and time of its file, a batch in one write, then fsync. The first line
+says what the rows were made from. At the end the tables are written whole and moved into place, what they were made
+from and the frames' files are kept beside them (``poses.csv.run.json``), and the journal is removed. A killed run
+therefore leaves the journal, with at most its last line torn; a resumed one drops that line and goes on. A finished
+table is resumed by turning it into a journal again.
+
+A resumed run keeps the rows of a frame whose file is as it was. It does again what could not be read or had another
+size, what was changed since, and what a damaged line of the journal held.
 """
 
-import contextlib
-import errno
 import json
-import os
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from io import FileIO
-from itertools import accumulate
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO
+from typing import Annotated, Any
 
-from filelock import lock_descriptor
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
+from torchpose.config import parse_json, read_text
 from torchpose.errors import ConfigError
+from torchpose.io.cells import row_check
+from torchpose.io.journal import Journal, Place
 from torchpose.io.misfits import Misfits
 from torchpose.io.rows import DETECTION_SCHEMA, NEWER, Row, Schema
+from torchpose.io.whole_run import WholeRun
 from torchpose.io.writers import atomic_path, check_table_path, read_rows, write_rows
+from torchpose.results import Status
 
 _UNSAID = {"--instances": 1}  # in what older runs were made from
+_FILES = "files"  # in what is kept beside a finished table, with the frames' names
+_MOST_ORIGIN = 256 << 20  # bytes of it (convention): three million frames
 Origin = Mapping[str, Any]
 """What rows are made from (versions, digests of the files, inputs), as JSON values by name."""
+Stamp = Annotated[list[int], Field(min_length=2, max_length=2)]
+"""Size of a frame's file in bytes and its time of change in ns: another picture under the same name has another one."""
+_STAMPS = TypeAdapter(dict[str, Stamp | None])
+_AGAIN = {status.name.lower() for status in (Status.UNREADABLE, Status.WRONG_SIZE)}
+
+
+def stamp_of(path: Path) -> Stamp | None:
+    """The stamp of a file; None where there is none."""
+    try:
+        found = path.stat()
+    except (OSError, ValueError):
+        return None
+    return [found.st_size, found.st_mtime_ns]
 
 
 class _Record(BaseModel):
@@ -37,6 +55,7 @@ class _Record(BaseModel):
     frame: str
     rows: Annotated[list[dict[str, Any]], Field(min_length=1)]
     detections: list[dict[str, Any]]
+    file: Stamp | None = None
 
 
 class ResultStore:
@@ -49,6 +68,8 @@ class ResultStore:
         targets: that every frame has a row of in ``out``, or several.
         origin: what the rows are made from; a resumed run must agree.
         resume: whether to keep the frames that an earlier run finished, instead of starting over.
+        files: stamps of the frames that there are now, by name. Of an earlier run's frames that are not among them all
+            rows are kept, of the others those that were made from the same file.
 
     Attributes:
         counts: number of rows by status, those of an earlier run included.
@@ -56,6 +77,8 @@ class ResultStore:
         crowded: frames that show more copies of a target than they have rows.
         most: by target, the most copies of it that one of these frames shows.
         misfits: by target, what its rows say together of target and camera file.
+        whole_run: what only all rows together show.
+        damaged: lines of the journal that were not as they had been written.
 
     Raises:
         ConfigError: a place cannot be written, another run is writing there, or there is an earlier run that cannot be
@@ -63,38 +86,57 @@ class ResultStore:
     """
 
     def __init__(
-        self, out: Path, detections: Path | None, *, schema: Schema, targets: int, origin: Origin, resume: bool
+        self,
+        out: Path,
+        detections: Path | None,
+        *,
+        schema: Schema,
+        targets: int,
+        origin: Origin,
+        resume: bool,
+        files: Mapping[str, Stamp | None] | None = None,
     ) -> None:
         check_table_path(out, "--out")
         if detections is not None:
             check_table_path(detections, "--detections")
             if detections.resolve() == out.resolve():
                 raise ConfigError(f"{detections}: --detections: is the file of --out too; give another")
+        self.damaged = 0
+        self._out, self._detections = out, detections
+        self._schema, self._targets = schema, targets
+        self._origin = json.loads(json.dumps(origin))
+        self._files = dict(files or {})
+        self._origin_path = out.with_name(out.name + ".run.json")
+        self._forget()
+        try:
+            self._journal = Journal(out.with_name(out.name + ".partial"))
+            try:
+                self._begin(resume)
+            except BaseException:
+                self._journal.remove() if self._journal.empty else self._journal.close()
+                raise
+        except OSError as error:
+            raise self._unwritable(error) from None
+
+    def _forget(self) -> None:
+        """No frame is done."""
         self.counts: Counter[str] = Counter()
         self.unreadable: dict[str, str] = {}
         self.crowded: set[str] = set()
         self.most: dict[str, int] = {}
         self.misfits: dict[str, Misfits] = {}
-        self._out, self._detections = out, detections
-        self._schema, self._targets = schema, targets
-        self._origin = json.loads(json.dumps(origin))
-        self._journal_path = out.with_name(out.name + ".partial")
-        self._origin_path = out.with_name(out.name + ".run.json")
-        self._places: dict[str, tuple[int, int]] = {}  # frame -> offset and length of its line in the journal
-        resumable = resume and self._journal_path.exists()
-        finished = list(self._finished()) if resume and not resumable and out.exists() else []
-        with contextlib.ExitStack() as stack:
-            try:
-                # unbuffered: what a full disk refuses must not be tried again when the file is closed
-                self._journal: FileIO = stack.enter_context(self._journal_path.open("a+b", buffering=0))
-                self._lock()
-                if not (resumable and self._load()):
-                    self._journal.truncate(0)
-                    self._write([{"origin": self._origin}])
-                    self.append(finished)
-            except OSError as error:
-                raise self._unwritable(error) from None
-            stack.pop_all()  # nothing went wrong: it stays open
+        self.whole_run = WholeRun()
+        self._places: dict[str, Place] = {}
+        self._made_from: dict[str, Stamp | None] = {}
+
+    def _begin(self, resume: bool) -> None:
+        """Takes over what an earlier run has left, or starts over."""
+        if resume and self._load():
+            return
+        finished = list(self._finished()) if resume and self._out.exists() else []
+        self._journal.clear()
+        self._journal.append([{"origin": self._origin}])
+        self._keep(finished)
 
     def __contains__(self, frame: str) -> bool:
         return frame in self._places
@@ -111,12 +153,17 @@ class ResultStore:
         Raises:
             ConfigError: the disk is full or gone; what was appended before is safe.
         """
+        self._keep([record | {"file": self._files.get(record["frame"])} for record in records])
+
+    def _keep(self, records: Sequence[Row]) -> None:
+        """Appends records that say which files they are of."""
         try:
-            places = self._write(records)
+            places = self._journal.append(records)
         except OSError as error:
             raise self._unwritable(error) from None
         for record, place in zip(records, places, strict=True):
-            self._note(record, place)
+            self._places[record["frame"]] = place
+            self._note(record)
 
     def finish(self, order: Sequence[str]) -> None:
         """Writes the tables and removes the journal.
@@ -130,10 +177,10 @@ class ResultStore:
             rows = (row for record in self._records(frames) for row in record["detections"])
             write_rows(self._detections, rows, DETECTION_SCHEMA)
         write_rows(self._out, (row for record in self._records(frames) for row in record["rows"]), self._schema)
+        files = {frame: self._made_from[frame] for frame in frames if self._made_from[frame] is not None}
         with atomic_path(self._origin_path) as path:
-            path.write_text(json.dumps(self._origin, indent=2) + "\n", encoding="utf-8")
-        self.close()
-        self._journal_path.unlink()
+            path.write_text(json.dumps(self._origin | ({_FILES: files} if files else {}), indent=1) + "\n")
+        self._journal.remove()
 
     def close(self) -> None:
         """Leaves the journal for a later run with ``resume``."""
@@ -141,87 +188,91 @@ class ResultStore:
 
     def _unwritable(self, error: OSError) -> ConfigError:
         return ConfigError(
-            f"{self._journal_path}: --out: cannot be written ({error.strerror}); free some space or choose another "
+            f"{self._out}.partial: --out: cannot be written ({error.strerror}); free some space or choose another "
             "place, with --resume to keep what is there"
         )
 
-    def _lock(self) -> None:
-        """Keeps a second run from writing the same journal; the system releases it however the run ends."""
-        try:
-            locked = lock_descriptor(self._journal.fileno(), blocking=False)
-        except OSError as error:
-            if error.errno != errno.ENOSYS:
-                raise
-            return  # a file system without locks, where this guard is missing
-        if not locked:
-            raise ConfigError(
-                f"{self._journal_path}: --out: another run is writing it; wait for it or choose another file"
-            )
-
-    def _reader(self) -> BinaryIO:
-        """The journal to read from, by its own descriptor: elsewhere than on POSIX the lock keeps others out."""
-        self._journal.seek(0)
-        return open(self._journal.fileno(), "rb", closefd=False)
-
-    def _write(self, records: Sequence[Row]) -> list[tuple[int, int]]:
-        lines = [json.dumps(record, allow_nan=False).encode() + b"\n" for record in records]
-        starts = accumulate(map(len, lines), initial=self._journal.seek(0, os.SEEK_END))
-        rest = memoryview(b"".join(lines))
-        while rest:
-            rest = rest[self._journal.write(rest) :]
-        os.fsync(self._journal.fileno())
-        return [(start, len(line)) for start, line in zip(starts, lines, strict=False)]
-
-    def _note(self, record: Row, place: tuple[int, int]) -> None:
-        self._places[record["frame"]] = place
+    def _note(self, record: Row) -> None:
+        """Counts what a record says."""
+        self._made_from[record["frame"]] = record["file"]
         self.counts.update(row["status"] for row in record["rows"])
         if record["rows"][0]["status"] == "unreadable":
             self.unreadable[record["frame"]] = record["rows"][0]["reason"]
         rows = Counter(row["target"] for row in record["rows"])
         for row in record["rows"]:
             self.misfits.setdefault(row["target"], Misfits()).add(row)
+            self.whole_run.add(row)
             if (row.get("copies") or 0) > rows[row["target"]]:
                 self.crowded.add(record["frame"])
                 self.most[row["target"]] = max(self.most.get(row["target"], 0), row["copies"])
 
     def _load(self) -> bool:
-        """Reads the journal of a killed run and drops a torn end; False if not even its first line is whole."""
-        offset = 0
-        with self._reader() as lines:
-            for line in lines:
-                if not line.endswith(b"\n"):
-                    break
-                try:
-                    record = json.loads(line)
-                except ValueError:  # a crash of the machine may leave blocks of zeros
-                    break
-                if offset == 0:
-                    self._check_origin(record.get("origin") if isinstance(record, dict) else None, self._journal_path)
-                else:
-                    try:
-                        self._note(_Record.model_validate(record).model_dump(), (offset, len(line)))
-                    except (ValidationError, KeyError, TypeError, ValueError):
-                        raise self._foreign(self._journal_path) from None
-                offset += len(line)
-        self._journal.truncate(offset)
-        return offset > 0
+        """Reads the journal of a killed run; False if not even its first line is whole."""
+        check, lines = self._record_check(), self._journal.lines()
+        _, head = next(lines, (None, {}))
+        if head == {}:
+            return False
+        self._check_origin(head and head.get("origin"), self._journal.path)
+        again = False  # whether a frame has several lines, of which the last counts
+        for place, line in lines:
+            if line is None:
+                self.damaged += 1
+                continue
+            try:
+                record = check(line)
+            except ValueError:
+                raise self._foreign(self._journal.path) from None
+            again = again or record["frame"] in self._places
+            if self._is_fresh(record):
+                self._places[record["frame"]] = place
+                self._note(record)
+            else:
+                self._places.pop(record["frame"], None)
+        if again:
+            places = self._places
+            self._forget()
+            self._places = places
+            for record in self._journal.read(list(places.values())):
+                self._note(record)
+        return True
+
+    def _is_fresh(self, record: Row) -> bool:
+        """Whether the rows of an earlier run are those that this one would make."""
+        if record["frame"] not in self._files:
+            return True
+        known = record["file"]
+        return known == self._files[record["frame"]] and not any(row["status"] in _AGAIN for row in record["rows"])
+
+    def _record_check(self) -> Callable[[Any], Row]:
+        """Refuses, by a ValueError, records that `append` did not write."""
+        rows, detections = row_check(self._schema), row_check(DETECTION_SCHEMA)
+
+        def check(line: Any) -> Row:
+            try:
+                record = _Record.model_validate(line, strict=True).model_dump()
+            except ValidationError:
+                raise ValueError("no record") from None
+            for part, checked in (("rows", rows), ("detections", detections)):
+                record[part] = [checked(row) for row in record[part]]
+                if any(row["frame"] != record["frame"] for row in record[part]):
+                    raise ValueError("rows of another frame")
+            return record
+
+        return check
 
     def _records(self, frames: Sequence[str]) -> Iterator[Row]:
-        with self._reader() as journal:
-            for frame in frames:
-                offset, length = self._places[frame]
-                journal.seek(offset)
-                record = json.loads(journal.read(length))
-                for part, schema in (("rows", self._schema), ("detections", DETECTION_SCHEMA)):
-                    newer = {column: cell for column, cell in NEWER.items() if column in schema}
-                    record[part] = [newer | row for row in record[part]]
-                yield record
+        for record in self._journal.read([self._places[frame] for frame in frames]):
+            for part, schema in (("rows", self._schema), ("detections", DETECTION_SCHEMA)):
+                newer = {column: cell for column, cell in NEWER.items() if column in schema}
+                record[part] = [newer | row for row in record[part]]
+            yield record
 
     def _finished(self) -> Iterator[Row]:
         """Records of the tables of a run that was completed."""
         try:
-            origin = json.loads(self._origin_path.read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+            origin = parse_json(read_text(self._origin_path, most=_MOST_ORIGIN))
+            files = _STAMPS.validate_python(origin.get(_FILES, {}), strict=True)
+        except (ConfigError, ValueError, AttributeError):
             raise ConfigError(
                 f"{self._origin_path}: --resume: missing or damaged, so what {self._out.name} was made from is not "
                 "known; run without --resume"
@@ -229,13 +280,14 @@ class ResultStore:
         self._check_origin(origin, self._out)
         records: dict[str, Row] = {}
         for row in read_rows(self._out, self._schema):
-            record = records.setdefault(row["frame"], {"frame": row["frame"], "rows": [], "detections": []})
-            record["rows"].append(row)
+            empty: Row = {"frame": row["frame"], "rows": [], "detections": [], "file": files.get(row["frame"])}
+            records.setdefault(row["frame"], empty)["rows"].append(row)
         if self._detections is not None:
             for row in read_rows(self._detections, DETECTION_SCHEMA):
                 if row["frame"] in records:
                     records[row["frame"]]["detections"].append(row)
-        yield from (r for r in records.values() if len({row["target"] for row in r["rows"]}) == self._targets)
+        whole = (r for r in records.values() if len({row["target"] for row in r["rows"]}) == self._targets)
+        yield from (record for record in whole if self._is_fresh(record))
 
     def _foreign(self, path: Path) -> ConfigError:
         return ConfigError(f"{path}: --resume: not written by torchpose; run without --resume")

@@ -5,17 +5,47 @@ import io
 import itertools
 import os
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from jaxtyping import Float
+from pydantic import TypeAdapter, ValidationError
 from torch import Tensor
 
-from torchpose.config import format_number, read_text, write_text
+from torchpose.config import MOST_TABLE_BYTES, format_number, read_text, shown, within, write_text
+from torchpose.config.kinds import Length, Radians, Word
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
+from torchpose.io.cells import FileName
 
 NAMES = ("frame", "target")
 POSE = ("tx", "ty", "tz", "rx", "ry", "rz")
+
+
+@dataclass(frozen=True)
+class _Column:
+    """What the cells of a column are: ``cells`` reads a list of text."""
+
+    meant: str
+    cells: Any  # TypeAdapter
+
+    def read(self, name: str, cells: tuple[str, ...]) -> list[Any]:
+        try:
+            values: list[Any] = self.cells.validate_python(list(cells))
+            return values
+        except ValidationError as caught:
+            line = caught.errors()[0]["loc"][0]
+        assert isinstance(line, int)  # the place in the list
+        raise ConfigError(f"{name}: {shown(cells[line])} in line {line + 2} is not {self.meant}; write one")
+
+
+_NUMBER = _Column("a number", TypeAdapter(list[float]))  # NaN and infinity too: a bound that does not exist
+_COLUMNS = {
+    "frame": _Column("the name of a file", TypeAdapter(list[FileName])),
+    "target": _Column("a name", TypeAdapter(list[Word])),
+    **dict.fromkeys(POSE[:3], _Column("a number, in mm", TypeAdapter(list[Length]))),
+    **dict.fromkeys(POSE[3:], _Column("a number, in rad", TypeAdapter(list[Radians]))),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +99,10 @@ def read_truth(path: str | os.PathLike[str]) -> Truth:
         ConfigError: the file is missing or not text, a column is missing or given twice, a row has another number of
             fields than the header, or a field is not a number.
     """
-    header, *rows = csv.reader(io.StringIO(read_text(path)))
+    try:
+        header, *rows = csv.reader(io.StringIO(read_text(path, most=MOST_TABLE_BYTES)))
+    except csv.Error as error:
+        raise ConfigError(f"{path}: file: is no table ({error}); give a truth file") from None
     for name in (*NAMES, *POSE):
         if name not in header:
             raise ConfigError(f"{path}: {name}: column is missing; the header needs {','.join((*NAMES, *POSE))}")
@@ -80,16 +113,9 @@ def read_truth(path: str | os.PathLike[str]) -> Truth:
         if len(row) != len(header):
             raise ConfigError(f"{path}: line {line}: has {len(row)} fields; give {len(header)}, as in the header")
     cells = dict(zip(header, zip(*rows, strict=True) if rows else itertools.repeat(()), strict=False))
-    columns = {name: _numbers(path, name, cells[name]) for name in header if name not in NAMES}
-    pose = torch.stack([columns.pop(name) for name in POSE], 1)
-    return Truth(list(cells["frame"]), list(cells["target"]), pose[:, :3], pose[:, 3:], columns)
-
-
-def _numbers(path: str | os.PathLike[str], name: str, cells: tuple[str, ...]) -> Tensor:
-    numbers = []
-    for line, cell in enumerate(cells, 2):
-        try:
-            numbers.append(float(cell))
-        except ValueError:
-            raise ConfigError(f"{path}: {name}: {cell!r} in line {line} is not a number; write one") from None
-    return torch.tensor(numbers, dtype=torch.float64)
+    with within(f"{path}: "):
+        columns = {name: _COLUMNS.get(name, _NUMBER).read(name, cells[name]) for name in header}
+    frame, target = columns.pop("frame"), columns.pop("target")
+    numbers = {name: torch.tensor(column, dtype=torch.float64) for name, column in columns.items()}
+    pose = torch.stack([numbers.pop(name) for name in POSE], 1)
+    return Truth(frame, target, pose[:, :3], pose[:, 3:], numbers)

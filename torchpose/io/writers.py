@@ -2,16 +2,24 @@
 
 import contextlib
 import csv
+import hashlib
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 
+from torchpose.config import check_regular, parse_json
 from torchpose.errors import ConfigError
-from torchpose.io.rows import NEWER, Row, Schema
+from torchpose.io.cells import CellError, row_check
+from torchpose.io.rows import NEWER, POSE, STD, Row, Schema
 
 TABLE_SUFFIXES = (".csv", ".jsonl", ".parquet")
+_WITH_POSE = ("ok", "ambiguous")
+# what the readers raise of files that are damaged: text that is none, another nesting, sizes that no memory holds
+_UNREADABLE = (ValueError, KeyError, TypeError, NotImplementedError, OSError, MemoryError, csv.Error)
+_LONG_NAME = 250  # bytes; file systems end at 255
+_LONGEST_LINE = 1 << 20  # bytes (convention): a row with the covariances of thousands of markers
 _ROW_GROUP = 4096
 
 
@@ -23,7 +31,7 @@ def check_table_path(path: Path, option: str) -> None:
         raise ConfigError(f"{path}: {option}: is a folder; give a file")
     if not path.parent.is_dir():
         raise ConfigError(f"{path}: {option}: folder {path.parent} does not exist; create it or choose another")
-    probe = _temporary(path)
+    probe = _temporary(path.with_name(f"{path.name}.run.json"))  # the longest name of what a run writes
     try:
         probe.touch()
         probe.unlink()
@@ -49,32 +57,58 @@ def read_rows(path: Path, schema: Schema) -> Iterator[Row]:
     Raises:
         ConfigError: the file is not such a table.
     """
-    columns = _cells(schema) if path.suffix.lower() == ".csv" else list(schema)
+    text = path.suffix.lower() == ".csv"
+    columns = _cells(schema) if text else list(schema)
+    check = row_check({column: schema[column] for column in columns}, text=text)
     try:
         for row in _READERS[path.suffix.lower()](path):
             if list(row) != [column for column in columns if column in row or column not in NEWER]:
                 raise ValueError("columns")
-            cells = {column: row[column] if column in row else NEWER[column] for column in columns}
-            yield {column: None if cell is None else schema[column](cell) for column, cell in cells.items()}
-    except (ValueError, KeyError, TypeError, OSError, csv.Error):
+            yield check(row)
+    except _UNREADABLE:
         raise ConfigError(
             f"{path}: --resume: not a table that torchpose wrote for these options; run without --resume"
         ) from None
 
 
-def read_table(path: Path) -> list[Row]:
-    """Rows of the POSES table of a command; the cells of a CSV are text, None where empty.
+def read_table(path: Path, schema: Schema, needed: Sequence[str]) -> list[Row]:
+    """Rows of the POSES table of a command, with the columns of the schema; None where there is none.
+
+    Args:
+        path: of the table.
+        schema: which columns are wanted.
+        needed: of these, those that the table must have.
 
     Raises:
-        ConfigError: the file cannot be read or is of another kind.
+        ConfigError: the file cannot be read, is of another kind, or has a cell of another kind.
     """
     if path.suffix not in _READERS:
         raise ConfigError(f"{path}: POSES: of an unknown type; give .csv, .jsonl or .parquet")
+    check, number = row_check(schema, text=path.suffix == ".csv"), 0
+    rows: list[Row] = []
     try:
-        return list(_READERS[path.suffix](path))
-    except (OSError, ValueError, TypeError) as error:
-        detail = getattr(error, "strerror", None) or str(error).splitlines()[0]
+        check_regular(path)
+        for number, row in enumerate(_READERS[path.suffix](path), 1):  # noqa: B007  # counts on behind the loop
+            if missing := [name for name in needed if name not in row]:
+                raise ConfigError(f"{path}: {missing[0]}: column is missing; give what torchpose estimate wrote")
+            rows.append(check(row))
+            _check_whole(rows[-1])
+    except ConfigError as error:
+        raise ConfigError(str(error).replace(": file: ", ": POSES: ", 1)) from None
+    except CellError as error:
+        raise ConfigError(f"{path}: row {number}: {error}") from None
+    except _UNREADABLE as error:
+        detail = getattr(error, "strerror", None) or (str(error).splitlines() or [type(error).__name__])[0]
         raise ConfigError(f"{path}: POSES: cannot be read ({detail}); give what torchpose estimate wrote") from None
+    return rows
+
+
+def _check_whole(row: Row) -> None:
+    """Raises CellError for half a pose, and for a status that promises one where there is none."""
+    for names in (POSE, STD):
+        empty = [name for name in names if row.get(name) is None]
+        if empty and (len(empty) < len(names) or (row.get("status") in _WITH_POSE and empty[0] in row)):
+            raise CellError(f"{empty[0]}: is empty; a pose has all of {', '.join(names)}")
 
 
 @contextlib.contextmanager
@@ -101,7 +135,9 @@ def atomic_path(
 
 
 def _temporary(path: Path) -> Path:
-    return path.with_name(f".{path.name}.tmp")
+    """A hidden name beside ``path``; a long one is cut, as there must be room for more."""
+    stem = path.name if len(os.fsencode(path.name)) < _LONG_NAME else hashlib.sha256(os.fsencode(path.name)).hexdigest()
+    return path.with_name(f".{stem}.tmp")
 
 
 def _cells(schema: Schema) -> list[str]:
@@ -132,9 +168,11 @@ def _write_jsonl(path: Path, rows: Iterable[Row], schema: Schema) -> None:
 
 
 def _read_jsonl(path: Path) -> Iterator[Row]:
-    with path.open(encoding="utf-8") as file:
-        for line in file:
-            if not isinstance(row := json.loads(line), dict):
+    with path.open("rb") as file:
+        while line := file.readline(_LONGEST_LINE + 1):
+            if len(line) > _LONGEST_LINE:
+                raise ValueError(f"a line has more than {_LONGEST_LINE} bytes")
+            if not isinstance(row := parse_json(line), dict):
                 raise ValueError("a line is not an object")
             yield row
 
@@ -153,7 +191,8 @@ def _write_parquet(path: Path, rows: Iterable[Row], schema: Schema) -> None:
     plain = {str: pa.string(), int: pa.int64(), float: number}
     arrow = pa.schema({c: nested[c] if kind is list else plain[kind] for c, kind in schema.items()})
     remaining = iter(rows)
-    with pq.ParquetWriter(path, arrow) as writer:
+    # opened here: pyarrow takes no path whose bytes are not UTF-8
+    with path.open("wb") as file, pq.ParquetWriter(file, arrow) as writer:
         while group := list(islice(remaining, _ROW_GROUP)):
             writer.write_table(pa.Table.from_pylist(group, arrow))
 
@@ -161,7 +200,7 @@ def _write_parquet(path: Path, rows: Iterable[Row], schema: Schema) -> None:
 def _read_parquet(path: Path) -> Iterator[Row]:
     import pyarrow.parquet as pq
 
-    with pq.ParquetFile(path) as file:
+    with path.open("rb") as opened, pq.ParquetFile(opened) as file:
         for group in file.iter_batches(_ROW_GROUP):
             yield from group.to_pylist()
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchpose.camera import Camera
+from torchpose.camera.plausible import check_pinhole
 from torchpose.kernels import LEAST, compiled, padded
 from torchpose.pnp.candidates import Candidates, expect, expect_pixels
 from torchpose.pnp.dlt import dlt
@@ -86,7 +87,7 @@ def solve(
     Raises:
         ValueError: shapes do not fit, or an unknown method.
         PnPError: with ``raise_on_failure``.
-        ConfigError: ``compile`` without a C++ compiler.
+        ConfigError: ``compile`` without a C++ compiler; a matrix that cannot be that of the points (`check_pinhole`).
     """
     inputs, starts = _checked(
         Inputs(object_points, image_points, camera, sigma_px, covariances, weights, mask, huber), method, initial
@@ -120,6 +121,8 @@ def _checked(
     for name, (value, shape) in shapes.items():
         if value is not None:
             expect(name, value, shape, (batch, *shape))
+    if isinstance(camera, Tensor):
+        check_pinhole(camera, pixels, given.mask)
     if method not in _LEAST:
         raise ValueError(f"method is {method!r}; choose one of {', '.join(_LEAST)}")
     if initial is not None:

@@ -1,5 +1,6 @@
 """Stage: one pose a target and frame from its identified markers, with covariance and status."""
 
+from torchpose.pose.boards import right_way_round, still_open
 from torchpose.pose.centers import common_center, compensate, raw_centers
 from torchpose.pose.copies import best_copies
 from torchpose.pose.covariance import pose_covariance
@@ -31,6 +32,8 @@ __all__ = [
     "outcome",
     "pose_covariance",
     "raw_centers",
+    "right_way_round",
     "shape_chi2",
     "solve_poses",
+    "still_open",
 ]

@@ -100,6 +100,9 @@ def gather_evidence(
     row, marker = mask.nonzero().unbind(-1)
     seen = rings[ring[row, marker]]
     center, covariance = locate(seen.outer, seen.inner, markers.radii[row, marker])
+    disc = markers.radii[row, marker, 1] < 0
+    center = torch.where(disc[:, None], seen.outer.params[:, :2], center)
+    covariance = torch.where(disc[:, None, None], seen.outer.center_covariance, covariance)
 
     def laid_out(values: Tensor, fill: float) -> Tensor:
         empty = torch.full((*ring.shape, *values.shape[1:]), fill, dtype=torch.float64, device=ring.device)

@@ -118,8 +118,10 @@ def _print(modes: _Modes) -> _Family:
     """A print bends by no less than it stretches: across it the variance of the places along it counts, and more."""
     places, gain = modes.by[..., : -CAMERA - 1], modes.by[..., -CAMERA - 1 : -CAMERA]
     values = _values(_PRINT, modes, _COARSE).square()
+    of_places = torch.cartesian_prod(values, values).unbind(-1)
+    parts = tuple(zip((places, places[..., 2::3]), of_places, strict=True))
+    evidence, weight, chi2 = _weighed(modes, parts, (gain, values))
     variances = torch.cartesian_prod(values, values, values).unbind(-1)
-    evidence, weight, chi2 = _weighed(modes, tuple(zip((places, places[..., 2::3], gain), variances, strict=True)))
     every, bent, of_gain = ((weight * v).sum(-1, keepdim=True) for v in variances)
     none, place = torch.zeros_like(modes.by[:, 0, -CAMERA:]), torch.cat([every, every, every + bent], -1)
     deviation = torch.cat([place.repeat(1, places.shape[-1] // 3), of_gain, none], -1).sqrt()
@@ -142,29 +144,43 @@ def _scatter(modes: _Modes) -> _Family:
     return _Family(_mean(likelihood), torch.zeros_like(modes.by[:, 0]), mean, square[:, 0] / mean)
 
 
-def _weighed(modes: _Modes, parts: tuple[tuple[Tensor, Tensor], ...]) -> tuple[Tensor, Tensor, Tensor]:
-    """Log evidence (N,) of unknowns with derivatives (N, r, e) and G variances each, their weights (N, G), and the mean
-    chi-squared (N,).
+_Part = tuple[Tensor, Tensor]
+"""Derivatives (N, r, e) by some of the further unknowns, and variances that each of these may have."""
+
+
+def _weighed(modes: _Modes, parts: tuple[_Part, ...], one: _Part | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    """Log evidence (N,) of unknowns with G variances each, their weights (N, G), and the mean chi-squared (N,).
+
+    With ``one`` more unknown (e = 1) of V variances, each of the G is combined with each of these, which then count
+    faster: its part is of rank one, and costs next to nothing (Sherman and Morrison 1950).
     """
     rows, r = modes.residual.shape
     some = max(1, _AT_ONCE // (len(parts[0][1]) * r * r))
     likelihood, square = (
         torch.cat(x)
-        for x in zip(*(_likelihood(modes, parts, slice(k, k + some)) for k in range(0, rows, some)), strict=True)
+        for x in zip(*(_likelihood(modes, parts, one, slice(k, k + some)) for k in range(0, rows, some)), strict=True)
     )
     weight = torch.softmax(likelihood, -1)
     return _mean(likelihood), weight, (weight * square).sum(-1)
 
 
-def _likelihood(modes: _Modes, parts: tuple[tuple[Tensor, Tensor], ...], rows: slice) -> tuple[Tensor, Tensor]:
+def _likelihood(modes: _Modes, parts: tuple[_Part, ...], one: _Part | None, rows: slice) -> tuple[Tensor, Tensor]:
     """Logarithm (n, G) under each of the variances, and chi-squared (n, G), of some rows."""
-    spread = torch.eye(modes.residual.shape[-1], dtype=modes.by.dtype, device=modes.by.device)
+    residual = modes.residual[rows, None, :, None]
+    spread = torch.eye(residual.shape[-2], dtype=modes.by.dtype, device=modes.by.device)
     for by, variance in parts:
         spread = spread + variance[:, None, None] * (by[rows] @ by[rows].mT)[:, None]
     factor = torch.linalg.cholesky(spread)
-    whitened = torch.linalg.solve_triangular(factor, modes.residual[rows, None, :, None], upper=False)
-    square = whitened.square().sum((-1, -2))
-    return -0.5 * square - factor.diagonal(dim1=-2, dim2=-1).log().sum(-1), square
+    logarithm = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    columns = residual if one is None else torch.cat([residual, one[0][rows, None]], -1)
+    whitened = torch.linalg.solve_triangular(factor, columns.expand(*factor.shape[:-1], -1), upper=False)
+    square = whitened[..., 0].square().sum(-1)
+    if one is not None:
+        held = 1 + one[1] * whitened[..., 1].square().sum(-1, keepdim=True)
+        pull = whitened.prod(-1).sum(-1, keepdim=True)
+        square = (square[..., None] - one[1] * pull.square() / held).flatten(-2)
+        logarithm = (logarithm[..., None] + 0.5 * held.log()).flatten(-2)
+    return -0.5 * square - logarithm, square
 
 
 def _values(ends: tuple[float, float], modes: _Modes, count: int = _GRID) -> Tensor:

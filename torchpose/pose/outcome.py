@@ -125,7 +125,9 @@ def _detections(scene: Scene, found: Found, mask: Tensor) -> Detections:
     center, covariance = raw_centers(scene.camera, evidence.center[row, marker], evidence.covariance[row, marker])
     ids = scene.table.ids[target, marker]
     number = torch.zeros_like(row) if len(mask) == scene.groups else row
-    return Detections(scene.frame[row], target, number, ids, center, covariance, ring.outer_raw, ring.inner_raw)
+    disc = scene.table.radii[target, marker, 1] < 0
+    inner = torch.where(disc[:, None], torch.nan, ring.inner_raw)
+    return Detections(scene.frame[row], target, number, ids, center, covariance, ring.outer_raw, inner)
 
 
 def _awarded(scene: Scene, support: Tensor, mask: Tensor, ring: Tensor, rings: int) -> tuple[Tensor, Tensor]:

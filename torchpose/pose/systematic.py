@@ -180,7 +180,7 @@ class _Joint(NamedTuple):
         """
         columns = torch.cat([own, by_print], -1)
         matrix, right = _assembled(normals, columns)
-        by_lens = (columns.mT @ (normals.information @ by_camera)).sum(1)
+        by_lens = columns.flatten(1, 2).mT @ (normals.information @ by_camera).flatten(1, 2)
         k = own.shape[-1]
         alone, known = scaled_inverse(matrix[:, :k, :k])
         shift = alone @ matrix[:, :k, k:]  # of the own unknowns, found without the numbers, by these
@@ -309,8 +309,10 @@ def _remaining(normals: MarkerNormals, known: Tensor, excess: Tensor, count: int
 
 def _assembled(normals: MarkerNormals, columns: Tensor) -> tuple[Tensor, Tensor]:
     """Normal equations (N, k, k), (N, k) of unknowns with these columns (N, M, n, k)."""
-    matrix = (columns.mT @ (normals.information @ columns)).sum(1)
-    return matrix, (columns.mT @ normals.right[..., None]).sum(1)[..., 0]
+    # all markers in one product: with many of them single ones are large together
+    every = columns.flatten(1, 2).mT
+    matrix = every @ (normals.information @ columns).flatten(1, 2)
+    return matrix, (every @ normals.right.flatten(1)[..., None])[..., 0]
 
 
 def _among(by: Tensor, n: int) -> Tensor:
@@ -338,7 +340,8 @@ def _rim_jacobian(evidence: Evidence, R: Tensor, t: Tensor) -> tuple[Tensor, Ten
     tangent = (by_point @ (along @ R.mT)[..., None]).squeeze(-1)  # px per rad
     length = torch.linalg.vector_norm(tangent, dim=-1)
     normal = torch.stack([-tangent[..., 1], tangent[..., 0]], -1) / length[..., None]
-    seen = evidence.mask.repeat_interleave(2 * _RIM_POINTS, 1)
+    # of a disc the inner edge is nowhere
+    seen = (evidence.mask[..., None] & (evidence.radii > 0)).flatten(1).repeat_interleave(_RIM_POINTS, 1)
     weight = normal[..., :, None] * normal[..., None, :] * (length * seen)[..., None, None]
     by_gain = by_point @ (grows @ R.mT)[..., None]
     return torch.cat([by_pose(by_point, arm), by_gain], -1), xy, weight

@@ -1,13 +1,13 @@
 """The report of the studies: one HTML file that needs no other, for a desk's screen and a phone's."""
 
 import base64
-import json
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 from string import Template
 from typing import Any
 
+from torchpose.config import MOST_TABLE_BYTES, parse_mapping, read_text
 from torchpose.io.rows import Row
 
 _PAGE = Path(__file__).with_name("study_report.html")  # beside it, as .css, its style
@@ -23,7 +23,7 @@ def report(folders: Sequence[Path], failed: dict[str, str], environment: dict[st
         failed: studies that ended with an error, and the error.
         environment: names and versions of what the figures depend on.
     """
-    records = [(folder, json.loads((folder / "result.json").read_text(encoding="utf-8"))) for folder in folders]
+    records = [(folder, parse_mapping(read_text(folder / "result.json", most=MOST_TABLE_BYTES))) for folder in folders]
     return Template(_PAGE.read_text(encoding="utf-8")).substitute(
         style=_PAGE.with_suffix(".css").read_text(encoding="utf-8"),
         kind="full" if any(r["full"] for _, r in records) else "quick",

@@ -1,5 +1,7 @@
 """Pictures that show at once what was found in a frame: fitted ellipses, ids, axes, status."""
 
+import math
+import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -10,7 +12,9 @@ import torch
 from torch import Tensor
 
 from torchpose.camera import Camera
+from torchpose.config import is_inside
 from torchpose.errors import ConfigError
+from torchpose.io.writers import atomic_path
 from torchpose.report.files import make_folder
 from torchpose.results import Poses, Reason, Status
 from torchpose.target import Target
@@ -25,23 +29,30 @@ _AXES: tuple[Colour, ...] = ((40, 40, 255), (40, 220, 40), (255, 110, 30))
 _AXIS_POINTS = 33  # along an axis, so that distortion bends it
 _SHIFT = 6  # OpenCV draws at 1/64 px
 _PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # lossless, so that a line of a pixel stays one; low effort: noise packs badly
+_LONGEST_NAME = 255  # bytes of a file's name in all usual file systems
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def picture_path(folder: Path, frame: str) -> Path:
-    """Where the picture of a frame lies: the frame's relative path, with ``.png`` appended unless it ends so."""
-    return folder / (frame if frame.lower().endswith(".png") else f"{frame}.png")
+    """Where the picture of a frame lies: the frame's relative path, with ``.png`` appended unless it ends so.
+
+    Raises:
+        ConfigError: that is not in the folder, or the name is longer than file systems have it.
+    """
+    path = folder / (frame if frame.lower().endswith(".png") else f"{frame}.png")
+    if not is_inside(path, folder):
+        problem = f"its picture would lie outside of {folder}"
+        raise ConfigError(f"{frame}: --overlay: {problem}; give an INPUT whose frames lie in its own folder")
+    if len(os.fsencode(path.name)) > _LONGEST_NAME:
+        raise ConfigError(f"{frame}: --overlay: the name is too long for a picture's; shorten it")
+    return path
 
 
 def write_picture(path: Path, picture: np.ndarray) -> None:
     """Writes a PNG file whole or not at all. ConfigError: it cannot be written."""
-    try:
+    with atomic_path(path, option="--overlay: ", fix="free some space", sync=False) as temporary:
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name}.tmp")
         temporary.write_bytes(cv2.imencode(".png", picture, _PNG)[1].tobytes())
-        temporary.replace(path)
-    except OSError as error:
-        raise ConfigError(f"{path}: --overlay: cannot be written ({error.strerror}); free some space") from None
 
 
 class Overlay:
@@ -110,8 +121,10 @@ class Overlay:
         columns = (found.outer, found.inner, found.center, found.marker, found.target)
         for outer, inner, center, marker, target in zip(*(column.tolist() for column in columns), strict=True):
             draw_ellipse(picture, outer, _OUTER)
-            draw_ellipse(picture, inner, _INNER)
-            _cross(picture, center, max(0.4 * inner[3], 3.0))
+            hole = math.isfinite(inner[3])  # discs have none
+            if hole:
+                draw_ellipse(picture, inner, _INNER)
+            _cross(picture, center, max(0.4 * inner[3], 3.0) if hole else 3.0)
             # a ring that two targets claim shows both ids, one below the other
             place = (center[0] + 0.75 * outer[2], center[1] - 0.75 * outer[2] + 32 * unit * target)
             draw_text(picture, str(marker), place, unit, _CENTRE)

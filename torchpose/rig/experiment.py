@@ -23,6 +23,7 @@ from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.geometry.rows import Rows
 from torchpose.io.manifest import read_manifest, read_records
+from torchpose.io.rows import POSE_SCHEMA
 from torchpose.io.writers import read_table
 from torchpose.rig.plan import Label
 from torchpose.rig.poses import to_transform
@@ -155,20 +156,19 @@ def _evaluate(frames: _Frames, manifest: Path) -> Experiment:
 
 def _join(manifest: Path, poses: Path) -> tuple[_Frames, tuple[str, ...], bool]:
     """The frames of both files, the images without a pose, and whether the rig was emulated."""
-    table = read_table(poses)
-    for name in ("frame", "target", "status", *_POSE, *_SIGMA):
-        if table and name not in table[0]:
-            raise ConfigError(f"{poses}: {name}: column is missing; give what torchpose estimate wrote")
-    targets = sorted({str(row["target"]) for row in table})
+    table = read_table(poses, POSE_SCHEMA, ("frame", "target", "status", *_POSE, *_SIGMA))
+    targets = sorted({row["target"] for row in table})
     if len(targets) > 1:
         raise ConfigError(f"{poses}: target: holds {', '.join(targets)}; estimate the experiment with one --target")
-    by_frame = {str(row["frame"]): row for row in table}
+    by_frame = {row["frame"]: row for row in table}
     robot = {frame.image: frame.robot_pose for frame in read_manifest(manifest)}
     rows, tool, labels, unused, emulated = [], [], [], [], False
     for number, record in read_records(manifest):
         emulated = emulated or bool(record.get("emulated"))
         image = record.get("image")
-        if record.get("record") != "frame" or image not in by_frame or not record.get("waypoint"):
+        if record.get("record") != "frame" or not isinstance(image, str) or image not in by_frame:
+            continue
+        if not record.get("waypoint"):
             continue
         label = validate(Label, record["waypoint"], f"{manifest}: line {number}: waypoint")
         if (label.kind, label.axis) not in _GROUPS:
@@ -187,7 +187,7 @@ def _join(manifest: Path, poses: Path) -> tuple[_Frames, tuple[str, ...], bool]:
         torch.tensor([_GROUPS.index((label.kind, label.axis)) for label in labels]),
         torch.tensor([label.value for label in labels], dtype=torch.float64),
         torch.tensor([label.origin for label in labels]),
-        *to_transform([[float(row[column]) for column in _POSE] for row in rows]),
+        *to_transform([[row[column] for column in _POSE] for row in rows]),
         *_covariances(rows),
         *to_transform(tool),
     )
@@ -199,15 +199,15 @@ def _covariances(rows: Sequence[dict[str, Any]]) -> tuple[Tensor, Tensor, Tensor
 
     def matrices(column: str, deviations: tuple[str, ...]) -> Tensor:
         if all(row.get(column) is not None for row in rows):
-            return torch.tensor([[list(map(float, line)) for line in row[column]] for row in rows], dtype=torch.float64)
+            return torch.tensor([row[column] for row in rows], dtype=torch.float64)
         names = deviations if all(row.get(name) is not None for row in rows for name in deviations) else _SIGMA
-        deviation = torch.tensor([[float(row[name]) for name in names] for row in rows], dtype=torch.float64)
+        deviation = torch.tensor([[row[name] for name in names] for row in rows], dtype=torch.float64)
         return torch.diag_embed(deviation.square())
 
     whole, noise = matrices("covariance", _SIGMA), matrices("noise_covariance", _NOISE)
     if any(row.get("systematic") is None for row in rows):
         return whole, whole, noise, whole[..., :0]
-    systematic = torch.tensor([[list(map(float, line)) for line in row["systematic"]] for row in rows]).double()
+    systematic = torch.tensor([row["systematic"] for row in rows], dtype=torch.float64)
     systematic = systematic.view(len(rows), 6, -1)
     return whole, whole - systematic @ systematic.mT, noise, systematic
 

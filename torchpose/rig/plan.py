@@ -11,30 +11,35 @@ import json
 import math
 import os
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import torch
 from jaxtyping import Float
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 from torch import Tensor
 
 from torchpose.config import read_yaml, validate
+from torchpose.config.kinds import Degrees, Length, Seed, Text, Word
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
-from torchpose.rig.poses import Pose, as_pose, from_transform, to_transform
+from torchpose.rig.poses import Pose, as_pose, to_transform
 from torchpose.rig.settings import SixNumbers, Strict, Workspace
 from torchpose.target import RigidTransformFile, Vector
 
 _AXES = {"x": 0, "y": 1, "z": 2, "pitch": 3, "yaw": 4, "roll": 5}  # places in a move
 _F64 = torch.float64
 
-_Range = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
+MOST_WAYPOINTS = 20_000  # of a plan (convention): a day at four seconds each
+_Range = Annotated[list[Length], Field(min_length=2, max_length=2)]
+_Turns = Annotated[list[Degrees], Field(min_length=2, max_length=2)]
+_Values = Annotated[list[Length], Field(min_length=1, max_length=MOST_WAYPOINTS)]
+_Angles = Annotated[list[Degrees], Field(min_length=1, max_length=MOST_WAYPOINTS)]
 _NONE = [0.0, 0.0]
 _Count = Annotated[int, Field(ge=1, le=10000)]
-# shift in mm and rotation vector in rad along the plan's axes; what the waypoint's label says besides its kind
-Moves = Iterator[tuple[Float[Tensor, " 6"], dict[str, Any]]]
+# shifts in mm and rotation vectors in rad along the plan's axes; what the waypoints' labels say besides their kind
+Moves = tuple[Float[Tensor, "N 6"], list[dict[str, Any]]]
 
 
 class Static(Strict):
@@ -42,16 +47,22 @@ class Static(Strict):
 
     repeats: _Count
 
+    def size(self) -> int:
+        return self.repeats
+
     def moves(self) -> Moves:
-        yield from [(torch.zeros(6, dtype=_F64), {"origin": True})] * self.repeats
+        return torch.zeros(self.repeats, 6, dtype=_F64), [{"origin": True}] * self.repeats
 
 
 class Translation(Strict):
     """The origin and moves away from it, axis by axis; ``repeats`` frames at each pose."""
 
-    axes: list[Literal["x", "y", "z"]] = Field(default=["x", "y", "z"], min_length=1)
-    values_mm: list[FiniteFloat] = Field(min_length=1)
+    axes: list[Literal["x", "y", "z"]] = Field(default=["x", "y", "z"], min_length=1, max_length=3)
+    values_mm: _Values
     repeats: _Count = 1
+
+    def size(self) -> int:
+        return len(self.axes) * (1 + len(self.values_mm)) * self.repeats
 
     def moves(self) -> Moves:
         return _sweep(self.axes, self.values_mm, self.repeats)
@@ -60,20 +71,24 @@ class Translation(Strict):
 class Rotation(Strict):
     """The origin and turns there, axis by axis; ``repeats`` frames at each pose."""
 
-    axes: list[Literal["roll", "pitch", "yaw"]] = Field(default=["roll", "pitch", "yaw"], min_length=1)
-    values_deg: list[FiniteFloat] = Field(min_length=1)
+    axes: list[Literal["roll", "pitch", "yaw"]] = Field(default=["roll", "pitch", "yaw"], min_length=1, max_length=3)
+    values_deg: _Angles
     repeats: _Count = 1
+
+    def size(self) -> int:
+        return len(self.axes) * (1 + len(self.values_deg)) * self.repeats
 
     def moves(self) -> Moves:
         return _sweep(self.axes, self.values_deg, self.repeats)
 
 
 def _sweep(axes: Sequence[str], values: Sequence[float], repeats: int) -> Moves:
-    for axis in axes:
-        for value in [0.0, *(value for value in values if value != 0)]:  # the origin comes first, and once
-            move = torch.zeros(6, dtype=_F64)
-            move[_AXES[axis]] = value if axis in "xyz" else math.radians(value)
-            yield from [(move, {"axis": axis, "value": value, "origin": value == 0})] * repeats
+    # the origin comes first, and once
+    places = [(axis, value) for axis in axes for value in (0.0, *(v for v in values if v != 0)) for _ in range(repeats)]
+    moves = torch.zeros(len(places), 6, dtype=_F64)
+    lengths = [value if axis in "xyz" else math.radians(value) for axis, value in places]
+    moves[torch.arange(len(places)), [_AXES[axis] for axis, _ in places]] = torch.tensor(lengths, dtype=_F64)
+    return moves, [{"axis": axis, "value": value, "origin": value == 0} for axis, value in places]
 
 
 class Spread(Strict):
@@ -83,9 +98,9 @@ class Spread(Strict):
     x_mm: _Range = _NONE
     y_mm: _Range = _NONE
     z_mm: _Range = _NONE
-    tilt_deg: _Range = _NONE
-    roll_deg: _Range = _NONE
-    seed: int = Field(default=0, ge=0)
+    tilt_deg: _Turns = _NONE
+    roll_deg: _Turns = _NONE
+    seed: Seed = 0
 
     @field_validator("x_mm", "y_mm", "z_mm", "tilt_deg", "roll_deg")
     @classmethod
@@ -94,16 +109,20 @@ class Spread(Strict):
             raise ValueError(f"has the limits {value[0]:g} > {value[1]:g}; swap them")
         return value
 
+    def size(self) -> int:
+        return self.count
+
     def moves(self) -> Moves:
         engine = torch.quasirandom.SobolEngine(6, scramble=True, seed=self.seed)
-        ranges = (self.x_mm, self.y_mm, self.z_mm, self.tilt_deg, self.roll_deg)
-        for *points, around in engine.draw(self.count, dtype=_F64).tolist():
-            x, y, z, tilt, roll = (low + (high - low) * p for (low, high), p in zip(ranges, points, strict=True))
-            azimuth, tilt = 2 * math.pi * around, math.radians(tilt)
-            lean = torch.tensor([tilt * math.cos(azimuth), tilt * math.sin(azimuth), 0], dtype=_F64)
-            spin = torch.tensor([0, 0, math.radians(roll)], dtype=_F64)
-            turn = rotations.log(rotations.exp(lean) @ rotations.exp(spin))
-            yield torch.cat([torch.tensor([x, y, z], dtype=_F64), turn]), {}
+        ranges = torch.tensor([self.x_mm, self.y_mm, self.z_mm, self.tilt_deg, self.roll_deg], dtype=_F64)
+        low, high = ranges.unbind(1)
+        points = engine.draw(self.count, dtype=_F64)
+        *shift, tilt, roll = (low + (high - low) * points[:, :5]).unbind(1)
+        azimuth, tilt, zero = 2 * math.pi * points[:, 5], tilt.deg2rad(), torch.zeros_like(tilt)
+        lean = torch.stack([tilt * azimuth.cos(), tilt * azimuth.sin(), zero], -1)
+        spin = torch.stack([zero, zero, roll.deg2rad()], -1)
+        turn = rotations.log(rotations.exp(lean) @ rotations.exp(spin))
+        return torch.cat([torch.stack(shift, -1), turn], -1), [{}] * self.count
 
 
 class Step(Strict):
@@ -114,33 +133,50 @@ class Step(Strict):
     rotation: Rotation | None = None
     handeye: Spread | None = None
     calibration: Spread | None = None
-    poses: list[SixNumbers] | None = None
+    poses: Annotated[list[SixNumbers], Field(min_length=1, max_length=MOST_WAYPOINTS)] | None = None
 
     @model_validator(mode="after")
     def _one(self) -> Step:
-        if len(self.model_fields_set) != 1:
-            kinds = ", ".join(type(self).model_fields)
-            raise ValueError(f"holds {len(self.model_fields_set)} kinds; write one entry for each of {kinds}")
+        kinds = [name for name in type(self).model_fields if getattr(self, name) is not None]
+        if len(kinds) != 1 or len(self.model_fields_set) != 1:
+            known = ", ".join(type(self).model_fields)
+            raise ValueError(f"holds {len(self.model_fields_set)} kinds; write one entry for each of {known}")
         return self
+
+    @property
+    def kind(self) -> str:
+        """Name of the one that it is."""
+        return next(iter(self.model_fields_set))
+
+    def size(self) -> int:
+        """Number of its waypoints, or a little more."""
+        return len(self.poses) if self.poses is not None else int(getattr(self, self.kind).size())
 
 
 class PlanFile(Strict):
     """A capture plan, see docs/rig.md."""
 
-    name: str
+    name: Word
     origin: RigidTransformFile
     axes: Literal["tool", "base"] | Vector = "tool"
     steps: list[Step] = Field(min_length=1)
+
+    @field_validator("steps")
+    @classmethod
+    def _few_enough(cls, steps: list[Step]) -> list[Step]:
+        if (count := sum(step.size() for step in steps)) > MOST_WAYPOINTS:
+            raise ValueError(f"has {count} waypoints; give at most {MOST_WAYPOINTS}, the rest in another plan")
+        return steps
 
 
 class Label(BaseModel):
     """What a frame is for; part of its record in the manifest."""
 
     model_config = ConfigDict(frozen=True)
-    id: str = ""  # of the waypoint, in frame ids and image names
-    kind: str  # static, translation, rotation, handeye, calibration or pose
-    axis: str | None = None  # x, y, z, roll, pitch or yaw of a translation or rotation
-    value: float = 0.0  # along or about the axis, mm or deg
+    id: Text = ""  # of the waypoint, in frame ids and image names
+    kind: Text  # static, translation, rotation, handeye, calibration or pose
+    axis: Text | None = None  # x, y, z, roll, pitch or yaw of a translation or rotation
+    value: Length = 0.0  # along or about the axis, mm or deg
     origin: bool = False  # the reference of its axis, or a static frame
 
 
@@ -165,8 +201,11 @@ class CapturePlan:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of all waypoints: the same for the same poses, however the file is laid out."""
-        rows = [[w.id, *w.pose, w.kind, w.axis, w.value, w.origin] for w in self.waypoints]
+        """SHA-256 of all waypoints: the same for the same poses to 1e-9, however the file is laid out and computed."""
+        rows = [
+            [w.id, *(round(number, 9) + 0.0 for number in w.pose), w.kind, w.axis, w.value, w.origin]
+            for w in self.waypoints
+        ]
         return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
 
     def positions(self) -> Float[Tensor, "N 3"]:
@@ -214,9 +253,12 @@ def load_plan(path: str | os.PathLike[str]) -> CapturePlan:
     for step in file.steps:
         for given in step.poses or ():
             waypoints.append(Waypoint(id=f"{len(waypoints):04d}", pose=as_pose(given), kind="pose"))
-        for kind in step.model_fields_set - {"poses"}:
-            for move, label in getattr(step, kind).moves():
-                # along and about the axes (columns in the base), about the tool's point
-                pose = from_transform(axes @ rotations.exp(move[3:]) @ axes.mT @ R, t + axes @ move[:3])
-                waypoints.append(Waypoint(id=f"{len(waypoints):04d}", pose=pose, kind=kind, **label))
+        if step.poses is None:
+            moves, labels = getattr(step, step.kind).moves()
+            # along and about the axes (columns in the base), about the tool's point
+            turn = rotations.log(axes @ rotations.exp(moves[:, 3:]) @ axes.mT @ R)
+            poses = torch.cat([t + moves[:, :3] @ axes.mT, turn], 1).tolist()
+            for pose, label in zip(poses, labels, strict=True):
+                identity = f"{len(waypoints):04d}"
+                waypoints.append(Waypoint(id=identity, pose=as_pose(pose), kind=step.kind, **label))
     return CapturePlan(file.name, os.fspath(path), origin, tuple(waypoints))

@@ -4,6 +4,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from torchpose.config.kinds import Side, Text, Word
 from torchpose.rig.plan import Label
 from torchpose.rig.poses import Pose
 from torchpose.rig.robot import RobotReading
@@ -32,12 +33,12 @@ class FrameRecord(BaseModel):
     """An image that is there, where the robot stood and when the camera exposed."""
 
     record: Literal["frame"] = "frame"
-    id: str
-    image: str
-    sha256: str
-    width: int
-    height: int
-    camera: str
+    id: Word
+    image: Word
+    sha256: Word
+    width: Side
+    height: Side
+    camera: Text
     waypoint: Label
     commanded_pose: Pose
     robot_pose: Pose  # the middle of the readings before and after the exposure

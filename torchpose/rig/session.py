@@ -1,7 +1,8 @@
 """The folder of a capture session: images and their manifest, written so that a fault leaves every earlier frame.
 
 An image is written under a temporary name, synced and renamed, then its line is appended to the manifest and synced:
-a line is there only for an image that is whole. ``torchpose.io.manifest`` describes what all manifests have in common.
+a line is there only for an image that is whole, with its digest. One process at a time writes a session: it holds the
+file ``.lock``, as long as it lives and no longer. ``torchpose.io.manifest`` says what all manifests have in common.
 """
 
 import contextlib
@@ -21,8 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from torchpose.config import validate
+from torchpose.config import check_regular, is_inside, validate
 from torchpose.errors import ConfigError
+from torchpose.io.journal import Lock
 from torchpose.io.manifest import read_records
 from torchpose.rig.faults import SessionFault, SessionReason
 from torchpose.rig.records import EndRecord, FrameRecord, SessionRecord
@@ -41,8 +43,9 @@ class Session:
         done: ids of the frames that are there.
 
     Raises:
-        ConfigError: a session is there and ``resume`` is not given; or it is, and none is there, it has another plan or
-            other cameras, one of its records is wrong or one of its images is missing; or the folder cannot be written.
+        ConfigError: another process writes it; a session is there and ``resume`` is not given; or it is, and none is
+            there, it has another plan or other cameras, one of its records is wrong or one of its images is missing or
+            not the one that was written; or the folder cannot be written.
     """
 
     def __init__(self, folder: Path, *, plan: str, images: Mapping[str, Any], resume: bool = False) -> None:
@@ -52,10 +55,32 @@ class Session:
         self._origin: dict[str, Any] = {"plan_digest": plan, "images": dict(images)}
         self._earlier: SessionRecord | None = None
         self._file: int | None = None
+        self._lock: Lock | None = None
         if resume:
-            self._recover()
-        elif self.manifest.exists():
+            if not self.manifest.exists():
+                problem = "does not exist; leave --resume out to start the session"
+                raise ConfigError(f"{self.manifest}: --resume: {problem}")
+            self._hold()  # before a torn line is dropped, which may be one that is being written
+            try:
+                self._recover()
+            except BaseException:
+                self.close()
+                raise
+        else:
+            self._check_new()
+
+    def _check_new(self) -> None:
+        if self.manifest.exists():
             raise ConfigError(f"{self.manifest}: --out: holds a session already; add --resume or choose another folder")
+
+    def _hold(self) -> None:
+        try:
+            self._lock = Lock(self.folder / ".lock")
+        except BlockingIOError:
+            problem = "another capture is writing this session; wait for it or choose another folder"
+            raise ConfigError(f"{self.folder}: --out: {problem}") from None
+        except OSError as error:
+            raise ConfigError(f"{self.folder}: --out: cannot be written ({error.strerror}); choose another") from None
 
     @property
     def begun(self) -> bool:
@@ -67,12 +92,22 @@ class Session:
             (self.folder / "images").mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise ConfigError(f"{self.folder}: --out: cannot be made ({error.strerror}); choose another") from None
+        if self._lock is None:
+            self._hold()
+            self._check_new()  # another capture may have begun and ended since
         return self
 
     def __exit__(self, *_: object) -> None:
         if self._file is not None:
             os.close(self._file)
             self._file = None
+        self.close()
+
+    def close(self) -> None:
+        """Lets other processes write the session, where it has not been entered; leaving it does so too."""
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
 
     def check_space(self, size: int) -> None:
         """Raises a SessionFault where the disk has less than ``size`` bytes left."""
@@ -163,19 +198,16 @@ class Session:
 
     def _recover(self) -> None:
         """Reads what an earlier run finished and closes its last line."""
-        if not self.manifest.exists():
-            raise ConfigError(f"{self.manifest}: --resume: does not exist; leave --resume out to start the session")
-        records = read_records(self.manifest)
-        for number, record in records:
-            where = f"{self.manifest}: line {number}"
+        last = 0
+        for last, record in read_records(self.manifest):  # counts on behind the loop
+            where = f"{self.manifest}: line {last}"
             if record.get("record") == "session" and self._earlier is None:
                 self._earlier = validate(SessionRecord, record, where)
             elif record.get("record") == "frame":
                 frame = validate(FrameRecord, record, where)
-                image = self.folder / frame.image
-                if not image.is_file():
-                    problem = "is missing, but the manifest lists it"
-                    raise ConfigError(f"{image}: --resume: {problem}; restore it or start anew")
+                if frame.id in self.done:
+                    raise ConfigError(f"{where}: id: {frame.id!r} occurs twice; two captures have written here")
+                self._check_image(frame, where)
                 self.done.add(frame.id)
         words = {"plan_digest": "has another plan", "images": "has other cameras or image sizes"}
         for key, value in self._origin.items():
@@ -183,11 +215,30 @@ class Session:
                 problem = f"the session {words[key]}"
                 raise ConfigError(f"{self.manifest}: --resume: {problem}; give the same, or another --out")
         content = self.manifest.read_bytes()
-        if records and records[-1][0] > content.count(b"\n"):  # a whole last line lacks its newline
+        if last > content.count(b"\n"):  # a whole last line lacks its newline
             with self.manifest.open("ab") as file:
                 file.write(b"\n")
         else:  # of a line that is torn, nothing is left
             os.truncate(self.manifest, content.rfind(b"\n") + 1)
+
+    def _check_image(self, frame: FrameRecord, where: str) -> None:
+        """Raises ConfigError unless the image of a frame is there as it was written."""
+        image = self.folder / frame.image
+        if not is_inside(image, self.folder):
+            raise ConfigError(f"{where}: image: {frame.image!r} lies outside of the session; give it anew")
+        try:
+            check_regular(image)
+            with image.open("rb") as file:
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
+        except FileNotFoundError:
+            problem = "is missing, but the manifest lists it"
+        except OSError as error:
+            problem = f"cannot be read ({error.strerror}), but the manifest lists it"
+        else:
+            if digest == frame.sha256:
+                return
+            problem = "is not the image that was written (its sha256 is another)"
+        raise ConfigError(f"{image}: --resume: {problem}; restore it or start anew")
 
 
 @contextlib.contextmanager

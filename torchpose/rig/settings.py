@@ -10,14 +10,16 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, field_validator, model_validator
 
 from torchpose.config import read_yaml, validate
+from torchpose.config.kinds import MOST_LENGTH, MOST_SIDE_PX, Length, Side, Word
 from torchpose.target import Vector
 
 MAX_SPEED_MM_S = 250.0  # the reduced speed of ISO 10218-1, for work beside people
 MAX_ACCELERATION_MM_S2 = 1200.0  # the default of the controller's own moves
 
-Positive = Annotated[FiniteFloat, Field(gt=0)]
+MOST_CAMERAS = 64  # of a rig (convention)
+Positive = Annotated[FiniteFloat, Field(gt=0, le=MOST_LENGTH)]
 AS_TUPLE = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)  # files have lists
-SixNumbers = Annotated[list[FiniteFloat], Field(min_length=6, max_length=6)]
+SixNumbers = Annotated[list[Length], Field(min_length=6, max_length=6)]
 
 
 class Strict(BaseModel):
@@ -59,7 +61,7 @@ class Settle(Strict):
 class RobotSettings(Strict):
     """The `robot:` part of a rig file."""
 
-    host: str = Field(min_length=1)  # name or address of the controller
+    host: Word  # name or address of the controller
     tcp: SixNumbers | None = None  # tool in the flange, mm and rotation vector in rad; None: as set at the pendant
     workspace: Workspace
     speed_mm_s: FiniteFloat = Field(
@@ -78,14 +80,14 @@ class CameraSettings(Strict):
     """One of the `cameras:` of a rig file."""
 
     name: str = Field(default="camera", pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=40)  # in image names
-    serial: str | None = None  # as printed on the camera; None takes the first that is free
-    width: int = Field(ge=1)  # of the frame, px
-    height: int = Field(ge=1)
-    offset_x: int | None = Field(default=None, ge=0)  # of its corner on the sensor; the middle by default
-    offset_y: int | None = Field(default=None, ge=0)
+    serial: Word | None = None  # as printed on the camera; None takes the first that is free
+    width: Side  # of the frame, px
+    height: Side
+    offset_x: int | None = Field(default=None, ge=0, le=MOST_SIDE_PX)  # of its corner on the sensor; None: the middle
+    offset_y: int | None = Field(default=None, ge=0, le=MOST_SIDE_PX)
     pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono16"] = "Mono8"  # above 8: 16-bit images, values as given
     exposure_us: Positive  # fixed, and the gain: the automatic functions are switched off
-    gain_db: FiniteFloat = 0.0
+    gain_db: FiniteFloat = Field(default=0.0, ge=-100, le=100)
     timeout_s: Positive = 5.0  # from trigger to image
     attempts: int = Field(default=3, ge=1, le=20)  # at one frame, before the session ends
     nodes: dict[str, bool | int | FiniteFloat | str] = {}  # further GenICam features, set in this order
@@ -118,7 +120,7 @@ class Rig(Strict):
     """What a rig file holds."""
 
     robot: RobotSettings
-    cameras: list[CameraSettings] = Field(min_length=1)
+    cameras: list[CameraSettings] = Field(min_length=1, max_length=MOST_CAMERAS)
     dwell_s: FiniteFloat = Field(default=0.2, ge=0, le=60)  # before the exposure, for vibrations to fade
 
     @field_validator("cameras")

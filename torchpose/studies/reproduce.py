@@ -1,7 +1,6 @@
 """All studies, one after the other, into one folder and one report."""
 
 import importlib
-import json
 import platform
 import time
 import traceback
@@ -10,6 +9,7 @@ from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from torchpose.config import parse_json
 from torchpose.errors import ConfigError, TorchposeError
 from torchpose.io.rows import Row
 from torchpose.io.writers import atomic_path
@@ -97,7 +97,7 @@ def _run(name: str, about: Row, progress: Progress) -> tuple[StudyResult, Row]:
 
 def _finished(folder: Path, about: Row) -> bool:
     try:
-        record = json.loads((folder / RESULT).read_text(encoding="utf-8"))
+        record = parse_json((folder / RESULT).read_bytes())
     except (OSError, ValueError):
         return False
     return isinstance(record, dict) and all(record.get(key) == value for key, value in about.items())

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchpose import pnp
-from torchpose.calibration.grids.board import Grid
 from torchpose.calibration.grids.marks import Marks, find_marks
 from torchpose.calibration.intrinsics import MIN_POINTS
 from torchpose.calibration.tone import Sizes, scale_at
@@ -19,8 +19,10 @@ from torchpose.camera import Camera
 from torchpose.geometry import conics
 from torchpose.geometry.least_squares import Pose
 from torchpose.geometry.projection import image_by_point
+from torchpose.grids import Grid
 from torchpose.refine import LEAST_KEPT, Refined, Sight, refine_photometric
 from torchpose.rings import mapped
+from torchpose.target import Target
 
 _HELD = 1e12  # information about the rotation of a mark: as good as known
 _SIZE = (
@@ -69,11 +71,11 @@ def mark_sight(frames: Tensor, marks: Marks, grid: Grid, camera: Camera) -> tupl
     radius = _radius(marks, grid, camera, R, t)
     known, view, point, start = _starts(marks, grid, camera, R, t)
     one = torch.ones_like(start[:, :1])
-    nominal = grid.radii[1] / grid.radii[0] if grid.radii else _DISC
-    measured = float(marks.ratio.nanmedian()) if grid.radii else _DISC
+    nominal = _DISC if grid.discs or grid.radii is None else grid.radii[1] / grid.radii[0]
+    measured = _DISC if grid.discs else float(marks.ratio.nanmedian())
     shape = torch.tensor([1.0, nominal if math.isnan(measured) else measured]).to(start)
     ellipse = _predicted(camera, R[view], start, radius)
-    inner = torch.cat([ellipse[:, :2], ellipse[:, 2:4] * shape[1], ellipse[:, 4:]], -1) if grid.radii else ellipse
+    inner = ellipse if grid.discs else torch.cat([ellipse[:, :2], ellipse[:, 2:4] * shape[1], ellipse[:, 4:]], -1)
     sight = Sight(
         view,
         one > 0,
@@ -89,6 +91,28 @@ def mark_sight(frames: Tensor, marks: Marks, grid: Grid, camera: Camera) -> tupl
     return known, view, point, sight, Pose(R[view], start)
 
 
+def nominal_board(marks: Marks, grid: Grid, camera: Camera) -> Target:
+    """The board as it is named, of marks as large as they look, dark or light.
+
+    Args:
+        marks: of all views, whose ellipses are in linear frames.
+        grid: the board.
+        camera: about right.
+    """
+    R, t, posed = _poses(marks, grid, camera)
+    marks = marks[posed[marks.view]]
+    outer = float(_radius(marks, grid, camera, R, t))
+    ratio = 0.0 if grid.discs else float(marks.ratio.nanmedian())
+    if math.isnan(ratio) and grid.radii is not None:
+        ratio = grid.radii[1] / grid.radii[0]
+    target = Target.of_grid(replace(grid, radii=(outer, ratio * outer)), "light" if _dark(marks) else "dark")
+    return replace(target, grid=grid)
+
+
+def _dark(marks: Marks) -> bool:
+    return float(marks.polarity.nanmedian()) > 0
+
+
 def sizes_of_marks(frames: Tensor, names: Sequence[str], grid: Grid, camera: Camera) -> Sizes:
     """Sizes of a grid's marks, see `torchpose.calibration.tone`: discs by the grey values, rings by their edges."""
     marks = find_marks(names, frames, grid, camera)
@@ -98,7 +122,7 @@ def sizes_of_marks(frames: Tensor, names: Sequence[str], grid: Grid, camera: Cam
     scale = scale_at(camera, R[marks.view], at)
     outer = marks.ellipse[:, 2:4].prod(-1).sqrt()
     inner = torch.where(marks.ratio > 0, marks.ratio * outer, torch.nan)
-    if grid.radii is None and len(marks):
+    if grid.discs and len(marks):
         known, _, _, sight, start = mark_sight(frames, marks, grid, camera)
         some = known.nonzero()[:, 0]
         some = some[:: len(some) // _SIZED + 1]

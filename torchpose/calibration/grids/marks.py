@@ -11,9 +11,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose.calibration.grids.board import Grid
-from torchpose.calibration.grids.lattice import order_marks
-from torchpose.calibration.grids.placement import place_patches
 from torchpose.calibration.views import Views
 from torchpose.camera import Camera
 from torchpose.detect import Candidates, find_candidates
@@ -21,6 +18,7 @@ from torchpose.detect.reduce import reduction_factor
 from torchpose.geometry import blur as blurs
 from torchpose.geometry.rows import Rows, shared
 from torchpose.geometry.segments import marked, near_pairs
+from torchpose.grids import Grid, order_marks, place_patches
 from torchpose.pose import common_center, raw_centers
 from torchpose.rings import measure_rings
 
@@ -106,7 +104,7 @@ def find_marks(names: Sequence[str], frames: Tensor, grid: Grid, camera: Camera)
     while factor > 1:
         factor //= 2
         count = torch.bincount(best[1].frame, minlength=len(frames))
-        rest = (count < len(grid.points)).nonzero()[:, 0]
+        rest = (count < len(grid)).nonzero()[:, 0]
         if rest.numel() == 0:
             break
         number, shapes = _found(frames[rest], grid, camera, factor)
@@ -124,11 +122,11 @@ def find_marks(names: Sequence[str], frames: Tensor, grid: Grid, camera: Camera)
 def _found(frames: Tensor, grid: Grid, camera: Camera, factor: int) -> tuple[Tensor, _Shapes]:
     """Marks found at one scale, and their numbers."""
     candidates = find_candidates(frames, factor)
-    shapes = _discs(candidates) if grid.radii is None else _rings(frames, candidates, grid, camera)
-    spacing = None if grid.radii is None else grid.spacing / grid.radii[0]
+    shapes = _discs(candidates) if grid.discs else _rings(frames, candidates, grid, camera)
+    spacing = None if grid.discs or grid.radii is None else grid.spacing / grid.radii[0]
     lattice = order_marks(shapes.frame, shapes.ellipse, shapes.polarity, spacing)
     height, width = frames.shape[-2:]
-    number = place_patches(lattice, shapes.center[lattice.mark], grid, (width, height), len(frames))
+    number, _ = place_patches(lattice, shapes.center[lattice.mark], grid, (width, height), len(frames))
     placed = number >= 0
     return number[placed], shapes[lattice.mark[placed]]
 

@@ -183,7 +183,8 @@ def _minimised(fit: _Fit, start: Pose, spread: Spread, stages: tuple[_Stage, ...
     own: dict[str, Block] = {"pose": start, "blur": spread}
     if fit.gain:
         outer, inner = fit.blocks.radii.unbind(-1)
-        most = _MOST_GAIN * torch.minimum(inner, 0.5 * (outer - inner)).amin().reshape(1)
+        hole = torch.where(inner > 0, inner, outer)
+        most = _MOST_GAIN * torch.minimum(hole, 0.5 * (outer - inner)).amin().reshape(1)
         own["gain"] = Vector(torch.zeros_like(start.t[:, :1]), low=-most, high=most)
     levels = first_levels(fit.coarse, start.R, start.t, spread)
     unknowns = Unknowns(own, {"levels": Vector(levels)}, fit.blocks.row)

@@ -146,8 +146,9 @@ def overdispersion(sectors: Sectors, variance: Tensor, row: Tensor, rows: int) -
     """By how much the scatter of edges along the rims exceeds that of independent noise (N,), as a factor of variance.
 
     Noise that is correlated between pixels (paper, compression, filters of the camera) pulls at an edge in step over
-    many of them. Every cell's displacement shows how much. What moves a circle as a whole, or makes it larger, is no
-    noise and taken off: a mean and a first harmonic of each.
+    many of them. Every cell's displacement shows how much. What moves a circle as a whole, makes it larger, or draws it
+    out is no noise and taken off: a mean and two harmonics of each. The second is a tilt, or a blur with a direction,
+    that is held or of which the last step is still to come; it moves no centre.
 
     Args:
         sectors: weighted as in the fit. variance: (K,) of noise. row: (K,) of ``rows``.
@@ -156,7 +157,8 @@ def overdispersion(sectors: Sectors, variance: Tensor, row: Tensor, rows: int) -
     hold = hold / variance[:, None, None]
     error = torch.where(hold > 0, pull / variance[:, None, None] / hold.clamp_min(_TINY), 0.0)
     angle = (torch.arange(hold.shape[-1], dtype=hold.dtype, device=hold.device) + 0.5) * (2 * math.pi / hold.shape[-1])
-    basis = torch.stack([torch.ones_like(angle), angle.cos(), angle.sin()], -1)
+    harmonics = [of(k * angle) for k in (1, 2) for of in (torch.cos, torch.sin)]
+    basis = torch.stack([torch.ones_like(angle), *harmonics], -1)
     weighted = hold[..., None] * basis
     right = (weighted * error[..., None]).sum(-2)
     taken = (solve_scaled((weighted.mT @ basis).flatten(0, 1), right.flatten(0, 1)).view_as(right) * right).sum(-1)

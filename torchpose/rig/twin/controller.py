@@ -23,17 +23,18 @@ START_POSE = (400.0, 0.0, 300.0, 3.141592653589793, 0.0, 0.0)  # mm, rad: in fro
 _START_S = 20.0  # a loaded machine may take long to start Python
 _ANSWER_S = 5.0
 
-_NotNegative = Annotated[FiniteFloat, Field(ge=0)]
+_Deviation = Annotated[FiniteFloat, Field(ge=0, le=1000)]  # mm or degrees (convention)
 
 
 class TwinErrors(BaseModel):
     """How the simulated robot deviates from an ideal one; part of a twin file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    repeatability_mm: _NotNegative = 0.0  # standard deviation by axis of the true pose about the reported one, drawn
-    repeatability_deg: _NotNegative = 0.0  # anew for every move
-    scale: FiniteFloat = 0.0  # how much longer true displacements from the start are than reported ones, relative
-    reading_noise_mm: _NotNegative = 0.0  # standard deviation by axis of every reported position
+    repeatability_mm: _Deviation = 0.0  # standard deviation by axis of the true pose about the reported one, drawn
+    repeatability_deg: _Deviation = 0.0  # anew for every move
+    # how much longer true displacements from the start are than reported ones, relative
+    scale: FiniteFloat = Field(default=0.0, ge=-0.5, le=0.5)
+    reading_noise_mm: _Deviation = 0.0  # standard deviation by axis of every reported position
 
 
 class TwinController:

@@ -22,24 +22,23 @@ from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.config import beside, read_yaml, validate
+from torchpose.config.kinds import Grey, Seed, Word
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.rig.child import ChildEnded
 from torchpose.rig.poses import from_transform, to_transform
-from torchpose.rig.settings import AS_TUPLE, Positive, Rig, Strict
+from torchpose.rig.settings import AS_TUPLE, MOST_CAMERAS, Positive, Rig, Strict
 from torchpose.rig.twin.controller import TwinController, TwinErrors
 from torchpose.sim import add_noise, render
 from torchpose.target import RigidTransformFile, Target
-
-_Grey = Annotated[FiniteFloat, Field(ge=0, le=255)]
 
 
 class TwinCamera(Strict):
     """What one camera of the rig really is, and where."""
 
-    name: str = "camera"  # as in the rig file
-    camera: str  # its camera file
-    focal_scale: Positive = 1.0  # the true focal length over that of the file
+    name: Word = "camera"  # as in the rig file
+    camera: Word  # its camera file
+    focal_scale: FiniteFloat = Field(default=1.0, ge=0.5, le=2)  # the true focal length over that of the file
     base_from_camera: RigidTransformFile | None = None  # where it is, one of both
     tool_from_camera: RigidTransformFile | None = None
 
@@ -53,13 +52,13 @@ class TwinCamera(Strict):
 class TwinImaging(Strict):
     """Blur, grey levels and noise, see `torchpose.sim.render` and `torchpose.sim.add_noise`; levels of 0 to 255."""
 
-    psf_sigma: Positive = 0.7
-    dark: _Grey = 30.0
-    light: _Grey = 220.0
-    surround: _Grey = 90.0
+    psf_sigma: FiniteFloat = Field(default=0.7, gt=0, le=100)
+    dark: Grey = 30.0
+    light: Grey = 220.0
+    surround: Grey = 90.0
     plate: Annotated[tuple[Positive, Positive], AS_TUPLE] | None = None
-    noise: FiniteFloat = Field(default=1.0, ge=0)
-    full_well: Positive | None = None
+    noise: Grey = 1.0
+    full_well: Annotated[float, Field(gt=0, le=1e9)] | None = None
 
 
 class TwinFile(Strict):
@@ -67,12 +66,12 @@ class TwinFile(Strict):
 
     host: str = Field(default="127.0.0.2", pattern=r"^127(\.\d{1,3}){3}$")
     robot: TwinErrors = TwinErrors()
-    cameras: list[TwinCamera] = Field(min_length=1)
-    target: str
+    cameras: list[TwinCamera] = Field(min_length=1, max_length=MOST_CAMERAS)
+    target: Word
     tool_from_target: RigidTransformFile | None = None
     base_from_target: RigidTransformFile | None = None
     imaging: TwinImaging = TwinImaging()
-    seed: int = Field(default=0, ge=0)
+    seed: Seed = 0
 
     @model_validator(mode="after")
     def _one_place(self) -> TwinFile:

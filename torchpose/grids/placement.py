@@ -5,16 +5,19 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
-from torchpose.calibration.grids.board import Grid
-from torchpose.calibration.grids.lattice import Lattice
 from torchpose.geometry.segments import segment_mean, segment_sum
+from torchpose.grids.board import Grid
+from torchpose.grids.lattice import Lattice
 
 LEAST_MARKS = 6  # of a patch: 12 numbers for the 8 of a plane's image
 _MOST_PLACES = 64  # of a patch on the board that are looked at, those with the most marks first
+# the same of the board turned, where only marks that it lacks by design tell: one of these makes two (derived), and one
+# stray shape, or one mark not found, a tie
+_TURNED = 2
 _MARGIN = 3  # marks that the second best place must explain less: one stray shape does not shift a board
 _CLEAR = 0.6  # of the lattice's spacing, from the border: a mark beyond may be cut off
 _TURNS = torch.tensor([[[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]], [[0, 1], [-1, 0]]])
@@ -22,11 +25,12 @@ _TURNS = torch.tensor([[[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]], 
 
 def place_patches(
     found: Lattice, centers: Float[Tensor, "K 2"], grid: Grid, size: tuple[int, int], frames: int
-) -> Int[Tensor, " K"]:
+) -> tuple[Int[Tensor, " K"], Bool[Tensor, " B"]]:
     """Number of each mark on the board, -1 where it has none or its patch may be several parts of the board.
 
     A place of a patch on the board is worth the marks that it explains less those that it should show and does not.
     Of places that a symmetry of the board makes equal the one counts whose rows point most to the right in the frame.
+    Also whether that decided, by frame.
 
     Args:
         found: patches of all frames.
@@ -36,7 +40,7 @@ def place_patches(
         frames: how many there are.
     """
     if len(found) == 0:
-        return found.mark
+        return found.mark, torch.zeros(frames, dtype=torch.bool, device=found.mark.device)
     every = _turned(found, frames)
     occupied = _occupied(every, found.frame, frames)
     count, offset = _overlaps(occupied, grid)
@@ -46,7 +50,8 @@ def place_patches(
     best, second = two[..., 0], two[..., -1]  # (B, 4)
     most = best.max(1, keepdim=True).values
     middle = segment_mean(found.at.double(), found.frame, frames)
-    turn = _rightward(image, middle, grid).masked_fill(best < most, -torch.inf).argmax(1)
+    equal = best > most - _TURNED
+    turn = _rightward(image, middle, grid).masked_fill(~equal, -torch.inf).argmax(1)
     row = torch.arange(frames, device=turn.device)
     other = ~grid.symmetries.to(turn.device)[(torch.arange(4, device=turn.device) - turn[:, None]) % 4]
     rival = torch.maximum(best.masked_fill(~other, -torch.inf).max(1).values, second[row, turn])
@@ -56,7 +61,7 @@ def place_patches(
     numbers = pad(grid.map.to(at.device), (1, 1, 1, 1), value=-1)
     limit = torch.tensor(numbers.shape[::-1], device=at.device) - 1
     at = (at + 1).clamp_min(0).minimum(limit)
-    return torch.where(sure[found.frame], numbers[at[:, 1], at[:, 0]], -1)
+    return torch.where(sure[found.frame], numbers[at[:, 1], at[:, 0]], -1), equal.sum(1) > 1
 
 
 class _Turned(NamedTuple):
@@ -104,7 +109,8 @@ def _missing(
     ``seen_by``: image (B, 3, 3) of the lattice, and the frames' size.
     """
     image, (width, height) = seen_by
-    at = grid.lattice.to(offset.device) - offset[..., None, :]  # (B, 4, Q, P, 2), in the turned patch
+    there = (grid.map.mT >= 0).nonzero()
+    at = there.to(offset.device) - offset[..., None, :]  # (B, 4, Q, P, 2), in the turned patch
     side = occupied.shape[-1]
     inside = ((at >= 0) & (at < side)).all(-1)
     held = at.clamp(0, side - 1)
