@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, replace
 from itertools import combinations
 from os import PathLike
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from numpy.typing import NDArray
@@ -15,7 +15,15 @@ from torch import Tensor, nn
 from torchpose.camera import LINEAR, Camera, Tone
 from torchpose.camera.model import Model
 from torchpose.camera.plausible import check_intrinsics
-from torchpose.detect import Candidates, Wanted, find_candidates, find_coarse, merge_duplicates, reduction_factor
+from torchpose.detect import (
+    Candidates,
+    Wanted,
+    find_candidates,
+    find_coarse,
+    merge_duplicates,
+    reduction_factor,
+    same_ellipses,
+)
 from torchpose.errors import ConfigError, FrameError
 from torchpose.geometry import blur as blurs
 from torchpose.geometry.grey import FRAME_TYPES, as_frames
@@ -27,8 +35,10 @@ from torchpose.identify import (
     Scene,
     identify,
     identify_boards,
+    in_company,
     indistinguishable,
     look_again,
+    named,
 )
 from torchpose.kernels import find_compiler
 from torchpose.pose import (
@@ -54,6 +64,17 @@ _LEAST_CANDIDATE = (
 _LEGIBLE = 1.8  # px, of blur, up to which the mean profile of a ring tells its code (measured: decisions/0059)
 _LAYOUT = ("ids", "centers", "normals", "radii", "valid", "polarity")  # of the table: what makes a target
 Method = Literal["photometric", "edges", "centers", "paper"]
+
+
+class _Tried(NamedTuple):
+    """Blurred rings (K,) that were measured before their frames were searched at all scales.
+
+    outer: the circles that they were measured from. exact: whether by the exact model.
+    """
+
+    outer: Candidates
+    rings: Rings
+    exact: Tensor
 
 
 class PoseEstimator(nn.Module):
@@ -212,10 +233,10 @@ class PoseEstimator(nn.Module):
         if not bool(scene.table.coded.all()):
             return self._found_with_boards(scene)
         if self.instances > 1:  # a copy may be too small for the coarse scale
-            candidates = find_candidates(frames, wanted=wanted, float_range=255.0)
-            return self._read(scene, self._rings(scene, self._circles(scene, candidates)))
+            circles = self._useful(scene, find_candidates(frames, wanted=wanted, float_range=255.0))
+            return self._read(scene, self._measured(scene, circles))
         coarse = find_coarse(frames, wanted=wanted, float_range=255.0)
-        rings, copies = self._likely(scene, coarse)
+        rings, copies, tried = self._likely(scene, coarse)
         first = self._read(scene, rings, copies)
         settled = _settled(*first)
         if bool(settled.all()):
@@ -224,7 +245,8 @@ class PoseEstimator(nn.Module):
         known = coarse[~settled[coarse.frame]]
         known = replace(known, frame=number[known.frame])
         finer = find_candidates(frames[rest], wanted=wanted, coarse=known, float_range=255.0)
-        more = self._rings(scene, self._circles(scene, replace(finer, frame=rest[finer.frame])))
+        circles = self._useful(scene, replace(finer, frame=rest[finer.frame]))
+        more = self._measured(scene, circles, tried)
         return self._read(scene, Rings.cat([rings[settled[rings.frame]], more]), copies)
 
     def _found_with_boards(self, scene: Scene) -> tuple[Scene, Found]:
@@ -232,7 +254,7 @@ class PoseEstimator(nn.Module):
         factor = reduction_factor(*scene.frames.shape[-2:])
         candidates = find_candidates(scene.frames, factor)
         while True:
-            found = self._read(scene, self._rings(scene, self._circles(scene, candidates)), None, candidates)
+            found = self._read(scene, self._measured(scene, self._circles(scene, candidates)), None, candidates)
             rest = (~_settled(*found)).nonzero()[:, 0]
             factor //= 2
             if factor < 1 or rest.numel() == 0:
@@ -244,32 +266,66 @@ class PoseEstimator(nn.Module):
         candidates = candidates[torch.isin(candidates.polarity, scene.table.polarity)]
         return find_circles(scene.frames, candidates, scene.camera)
 
-    def _rings(self, scene: Scene, circles: Circles, *, precise: bool = True) -> Rings:
-        return measure_circles(scene.frames, circles, scene.camera, correct=self._recipe.correct, precise=precise)
+    def _useful(self, scene: Scene, candidates: Candidates) -> Circles:
+        """The circles that may be of a pose, and those that tell by their code alone that a target is there."""
+        circles = self._circles(scene, candidates)
+        if len(circles) == 0:
+            return circles
+        rough, at = rough_rings(circles, scene.camera), (scene.table, scene.camera.matrix)
+        return circles[in_company(rough, *at) | (_legible(circles.inside.blur) & named(rough, *at))]
 
-    def _likely(self, scene: Scene, candidates: Candidates) -> tuple[Rings, Tensor]:
+    def _rings(self, scene: Scene, circles: Circles, *, hopeful: bool = False) -> tuple[Rings, Tensor]:
+        return measure_circles(scene.frames, circles, scene.camera, correct=self._recipe.correct, hopeful=hopeful)
+
+    def _measured(self, scene: Scene, circles: Circles, tried: _Tried | None = None) -> Rings:
+        """The rings of all circles; those that were tried before are not measured from the start again."""
+        if len(circles) == 0:
+            return self._rings(scene, circles)[0]
+        fresh = torch.ones_like(circles.outer.frame, dtype=torch.bool)
+        parts = []
+        if tried is not None:
+            now, before = same_ellipses(circles.outer, tried.outer)
+            equal = (circles.outer.ellipse[now] == tried.outer.ellipse[before]).all(1)
+            fresh[now[equal]] = False
+            old = marked(before[equal], len(tried.rings))
+            parts = [tried.rings[old & tried.exact], tried.rings[old & ~tried.exact]]
+        every = Rings.cat([*parts, self._rings(scene, circles[fresh], hopeful=True)[0]])
+        # a blurred ring that is alone now is none that could be named
+        kept = in_company(every, scene.table, scene.camera.matrix) | _legible(every.blur)
+        done = len(parts[0]) if parts else 0
+        again, _ = measure_exactly(scene.frames, every[done:][kept[done:]], scene.camera)
+        return Rings.cat([every[:done], again])
+
+    def _likely(self, scene: Scene, candidates: Candidates) -> tuple[Rings, Tensor, _Tried]:
         """The rings that the best copy of every target has by its circles' rough places and codes, measured.
 
-        Also how many copies (B T,) were seen.
+        Also how many copies (B T,) were seen, and what was measured for that.
         """
+        circles, count, least = self._circles(scene, candidates), len(scene.frames), int(scene.table.valid.sum())
+        rough = rough_rings(circles, scene.camera)
         # frames with fewer circles than markers are searched at all scales anyway
-        circles = _of_full_frames(self._circles(scene, candidates), int(scene.table.valid.sum()))
-        precise = not self._recipe.on_rims
+        some = in_company(rough, scene.table, scene.camera.matrix)
+        some &= _full(rough.frame[some], count, least)[rough.frame]
         # the code of a much blurred ring is not to be read off its profile
-        blurred = blurs.axes(circles.inside.blur)[1] > _LEGIBLE**2
-        sharp, known = circles[~blurred], self._rings(scene, circles[blurred], precise=precise)
-        rough = Rings.cat([rough_rings(sharp, scene.camera), known])
-        likely = identify(rough, scene.table, scene.camera, len(scene.frames), instances=1)
-        lacking = _lacking(scene, likely)[known.frame]
-        if not precise and bool(lacking.any()):
-            # of a blurred ring the quicker model reads most codes; the dearer one reads those that are missing
-            again = measure_exactly(scene.frames, known[lacking], scene.camera)
-            known = Rings.cat([known[~lacking], again])
-            rough = Rings.cat([rough[torch.arange(len(sharp), device=again.frame.device)], known])
-            likely = identify(rough, scene.table, scene.camera, len(scene.frames), instances=1)
-        named = marked(likely.ring[likely.ring >= 0], len(rough))
-        others = self._rings(scene, sharp[named[: len(sharp)]], precise=precise)
-        return Rings.cat([others, known[named[len(sharp) :]]]), likely.copies
+        clear = _legible(rough.blur)
+        sharp, blurred, rough = circles[some & clear], circles[some & ~clear], rough[some & clear]
+        known, of = self._rings(scene, blurred)
+        likely = identify(Rings.cat([rough, known]), scene.table, scene.camera, count, instances=1)
+        # of a blurred ring the quicker model reads most codes; the dearer one reads those that are missing
+        full = _full(torch.cat([rough.frame, known.frame]), count, least)
+        exact = ((_lacking(scene, likely) & full) | (not self._recipe.on_rims))[known.frame]
+        if bool(exact.any()):
+            again, which = measure_exactly(scene.frames, known[exact], scene.camera)
+            of = torch.cat([of[~exact], of[exact][which]])
+            known = Rings.cat([known[~exact], again])
+            exact = torch.arange(len(known), device=of.device) >= len(known) - len(again)
+            likely = identify(Rings.cat([rough, known]), scene.table, scene.camera, count, instances=1)
+        chosen = marked(likely.ring[likely.ring >= 0], len(rough) + len(known))
+        others, _ = self._rings(scene, sharp[chosen[: len(rough)]])
+        if not self._recipe.on_rims:
+            others, _ = measure_exactly(scene.frames, others, scene.camera)
+        tried = _Tried(blurred.outer[of], known, exact)
+        return Rings.cat([others, known[chosen[len(rough) :]]]), likely.copies, tried
 
     def _read(
         self, scene: Scene, rings: Rings, copies: Tensor | None = None, marks: Candidates | None = None
@@ -326,10 +382,14 @@ class PoseEstimator(nn.Module):
         return solutions
 
 
-def _of_full_frames(circles: Circles, least: int) -> Circles:
-    """Those of frames that have at least so many."""
-    frame = circles.outer.frame
-    return circles[(torch.bincount(frame) >= least)[frame]]
+def _legible(blur: Tensor) -> Tensor:
+    """Rings (K,) bool of these blurs (K, 3) whose profile tells their code."""
+    return blurs.axes(blur)[1] <= _LEGIBLE**2
+
+
+def _full(frame: Tensor, frames: int, least: int) -> Tensor:
+    """Frames (B,) bool that have at least so many of the items of frames (K,)."""
+    return torch.bincount(frame, minlength=frames) >= least
 
 
 def _lacking(scene: Scene, identified: Identified) -> Tensor:
