@@ -13,7 +13,8 @@ import pytest
 ROOT = Path(__file__).parents[1] / "torchpose"
 # each room may import those before it, and rooms of its own line none of each other
 FLOW = [
-    ["errors", "geometry"],
+    ["errors"],
+    ["geometry"],
     ["config", "ellipse", "grids", "kernels"],
     ["camera", "target"],
     ["handeye", "results", "pnp"],

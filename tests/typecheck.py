@@ -28,7 +28,7 @@ _NUMBER: Any = float | int | torch.Tensor
 _beartype: Any = beartype(conf=BeartypeConf(hint_overrides=FrozenDict({float: _NUMBER})))
 OFTEN = 100  # calls of a function after which every tenth is checked
 # constructors that take what `torch.as_tensor` takes, and say with the field's name what is wrong with the rest
-COERCING = {"torchpose.camera.model.Camera.__init__"}
+COERCING = {"torchpose.camera.model.Camera.__init__", "torchpose.pipeline.PoseEstimator.__init__"}
 
 
 def install() -> None:
@@ -52,7 +52,11 @@ class _Loader(SourceFileLoader):
         for name, value in list(vars(module).items()):
             if getattr(value, "__module__", None) != module.__name__:
                 continue  # of another module, which has been through here
-            if isinstance(value, FunctionType):
+            if getattr(value, "checks_arguments", False):
+                value.__wrapped__ = checked(
+                    value.__wrapped__
+                )  # after the function's own checks, whose errors are public
+            elif isinstance(value, FunctionType):
                 setattr(module, name, checked(value))
             elif isinstance(value, type):
                 _check_methods(value)

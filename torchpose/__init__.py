@@ -6,15 +6,18 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from torchpose import ellipse, pnp
+    from torchpose import analysis, calibration, design, detect, ellipse, pnp, sim
     from torchpose.camera import Camera
-    from torchpose.errors import ConfigError, FrameError, TorchposeError
+    from torchpose.errors import ArgumentError, ConfigError, FrameError, TorchposeError
     from torchpose.handeye import HandEye
     from torchpose.pipeline import PoseEstimator
+    from torchpose.pose import centers
     from torchpose.results import Detections, Misfit, Motions, Poses, Reason, Status
+    from torchpose.rings import zernike
     from torchpose.target import Target
 
 __all__ = [
+    "ArgumentError",
     "Camera",
     "ConfigError",
     "Detections",
@@ -28,12 +31,20 @@ __all__ = [
     "Status",
     "Target",
     "TorchposeError",
+    "analysis",
+    "calibration",
+    "centers",
+    "design",
+    "detect",
     "ellipse",
     "pnp",
+    "sim",
+    "zernike",
 ]
 __version__ = "0.2.0.dev0"
 
 _HOME = {
+    "ArgumentError": "errors",
     "Camera": "camera",
     "ConfigError": "errors",
     "Detections": "results",
@@ -48,6 +59,7 @@ _HOME = {
     "Target": "target",
     "TorchposeError": "errors",
 }
+_MODULES = {"centers": "pose.centers", "zernike": "rings.zernike"}
 
 
 def __getattr__(name: str) -> Any:
@@ -55,7 +67,7 @@ def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     if name not in _HOME:
-        return import_module(f"{__name__}.{name}")
+        return import_module(f"{__name__}.{_MODULES.get(name, name)}")
     value = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
     globals()[name] = value
     return value

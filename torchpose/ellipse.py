@@ -12,7 +12,9 @@ import torch
 from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
+from torchpose.errors import ArgumentError
 from torchpose.geometry import conics
+from torchpose.geometry.arguments import checked, expect_index, expect_not_negative, expect_positive
 from torchpose.geometry.least_squares import geman_mcclure
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import Tiles
@@ -54,6 +56,7 @@ class EllipseFit(Rows):
         return self.covariance[:, :2, :2]
 
 
+@checked
 def fit(
     points: Points, index: Index, count: int, weights: Weights = None, *, method: Method = "halir-flusser"
 ) -> Ellipses:
@@ -75,7 +78,12 @@ def fit(
     Returns:
         NaN for ellipses with fewer than 6 points of weight above 0, whose points lie on a line, or with a NaN among
         them.
+
+    Raises:
+        ArgumentError: shapes or dtypes that do not fit, an index outside of 0 to count - 1, a negative weight, an
+            unknown method; so do all functions of this module.
     """
+    _expect(index, count, weights)
     if count == 0:
         return torch.zeros(0, 5, dtype=torch.float64, device=points.device)
     if weights is None and _is_blocked(index, count):
@@ -86,6 +94,13 @@ def fit(
     else:
         parts = [_moments(block, weight) for block, weight in _padded(points, index, count, weights)]
     return _from_moments(*(torch.cat(part) for part in zip(*parts, strict=True)), method=method)
+
+
+def _expect(index: Tensor, count: int, weights: Tensor | None = None) -> None:
+    expect_not_negative(count=count)
+    expect_index("index", index, count)
+    if weights is not None:
+        expect_not_negative(weights=weights)
 
 
 def _is_blocked(index: Tensor, count: int) -> bool:
@@ -114,6 +129,7 @@ def _padded(points: Tensor, index: Tensor, count: int, weights: Tensor | None) -
         yield block, weight
 
 
+@checked
 def fit_blocks(
     points: Float[Tensor, "M P 2"], weights: Real[Tensor, "M P"] | None = None, *, method: Method = "halir-flusser"
 ) -> Ellipses:
@@ -121,6 +137,8 @@ def fit_blocks(
 
     Free of data-dependent control flow: ``torch.compile(fit_blocks)`` fuses it, at half the cost or less.
     """
+    if weights is not None:
+        expect_not_negative(weights=weights)
     return _from_moments(*_moments(points, weights), method=method)
 
 
@@ -265,14 +283,18 @@ def _positive_eigenvector(matrix: Tensor, eye: Tensor) -> Tensor:
     return crosses.gather(0, longest.expand(1, 3, -1)).squeeze(0)
 
 
+@checked
 def distance(points: Points, index: Index, ellipses: Ellipses) -> Float[Tensor, " E"]:
     """Signed first-order distances in px of points to their ellipses, positive outside (Sampson)."""
+    _expect(index, len(ellipses))
     value, gx, gy = _radial(points, index, ellipses)
     return value / torch.sqrt(gx * gx + gy * gy)
 
 
+@checked
 def curvature(points: Points, index: Index, ellipses: Ellipses) -> Float[Tensor, " E"]:
     """Curvature in 1/px of the ellipses where the rays from their centres through the points meet them."""
+    _expect(index, len(ellipses))
     _, gx, gy = _radial(points, index, ellipses)
     steep = gx * gx + gy * gy
     # p^3 / (a b)^2 with p = 1 / |grad rho| the distance of the tangent from the centre
@@ -300,6 +322,7 @@ def _radius(x: Tensor, y: Tensor, cx: Tensor, cy: Tensor, i11: Tensor, i12: Tens
     return rho - 1, (i11 * u + i12 * v) / rho, (i12 * u + i22 * v) / rho
 
 
+@checked
 def fit_robust(
     points: Points,
     index: Index,
@@ -321,6 +344,10 @@ def fit_robust(
         scales: px, scales of the weights, from the error of ``start`` down to a few times the edge noise.
         cut: in standard deviations.
     """
+    _expect(index, count)
+    expect_positive(cut=cut, **{f"scales[{i}]": scale for i, scale in enumerate(scales)})
+    if len(start) != count:
+        raise ArgumentError(f"start: has {len(start)} ellipses; give one for each of the {count} of count")
     tiles, xy, there = _tiled(points, index, count)
 
     def distances(ellipses: Tensor) -> Tensor:
@@ -349,6 +376,7 @@ def fit_robust(
     return ellipses, tiles.flat(keep) > 0
 
 
+@checked
 def with_covariance(
     points: Points, index: Index, ellipses: Ellipses, weights: Weights = None, *, correlation: float = 1.0
 ) -> EllipseFit:
@@ -365,6 +393,8 @@ def with_covariance(
         correlation: variance inflation where errors are correlated along the edge (`zernike.edge_correlation`).
     """
     count = ellipses.shape[0]
+    _expect(index, count, weights)
+    expect_positive(correlation=correlation)
     w = torch.ones_like(points[:, 0], dtype=torch.float64) if weights is None else weights.double()
     value, gx, gy = _radial(points, index, ellipses)
     norm = torch.sqrt(gx * gx + gy * gy)

@@ -33,3 +33,7 @@ class ConfigError(TorchposeError):
 
 class FrameError(TorchposeError):
     """Frames of a wrong size, type or value range were passed to a stage."""
+
+
+class ArgumentError(TorchposeError, ValueError):
+    """An argument of a function has a wrong shape, type or device, or is out of range; the message names it first."""

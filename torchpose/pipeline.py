@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, replace
 from itertools import combinations
-from typing import Any, Literal, get_args
+from os import PathLike
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from torchpose.camera import LINEAR, Camera, Tone
 from torchpose.camera.model import Model
 from torchpose.camera.plausible import check_intrinsics
-from torchpose.detect import Candidates, Wanted, find_candidates, find_coarse, merge_duplicates, reduction_factor
+from torchpose.detect import (
+    Candidates,
+    Wanted,
+    find_candidates,
+    find_coarse,
+    merge_duplicates,
+    reduction_factor,
+    same_ellipses,
+)
 from torchpose.errors import ConfigError, FrameError
 from torchpose.geometry import blur as blurs
-from torchpose.geometry.grey import grey
+from torchpose.geometry.grey import FRAME_TYPES, as_frames
 from torchpose.geometry.segments import marked
 from torchpose.identify import (
     MIN_MARKERS,
@@ -25,8 +35,10 @@ from torchpose.identify import (
     Scene,
     identify,
     identify_boards,
+    in_company,
     indistinguishable,
     look_again,
+    named,
 )
 from torchpose.kernels import find_compiler
 from torchpose.pose import (
@@ -50,8 +62,19 @@ _LEAST_CANDIDATE = (
     3.0  # px of semi-minor axis: rings below 4 are refused (`rings.measure`); candidates of covered ones err
 )
 _LEGIBLE = 1.8  # px, of blur, up to which the mean profile of a ring tells its code (measured: decisions/0059)
-_FRAME_TYPES = (torch.uint8, torch.uint16, torch.float16, torch.bfloat16, torch.float32, torch.float64)
+_LAYOUT = ("ids", "centers", "normals", "radii", "valid", "polarity")  # of the table: what makes a target
 Method = Literal["photometric", "edges", "centers", "paper"]
+
+
+class _Tried(NamedTuple):
+    """Blurred rings (K,) that were measured before their frames were searched at all scales.
+
+    outer: the circles that they were measured from. exact: whether by the exact model.
+    """
+
+    outer: Candidates
+    rings: Rings
+    exact: Tensor
 
 
 class PoseEstimator(nn.Module):
@@ -59,8 +82,9 @@ class PoseEstimator(nn.Module):
 
     Args:
         camera: intrinsics and distortion; frames must have its size.
-        target: one target or several; each gets a row for every frame. A board of equal marks that looks the same after
-            a turn is ambiguous, unless measured places tell or it is said to be upright (`Target.upright`).
+        target: one target or several, as `Target`, name or path; each gets a row for every frame. A board of equal
+            marks that looks the same after a turn is ambiguous, unless measured places tell or it is said to be upright
+            (`Target.upright`).
         instances: most copies of a target that a frame is searched for. Every further copy that has a pose adds a row;
             without it the best-supported copy counts, and `Poses.copies` says how many were seen.
         method: "photometric" refines every pose on the grey values around its rings, "edges" on all their edge points;
@@ -83,7 +107,7 @@ class PoseEstimator(nn.Module):
     def __init__(
         self,
         camera: Camera,
-        target: Target | Sequence[Target],
+        target: Target | str | PathLike[str] | Sequence[Target | str | PathLike[str]],
         *,
         instances: int = 1,
         method: Method = "photometric",
@@ -92,9 +116,11 @@ class PoseEstimator(nn.Module):
         compile: bool = False,
     ) -> None:
         super().__init__()
+        if not isinstance(camera, Camera):
+            raise ConfigError(f"camera: is of type {type(camera).__name__}; pass a Camera, such as Camera.load(path)")
         check_intrinsics(camera.matrix, camera.width, camera.height, camera.model)
         self.camera = camera
-        self.targets = (target,) if isinstance(target, Target) else tuple(target)
+        self.targets = _targets(target)
         _check_targets(self.targets)
         if instances < 1:
             raise ConfigError(f"instances: {instances} given; give the most copies of a target in a frame, 1 or more")
@@ -114,8 +140,7 @@ class PoseEstimator(nn.Module):
         for owner in ("camera", "table"):
             for name, value in _tensors(getattr(self, owner)).items():
                 self.register_buffer(f"{owner}_{name}", value.detach().clone())  # the caller's own stays the caller's
-        lens = get_args(Model).index(self.camera.model)
-        self.register_buffer("made_for", torch.tensor([self.camera.width, self.camera.height, lens]))
+        self.register_buffer("made_for", self._of_camera())
         self._from_buffers()
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> PoseEstimator:
@@ -128,15 +153,25 @@ class PoseEstimator(nn.Module):
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any) -> None:
         """
         Raises:
-            ConfigError: the state is of a camera of another size or lens model.
+            ConfigError: the state is of a camera of another size or lens model, or of another target.
         """
-        made_for = state_dict.get(f"{prefix}made_for", self.made_for)
-        if not torch.equal(made_for.to(self.made_for), self.made_for):
+        # from what was given, not from the buffers: these may be on the device meta, without numbers
+        made_for, table = self._of_camera(), MarkerTable.of(self.targets)
+        given = state_dict.get(f"{prefix}made_for", made_for)
+        if not torch.equal(given.to(made_for), made_for):
             raise ConfigError(
                 "state_dict: made for a camera of another size or lens model; make the estimator for that one"
             )
+        for name in _LAYOUT:
+            own, other = getattr(table, name), state_dict.get(f"{prefix}table_{name}")
+            if other is not None and not other.is_meta and not torch.equal(other.to(own), own):
+                raise ConfigError("state_dict: made for another target; make the estimator for that one")
         super()._load_from_state_dict(state_dict, prefix, *args)
         self._from_buffers()
+
+    def _of_camera(self) -> Tensor:
+        """(3,) what a camera is beside its numbers."""
+        return torch.tensor([self.camera.width, self.camera.height, get_args(Model).index(self.camera.model)])
 
     def _from_buffers(self) -> None:
         for owner in ("camera", "table"):
@@ -152,12 +187,12 @@ class PoseEstimator(nn.Module):
         return f"camera={self.camera.width}x{self.camera.height}, targets=[{names}]"
 
     @torch.no_grad()
-    def forward(self, frames: Tensor) -> Poses:
+    def forward(self, frames: Tensor | NDArray[Any]) -> Poses:
         """Poses of every target in every frame.
 
         Args:
-            frames: (B, H, W) or (B, 1, H, W) grey, or (B, 3, H, W) RGB, of which the luma counts; uint8, uint16, or
-                floating point with white at ``float_range``.
+            frames: (H, W), (B, H, W) or (B, 1, H, W) grey, or (B, 3, H, W) RGB, of which the luma counts; tensors or
+                NumPy arrays of uint8, uint16, or floating point with white at ``float_range``.
 
         Returns:
             Rows sorted by frame, target and instance, on the device of the frames: B * T of them with
@@ -177,16 +212,9 @@ class PoseEstimator(nn.Module):
             found = found._replace(solutions=still_open(scene, found))
         return outcome(scene, found)
 
-    def _checked(self, frames: Tensor) -> Tensor:
-        if frames.ndim == 4 and frames.shape[1] == 1:
-            frames = frames[:, 0]
-        if frames.ndim == 4 and frames.shape[1] == 3 and frames.dtype in _FRAME_TYPES:
-            frames = grey(frames)
-        if frames.ndim != 3:
-            raise FrameError(
-                f"frames: shape {tuple(frames.shape)}; pass grey frames (B, H, W) or (B, 1, H, W), or RGB (B, 3, H, W)"
-            )
-        if frames.dtype not in _FRAME_TYPES:
+    def _checked(self, frames: Tensor | NDArray[Any]) -> Tensor:
+        frames = as_frames(frames)
+        if frames.dtype not in FRAME_TYPES:
             raise FrameError(f"frames: dtype {frames.dtype}; pass uint8, uint16 or floating point")
         size = (self.camera.height, self.camera.width)
         if tuple(frames.shape[1:]) != size:
@@ -205,10 +233,10 @@ class PoseEstimator(nn.Module):
         if not bool(scene.table.coded.all()):
             return self._found_with_boards(scene)
         if self.instances > 1:  # a copy may be too small for the coarse scale
-            candidates = find_candidates(frames, wanted=wanted)
-            return self._read(scene, self._rings(scene, self._circles(scene, candidates)))
-        coarse = find_coarse(frames, wanted=wanted)
-        rings, copies = self._likely(scene, coarse)
+            circles = self._useful(scene, find_candidates(frames, wanted=wanted, float_range=255.0))
+            return self._read(scene, self._measured(scene, circles))
+        coarse = find_coarse(frames, wanted=wanted, float_range=255.0)
+        rings, copies, tried = self._likely(scene, coarse)
         first = self._read(scene, rings, copies)
         settled = _settled(*first)
         if bool(settled.all()):
@@ -216,8 +244,9 @@ class PoseEstimator(nn.Module):
         rest, number = (~settled).nonzero()[:, 0], (~settled).cumsum(0) - 1
         known = coarse[~settled[coarse.frame]]
         known = replace(known, frame=number[known.frame])
-        finer = find_candidates(frames[rest], wanted=wanted, coarse=known)
-        more = self._rings(scene, self._circles(scene, replace(finer, frame=rest[finer.frame])))
+        finer = find_candidates(frames[rest], wanted=wanted, coarse=known, float_range=255.0)
+        circles = self._useful(scene, replace(finer, frame=rest[finer.frame]))
+        more = self._measured(scene, circles, tried)
         return self._read(scene, Rings.cat([rings[settled[rings.frame]], more]), copies)
 
     def _found_with_boards(self, scene: Scene) -> tuple[Scene, Found]:
@@ -225,7 +254,7 @@ class PoseEstimator(nn.Module):
         factor = reduction_factor(*scene.frames.shape[-2:])
         candidates = find_candidates(scene.frames, factor)
         while True:
-            found = self._read(scene, self._rings(scene, self._circles(scene, candidates)), None, candidates)
+            found = self._read(scene, self._measured(scene, self._circles(scene, candidates)), None, candidates)
             rest = (~_settled(*found)).nonzero()[:, 0]
             factor //= 2
             if factor < 1 or rest.numel() == 0:
@@ -237,32 +266,66 @@ class PoseEstimator(nn.Module):
         candidates = candidates[torch.isin(candidates.polarity, scene.table.polarity)]
         return find_circles(scene.frames, candidates, scene.camera)
 
-    def _rings(self, scene: Scene, circles: Circles, *, precise: bool = True) -> Rings:
-        return measure_circles(scene.frames, circles, scene.camera, correct=self._recipe.correct, precise=precise)
+    def _useful(self, scene: Scene, candidates: Candidates) -> Circles:
+        """The circles that may be of a pose, and those that tell by their code alone that a target is there."""
+        circles = self._circles(scene, candidates)
+        if len(circles) == 0:
+            return circles
+        rough, at = rough_rings(circles, scene.camera), (scene.table, scene.camera.matrix)
+        return circles[in_company(rough, *at) | (_legible(circles.inside.blur) & named(rough, *at))]
 
-    def _likely(self, scene: Scene, candidates: Candidates) -> tuple[Rings, Tensor]:
+    def _rings(self, scene: Scene, circles: Circles, *, hopeful: bool = False) -> tuple[Rings, Tensor]:
+        return measure_circles(scene.frames, circles, scene.camera, correct=self._recipe.correct, hopeful=hopeful)
+
+    def _measured(self, scene: Scene, circles: Circles, tried: _Tried | None = None) -> Rings:
+        """The rings of all circles; those that were tried before are not measured from the start again."""
+        if len(circles) == 0:
+            return self._rings(scene, circles)[0]
+        fresh = torch.ones_like(circles.outer.frame, dtype=torch.bool)
+        parts = []
+        if tried is not None:
+            now, before = same_ellipses(circles.outer, tried.outer)
+            equal = (circles.outer.ellipse[now] == tried.outer.ellipse[before]).all(1)
+            fresh[now[equal]] = False
+            old = marked(before[equal], len(tried.rings))
+            parts = [tried.rings[old & tried.exact], tried.rings[old & ~tried.exact]]
+        every = Rings.cat([*parts, self._rings(scene, circles[fresh], hopeful=True)[0]])
+        # a blurred ring that is alone now is none that could be named
+        kept = in_company(every, scene.table, scene.camera.matrix) | _legible(every.blur)
+        done = len(parts[0]) if parts else 0
+        again, _ = measure_exactly(scene.frames, every[done:][kept[done:]], scene.camera)
+        return Rings.cat([every[:done], again])
+
+    def _likely(self, scene: Scene, candidates: Candidates) -> tuple[Rings, Tensor, _Tried]:
         """The rings that the best copy of every target has by its circles' rough places and codes, measured.
 
-        Also how many copies (B T,) were seen.
+        Also how many copies (B T,) were seen, and what was measured for that.
         """
+        circles, count, least = self._circles(scene, candidates), len(scene.frames), int(scene.table.valid.sum())
+        rough = rough_rings(circles, scene.camera)
         # frames with fewer circles than markers are searched at all scales anyway
-        circles = _of_full_frames(self._circles(scene, candidates), int(scene.table.valid.sum()))
-        precise = not self._recipe.on_rims
+        some = in_company(rough, scene.table, scene.camera.matrix)
+        some &= _full(rough.frame[some], count, least)[rough.frame]
         # the code of a much blurred ring is not to be read off its profile
-        blurred = blurs.axes(circles.inside.blur)[1] > _LEGIBLE**2
-        sharp, known = circles[~blurred], self._rings(scene, circles[blurred], precise=precise)
-        rough = Rings.cat([rough_rings(sharp, scene.camera), known])
-        likely = identify(rough, scene.table, scene.camera, len(scene.frames), instances=1)
-        lacking = _lacking(scene, likely)[known.frame]
-        if not precise and bool(lacking.any()):
-            # of a blurred ring the quicker model reads most codes; the dearer one reads those that are missing
-            again = measure_exactly(scene.frames, known[lacking], scene.camera)
-            known = Rings.cat([known[~lacking], again])
-            rough = Rings.cat([rough[torch.arange(len(sharp), device=again.frame.device)], known])
-            likely = identify(rough, scene.table, scene.camera, len(scene.frames), instances=1)
-        named = marked(likely.ring[likely.ring >= 0], len(rough))
-        others = self._rings(scene, sharp[named[: len(sharp)]], precise=precise)
-        return Rings.cat([others, known[named[len(sharp) :]]]), likely.copies
+        clear = _legible(rough.blur)
+        sharp, blurred, rough = circles[some & clear], circles[some & ~clear], rough[some & clear]
+        known, of = self._rings(scene, blurred)
+        likely = identify(Rings.cat([rough, known]), scene.table, scene.camera, count, instances=1)
+        # of a blurred ring the quicker model reads most codes; the dearer one reads those that are missing
+        full = _full(torch.cat([rough.frame, known.frame]), count, least)
+        exact = ((_lacking(scene, likely) & full) | (not self._recipe.on_rims))[known.frame]
+        if bool(exact.any()):
+            again, which = measure_exactly(scene.frames, known[exact], scene.camera)
+            of = torch.cat([of[~exact], of[exact][which]])
+            known = Rings.cat([known[~exact], again])
+            exact = torch.arange(len(known), device=of.device) >= len(known) - len(again)
+            likely = identify(Rings.cat([rough, known]), scene.table, scene.camera, count, instances=1)
+        chosen = marked(likely.ring[likely.ring >= 0], len(rough) + len(known))
+        others, _ = self._rings(scene, sharp[chosen[: len(rough)]])
+        if not self._recipe.on_rims:
+            others, _ = measure_exactly(scene.frames, others, scene.camera)
+        tried = _Tried(blurred.outer[of], known, exact)
+        return Rings.cat([others, known[chosen[len(rough) :]]]), likely.copies, tried
 
     def _read(
         self, scene: Scene, rings: Rings, copies: Tensor | None = None, marks: Candidates | None = None
@@ -319,10 +382,14 @@ class PoseEstimator(nn.Module):
         return solutions
 
 
-def _of_full_frames(circles: Circles, least: int) -> Circles:
-    """Those of frames that have at least so many."""
-    frame = circles.outer.frame
-    return circles[(torch.bincount(frame) >= least)[frame]]
+def _legible(blur: Tensor) -> Tensor:
+    """Rings (K,) bool of these blurs (K, 3) whose profile tells their code."""
+    return blurs.axes(blur)[1] <= _LEGIBLE**2
+
+
+def _full(frame: Tensor, frames: int, least: int) -> Tensor:
+    """Frames (B,) bool that have at least so many of the items of frames (K,)."""
+    return torch.bincount(frame, minlength=frames) >= least
 
 
 def _lacking(scene: Scene, identified: Identified) -> Tensor:
@@ -337,6 +404,16 @@ def _settled(scene: Scene, found: Found) -> Tensor:
     missing = scene.table.valid[scene.target] & (found.identified.ring < 0)
     good = marked(agreed, len(scene.frame)) & ~missing.any(1)
     return marked(scene.group[good], scene.groups).view(len(scene.frames), len(scene.table)).all(1)
+
+
+def _targets(given: Any) -> tuple[Target, ...]:
+    """Targets given as such, by their names or by the paths of their files, one or several."""
+    several = [given] if isinstance(given, Target | str | PathLike) or not isinstance(given, Iterable) else given
+    loaded = tuple(Target.load(each) if isinstance(each, str | PathLike) else each for each in several)
+    for each in loaded:
+        if not isinstance(each, Target):
+            raise ConfigError(f"target: is of type {type(each).__name__}; pass a Target, or its name or path")
+    return loaded
 
 
 def _check_targets(targets: Sequence[Target]) -> None:

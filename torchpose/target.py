@@ -13,7 +13,7 @@ import torch
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, field_validator
 from torch import Tensor
 
-from torchpose.config import format_list, format_number, read_yaml, validate, within, write_text
+from torchpose.config import format_list, format_number, quoted, read_yaml, validate, within, write_text
 from torchpose.config.kinds import Length, Number, Text
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
@@ -354,7 +354,7 @@ class Target:
             ConfigError: the folder does not exist or cannot be written.
         """
         board = [] if self.grid is None else [f'board: "{self.grid}"']
-        lines = [f'name: "{self.name}"', "units: mm", f"background: {self.background}", *board, "markers:"]
+        lines = [f"name: {quoted(self.name)}", "units: mm", f"background: {self.background}", *board, "markers:"]
         markers = zip(self.ids.tolist(), self.centers.tolist(), self.radii.tolist(), self.normals.tolist(), strict=True)
         for marker, center, (outer, inner), normal in markers:
             facing = "" if normal == [0, 0, 1] else f", normal: {format_list(normal)}"
@@ -375,7 +375,7 @@ class Target:
         if self.scale_sigma:
             lines.append(f"scale_sigma: {format_number(self.scale_sigma)}")
         if self.adjustment is not None:
-            lines.append(f'adjustment: "{self.adjustment}"')
+            lines.append(f"adjustment: {quoted(self.adjustment)}")
         if self.cross_covariance is not None:
             (rows, cols), data = self.cross_covariance.shape, format_list(self.cross_covariance.flatten().tolist())
             lines.append(f"camera_cross_covariance: {{rows: {rows}, cols: {cols}, data: {data}}}")

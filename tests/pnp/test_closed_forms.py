@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from tests.pnp.scenes import CUBOID, F64, GRID, SQUARE, errors, project, views
+from torchpose.errors import ArgumentError
 from torchpose.geometry import rotations
 from torchpose.pnp import Candidates, dlt, epnp, lines, p3p, planar, posit
 
@@ -181,9 +182,9 @@ def test_dlt_refuses_a_plane_and_planar_refuses_a_solid() -> None:
 @pytest.mark.parametrize("solver", [planar, dlt, p3p, epnp, posit])
 def test_shapes_that_do_not_fit_are_named(solver: Solver) -> None:
     _, _, xy = views(CUBOID, 4)
-    with pytest.raises(ValueError, match="image_points has shape"):
+    with pytest.raises(ArgumentError, match="image_points: has shape"):
         solver(CUBOID, xy[0])
-    with pytest.raises(ValueError, match="object_points has shape"):
+    with pytest.raises(ArgumentError, match="object_points: has shape"):
         solver(CUBOID[:3], xy)
-    with pytest.raises(ValueError, match="mask has shape"):
+    with pytest.raises(ArgumentError, match="mask: has shape"):
         solver(CUBOID, xy, torch.ones(3, 8, dtype=torch.bool))

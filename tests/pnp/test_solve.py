@@ -15,6 +15,7 @@ from torch import Tensor
 from tests.pnp.scenes import CUBOID, F64, FOCAL, GRID, MATRIX, SQUARE, errors, pixels, project, views
 from torchpose import ConfigError, kernels, pnp
 from torchpose.camera import Camera
+from torchpose.errors import ArgumentError
 from torchpose.geometry import rotations
 from torchpose.pnp import PnPCode, PnPResult
 
@@ -361,18 +362,24 @@ def test_gradient_through_a_lens_and_past_a_failure() -> None:
 def test_wrong_arguments_are_named() -> None:
     image = pixels(views(SQUARE, 3)[2])
     for arguments, message in (
-        ({"method": "magic"}, "method is 'magic'; choose one of"),
-        ({"mask": torch.ones(2, 4)}, "mask has shape"),
-        ({"weights": torch.ones(3)}, "weights has shape"),
-        ({"covariances": torch.ones(3, 4, 2)}, "covariances has shape"),
-        ({"initial": (torch.zeros(2, 3, 3), torch.zeros(2, 3))}, "initial has shapes"),
-        ({"max_iterations": 0}, "max_iterations is 0"),
+        ({"method": "magic"}, "method: is 'magic'; choose one of"),
+        ({"mask": torch.ones(2, 4, dtype=torch.bool)}, "mask: has shape"),
+        ({"weights": torch.ones(3)}, "weights: has shape"),
+        ({"covariances": torch.ones(3, 4, 2)}, "covariances: has shape"),
+        ({"initial": (torch.zeros(2, 3, 3), torch.zeros(2, 3))}, "initial: has shapes"),
+        ({"mask": torch.ones(3, 4)}, "mask: has dtype"),
+        ({"weights": -torch.ones(4)}, "weights: is negative"),
+        ({"sigma_px": 0.0}, "sigma_px: is 0.0; give a number above 0"),
+        ({"sigma_px": -1.0}, "sigma_px: is -1.0"),
+        ({"huber": 0.0}, "huber: is 0.0"),
+        ({"mask": torch.ones(3, 4, dtype=torch.bool, device="meta")}, "mask: is on meta, but image_points on cpu"),
+        ({"max_iterations": 0}, "max_iterations: is 0"),
     ):
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises(ArgumentError, match=message):
             pnp.solve(SQUARE, image, MATRIX, **arguments)
-    with pytest.raises(ValueError, match="object_points has shape"):
+    with pytest.raises(ArgumentError, match="object_points: has shape"):
         pnp.solve(GRID, image, MATRIX)
-    with pytest.raises(ValueError, match="camera has shape"):
+    with pytest.raises(ArgumentError, match="camera: has shape"):
         pnp.solve(SQUARE, image, MATRIX[:2])
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -12,9 +14,11 @@ from torchpose.geometry.blur import isotropic
 from torchpose.geometry.sectors import SECTORS
 from torchpose.identify.assignments import ratio_tolerance
 from torchpose.rings.inner_circles import InnerCircles
-from torchpose.rings.small_rings import fit_small_rings
+from torchpose.rings.small_rings import SmallRings, fit_small_rings
 from torchpose.sim import add_noise, render
 from torchpose.target import Target
+
+FOCAL = torch.tensor(1111.11)
 
 
 def begun(frame: Tensor, outer: Tensor, ratio: Tensor) -> tuple[Candidates, InnerCircles]:
@@ -24,6 +28,16 @@ def begun(frame: Tensor, outer: Tensor, ratio: Tensor) -> tuple[Candidates, Inne
     inner = torch.cat([outer[:, :2], outer[:, 2:4] * ratio[:, None], outer[:, 4:]], -1)
     seen = torch.ones(len(frame), SECTORS, dtype=torch.bool)
     return candidates, InnerCircles(ratio, one > 0, inner, seen, isotropic(0.8 * one), one < 0)
+
+
+def by_both(frames: Tensor, candidates: Candidates, inside: InnerCircles) -> SmallRings:
+    """The first fit, continued by the exact one where the blur is wide."""
+    first = fit_small_rings(frames, candidates, inside, FOCAL)
+    outer, inner = first.outer.params, first.inner.params
+    ratio = (inner[:, 2:4].prod(-1) / outer[:, 2:4].prod(-1)).sqrt()
+    inside = replace(inside, ratio=ratio, ellipse=inner, blur=first.blur)
+    second = fit_small_rings(frames, replace(candidates, ellipse=outer), inside, FOCAL, begun=True)
+    return second.where(first.promising, first)
 
 
 @pytest.mark.parametrize("tilt", [0.1, 40.0])
@@ -39,7 +53,7 @@ def test_within_their_own_covariance(tilt: float, noise: float) -> None:
     rough[:, :2] += 0.4
     rough[:, 2:4] += 0.3
     ratio = truth[:, 1, 3] / truth[:, 0, 3] + 0.05
-    found = fit_small_rings(frames, *begun(frame, rough, ratio), torch.tensor(1111.11))
+    found = fit_small_rings(frames, *begun(frame, rough, ratio), FOCAL)
     assert found.good.all()
     for fit, exact in ((found.outer, truth[:, 0]), (found.inner, truth[:, 1])):
         error = fit.params[:, :2] - exact[:, :2]
@@ -62,7 +76,7 @@ def test_codes_of_much_blurred_rings(blur: float) -> None:
     rough = truth[:, 0].clone()
     rough[:, 2:4] += 0.5
     frame, start = torch.arange(10).repeat_interleave(4), torch.full((40,), 0.45, dtype=torch.float64)
-    found = fit_small_rings(frames, *begun(frame, rough, start), torch.tensor(1111.11))
+    found = by_both(frames, *begun(frame, rough, start))
     code = (found.inner.params[:, 2:4].prod(-1) / found.outer.params[:, 2:4].prod(-1)).sqrt()
     off = (code - truth[:, 1, 3] / truth[:, 0, 3]).abs() / ratio_tolerance(truth[:, 0, 3])
     assert found.good.double().mean() >= 0.8  # where the blur leaves the code open, the fit says so
@@ -77,7 +91,7 @@ def test_codes_without_noise() -> None:
     truth = exact_ellipses(target, camera, r, torch.tensor([[0.0, 0, 790]], dtype=torch.float64))[0]
     rough = truth[:, 0] + torch.tensor([0.2, -0.1, 0.4, 0.4, 0], dtype=torch.float64)
     nought, start = torch.zeros(4, dtype=torch.int64), torch.full((4,), 0.4, dtype=torch.float64)
-    found = fit_small_rings(frame, *begun(nought, rough, start), torch.tensor(1111.11))
+    found = by_both(frame, *begun(nought, rough, start))
     code = (found.inner.params[:, 2:4].prod(-1) / found.outer.params[:, 2:4].prod(-1)).sqrt()
     assert found.good.all()
     assert (code - truth[:, 1, 3] / truth[:, 0, 3])[:3].abs().max() < 0.005
@@ -92,5 +106,5 @@ def test_refuses_what_is_no_ring() -> None:
     rough = [[20.0, 20, 7, 7, 0], [40, 40, 9, 9, 0], [1, 40, 7, 7, 0], [60, 60, 7, 7, 0]]
     half = torch.full((4,), 0.5, dtype=torch.float64)
     frame = torch.zeros(4, dtype=torch.int64)
-    found = fit_small_rings(frames, *begun(frame, torch.tensor(rough).double(), half), torch.tensor(1111.11))
+    found = fit_small_rings(frames, *begun(frame, torch.tensor(rough).double(), half), FOCAL)
     assert not found.good.any()

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.geometry import rotations
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.least_squares import scaled_inverse
 from torchpose.sim import boundary, renderer
 from torchpose.sim.blur import Blur, Pair, blur_of, blurred, start
@@ -40,6 +41,7 @@ class Conditions:
     bits: int = 8
 
 
+@checked
 @torch.enable_grad()
 def pose_crlb(camera: Camera, target: Target, R: Tensor, t: Tensor, **conditions: Any) -> Float[Tensor, "B 6 6"]:
     """Lower bound of the pose covariance from frames of `torchpose.sim.render` with white Gaussian noise.

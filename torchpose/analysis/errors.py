@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.geometry import rotations
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.rows import Rows
 
 
@@ -59,6 +60,7 @@ class PoseErrors(Rows):
         return torch.linalg.vector_norm(self.rotation, dim=-1)
 
 
+@checked
 def pose_errors(estimated: UncertainPose, truth: Pose) -> PoseErrors:
     """Errors of estimated poses, row by row.
 
@@ -77,6 +79,7 @@ def pose_difference(estimated: Pose, truth: Pose) -> Float[Tensor, "*batch 6"]:
     return torch.cat([estimated.t - truth.t, rotations.log(estimated.R @ truth.R.mT)], -1)
 
 
+@checked
 def rms(values: Tensor) -> Tensor:
     """Root mean square along the first dimension of (N, ...), without the rows that are NaN; NaN where all are."""
     return values.square().nanmean(0).sqrt()

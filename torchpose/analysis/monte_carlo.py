@@ -13,6 +13,7 @@ from torchpose.analysis.joint import grown, print_numbers
 from torchpose.analysis.sensitivity import Uncertainty, marker_axes, markers_seen, radius_shift
 from torchpose.camera import Camera
 from torchpose.geometry import least_squares
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.least_squares import covariance_factor
 from torchpose.pipeline import PoseEstimator
 from torchpose.sim import add_noise, render
@@ -30,6 +31,7 @@ class Trials:
     true_camera: Camera | None = None  # about which cameras are drawn, if not the nominal one: for errors of known size
 
 
+@checked
 def simulate_points(
     camera: Camera, target: Target, R: Tensor, t: Tensor, uncertainty: Uncertainty, **trials: Any
 ) -> Float[Tensor, "D B 6"]:
@@ -74,6 +76,7 @@ def simulate_points(
     return _errors(found, R, t)
 
 
+@checked
 def simulate_frames(
     camera: Camera, target: Target, R: Tensor, t: Tensor, uncertainty: Uncertainty, **imaging: Any
 ) -> Float[Tensor, "D B 6"]:

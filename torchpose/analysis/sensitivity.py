@@ -19,6 +19,7 @@ from torch import Tensor
 from torchpose.analysis.joint import POSE, grown, joint_inverse, marker_columns, print_numbers
 from torchpose.camera import Camera
 from torchpose.camera.derivatives import by_intrinsics
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.least_squares import covariance_factor
 from torchpose.geometry.projection import by_pose, image_by_point
 from torchpose.geometry.rotations import plane_axes
@@ -91,6 +92,7 @@ class ErrorBudget:
         return covariance.diagonal(dim1=-2, dim2=-1).sqrt()
 
 
+@checked
 def edge_noise(noise: float, contrast: float, blur: float) -> float:
     """Least standard deviation (px) of an edge's position averaged over 1 px of its length: ``image`` of "rings".
 
@@ -101,6 +103,7 @@ def edge_noise(noise: float, contrast: float, blur: float) -> float:
     return noise * math.sqrt(2 * math.sqrt(math.pi * (blur * blur + 1 / 12))) / contrast
 
 
+@checked
 def propagate(
     camera: Camera, target: Target, R: Tensor, t: Tensor, uncertainty: Uncertainty, *, features: Features = "centers"
 ) -> ErrorBudget:

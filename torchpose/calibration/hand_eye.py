@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.least_squares import Minimum, Normal, Pose, Unknowns, minimise
 from torchpose.geometry.projection import by_pose
 from torchpose.handeye import HandEye
@@ -48,6 +49,7 @@ class HandEyeFit:
     robot_sigma_rad: float  # the same of its orientation
 
 
+@checked
 def calibrate_hand_eye(
     robot: Transform,
     target: Transform,

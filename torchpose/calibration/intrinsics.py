@@ -18,6 +18,7 @@ from torchpose.calibration.views import Views
 from torchpose.camera import Camera
 from torchpose.camera.model import Model
 from torchpose.errors import ConfigError
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.projection import image_by_point
 
 LENS_MODELS: dict[str, tuple[Model, tuple[str, ...]]] = {
@@ -114,6 +115,7 @@ def with_lens(camera: Camera, lens: str) -> Camera:
     return replace(camera, model=model, distortion=distortion, covariance=None).to(torch.float64)
 
 
+@checked
 def calibrate_intrinsics(
     views: Views, starts: list[Camera], *, lens: str = "brown5", plate: Plate | None = None
 ) -> Calibration:

@@ -1,5 +1,6 @@
 """Text files: read within bounds, written whole or not at all."""
 
+import json
 import os
 import stat
 from collections.abc import Iterable
@@ -109,3 +110,9 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise ConfigError(f"{path}: file: cannot be written ({error.strerror}); check the folder") from None
+
+
+def quoted(text: str) -> str:
+    """A string as YAML reads it back, whatever is in it."""
+    double = json.dumps(text, ensure_ascii=False)
+    return "".join(c if c.isprintable() or c == " " else f"\\U{ord(c):08x}" for c in double)

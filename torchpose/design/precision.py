@@ -14,6 +14,7 @@ from torchpose.camera import Camera
 from torchpose.design.predict import Imaging, deviations, edge_covariance, in_view, outlines, predicted_covariance
 from torchpose.design.volume import Offsets, Poses, WorkingVolume
 from torchpose.errors import ConfigError
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.rows import Rows
 from torchpose.io.rows import Row
 from torchpose.target import Target
@@ -88,6 +89,7 @@ class PrecisionMap:
     by_place: Float[Tensor, "Y X 3"]  # at the farthest distance, over tilts of 0 and the largest
 
 
+@checked
 def predict_volume(camera: Camera, target: Target, volume: WorkingVolume, imaging: Imaging) -> Precision:
     """Predicted standard deviations of a target in the middle and where each of them is largest.
 
@@ -112,6 +114,7 @@ def predict_volume(camera: Camera, target: Target, volume: WorkingVolume, imagin
     return Precision(found[0], found.amax(0), R[worst], t[worst])
 
 
+@checked
 def precision_map(camera: Camera, target: Target, volume: WorkingVolume, imaging: Imaging) -> PrecisionMap:
     """Maps of the predicted deviations over distance and tilt, and over the offset; the roll is 0."""
     distance, tilt = _steps(*volume.distance), _steps(0.0, volume.tilt)

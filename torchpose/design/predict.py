@@ -14,6 +14,7 @@ from torchpose.analysis.joint import POSE, grown, joint_inverse, marker_columns
 from torchpose.analysis.sensitivity import around, ring_edges
 from torchpose.camera import Camera
 from torchpose.errors import ConfigError
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.projection import by_pose
 from torchpose.identify import MarkerTable
 from torchpose.pose import Evidence, Setting, on_print
@@ -66,11 +67,13 @@ class Imaging:
         return self.blur(camera, camera.matrix.new_tensor(depths)).tolist()
 
 
+@checked
 def best_focus(near: float, far: float) -> float:
     """Distance in mm to focus on, so that both ends of a range have the same disc of defocus: 2 / (1/near + 1/far)."""
     return 2 / (1 / near + 1 / far)
 
 
+@checked
 def sharp_range(camera: Camera, lens: Defocus, psf_sigma: float) -> tuple[float, float]:
     """Depths in mm between which defocus adds less blur than the lens has in focus: a disc of up to 2 psf_sigma px.
 
@@ -82,6 +85,7 @@ def sharp_range(camera: Camera, lens: Defocus, psf_sigma: float) -> tuple[float,
     return 1 / (focus + reach), 1 / (focus - reach) if focus > reach else math.inf
 
 
+@checked
 def edge_covariance(camera: Camera, target: Target, R: Tensor, t: Tensor, imaging: Imaging) -> Float[Tensor, "B 6 6"]:
     """Covariance of the pose from the position of every bit of edge along its normal, grey levels and blur known.
 
@@ -118,6 +122,7 @@ def marker_information(
     return jacobian.flatten(2, 3).mT @ weighted.flatten(2, 3)
 
 
+@checked
 def predicted_covariance(
     camera: Camera, target: Target, R: Tensor, t: Tensor, imaging: Imaging
 ) -> Float[Tensor, "B 6 6"]:
@@ -182,6 +187,7 @@ def rims(target: Target) -> Float[Tensor, "circles samples 3"]:
     return (target.centers[:, None, None] + circle).flatten(0, 1)
 
 
+@checked
 def deviations(covariance: Float[Tensor, "B 6 6"]) -> Float[Tensor, "B 6"]:
     """Standard deviations of covariances: x, y, z in um, then about x, y, z in mdeg."""
     std = covariance.diagonal(dim1=-2, dim2=-1).sqrt() * 1e3

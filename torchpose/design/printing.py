@@ -13,6 +13,7 @@ from torchpose.design.predict import Imaging, marker_information
 from torchpose.design.volume import WorkingVolume
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.least_squares import covariance_factor, scaled_inverse
 from torchpose.identify.scene import MOST_GAIN
 from torchpose.target import Target
@@ -70,6 +71,7 @@ PRINTS = {
 }
 
 
+@checked
 def print_of(text: str) -> PrintClass:
     """A print class by its name, or by its numbers ``PLACES,GAIN`` or ``PLACES,GAIN,FLATNESS`` in um.
 
@@ -87,6 +89,7 @@ def print_of(text: str) -> PrintClass:
     return PrintClass(*values)
 
 
+@checked
 def measured(camera: Camera, target: Target, volume: WorkingVolume, imaging: Imaging) -> Target:
     """The target as `torchpose calibrate --measure-target` would leave it, with the covariance of places and gain.
 
@@ -114,6 +117,7 @@ def measured(camera: Camera, target: Target, volume: WorkingVolume, imaging: Ima
     return replace(target, covariance=left.mT @ left)
 
 
+@checked
 def scale_deviation(target: Target) -> float:
     """Relative standard deviation of the scale in which the places of a print fit those of its file best."""
     assert target.covariance is not None

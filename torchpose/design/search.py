@@ -15,6 +15,7 @@ from torchpose.design.predict import Imaging, deviations, edge_covariance, in_vi
 from torchpose.design.printing import PrintClass, measured
 from torchpose.design.volume import WorkingVolume
 from torchpose.errors import ConfigError
+from torchpose.geometry.arguments import checked
 from torchpose.identify.markers import ratio_tolerance
 from torchpose.identify.scene import MOST_GAIN
 from torchpose.target import Target
@@ -107,6 +108,7 @@ class _Task:
         return measured(self.camera, target, self.volume, self.imaging)
 
 
+@checked
 def design_target(
     camera: Camera, volume: WorkingVolume, plate: Size, need: Need, imaging: Imaging, **choice: Any
 ) -> Design:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from torchpose.design.drawing import Circle, Line, Page, Rectangle, Shape, Text
 from torchpose.errors import ConfigError
+from torchpose.geometry.arguments import checked
 from torchpose.io.writers import atomic_path
 from torchpose.target import Target
 
@@ -42,6 +43,7 @@ class Sheet:
         return list(files)
 
 
+@checked
 def plate_around(target: Target) -> tuple[float, float]:
     """Width and height in mm of the smallest plate, centred on the origin, that leaves every ring a quiet zone."""
     reach = target.centers[:, :2].abs() + (1 + _QUIET) * target.radii[:, :1]
@@ -49,6 +51,7 @@ def plate_around(target: Target) -> tuple[float, float]:
     return width, height
 
 
+@checked
 def make_sheet(target: Target, plate: tuple[float, float]) -> Sheet:
     """The print sheet of a target on a plate of the given width and height in mm, centred on the target's origin.
 

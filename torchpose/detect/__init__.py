@@ -4,7 +4,7 @@ from torchpose.detect.candidates import find_candidates, find_coarse
 from torchpose.detect.lines import Segments
 from torchpose.detect.reduce import reduction_factor
 from torchpose.detect.shapes import Shapes, find_shapes
-from torchpose.detect.validation import Candidates, Verdict, Wanted, merge_duplicates
+from torchpose.detect.validation import Candidates, Verdict, Wanted, merge_duplicates, same_ellipses
 
 __all__ = [
     "Candidates",
@@ -17,4 +17,5 @@ __all__ = [
     "find_shapes",
     "merge_duplicates",
     "reduction_factor",
+    "same_ellipses",
 ]

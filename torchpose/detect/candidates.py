@@ -4,14 +4,14 @@ import math
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose import ellipse
 from torchpose.detect.arcs import chain_pairs, describe_arcs, fit_pairs, follow
-from torchpose.detect.finer import MIN_ASPECT, MIN_SEMI_MINOR, SHIFT, SIDE, cut_outs, promising_places
+from torchpose.detect.finer import MIN_ASPECT, MIN_SEMI_MINOR, SIDE, cut_outs, promising_places
 from torchpose.detect.partial import SETTLE, free_of_stumps
-from torchpose.detect.prospects import crests, hints, rings, sorted_out
+from torchpose.detect.prospects import crests, rings, sorted_out
 from torchpose.detect.reduce import area_reduce, reduction_factor
 from torchpose.detect.regions import (
     AGREE_COS,
@@ -32,16 +32,19 @@ from torchpose.detect.validation import (
     SAME,
     WHOLE,
     Candidates,
-    Place,
     Verdict,
     Wanted,
     accepted,
     explain_once,
+    glance,
     merge_duplicates,
     score,
     without_known,
 )
+from torchpose.errors import ArgumentError
 from torchpose.geometry import conics
+from torchpose.geometry.arguments import checked
+from torchpose.geometry.grey import Frames, as_frames, levels
 from torchpose.geometry.segments import marked, members, positions, segment_mean
 
 _MIN_CRESTS = 7  # of cells that are left where edges are thinned
@@ -52,34 +55,42 @@ _ARC_ROUNDS = 3  # of following the ellipse of a pair of arcs
 _PART_ROUNDS = 2  # of following the ellipse of a region that is only a part of it
 _RING_SETTLE = 2  # fits of a ring to what agrees: its edges are measured later
 
-_LENGTH = 1.5  # of a place: semi-major axis over the least semi-minor one wanted (measured: docs/tried.md, cost)
 
-
+@checked
 def find_candidates(
-    frames: Shaped[Tensor, "B H W"],
+    frames: Frames,
     factor: int | None = None,
     *,
     explain: bool = False,
     wanted: Wanted = ANYTHING,
     coarse: Candidates | None = None,
+    float_range: float | None = None,
 ) -> Candidates:
     """Ellipses in grey frames, one pass for the whole batch.
 
     Args:
-        frames: in grey levels: 0..255 for float frames, up to 65535 for uint16. Steps below 1.5 levels are taken for
-            quantisation. NaN pixels are ignored.
+        frames: (H, W), (B, H, W) or (B, 1, H, W) grey, or (B, 3, H, W) RGB; uint8, uint16 or floating point, tensors
+            or NumPy arrays. Steps below 1.5 levels, of 255 in floating-point frames, are taken for quantisation. NaN
+            pixels are ignored.
         factor: integer reduction before the search; by default the smallest that gives at most 1.3 megapixels. The
             smallest semi-minor axis found is 2 reduced pixels. The same is looked for once more at twice the
             reduction, where blurred and noisy edges stand out four times as much.
         explain: also return what was looked at and rejected, see `Candidates.verdict`.
         wanted: what is asked for; of other ellipses only whole ones are found, and left out.
         coarse: what `find_coarse` found in these frames, if it is known.
+        float_range: white in floating-point frames; by default 1.0 where none of their values exceeds it, else 255.0.
+
+    Raises:
+        FrameError: frames of another shape or dtype. ArgumentError: another argument is wrong.
     """
+    frames = levels(as_frames(frames), float_range)
+    _expect_factor(factor)
     factor = reduction_factor(*frames.shape[-2:]) if factor is None else factor
     reduced = area_reduce(frames, factor)
     grad = gradient(reduced)
     sharp = find_ellipses(grad, wanted.reduced(factor))
-    found = [find_finer(frames, factor, grad, sharp, wanted)] if factor > 1 else []
+    # rings are found without (docs/tried.md)
+    found = [find_finer(frames, factor, grad, sharp, wanted)] if factor > 1 and not wanted.concentric else []
     found.append(replace(sharp, ellipse=conics.rescaled(sharp.ellipse, factor)))
     if coarse is None:
         known = accepted(sharp)
@@ -91,16 +102,23 @@ def find_candidates(
     return merge_duplicates(every if explain else accepted(every), explain=explain)
 
 
-def find_coarse(frames: Shaped[Tensor, "B H W"], *, wanted: Wanted = ANYTHING) -> Candidates:
+@checked
+def find_coarse(frames: Frames, *, wanted: Wanted = ANYTHING, float_range: float | None = None) -> Candidates:
     """What `find_candidates` finds at the coarser of its scales, at a fraction of its cost, and without its exclusion.
 
     Large rings are seen whole there, and texture, letters and noise are not seen at all.
     """
+    frames = levels(as_frames(frames), float_range)
     factor = reduction_factor(*frames.shape[-2:])
     reduced = area_reduce(area_reduce(frames, factor), 2, exact=True)
     found = accepted(find_ellipses(gradient(reduced), wanted.reduced(2 * factor)))
     found = replace(found, ellipse=conics.rescaled(found.ellipse, 2 * factor))
     return found[wanted.admits(found)]
+
+
+def _expect_factor(factor: int | None) -> None:
+    if factor is not None and factor < 1:
+        raise ArgumentError(f"factor: is {factor}; give an integer from 1")
 
 
 def find_finer(
@@ -112,11 +130,7 @@ def find_finer(
     """
     fine = factor // 2
     whole = (found.verdict == Verdict.ACCEPTED) & (found.cover > WHOLE)
-    # an arc of what is wanted turns as it does, though its own ellipse may be flatter
-    asked = (found.polarity * wanted.polarity >= 0) & (found.ellipse[:, 2] >= _LENGTH * wanted.semi_minor / factor)
-    place = promising_places(found.frame, found.ellipse, whole, asked)
-    if wanted.concentric:
-        place = place[hints(sharp, found[place])]
+    place = promising_places(found.frame, found.ellipse, whole)
     height, width = frames.shape[-2:]
     if place.numel() == 0 or min(height, width) < SIDE * fine:
         return found[place[:0]]
@@ -125,10 +139,7 @@ def find_finer(
     grad = gradient(cut)
     # where edges fill most of a cut-out, the noise of the whole frame tells more than the median of their gradients
     grad = replace(grad, threshold=torch.minimum(grad.threshold, factor / fine * sharp.threshold[frame]))
-    if wanted is not ANYTHING:  # what lies elsewhere in a cut-out is a place of its own
-        reach = SHIFT + factor / fine * found.ellipse[place, 2]
-        wanted = replace(wanted.reduced(fine), place=Place((middle - corner - 0.5 * (fine - 1)) / fine, SHIFT, reach))
-    finer = accepted(find_ellipses(grad, wanted))
+    finer = accepted(find_ellipses(grad, wanted.reduced(fine)))
     ellipses = conics.rescaled(finer.ellipse, fine)
     ellipses = torch.cat([ellipses[:, :2] + corner[finer.frame], ellipses[:, 2:]], -1)
     # the ellipses that might have been tried are those of the frame, not those of the cut-out
@@ -143,8 +154,7 @@ def find_ellipses(grad: Gradient, wanted: Wanted = ANYTHING, known: Candidates |
     What is not ``wanted`` is among them where it is seen whole, and explains its edges.
     ``known`` are accepted ellipses of a finer scale in the pixels of this one, which may explain edges better.
     """
-    cell = wanted.within_reach(grad, strong_cells(grad))
-    least = MIN_CELLS
+    cell, least = strong_cells(grad), MIN_CELLS
     if wanted.concentric:
         cell, least = crests(grad, cell), _MIN_CRESTS
     regions = level_line_regions(grad, cell, least)
@@ -168,8 +178,8 @@ def find_ellipses(grad: Gradient, wanted: Wanted = ANYTHING, known: Candidates |
     moved = positions((freed != some.ellipse).any(-1) & (plausible(grad, freed) == Verdict.ACCEPTED))
     if moved.numel():
         again = score(grad, some.frame[moved], freed[moved], some.polarity[moved])
-        found = found.replaced(valid[moved], again)
-    return explain_once(grad, merge_duplicates(found, explain=True), known)
+        found = merge_duplicates(found.replaced(valid[moved], again), explain=True)
+    return explain_once(grad, found, known)
 
 
 def fit_regions(grad: Gradient, regions: Regions, wanted: Wanted = ANYTHING) -> tuple[Candidates, Tensor]:
@@ -204,8 +214,7 @@ def fit_regions(grad: Gradient, regions: Regions, wanted: Wanted = ANYTHING) -> 
     whole = marked(good[(found.verdict == Verdict.ACCEPTED) & (found.cover > WHOLE)], count)
     explained = along & whole.index_select(0, regions.region)
     bad = positions((verdict != Verdict.ACCEPTED) & params.isfinite().all(-1))
-    unknown = torch.full((bad.numel(),), torch.nan, dtype=params.dtype, device=params.device)
-    rejected = Candidates(regions.frame[bad], params[bad], polarity[bad], unknown, unknown, verdict[bad])
+    rejected = Candidates.unscored(regions.frame[bad], params[bad], polarity[bad], verdict[bad])
     return Candidates.cat([found, rejected]), explained
 
 
@@ -250,10 +259,11 @@ def fit_arcs(grad: Gradient, arcs: Regions, wanted: Wanted = ANYTHING) -> Candid
     r = ellipse.distance(xy, index, params)
     rms = segment_mean(r.square(), index, len(pair), weight.double()).sqrt()
     good = positions(rms < ON_EDGE)
-    frame, polarity = about.frame[pair[good, 0]], about.curvature[pair[good, 0]].sign()
-    mine = wanted.admits_ellipses(frame, params[good], polarity)
-    found = score(grad, frame[mine], params[good][mine], polarity[mine])
-    found = found[asked_for(grad, found, wanted, found.cover > 0.5)]
+    first = pair[good, 0]
+    likely = Candidates.unscored(about.frame[first], params[good], about.curvature[first].sign())
+    likely = likely[asked_for(grad, likely, wanted, glance(grad, likely, 0.5))]
+    found = score(grad, likely.frame, likely.ellipse, likely.polarity)
+    found = found[found.cover > 0.5]
     found, _ = _followed(grad, merge_duplicates(found, 2 * SAME), _ARC_ROUNDS)
     return accepted(found)
 

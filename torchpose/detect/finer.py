@@ -9,22 +9,20 @@ from torchpose.detect.regions import BESIDE, MOST_A_FRAME
 from torchpose.geometry.segments import marked, near_pairs, positions, rank_in_group
 
 SIDE = 64  # px of a cut-out (convention: docs/decisions/0051)
-SHIFT = SIDE / 4  # px: how far from its middle the ellipse that it is made for may have its centre (convention)
 MIN_SEMI_MINOR = 2.0  # px of any scale: the least that the gradient's two pixels leave a hole in (convention)
 MIN_ASPECT = 0.12  # of an ellipse: a tilt of 83 degrees (convention)
-_LARGEST = (SIDE / 2 - SHIFT) / 2  # reduced px of semi-major axis: what a cut-out holds wherever in it (derived)
+_LARGEST = SIDE / 8  # reduced px of semi-major axis: what a cut-out holds wherever in it (derived)
 
 
 def promising_places(
-    frame: Int[Tensor, " M"], ellipses: Float[Tensor, "M 5"], whole: Bool[Tensor, " M"], asked: Bool[Tensor, " M"]
+    frame: Int[Tensor, " M"], ellipses: Float[Tensor, "M 5"], whole: Bool[Tensor, " M"]
 ) -> Int[Tensor, " P"]:
     """Indices of the small ellipses, of whatever verdict, worth a finer look; ellipses are sorted by frame.
 
-    Those within one that was seen whole are not, nor those beside a larger one of the same place, nor those that are
-    not asked for.
+    Those within one that was seen whole are not, nor those beside a larger one of the same place.
     """
     a, b = ellipses[:, 2], ellipses[:, 3]
-    place = positions((a < _LARGEST) & (b > 0.5 * MIN_SEMI_MINOR) & (b > MIN_ASPECT * a) & ~whole & asked)
+    place = positions((a < _LARGEST) & (b > 0.5 * MIN_SEMI_MINOR) & (b > MIN_ASPECT * a) & ~whole)
     place = place[torch.argsort(a[place], descending=True, stable=True)]
     place = place[torch.argsort(frame[place], stable=True)]
     known = positions(whole)

@@ -77,13 +77,6 @@ def rings(grad: Gradient, found: Candidates) -> Bool[Tensor, " M"]:
     return second_edges(grad, found) > _SHARE
 
 
-def hints(grad: Gradient, found: Candidates) -> Bool[Tensor, " M"]:
-    """Whether it does in some of them: an ellipse of a few cells may be a poor fit to what is there.
-
-    Half as many will do: the place of the one ring of 650 that only the finer look finds has 0.44."""
-    return second_edges(grad, found) > 0.5 * _SHARE
-
-
 def second_edges(grad: Gradient, found: Candidates) -> Float[Tensor, " M"]:
     """Share of the directions in which each ellipse is seen that have a second edge, of the opposite step, inside."""
     if len(found) == 0:

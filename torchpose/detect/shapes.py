@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Shaped
 from torch import Tensor
 
 from torchpose import ellipse
@@ -13,6 +12,8 @@ from torchpose.detect.reduce import area_reduce, reduction_factor
 from torchpose.detect.regions import ON_EDGE, gradient, strong_cells
 from torchpose.detect.validation import Candidates, Verdict
 from torchpose.geometry import conics
+from torchpose.geometry.arguments import checked
+from torchpose.geometry.grey import Frames, as_frames, levels
 from torchpose.geometry.segments import marked, pairs_in_group, positions, segment_sum
 
 _MOSTLY = 0.7  # of the samples of a line, or of the perimeter of an ellipse: between half and all (convention)
@@ -28,7 +29,10 @@ class Shapes:
     segments: Segments
 
 
-def find_shapes(frames: Shaped[Tensor, "B H W"], factor: int | None = None, *, explain: bool = False) -> Shapes:
+@checked
+def find_shapes(
+    frames: Frames, factor: int | None = None, *, explain: bool = False, float_range: float | None = None
+) -> Shapes:
     """Ellipses, segments and polygons of grey frames; where two explain the same edge, the likelier one.
 
     That is the one with fewer false alarms (Patraucean, Gurdjos, Grompone von Gioi 2017): a hexagon is no circle though
@@ -38,9 +42,11 @@ def find_shapes(frames: Shaped[Tensor, "B H W"], factor: int | None = None, *, e
         frames: as for `find_candidates`.
         factor: likewise.
         explain: likewise.
+        float_range: likewise.
     """
+    frames = levels(as_frames(frames), float_range)
     factor = reduction_factor(*frames.shape[-2:]) if factor is None else factor
-    ellipses = find_candidates(frames, factor, explain=explain)
+    ellipses = find_candidates(frames, factor, explain=explain, float_range=255.0)
     grad = gradient(area_reduce(frames, factor))
     segments = find_segments(grad, strong_cells(grad))
     segments = replace(segments, ends=factor * segments.ends + 0.5 * (factor - 1))

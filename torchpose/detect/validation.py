@@ -28,6 +28,8 @@ _ROUNDS = 4
 # 22.5 degrees in units of pi: a sample with a smaller error is on the arc, in noise one of eight (convention)
 _COVER_ERROR = 0.125
 
+_GLANCE = 48  # samples of an ellipse: of half a perimeter they tell to a fifteenth (convention)
+
 
 class Verdict(IntEnum):
     """What became of an ellipse that was looked at."""
@@ -64,14 +66,11 @@ class Candidates(Rows):
     cover: Float[Tensor, " M"]
     verdict: Int[Tensor, " M"]
 
-
-@dataclass(frozen=True, eq=False)
-class Place:
-    """Where an ellipse is looked for in each of B frames, in their px."""
-
-    center: Float[Tensor, "B 2"]
-    shift: float  # how far off its centre may be
-    reach: Float[Tensor, " B"]  # how far from there its edge may run
+    @classmethod
+    def unscored(cls, frame: Tensor, ellipse: Tensor, polarity: Tensor, verdict: Tensor | int = 0) -> "Candidates":
+        """Ellipses whose false alarms nobody has counted; accepted, unless another verdict is given."""
+        unknown = torch.full_like(ellipse[:, 0], torch.nan)
+        return cls(frame, ellipse, polarity, unknown, unknown, torch.zeros_like(frame) + verdict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,13 +80,11 @@ class Wanted:
     Attributes:
         polarity: +1 dark inside, -1 light inside, 0 either.
         semi_minor: px, the least.
-        place: where in each frame; None for anywhere.
         concentric: outer circles of rings only.
     """
 
     polarity: float = 0.0
     semi_minor: float = 0.0
-    place: Place | None = None
     concentric: bool = False
 
     @classmethod
@@ -97,32 +94,12 @@ class Wanted:
         return cls(float(each) if each.numel() == 1 else 0.0, semi_minor, concentric=True)
 
     def reduced(self, factor: int) -> "Wanted":
-        """The same in a frame reduced by a factor, anywhere in it."""
-        return replace(self, semi_minor=self.semi_minor / factor, place=None)
+        """The same in a frame reduced by a factor."""
+        return replace(self, semi_minor=self.semi_minor / factor)
 
     def admits(self, found: Candidates) -> Bool[Tensor, " M"]:
         """Which candidates are asked for, by their ellipses alone."""
-        return self.admits_ellipses(found.frame, found.ellipse, found.polarity)
-
-    def admits_ellipses(self, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> Bool[Tensor, " M"]:
-        """Which ellipses (M, 5) of frames (M,) and polarities (M,) are asked for."""
-        good = ellipses[:, 3] >= self.semi_minor
-        if self.polarity:
-            good &= polarity == self.polarity
-        if self.place is not None:
-            away = ellipses[:, :2] - self.place.center[frame]
-            good &= torch.linalg.vector_norm(away, dim=-1) < self.place.shift
-        return good
-
-    def within_reach(self, grad: Gradient, cells: Int[Tensor, " P"]) -> Int[Tensor, " Q"]:
-        """Those of the cells that an ellipse of the place may run through."""
-        if self.place is None:
-            return cells
-        frame = torch.div(cells, grad.shape[1] * grad.shape[2], rounding_mode="floor")
-        (column, row), center = grad.grid(cells), self.place.center.mT.float().contiguous()
-        x = column.float() + 0.5 - center[0].index_select(0, frame)
-        y = row.float() + 0.5 - center[1].index_select(0, frame)
-        return cells[positions(x * x + y * y < self.place.reach.float().square().index_select(0, frame))]
+        return (found.ellipse[:, 3] >= self.semi_minor) & (found.polarity * self.polarity >= 0)
 
 
 ANYTHING = Wanted()
@@ -143,9 +120,9 @@ class Samples(Rows):
     error: Float[Tensor, " S"]  # angle between gradient and normal, divided by pi; 0.5 beyond the frame
 
 
-def sample_edges(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> Samples:
-    """Samples of ellipses (M, 5), cells, of frames (M,) int64 and polarities (M,) +1 or -1."""
-    at = perimeter_samples(ellipses)
+def sample_edges(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor, most: int | None = None) -> Samples:
+    """Samples of ellipses (M, 5), cells, of frames (M,) int64 and polarities (M,) +1 or -1; ``most`` of each."""
+    at = perimeter_samples(ellipses, most)
     return edges_at(grad, frame, at.of, at.xy, at.normal * polarity.index_select(0, at.of)[:, None])
 
 
@@ -157,6 +134,14 @@ def edges_at(grad: Gradient, frame: Tensor, of: Tensor, xy: Tensor, normal: Tens
     cos = (gx * nx + gy * ny) / (gx * gx + gy * gy).sqrt().clamp_min(1e-6)
     error = torch.where(on_frame, cos.clamp(-1, 1).acos() / torch.pi, 0.5)  # 0.5: neither for nor against
     return Samples(of, xy, torch.stack([gx, gy]).mT, error)
+
+
+def glance(grad: Gradient, some: Candidates, least: float) -> Bool[Tensor, " M"]:
+    """Whether such a cover of each ellipse is not yet ruled out by a few samples, at three of their deviations."""
+    samples = sample_edges(grad, some.frame, some.ellipse, some.polarity, _GLANCE)
+    _, cover = false_alarms(grad, samples.error, samples.of, len(some))
+    deviation = math.sqrt(least * (1 - least) / _GLANCE)
+    return cover > least - 3 * deviation
 
 
 def score(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> Candidates:

@@ -17,7 +17,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-_STEP = 1.0  # standard deviations of the blur from node to node: an error below 1e-8
+# standard deviations of the blur from node to node: values err by 1e-5, derivatives by a thousandth of their largest
+# (measured against 400 nodes, axes' ratios down to a third)
+_STEP = 1.25
 
 
 def nodes_of_each(semi_major: Float[Tensor, " K"], sigma: Float[Tensor, " K"]) -> Float[Tensor, " K"]:

@@ -2,6 +2,7 @@
 
 from torchpose.identify.alike import indistinguishable
 from torchpose.identify.boards import identify_boards
+from torchpose.identify.company import in_company, named
 from torchpose.identify.copies import MIN_MARKERS
 from torchpose.identify.markers import Identified, identify
 from torchpose.identify.scene import MarkerTable, Scene, drawn_radii
@@ -15,6 +16,8 @@ __all__ = [
     "drawn_radii",
     "identify",
     "identify_boards",
+    "in_company",
     "indistinguishable",
     "look_again",
+    "named",
 ]

@@ -2,10 +2,12 @@
 
 import torch
 
+from torchpose.geometry.arguments import checked
 from torchpose.identify.hypotheses import SIZE_TOLERANCE
 from torchpose.target import MIN_RATIO_GAP, MIN_SPREAD, Target
 
 
+@checked
 def indistinguishable(one: Target, other: Target) -> bool:
     """Whether two targets look alike: as many rings of the same codes, sizes and places, whatever their scale.
 

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.camera import Camera
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.rows import Rows, shared
 from torchpose.geometry.segments import marked, pairs_in_group, segment_sum
 from torchpose.identify.assignments import Assignments, Codes, propose, ratio_tolerance
@@ -62,6 +63,7 @@ class Identified(Rows):
         return _different(group[free], marker[free], (count, self.ring.shape[1]))[self.group]
 
 
+@checked
 def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int, instances: int | None = None) -> Identified:
     """Assigns rings to the markers of every target in every frame; two rings at least, three for further copies.
 

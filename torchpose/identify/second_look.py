@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from torchpose.camera import Camera
-from torchpose.detect import Candidates, Verdict
+from torchpose.detect import Candidates
 from torchpose.geometry import conics
+from torchpose.geometry.arguments import checked
 from torchpose.identify.assignments import Codes, Marks
 from torchpose.identify.copies import MIN_MARKERS
 from torchpose.identify.hypotheses import PLACE_TOLERANCE
@@ -21,6 +22,7 @@ from torchpose.identify.scene import MarkerTable, Scene
 from torchpose.rings import Rings, mapped, measure_predicted
 
 
+@checked
 def look_again(
     scene: Scene, rings: Rings, identified: Identified, seen: Tensor, R: Tensor, t: Tensor, *, correct: bool = True
 ) -> tuple[Rings, Identified]:
@@ -49,8 +51,7 @@ def look_again(
     kept = in_view.nonzero()[:, 0]
     if kept.numel() == 0:
         return rings, identified
-    unknown, verdict = torch.full_like(depth[kept], torch.nan), torch.full_like(kept, int(Verdict.ACCEPTED))
-    candidates = Candidates(scene.frame[row[kept]], outer[kept], markers.polarity[row[kept]], unknown, unknown, verdict)
+    candidates = Candidates.unscored(scene.frame[row[kept]], outer[kept], markers.polarity[row[kept]])
     found, which = measure_predicted(scene.frames, candidates, raw[kept, 1], camera, correct=correct)
     row, marker, ideal = row[kept[which]], marker[kept[which]], ideal[kept[which], 0]
     measured = found.outer.params

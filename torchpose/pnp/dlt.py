@@ -19,7 +19,7 @@ def dlt(object_points: Tensor, image_points: Tensor, mask: Tensor | None = None)
         `Candidates` with S = 1; NaN for coplanar points.
 
     Raises:
-        ValueError: the shapes do not fit.
+        ArgumentError: the shapes do not fit.
     """
     points, xy, weight = batch_last(object_points, image_points, mask)
     frame = plane_frame(points, weight)

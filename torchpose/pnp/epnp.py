@@ -36,7 +36,7 @@ def epnp(object_points: Tensor, image_points: Tensor, mask: Tensor | None = None
         better one: `planar` finds both.
 
     Raises:
-        ValueError: the shapes do not fit.
+        ArgumentError: the shapes do not fit.
     """
     points, xy, weight = batch_last(object_points, image_points, mask)
     batch = xy.shape[2]

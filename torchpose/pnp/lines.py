@@ -8,7 +8,9 @@ projected end points of the object lines from the observed lines.
 import torch
 from torch import Tensor
 
-from torchpose.pnp.candidates import Candidates, expect
+from torchpose.errors import ArgumentError
+from torchpose.geometry.arguments import one_device
+from torchpose.pnp.candidates import Candidates, expect, expect_mask
 from torchpose.pnp.dlt import least_eigenvectors, nearest_rotation
 from torchpose.pnp.iterative import minimise
 from torchpose.pnp.normal_equations import Observations
@@ -33,7 +35,7 @@ def lines(
         where the lines do not fix the pose or the refinement does not converge.
 
     Raises:
-        ValueError: the shapes do not fit.
+        ArgumentError: the shapes do not fit.
     """
     points, foot, n, weight = _constraints(object_lines, image_lines, mask)
     frame = plane_frame(points, weight)
@@ -64,11 +66,11 @@ def _constraints(
     """Points (3, 2N, B) of the object lines, of each a point (2, 2N, B) of its image line, the plane through this and
     the camera centre, n . (x, y, 1) = 0 (3, 2N, B), and weights (2N, B)."""
     if image_lines.ndim != 4 or image_lines.shape[2:] != (2, 2):
-        raise ValueError(f"image_lines has shape {tuple(image_lines.shape)}; expected (B, N, 2, 2)")
+        raise ArgumentError(f"image_lines: has shape {tuple(image_lines.shape)}; give (B, N, 2, 2)")
     batch, count = image_lines.shape[:2]
     expect("object_lines", object_lines, (count, 2, 3), (batch, count, 2, 3))
-    if mask is not None:
-        expect("mask", mask, (batch, count))
+    expect_mask(mask, (batch, count))
+    one_device(image_lines=image_lines, object_lines=object_lines, mask=mask)
     ends = image_lines.double().permute(3, 2, 1, 0)  # (2, end, N, B)
     points = object_lines.to(ends).expand(batch, count, 2, 3).permute(3, 2, 1, 0)  # (3, end, N, B)
     if mask is not None:

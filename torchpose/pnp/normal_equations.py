@@ -91,11 +91,11 @@ class Derivatives(NamedTuple):
 
 
 def sums_of(points: Tensor) -> Sums:
-    """The sums over points (3, N, 1), found by applying them to unit vectors."""
-    count = points.shape[1]
-    unit = torch.eye(_PRODUCTS * count, dtype=points.dtype, device=points.device).unflatten(0, (_PRODUCTS, count))
+    """The sums over points (3, N, 1), found by applying them to unit vectors, the points one by one."""
+    unit = torch.eye(_PRODUCTS, dtype=points.dtype, device=points.device)[:, None, :, None]
+    single, unit = points.transpose(1, 2)[:, :, None], unit.expand(-1, -1, -1, points.shape[1])  # (3, 1, 1, N)
     model = torch.cat([points.flatten(1), torch.ones_like(points[0].flatten(1)).T]).T.contiguous()
-    return Sums(model, assemble(points, unit), assemble(points, unit, newton=True))
+    return Sums(model, assemble(single, unit).flatten(1), assemble(single, unit, newton=True).flatten(1))
 
 
 def camera_points(obs: Observations, pose: Tensor) -> Tensor:

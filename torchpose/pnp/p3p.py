@@ -29,19 +29,27 @@ def p3p(object_points: Tensor, image_points: Tensor, mask: Tensor | None = None)
         NaN where there are fewer solutions.
 
     Raises:
-        ValueError: the shapes do not fit.
+        ArgumentError: the shapes do not fit.
     """
     points, xy, weight = batch_last(object_points, image_points, mask)
+    return rank(*of_three(points, xy, weight), points, xy, weight)
+
+
+def of_three(points: Tensor, xy: Tensor, weight: Tensor | None, *, nearly: bool = False) -> tuple[Tensor, Tensor]:
+    """R (3, 3, 4, B), t (3, 4, B) from the widest three of points (3, N, B) and their images (2, N, B), unsorted.
+
+    Two solutions that noise makes complex are NaN, or with ``nearly`` the pose where they would meet.
+    """
     index = widest_triple(points, weight).expand(3, xy.shape[2])
     corners = points.expand(-1, -1, xy.shape[2]).gather(1, index.expand(3, 3, -1))  # (3, 3 points, B)
     image = xy.gather(1, index.expand(2, 3, -1))
     rays = torch.cat([image, torch.ones_like(image[:1])])
     rays = rays / rays.square().sum(0).sqrt()
-    distances = _distances(corners, rays)  # (3 points, 4, B)
+    distances = _distances(corners, rays, nearly)  # (3 points, 4, B)
     seen = rays[:, :, None] * distances  # (3, 3 points, 4, B)
     r = matmul3(_triad(seen), _triad(corners).transpose(0, 1)[:, :, None])
     t = seen.mean(1) - (r * corners.mean(1)[:, None]).sum(1)
-    return rank(r, t, points, xy, weight)
+    return r, t
 
 
 def widest_triple(points: Tensor, weight: Tensor | None) -> Tensor:
@@ -61,8 +69,11 @@ def widest_triple(points: Tensor, weight: Tensor | None) -> Tensor:
     return torch.stack([first, second, third])
 
 
-def _distances(corners: Tensor, rays: Tensor) -> Tensor:
-    """Distances (3, 4, B) of the corners (3, 3, B) along the unit rays (3, 3, B); NaN where there is no solution."""
+def _distances(corners: Tensor, rays: Tensor, nearly: bool) -> Tensor:
+    """Distances (3, 4, B) of the corners (3, 3, B) along the unit rays (3, 3, B); NaN where there is no solution.
+
+    With ``nearly`` a line of the pencil's degenerate conic that just misses the other conics counts as touching them.
+    """
     squares = torch.stack([(corners[:, i] - corners[:, j]).square().sum(0) for i, j in _PAIRS])
     unit = squares.sum(0)
     squares = squares / unit  # (3, B)
@@ -91,7 +102,9 @@ def _distances(corners: Tensor, rays: Tensor) -> Tensor:
     a, b, c = (qu * u).sum(0), (qu * v).sum(0), ((other[:, :, None] * v).sum(1) * v).sum(0)
     # a touching line has a double root, of which rounding can make a slightly negative discriminant
     discriminant = b * b - a * c
-    root = torch.where(discriminant > -1e-7 * (b * b + (a * c).abs()), discriminant.clamp_min(0), torch.nan).sqrt()
+    touching = -torch.inf if nearly else -1e-7
+    root = discriminant.clamp_min(0).sqrt()
+    root = torch.where(discriminant > touching * (b * b + (a * c).abs()), root, torch.nan)
     q = -(b + torch.where(b < 0, -root, root))
     # (alpha : beta) of alpha u + beta v: the roots q / a and c / q of a x^2 + 2 b x + c
     alpha, beta = torch.cat([q, c]), torch.cat([a, q])
@@ -103,6 +116,14 @@ def _distances(corners: Tensor, rays: Tensor) -> Tensor:
     )
     x = ray / total.sqrt()
 
+    x, residual = _polished(x, cosines, squares)
+    positive = (x > 0).all(0)
+    exact = nearly | (residual.abs().amax(0) < 1e-9)
+    return torch.where(positive & exact, x, torch.nan) * unit.sqrt()
+
+
+def _polished(x: Tensor, cosines: Tensor, squares: Tensor) -> tuple[Tensor, Tensor]:
+    """Distances (3, 4, B) after Newton steps on the cosine law, and by how much they missed it before the last."""
     for _ in range(_POLISHING):
         residual = torch.stack(
             [x[i] ** 2 + x[j] ** 2 - 2 * cosines[k] * x[i] * x[j] - squares[k] for k, (i, j) in enumerate(_PAIRS)]
@@ -116,9 +137,7 @@ def _distances(corners: Tensor, rays: Tensor) -> Tensor:
         # at a double root the Jacobian is singular: the step is then of no use
         small = step.abs().amax(0) < 0.1
         x = torch.where(small, x - step, x)
-    positive = (x > 0).all(0)
-    exact = residual.abs().amax(0) < 1e-9
-    return torch.where(positive & exact, x, torch.nan) * unit.sqrt()
+    return x, residual
 
 
 def _cubic_root(cubic: Tensor, *lower: Tensor) -> Tensor:

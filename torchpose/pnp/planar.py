@@ -15,8 +15,17 @@ from torchpose.pnp.candidates import Candidates, batch_last, rank, weighted_mean
 
 # thickness over extent (standard deviations) above which points are no plane
 _FLATNESS = 1e-2
+# below which they are an exact plane but for rounding in float32 (derived)
+_EVENNESS = 1e-6
+# and above which they have no second pose that resembles the first (convention)
+_THINNESS = 0.15
 # width over length (standard deviations) below which points are a line
 _COLLINEARITY = 1e-4
+# least curvature of the products of places and images, over their scatters, that fixes a homography: it is 0 where all
+# points but one lie on a line or only three are distinct, about 4 for a square seen from afar: in exact images
+# (rounding), and for a start that noise must not spoil (convention; what fails it is looked at by `third_pass`)
+_FIXED = 1e-12
+FIXED_FIRMLY = 1e-3
 
 
 class Frame(NamedTuple):
@@ -36,6 +45,16 @@ class Frame(NamedTuple):
     def flat(self) -> Tensor:
         """(B,) bool, do the points lie in a plane?"""
         return self.extent[0] <= _FLATNESS * self.extent[2]
+
+    @property
+    def even(self) -> Tensor:
+        """(B,) bool, are they a plane to rounding in float32?"""
+        return self.extent[0] <= _EVENNESS * self.extent[2]
+
+    @property
+    def thin(self) -> Tensor:
+        """(B,) bool, may a second pose explain them nearly as well, as it does for a plane?"""
+        return self.extent[0] <= _THINNESS * self.extent[2]
 
     @property
     def wide(self) -> Tensor:
@@ -61,7 +80,7 @@ def planar(object_points: Tensor, image_points: Tensor, mask: Tensor | None = No
         or not in front of the camera in that solution.
 
     Raises:
-        ValueError: the shapes do not fit.
+        ArgumentError: the shapes do not fit.
     """
     points, xy, weight = batch_last(object_points, image_points, mask)
     frame = plane_frame(points, weight)
@@ -87,16 +106,18 @@ def plane_frame(points: Tensor, weight: Tensor | None) -> Frame:
     return Frame(frame, center, extent)
 
 
-def ippe(points: Tensor, xy: Tensor, weight: Tensor | None, frame: Tensor, center: Tensor) -> tuple[Tensor, Tensor]:
+def ippe(
+    points: Tensor, xy: Tensor, weight: Tensor | None, frame: Tensor, center: Tensor, fixed: float = _FIXED
+) -> tuple[Tensor, Tensor]:
     """R (3, 3, 2, B) and t (3, 2, B) of the points (3, N, B) of the plane ``frame`` (3, 3, B) about ``center`` (3, B).
 
-    The two solutions come unsorted; both reproduce the homography to first order about the centre.
+    The two solutions come unsorted; both reproduce the homography to first order about the centre. NaN where it is not
+    ``fixed``, which takes four points of which no three lie on a line.
     """
     offset = points - center[:, None]
     if weight is not None:
         offset = offset * weight
-    # orthonormal basis of the columns 1, x, y of the plane coordinates: x and y are uncorrelated by the choice of axes
-    # as long as no point is missing, and made so otherwise
+    # orthonormal basis of 1, x, y: x and y are uncorrelated by the choice of axes as long as no point is missing
     ones = torch.ones_like(offset[0]) if weight is None else weight
     x, y = (frame[0, :, None] * offset).sum(0), (frame[1, :, None] * offset).sum(0)
     plane = torch.stack([x, y, ones])  # (3, N, B)
@@ -114,13 +135,14 @@ def ippe(points: Tensor, xy: Tensor, weight: Tensor | None, frame: Tensor, cente
     a, b, c = residual.unflatten(0, (2, 3)).transpose(0, 1).flatten(1, 2)  # (2N, B) each
     aa, ab, bb, ac, bc = (a * a).sum(0), (a * b).sum(0), (b * b).sum(0), (a * c).sum(0), (b * c).sum(0)
     determinant = aa * bb - ab * ab
+    scatter = coefficients[:2, 2::3].square().sum((0, 1)) * lengths[0].square() / lengths[2] ** 4
+    determinant = torch.where(determinant > fixed * scatter * (aa + bb), determinant, torch.nan)
     p = torch.stack([ab * bc - bb * ac, ab * ac - aa * bc]) / determinant  # (2, B): h3 = (p, 1)
 
     # rows 1 and 2 of H in the basis, then in x, y, 1
     h = coefficients.unflatten(1, (2, 3))  # (basis, row, column, B)
     h = h[:, :, 0] * p[0] + h[:, :, 1] * p[1] + h[:, :, 2]  # (3, 2, B)
-    hy = h[1] / (y_norm * lengths[1])
-    hx = (h[0] - skewness * h[1] / y_norm) / lengths[0]
+    hx, hy = (h[0] - skewness * h[1] / y_norm) / lengths[0], h[1] / (y_norm * lengths[1])
     q = h[2] / lengths[2]  # (2, B): image of the centroid
     jx, jy = hx - q * p[0], hy - q * p[1]  # columns of the Jacobian of the projection at the centroid
 

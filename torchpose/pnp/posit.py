@@ -30,7 +30,7 @@ def posit(object_points: Tensor, image_points: Tensor, mask: Tensor | None = Non
         `Candidates` with S = 2: both poses of a plane; the second is NaN for points in general position.
 
     Raises:
-        ValueError: the shapes do not fit.
+        ArgumentError: the shapes do not fit.
     """
     points, xy, weight = batch_last(object_points, image_points, mask)
     frame = plane_frame(points, weight)

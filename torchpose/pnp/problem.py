@@ -21,6 +21,8 @@ class Body(NamedTuple):
         frame: (3, 3, B), axes of their plane as rows, the last one normal to it.
         center: (3, B), centroid. unit: (B,), extent.
         flat, line: (B,) bool, do the points lie in a plane, on a line (or in a spot)?
+        thin: (B,) bool, are they so nearly a plane that a second pose may explain them?
+        warped: (B,) bool, do they lie in a plane, but not quite?
     """
 
     points: Tensor
@@ -30,6 +32,8 @@ class Body(NamedTuple):
     unit: Tensor
     flat: Tensor
     line: Tensor
+    thin: Tensor
+    warped: Tensor
 
 
 @dataclass(frozen=True)
@@ -177,7 +181,17 @@ def _body(points: Tensor, weight: Tensor | None) -> Body:
     if weight is not None:
         local = torch.where(weight > 0, local, 0.0)
     spot = frame.extent[2] <= 1e-12 * frame.center.abs().amax(0)
-    return Body(local, None, frame.axes, frame.center, unit, frame.flat, ~frame.wide | spot)
+    return Body(
+        local,
+        None,
+        frame.axes,
+        frame.center,
+        unit,
+        frame.flat,
+        ~frame.wide | spot,
+        frame.thin,
+        frame.flat & ~frame.even,
+    )
 
 
 def _rays(camera: Camera | Tensor, pixels: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:

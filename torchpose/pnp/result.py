@@ -17,7 +17,7 @@ class PnPCode(IntEnum):
     DEGENERATE = 2  # the points lie on one line or in one spot, or do not fix all six parameters
     BEHIND_CAMERA = 3  # no pose with all points in front of the camera explains them
     NOT_CONVERGED = 4  # of two minima, both are to be reached
-    TOO_FEW = 5  # fewer points than the method needs
+    TOO_FEW = 5  # fewer points than the method needs; those that coincide count once
     NOT_FINITE = 6  # NaN, infinity, a pixel without a ray, or a covariance that is not positive definite
 
 

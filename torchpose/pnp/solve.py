@@ -11,8 +11,10 @@ from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.camera.plausible import check_pinhole
+from torchpose.errors import ArgumentError
+from torchpose.geometry.arguments import expect_not_negative, expect_positive, one_device
 from torchpose.kernels import LEAST, compiled, padded
-from torchpose.pnp.candidates import Candidates, expect, expect_pixels
+from torchpose.pnp.candidates import Candidates, expect, expect_mask, expect_pixels
 from torchpose.pnp.dlt import dlt
 from torchpose.pnp.epnp import epnp
 from torchpose.pnp.first_pass import EVALUATIONS, Rest, first_pass, upright
@@ -22,10 +24,11 @@ from torchpose.pnp.normal_equations import COST, normal_equations
 from torchpose.pnp.p3p import p3p
 from torchpose.pnp.planar import planar
 from torchpose.pnp.posit import posit
-from torchpose.pnp.problem import Inputs, Problem, prepare
+from torchpose.pnp.problem import Body, Inputs, Problem, prepare
 from torchpose.pnp.result import PnPCode, PnPError, PnPResult
 from torchpose.pnp.second_pass import second_pass
-from torchpose.pnp.starts import batch_first, of_planes, planes, starts
+from torchpose.pnp.starts import as_poses, batch_first, of_planes, planes, starts
+from torchpose.pnp.third_pass import every_start, firm, start_roughly, third_pass, verdicts
 from torchpose.pnp.verdict import Bad, Found, Minima, Table, choose, write
 
 Method = Literal["iterative", "planar", "dlt", "p3p", "epnp", "posit"]
@@ -85,7 +88,7 @@ def solve(
         the points, the pixels and the camera (implicit function theorem); the other fields are not.
 
     Raises:
-        ValueError: shapes do not fit, or an unknown method.
+        ArgumentError: shapes, dtypes or devices do not fit, a number is out of its range, or an unknown method.
         PnPError: with ``raise_on_failure``.
         ConfigError: ``compile`` without a C++ compiler; a matrix that cannot be that of the points (`check_pinhole`).
     """
@@ -93,7 +96,7 @@ def solve(
         Inputs(object_points, image_points, camera, sigma_px, covariances, weights, mask, huber), method, initial
     )
     if max_iterations < 1:
-        raise ValueError(f"max_iterations is {max_iterations}; expected 1 or more")
+        raise ArgumentError(f"max_iterations: is {max_iterations}; give 1 or more")
     compile = compile and inputs.pixels.device.type == "cpu" and inputs.pixels.shape[1] <= _COMPILED_POINTS
     with torch.no_grad():
         result = _solve(inputs, method, starts, max_iterations, compile)
@@ -110,33 +113,44 @@ def solve(
 def _checked(
     given: Inputs, method: Method, initial: tuple[Tensor, Tensor] | None
 ) -> tuple[Inputs, tuple[Tensor, Tensor] | None]:
-    """The arguments in float64, and the starts R (B, S, 3, 3), t (B, S, 3); raises ValueError where one is wrong."""
+    """The arguments in float64, and the starts R (B, S, 3, 3), t (B, S, 3); raises ArgumentError where one is wrong."""
     batch, count = expect_pixels(given.pixels)
     pixels, camera = given.pixels.double(), given.camera
     shapes = {"object_points": (given.points, (count, 3)), "covariances": (given.covariances, (count, 2, 2))}
-    shapes |= {"weights": (given.weights, (count,)), "mask": (given.mask, (count,))}
-    if isinstance(camera, Tensor):
-        camera = camera.to(pixels)
+    shapes |= {"weights": (given.weights, (count,))}
+    if not isinstance(camera, Camera):
         shapes["camera"] = camera, (3, 3)
     for name, (value, shape) in shapes.items():
         if value is not None:
             expect(name, value, shape, (batch, *shape))
+    expect_mask(given.mask, (count,), (batch, count))
+    one_device(image_points=pixels, **{name: value for name, (value, _) in shapes.items()}, mask=given.mask)
+    expect_positive(sigma_px=given.sigma_px)
+    if given.weights is not None:
+        expect_not_negative(weights=given.weights)
+    if given.huber is not None and not given.huber > 0:
+        raise ArgumentError(f"huber: is {given.huber}; give a number of standard deviations above 0")
     if isinstance(camera, Tensor):
         check_pinhole(camera, pixels, given.mask)
     if method not in _LEAST:
-        raise ValueError(f"method is {method!r}; choose one of {', '.join(_LEAST)}")
+        raise ArgumentError(f"method: is {method!r}; choose one of {', '.join(_LEAST)}")
     if initial is not None:
-        if method != "iterative":
-            raise ValueError(f"initial is for method 'iterative'; method {method!r} needs no start")
-        rotation, translation = initial
-        if rotation.shape[0] != batch or rotation.shape[-2:] != (3, 3) or translation.shape != rotation.shape[:-1]:
-            raise ValueError(
-                f"initial has shapes {[tuple(v.shape) for v in initial]}; expected (B, 3, 3) and (B, 3), or "
-                "(B, S, 3, 3) and (B, S, 3)"
-            )
-        initial = rotation.to(pixels), translation.to(pixels)
+        initial = _checked_starts(initial, method, pixels)
+    camera = camera if isinstance(camera, Camera) else camera.to(pixels)
     huber = None if given.huber in (None, float("inf")) else float(given.huber)
     return replace(given, points=given.points.to(pixels), pixels=pixels, camera=camera, huber=huber), initial
+
+
+def _checked_starts(initial: tuple[Tensor, Tensor], method: Method, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    if method != "iterative":
+        raise ArgumentError(f"initial: is for method 'iterative'; method {method!r} needs no start")
+    rotation, translation = initial
+    if rotation.shape[0] != len(pixels) or rotation.shape[-2:] != (3, 3) or translation.shape != rotation.shape[:-1]:
+        raise ArgumentError(
+            f"initial: has shapes {[tuple(v.shape) for v in initial]}; give (B, 3, 3) and (B, 3), or (B, S, 3, 3) and "
+            "(B, S, 3)"
+        )
+    return rotation.to(pixels), translation.to(pixels)
 
 
 @cache
@@ -161,13 +175,16 @@ def _solve(
         inputs, initial = inputs.rows(index), None if initial is None else (initial[0][index], initial[1][index])
     batch = len(inputs.pixels)
     table = Table.empty(batch, inputs.pixels, compile)
+    doubt = torch.zeros(2, batch, dtype=torch.bool, device=inputs.pixels.device)
     pending: list[tuple[Tensor, Rest]] = []
     # a chunk of its own for the last few would be too small to be compiled
     firsts = range(0, max(batch - LEAST, min(batch, 1)), _CHUNK)
     for start, stop in pairwise((*firsts, batch)):
         rows = slice(start, stop)
         given = None if initial is None else (initial[0][rows], initial[1][rows])
-        which, rest = _solve_chunk(inputs.rows(rows), method, given, max_iterations, compile, table.columns(rows))
+        problem = prepare(inputs.rows(rows))
+        doubt[0, rows], doubt[1, rows] = problem.body.thin, start_roughly(problem)
+        which, rest = _solve_chunk(problem, method, given, max_iterations, compile, table.columns(rows))
         if rest is not None and len(which):
             which = padded(which) if compile else which
             pending.append((which + start, Rest(*(v[..., which] for v in rest))))
@@ -179,11 +196,47 @@ def _solve(
             _finish(problem, minima, _bad(problem, rest.pose[:, :, None], 0), columns, compile)
             table.replace(which, columns)
             pending = []
+    if method == "iterative" and initial is None:
+        for which in table.doubtful(*doubt).split(_CHUNK):
+            _look_further(inputs, which, table, max_iterations, compile)
     return table.columns(slice(asked)).result()
 
 
+def _look_further(inputs: Inputs, which: Tensor, table: Table, max_iterations: int, compile: bool) -> None:
+    """Third pass of the poses ``which`` (L,), of which ``table`` has one minimum or none."""
+    if len(which):
+        which = which[(table.integers[1, which] > PnPCode.AMBIGUOUS) | ~firm(*_outline(inputs, which))]
+    if len(which) == 0:
+        return
+    which = padded(which) if compile else which
+    problem, columns = prepare(inputs.rows(which)), Table.empty(len(which), inputs.pixels, compile)
+    pose, chi2, code = table.minimum(which)
+    poses = every_start(problem, _centred(problem, pose))
+    minima = third_pass(problem, poses, chi2, max_iterations, compile)
+    bad = (*verdicts(problem, minima, code > PnPCode.AMBIGUOUS), *_bad(problem, poses, _LEAST["iterative"]))
+    _finish(problem, minima, bad, columns, compile)
+    # with nothing to start from, the verdict of the passes before stands
+    found = poses[0, 0].isnan().logical_not().any(0).nonzero().squeeze(1)
+    table.replace(which[found], Table(columns.floats[:, found], columns.integers[:, found]))
+
+
+def _outline(inputs: Inputs, which: Tensor) -> tuple[Body, Tensor | None]:
+    """The object points of poses (L,), and their weights."""
+    if inputs.body is not None:
+        return inputs.body, None
+    problem = prepare(inputs.rows(which))
+    return problem.body, problem.weight
+
+
+def _centred(problem: Problem, pose: Tensor) -> Tensor:
+    """Poses (3, 4, ..., B) of the object's origin about the centroid, in units of the extent."""
+    shape = (3, *[1] * (pose.ndim - 3), -1)
+    r, t, center = pose[:, :3], pose[:, 3], problem.body.center.view(shape)
+    return torch.cat([r, ((t + (r * center).sum(1)) / problem.body.unit)[:, None]], 1)
+
+
 def _solve_chunk(
-    inputs: Inputs,
+    problem: Problem,
     method: Method,
     initial: tuple[Tensor, Tensor] | None,
     max_iterations: int,
@@ -191,11 +244,10 @@ def _solve_chunk(
     table: Table,
 ) -> tuple[Tensor, Rest | None]:
     """Writes the results of a chunk; returns which poses are left over (L,), and what is known of all."""
-    problem = prepare(inputs)
-    body, least, none = problem.body, _LEAST[method], inputs.pixels.new_zeros(0, dtype=torch.int64)
+    least, none = _LEAST[method], problem.seen.new_zeros(0)
     if method != "iterative":
         found = _CLOSED_FORMS[method](*batch_first(problem.observed, problem.weight))
-        closed = torch.cat([found.R, found.t[..., None]], 3).permute(2, 3, 1, 0)
+        closed = as_poses([found])
         cost = normal_equations(problem.final.each(), closed)[COST]
         solutions = Found(closed, cost, torch.zeros_like(cost, dtype=torch.int64), cost.isfinite())
         write(problem, choose(problem.final, solutions), _bad(problem, closed, least), table)
@@ -204,9 +256,7 @@ def _solve_chunk(
     if initial is not None:
         least = _LEAST_STARTED
         r, t = (v if v.ndim == n else v[:, None] for v, n in zip(initial, (4, 3), strict=True))
-        r, t = r.permute(2, 3, 1, 0), t.permute(2, 1, 0)
-        t = (t + (r * body.center[:, None]).sum(1)) / body.unit
-        poses = torch.cat([r, t[:, None]], 1)
+        poses = _centred(problem, torch.cat([r.permute(2, 3, 1, 0), t.permute(2, 1, 0)[:, None]], 1))
     elif not planes(problem):
         poses = starts(problem)
     # of several starts that are given, the minimum of each is wanted

@@ -7,7 +7,7 @@ from torchpose.pnp.candidates import Candidates
 from torchpose.pnp.epnp import epnp
 from torchpose.pnp.normal_equations import Observations
 from torchpose.pnp.p3p import p3p
-from torchpose.pnp.planar import ippe
+from torchpose.pnp.planar import FIXED_FIRMLY, ippe
 from torchpose.pnp.problem import Problem
 
 # root mean square of a start, in normalised coordinates, above which points may lie behind the camera
@@ -38,7 +38,7 @@ def of_planes(problem: Problem) -> Tensor:
     body, weight, single = problem.body, problem.weight, problem.observed.to(torch.float32)
     center = torch.zeros_like(body.center).to(single.xy)
     mask = None if weight is None else weight.to(single.xy)
-    r, t = ippe(single.points, single.xy, mask, body.frame.to(single.xy), center)
+    r, t = ippe(single.points, single.xy, mask, body.frame.to(single.xy), center, FIXED_FIRMLY)
     return torch.cat([r, t[:, None]], 1)
 
 
@@ -64,5 +64,10 @@ def _in_space(problem: Problem, rows: Tensor) -> Tensor:
             solutions = [
                 Candidates(torch.where(reflected[..., None, None], torch.inf, s.R), s.t, s.rms) for s in solutions
             ]
+    return as_poses(solutions)
+
+
+def as_poses(solutions: list[Candidates]) -> Tensor:
+    """All solutions as poses (3, 4, S, B)."""
     r, t = torch.cat([s.R for s in solutions], 1), torch.cat([s.t for s in solutions], 1)
     return torch.cat([r, t[..., None]], 3).permute(2, 3, 1, 0)

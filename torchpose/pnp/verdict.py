@@ -81,6 +81,20 @@ class Table(NamedTuple):
         self.floats.index_copy_(1, index, part.floats)
         self.integers.index_copy_(1, index, part.integers)
 
+    def doubtful(self, another: Tensor, rough: Tensor) -> Tensor:
+        """Poses (L,) that have no minimum though the points are sound, or one though there may be ``another`` (B,).
+
+        And all of those whose starts were ``rough`` (B,).
+        """
+        code = self.integers[1]
+        sound = (code != PnPCode.TOO_FEW) & (code != PnPCode.NOT_FINITE)
+        alone = self.floats[62].isnan() & (another | (code > PnPCode.AMBIGUOUS))
+        return (sound & (alone | rough)).nonzero().squeeze(1)
+
+    def minimum(self, index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """[R | t] (3, 4, L), chi-squared and code (L,) of the poses ``index``."""
+        return self.floats[:12, index].unflatten(0, (3, 4)), self.floats[60, index], self.integers[1, index]
+
     def result(self) -> PnPResult:
         """As views."""
         pose, alt = (self.floats[k : k + 12].unflatten(0, (3, 4)) for k in (0, 12))

@@ -6,8 +6,10 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import conics
+from torchpose.geometry.arguments import checked
 
 
+@checked
 def compensate(outer: EllipseFit, inner: EllipseFit, radii: Tensor) -> tuple[Tensor, Tensor]:
     """Image of the common centre of two concentric circles from both ellipse centres, eq. (7).
 
@@ -30,6 +32,7 @@ def compensate(outer: EllipseFit, inner: EllipseFit, radii: Tensor) -> tuple[Ten
     return center, covariance
 
 
+@checked
 def common_center(outer: EllipseFit, inner: EllipseFit, radii: Tensor) -> tuple[Tensor, Tensor]:
     """`exact` for rings of two circles; arguments and result as `compensate`."""
     ellipses = torch.stack([outer.params, inner.params], -2)
@@ -72,6 +75,7 @@ def exact(ellipses: Tensor, covariances: Tensor, radii: Tensor) -> tuple[Tensor,
     return torch.where(slope.isfinite().all(-1).all(-1)[..., None], center, torch.nan), covariance
 
 
+@checked
 def raw_centers(camera: Camera, ideal: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
     """Centres (K, 2) and covariances (K, 2, 2) of ideal pixels as pixels of the distorted frame."""
     k = camera.matrix

@@ -4,11 +4,13 @@ from dataclasses import replace
 
 import torch
 
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.segments import marked, rank_in_group
 from torchpose.identify import MIN_MARKERS, Scene
 from torchpose.pose.outcome import Found
 
 
+@checked
 def best_copies(scene: Scene, found: Found, instances: int) -> tuple[Scene, Found]:
     """The best rows of every frame and target: those with a pose first, then by support as they come.
 

@@ -3,11 +3,13 @@
 import torch
 from torch import Tensor
 
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.least_squares import scaled_inverse
 from torchpose.geometry.projection import by_pose, image_by_point
 from torchpose.pose.evidence import Evidence, visible
 
 
+@checked
 def pose_covariance(evidence: Evidence, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
     """Pose covariance (J^T W J)^-1 (N, 6, 6), and whether the centres determine all six parameters (N,)."""
     jacobian, _, weight = center_jacobian(evidence, R, t)

@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.segments import marked
 from torchpose.identify import MarkerTable
 from torchpose.rings import Rings
@@ -11,6 +12,7 @@ from torchpose.rings import Rings
 _ACROSS = 0.3  # of the semi-major axis: rings so far across each other are not both there (convention)
 
 
+@checked
 def crossed_out(
     rings: Rings,
     frame: Int[Tensor, " N"],

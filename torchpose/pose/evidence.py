@@ -12,6 +12,7 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.least_squares import covariance_factor
 from torchpose.geometry.rows import Rows, shared
 from torchpose.identify import MarkerTable
@@ -80,6 +81,7 @@ class Evidence(Rows):
         return replace(self, mask=mask)
 
 
+@checked
 def gather_evidence(
     rings: Rings,
     ring: Int[Tensor, "N M"],
@@ -145,6 +147,7 @@ def predicted_circles(evidence: Evidence, R: Tensor, t: Tensor) -> Tensor:
     )
 
 
+@checked
 def shape_chi2(evidence: Evidence, R: Tensor, t: Tensor) -> Tensor:
     """`misfit_of_shapes` (N, S) under S poses."""
     return misfit_of_shapes(evidence, predicted_circles(evidence, R, t))
@@ -174,6 +177,7 @@ def misfit_of_shapes(evidence: Evidence, predicted: Tensor) -> Tensor:
     return torch.where(evidence.mask[:, None, :, None], chi2, 0.0).sum((-1, -2))
 
 
+@checked
 def center_rms(evidence: Evidence, R: Tensor, t: Tensor) -> Tensor:
     """RMS distance (N,) in px of the compensated centres from the projected ones."""
     x = (R[:, None] @ evidence.points[..., None]).squeeze(-1) + t[:, None]

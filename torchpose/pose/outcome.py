@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.segments import marked, rank_in_group
 from torchpose.identify import MIN_MARKERS, Identified, Scene
 from torchpose.pose.centers import raw_centers
@@ -28,6 +29,7 @@ class Found(NamedTuple):
     solutions: Solutions
 
 
+@checked
 def outcome(scene: Scene, found: Found) -> Poses:
     """Rows of every frame and target: at least one, and one for each copy that has a pose."""
     rows, solvable = len(found.evidence), found.solvable

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchpose import pnp
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.robust import CUT
 from torchpose.pose.covariance import pose_covariance
 from torchpose.pose.evidence import CENTER_RMS, Evidence, misfit_of_shapes, predicted_circles, visible
@@ -20,6 +21,7 @@ from torchpose.results import Reason, Status
 _ITERATIONS = 60  # of the solver, at most: rows that have converged rest
 
 
+@checked
 def solve_poses(evidence: Evidence, rough: tuple[Tensor, Tensor], *, compile: bool = False) -> Solutions:
     """Pose, alternative, covariance and status of N rows with three markers or more.
 

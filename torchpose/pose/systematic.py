@@ -21,6 +21,7 @@ from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.camera.derivatives import by_intrinsics
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.least_squares import covariance_factor, scaled_inverse, solve_scaled
 from torchpose.geometry.projection import by_pose
 from torchpose.geometry.rotations import plane_axes
@@ -108,6 +109,7 @@ class OnPrint(Rows):
     known: Bool[Tensor, " N"]
 
 
+@checked
 def on_print(
     normals: MarkerNormals, setting: Setting, moved: Float[Tensor, "N M 5"], *, estimate: bool = True
 ) -> OnPrint:
@@ -401,6 +403,7 @@ def _center_jacobian(evidence: Evidence, R: Tensor, t: Tensor) -> tuple[Tensor, 
     return torch.nn.functional.pad(jacobian, (0, 1)), xy, weight
 
 
+@checked
 def center_normals(evidence: Evidence, R: Tensor, t: Tensor) -> MarkerNormals:
     """What the compensated centres tell; gain moves none."""
     jacobian, xy, weight = _center_jacobian(evidence, R, t)

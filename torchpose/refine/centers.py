@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.geometry import rotations
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.least_squares import Normal, Pose, Unknowns, minimise
 from torchpose.geometry.rows import Rows
 from torchpose.pose import Evidence, MarkerNormals
@@ -40,6 +41,7 @@ class OnCenters(Rows):
     normals: MarkerNormals
 
 
+@checked
 def refine_centers(evidence: Evidence, rotation: Tensor, translation: Tensor) -> OnCenters:
     """Refines N poses on the centres of the ellipses of both circles of every marker seen.
 

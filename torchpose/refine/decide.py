@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchpose.geometry import rotations
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.robust import of_chance
 from torchpose.pose import AMBIGUOUS_CHI2, SHAPE_FLOOR, Evidence, Solutions, center_rms, pose_covariance, shape_chi2
 from torchpose.refine.centers import refine_centers
@@ -20,6 +21,7 @@ from torchpose.refine.sight import LEAST_KEPT, Refined, Sight
 from torchpose.results import Reason, Status
 
 
+@checked
 def decide(solutions: Solutions, evidence: Evidence, sight: Sight | None = None) -> Solutions:
     """Solutions whose ambiguous rows are `Status.OK` where the ellipses' centres and shapes tell which pose is right.
 
@@ -61,6 +63,7 @@ def decide(solutions: Solutions, evidence: Evidence, sight: Sight | None = None)
     return solutions.replaced(row[sure], decided[sure])
 
 
+@checked
 def decide_on_grey(solutions: Solutions, evidence: Evidence, sight: Sight) -> Solutions:
     """Solutions whose ambiguous rows are `Status.OK` where the grey values tell which pose is right.
 

@@ -9,11 +9,12 @@ from torch import Tensor
 
 from torchpose import ellipse
 from torchpose.camera import Camera
-from torchpose.detect import Candidates, Verdict
+from torchpose.detect import Candidates
 from torchpose.detect.reduce import only_reduced, reduction_for
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.blurred_edge import LEAST, MOST
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.sectors import SECTORS, clear_of_ends, sector_about
@@ -70,6 +71,7 @@ class Rings(Rows):
         return (i[:, 2] * i[:, 3] / (o[:, 2] * o[:, 3])).sqrt()
 
 
+@checked
 def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera, *, correct: bool = True) -> Rings:
     """Measures outer and inner circle of every candidate that has both, each fitted separately.
 
@@ -78,7 +80,7 @@ def measure_rings(frames: Tensor, candidates: Candidates, camera: Camera, *, cor
         camera: its distortion is taken off the sub-pixel points before the final fit.
         correct: free the edges from what blur and curvature do to them; False leaves them as the moments read them.
     """
-    return measure_circles(frames, find_circles(frames, candidates, camera), camera, correct=correct)
+    return _both(frames, find_circles(frames, candidates, camera), camera, correct)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +99,7 @@ class Circles(Rows):
         return len(self.outer)
 
 
+@checked
 def find_circles(frames: Tensor, candidates: Candidates, camera: Camera) -> Circles:
     """Those of the candidates that have a circle inside; arguments as for `measure_rings`."""
     if len(candidates) == 0:  # frames without any cost nothing here
@@ -107,6 +110,7 @@ def find_circles(frames: Tensor, candidates: Candidates, camera: Camera) -> Circ
     return Circles(candidates, inside)[inside.found]
 
 
+@checked
 def rough_rings(circles: Circles, camera: Camera) -> Rings:
     """The circles as rings of the accuracy that they have now: good to name them, at a hundredth of the cost."""
     outer, inner = circles.outer.ellipse, circles.inside.ellipse
@@ -122,13 +126,18 @@ def rough_rings(circles: Circles, camera: Camera) -> Rings:
     return Rings(circles.outer.frame, circles.outer.polarity, outer, inner, first, second, *known)
 
 
+@checked
 def measure_circles(
-    frames: Tensor, circles: Circles, camera: Camera, *, correct: bool = True, precise: bool = True
-) -> Rings:
-    """`measure_rings` of circles that were found before; ``precise`` as for `fit_small_rings`."""
+    frames: Tensor, circles: Circles, camera: Camera, *, correct: bool = True, hopeful: bool = False
+) -> tuple[Rings, Tensor]:
+    """`measure_rings` of circles found before, and which circle each ring is of.
+
+    Rings of a wide blur are measured by the quicker model of `fit_small_rings` alone; with ``hopeful`` those are among
+    them that only the exact one may explain.
+    """
     if len(circles) == 0:
-        return _no_rings(circles.outer)
-    return _measured(frames, circles, camera, _How(correct, precise))[0]
+        return _no_rings(circles.outer), circles.outer.frame
+    return _measured(frames, circles, camera, _How(correct, hopeful))
 
 
 def _no_rings(candidates: Candidates) -> Rings:
@@ -139,32 +148,44 @@ def _no_rings(candidates: Candidates) -> Rings:
     return Rings(frame, polarity, none, none, fit, fit, none[:, :3], frame > 0, seen)
 
 
+@checked
 def measure_predicted(
     frames: Tensor, candidates: Candidates, inner: Tensor, camera: Camera, *, correct: bool = True
 ) -> tuple[Rings, Tensor]:
     """The same where the inner ellipses (M, 5) are known, about; also which candidate each ring is of, (K,) int64."""
     inside = replace(find_inner(frames, candidates, camera), ellipse=inner)
-    return _measured(frames, Circles(candidates, inside), camera, _How(correct))
+    return _both(frames, Circles(candidates, inside), camera, correct)
 
 
-def measure_exactly(frames: Tensor, rings: Rings, camera: Camera) -> Rings:
-    """Rings measured before, those whose blur is wide for their size again, by the exact model of `fit_small_rings`."""
+def _both(frames: Tensor, circles: Circles, camera: Camera, correct: bool) -> tuple[Rings, Tensor]:
+    """Rings of circles by both models, and whose they are."""
+    rings, of = measure_circles(frames, circles, camera, correct=correct, hopeful=True)
+    rings, which = measure_exactly(frames, rings, camera)
+    return rings, of[which]
+
+
+@checked
+def measure_exactly(frames: Tensor, rings: Rings, camera: Camera) -> tuple[Rings, Tensor]:
+    """Rings measured before, those whose blur is wide for their size again, by the exact model of `fit_small_rings`.
+
+    Also which of the rings each is.
+    """
     blurred = blurs.axes(rings.blur)[1].sqrt() > BLURRED * rings.inner_raw[:, 3]
-    some = rings[blurred]
+    left, index = (part.nonzero()[:, 0] for part in (~blurred, blurred))
+    some = rings[index]
     if len(some) == 0:
-        return rings
-    unknown, verdict = torch.full_like(some.polarity, torch.nan), torch.full_like(some.frame, int(Verdict.ACCEPTED))
-    candidates = Candidates(some.frame, some.outer_raw, some.polarity, unknown, unknown, verdict)
+        return rings, left
+    candidates = Candidates.unscored(some.frame, some.outer_raw, some.polarity)
     inside = replace(find_inner(frames, candidates, camera), ellipse=some.inner_raw, blur=some.blur)
-    again, _ = _measured(frames, Circles(candidates, inside), camera, _How(correct=True, begun=True))
-    return Rings.cat([rings[~blurred], again])
+    again, of = _measured(frames, Circles(candidates, inside), camera, _How(correct=True, begun=True))
+    return Rings.cat([rings[left], again]), torch.cat([left, index[of]])
 
 
 class _How(NamedTuple):
-    """correct: as for `measure_rings`. precise, begun: as for `fit_small_rings`."""
+    """correct, hopeful: as for `measure_circles`. begun: as for `fit_small_rings`."""
 
     correct: bool
-    precise: bool = True
+    hopeful: bool = False
     begun: bool = False
 
 
@@ -299,10 +320,10 @@ def _as_a_whole(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> 
     """The same for rings whose circles are too close to each other, or too small, to be measured one by one."""
     focal = camera.matrix.diagonal()[:2].mean()
     candidates = circles.outer
-    found = fit_small_rings(frames, candidates, circles.inside, focal, precise=how.precise, begun=how.begun)
+    found = fit_small_rings(frames, candidates, circles.inside, focal, begun=how.begun)
     least_outer, least_inner = _LEAST_SEMI_MINOR
     large = (found.outer.params[:, 3] > least_outer) & (found.inner.params[:, 3] > least_inner)
-    index = (found.good & large).nonzero()[:, 0]
+    index = ((found.good & large) | (found.promising & how.hopeful)).nonzero()[:, 0]
     outer, inner = found.outer[index], found.inner[index]
 
     both = torch.cat([outer.params, inner.params])

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple, cast
 
 import torch
@@ -77,6 +77,7 @@ class SmallRings(Rows):
         inner: the same.
         blur: px^2, see `geometry.blur`.
         good: whether the model explains what is seen.
+        promising: whether it is that of a blur too wide for it, and the exact one may explain more.
         seen: sectors in which it does.
     """
 
@@ -84,6 +85,7 @@ class SmallRings(Rows):
     inner: EllipseFit
     blur: Float[Tensor, "K 3"]
     good: Bool[Tensor, " K"]
+    promising: Bool[Tensor, " K"]
     seen: Bool[Tensor, "K 48"]
 
 
@@ -120,7 +122,6 @@ def fit_small_rings(
     inside: InnerCircles,
     focal: Float[Tensor, ""],
     *,
-    precise: bool = True,
     begun: bool = False,
 ) -> SmallRings:
     """Fits the model above by damped Gauss-Newton from rough rings.
@@ -130,40 +131,24 @@ def fit_small_rings(
         candidates: the outer circles, about.
         inside: what is inside of them, about; directions in which the outer edge does not show do not count.
         focal: px.
-        precise: fit rings of a wide blur by the exact integral; else a code may be off by a fifth of its tolerance.
-        begun: circles and blur are those of such a fit already, and only the exact one is wanted.
+        begun: circles and blur are those of such a fit, which the exact integral continues; by the first one alone
+            codes of rings of a wide blur may be off by a fifth of their tolerance.
     """
-    frame, outer, polarity, ratio, seen = (
-        candidates.frame,
-        candidates.ellipse,
-        candidates.polarity,
-        inside.ratio,
-        inside.seen,
-    )
+    frame, outer, ratio, scheme = candidates.frame, candidates.ellipse, inside.ratio, _PRECISE if begun else _ROUGH
     shape = conics.shape_matrix(outer)
     start = [outer[:, :2], shape[:, 0, :1], shape[:, 0, 1:], shape[:, 1, 1:], ratio[:, None]]
     apart = inside.ellipse[:, :2] - outer[:, :2] if begun else torch.zeros_like(outer[:, :2])
-    theta = torch.cat([*start, apart], -1)
     parted = (outer[:, 2].square() * (1 - ratio.square()) / focal).clamp_min(_LEAST_PARTED)
-    first = _Start(theta, Spread(blurs.limited(inside.blur, _START_SIGMA**2, MOST**2)), seen, parted, inside.clipped)
-    fit, which = _no_fit(first), torch.arange(len(outer), device=outer.device)
-    if not begun:
-        margin = torch.full_like(ratio, _MARGIN)
-        for part in _parts(_pixels(outer, margin)):
-            some = _fitted(_windows(frames, frame[part], outer[part], margin[part]), first[part], _ROUGH)
-            fit = fit.replaced(part, some)
-        if not precise:
-            return _judged(fit, outer, polarity)
-        which = _blurred(fit, outer, polarity)
-    least, most = (axis.sqrt() for axis in blurs.axes(fit.blur))
-    reach = (_BLURRED_MARGIN * most).clamp_min(_MARGIN)
-    first = replace(first, theta=fit.theta, spread=Spread(fit.blur))
-    nodes = nodes_of_each(outer[which, 2], least[which]).clamp_max(MOST_NODES)
-    for part in _parts(_pixels(outer[which], reach[which]), nodes):
-        part = which[part]
-        window = _windows(frames, frame[part], outer[part], reach[part])
-        fit = fit.replaced(part, _fitted(window, first[part], _PRECISE))
-    return _judged(fit, outer, polarity)
+    spread = Spread(blurs.limited(inside.blur, _START_SIGMA**2, MOST**2))
+    first = _Start(torch.cat([*start, apart], -1), spread, inside.seen, parted, inside.clipped)
+    least, most = (axis.sqrt() for axis in blurs.axes(spread.values))
+    margin = (_BLURRED_MARGIN * most).clamp_min(_MARGIN) if begun else torch.full_like(ratio, _MARGIN)
+    nodes = nodes_of_each(outer[:, 2], least).clamp_max(MOST_NODES) if begun else None
+    fit = _no_fit(first)
+    for part in _parts(_pixels(outer, margin), nodes):
+        window = _windows(frames, frame[part], outer[part], margin[part])
+        fit = fit.replaced(part, _fitted(window, first[part], scheme))
+    return _judged(fit, outer, candidates.polarity)
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,14 +218,6 @@ def _parts(pixels: Tensor, nodes: Tensor | None = None) -> Iterator[Tensor]:
         step = torch.zeros_like(step)
     part = 1_000_000 * step + ((size if nodes is None else size * nodes[order]).cumsum(0) / _PART).long()
     yield from order.split(part.unique_consecutive(return_counts=True)[1].tolist() if len(order) else [])
-
-
-def _blurred(fit: _Fit, outer: Tensor, polarity: Tensor) -> Tensor:
-    """Indices of the fits that may be rings whose blur is wide for their size."""
-    blur, inner = blurs.axes(fit.blur)[1].sqrt(), fit.theta[:, 5] * outer[:, 3]
-    # the first fit may leave twice as much
-    promising = fit.sound & (fit.contrast * polarity < 0) & (1 - fit.explained < 2 * (1 - _LEAST_EXPLAINED))
-    return (promising & (blur > BLURRED * inner)).nonzero()[:, 0]
 
 
 def _fitted(window: _Window, begun: _Start, scheme: _Scheme) -> _Fit:
@@ -374,12 +351,15 @@ def _judged(fit: _Fit, outer: Tensor, polarity: Tensor) -> SmallRings:
     inner_jacobian[:, 2:, 2:5] *= ratio[:, None, None]
     inner_jacobian[:, 2, 5], inner_jacobian[:, 4, 5] = params[:, 2], params[:, 3]
     inner = torch.cat([params[:, :2] + theta[:, 6:], params[:, 2:4] * ratio[:, None], params[:, 4:]], -1)
+    # a first fit may leave twice as much
+    may = shape_ok & fit.sound & (fit.contrast * polarity < 0) & (1 - fit.explained < 2 * (1 - _LEAST_EXPLAINED))
+    promising = may & (blurs.axes(fit.blur)[1].sqrt() > BLURRED * ratio * params[:, 3])
     # both circles tell the same shape and nearly the same centre: as independent ones each has twice the variance
     fits = [
         EllipseFit(p, 2 * j @ covariance @ j.mT, fit.variance.sqrt(), fit.pixels)
         for p, j in ((params, outer_jacobian), (inner, inner_jacobian))
     ]
-    return SmallRings(fits[0], fits[1], fit.blur, good, fit.seen)
+    return SmallRings(fits[0], fits[1], fit.blur, good, promising, fit.seen)
 
 
 class _Window(NamedTuple):

@@ -13,10 +13,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor, nn
 
+from torchpose.errors import ArgumentError
 from torchpose.geometry import blur as blurs
+from torchpose.geometry.arguments import checked, expect_index
 from torchpose.geometry.least_squares import solve_scaled
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import segment_sum, values_at
@@ -30,6 +32,11 @@ _ROUND = (
     0.01  # information about the blur's direction that is taken for there, in that about its size: an arc tells little
 )
 _LEAST_SLOPE = 0.4  # sigma = 0.22 N; a wider blur is out of the mask's reach and stays uncorrected beyond that
+
+
+Frames = Shaped[Tensor, "B H W"]
+Index = Int[Tensor, " E"]
+Pixels = Int[Tensor, "E 2"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,8 +120,9 @@ class ZernikeMoments(nn.Module):
         return nn.functional.conv2d(frames.to(self.weight.dtype), self.weight)
 
 
+@checked
 def moments_at(
-    frames: Tensor, frame: Tensor, pixels: Tensor, size: int = MASK, orders: tuple[tuple[int, int], ...] = EDGE_ORDERS
+    frames: Frames, frame: Index, pixels: Pixels, size: int = MASK, orders: tuple[tuple[int, int], ...] = EDGE_ORDERS
 ) -> Tensor:
     """Zernike moments (E, K) float32 of the windows at given pixels only; the columns as in `kernels`.
 
@@ -124,6 +132,7 @@ def moments_at(
     """
     height, width = frames.shape[-2:]
     half = size // 2
+    _expect_inside(frames, frame, pixels, half)
     d = torch.arange(-half, half + 1, device=frames.device)
     window = (d[:, None] * width + d[None, :]).flatten()
     base = (frame * height + pixels[:, 1]) * width + pixels[:, 0]
@@ -134,7 +143,21 @@ def moments_at(
     return values.sub_(middle) @ weight.T + middle * weight.sum(1)
 
 
-def locate(frames: Tensor, frame: Tensor, pixels: Tensor, size: int = MASK) -> Edges:
+def _expect_inside(frames: Tensor, frame: Tensor, pixels: Tensor, half: int) -> None:
+    """Raises ArgumentError where a window leaves its frame: it would hold pixels of the next line or frame."""
+    expect_index("frame", frame, len(frames))
+    if pixels.numel():
+        low, high = pixels.aminmax(dim=0)
+        size = torch.tensor([frames.shape[-1], frames.shape[-2]], device=pixels.device)
+        if bool((low < half).any() | (high >= size - half).any()):
+            raise ArgumentError(
+                f"pixels: go from {low.tolist()} to {high.tolist()} in frames of {size.tolist()}; "
+                f"stay {half} px from the border, half of the window"
+            )
+
+
+@checked
+def locate(frames: Frames, frame: Index, pixels: Pixels, size: int = MASK) -> Edges:
     """Sub-pixel edge in the window of each given pixel: phi from A_11, then l = A_20 / A'_11.
 
     Args:
@@ -151,6 +174,7 @@ def locate(frames: Tensor, frame: Tensor, pixels: Tensor, size: int = MASK) -> E
     return Edges(torch.stack([u + dx, v + dy]).mT, torch.stack([nx, ny]).mT, offset, step, inside)
 
 
+@checked
 def edge_blur(offset: Tensor, distance: Tensor, normal: Tensor, group: Tensor, count: int) -> Tensor:
     """What blur makes of small offsets, per group: its covariance (count, 3) px^2, see `geometry.blur`.
 
@@ -176,11 +200,13 @@ def edge_blur(offset: Tensor, distance: Tensor, normal: Tensor, group: Tensor, c
     return blurs.limited(found, 0.0, (1 - _LEAST_SLOPE) * MASK**2 / 12)
 
 
+@checked
 def slope_across(blur: Tensor, normal: Tensor) -> Tensor:
     """Slope (E,) of measured offsets over true distances under blurs (E, 3) at edges of these normals (E, 2)."""
     return (1 - 12 / MASK**2 * blurs.across(blur, *normal.unbind(-1))).clamp(_LEAST_SLOPE, 1.0)
 
 
+@checked
 def deblur(offset: Tensor, slope: Tensor, size: int = MASK) -> Tensor:
     """True offsets (E,) in px from measured ones (E,) and the slope (E,) of their blur: inverts `edge_blur`'s law.
 
@@ -194,6 +220,7 @@ def deblur(offset: Tensor, slope: Tensor, size: int = MASK) -> Tensor:
     return true
 
 
+@checked
 def curvature_shift(blur: Tensor, normal: Tensor, size: int = MASK) -> Tensor:
     """How far edges of unit curvature are read on their convex side, px^2 (px for a curvature of 1/px).
 

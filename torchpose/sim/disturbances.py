@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.rows import Rows, shared
 from torchpose.sim.fields import keys_of, smooth_field, uniform
 from torchpose.sim.sensor import normal_deviates
@@ -77,6 +78,7 @@ class SensorPattern:
     seed: int = 0
 
 
+@checked
 def disturbed(
     frames: Float[Tensor, "B H W"], what: Disturbances, index: Int[Tensor, " B"] | None = None
 ) -> Float[Tensor, "B H W"]:
@@ -100,6 +102,7 @@ def disturbed(
     return frames
 
 
+@checked
 def read_out(
     frames: Float[Tensor, "B H W"], pattern: SensorPattern, seed: int, index: Int[Tensor, " B"] | None = None
 ) -> Float[Tensor, "B H W"]:

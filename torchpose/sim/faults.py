@@ -8,9 +8,11 @@ from torch import Tensor, nn
 
 from torchpose.config import suggest
 from torchpose.errors import ConfigError
+from torchpose.geometry.arguments import checked
 from torchpose.sim.sensor import GREY_MAX, frame_keys
 
 
+@checked
 def with_faults(
     frames: Tensor, faults: Callable[[Tensor], Tensor], seed: int = 0, *, index: Tensor | None = None
 ) -> Tensor:
@@ -31,6 +33,7 @@ def with_faults(
     return out
 
 
+@checked
 def faults_of(wanted: Mapping[str, Mapping[str, Any]]) -> nn.Sequential:
     """Modules of `kornia.augmentation` by name, with their arguments, in order; in every frame unless ``p`` says so.
 

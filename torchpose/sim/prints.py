@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.errors import ConfigError
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.rotations import plane_axes
 from torchpose.geometry.rows import Rows, shared
 from torchpose.sim.raster import raster_sides
@@ -140,6 +141,7 @@ class Prints(Rows):
         return Sides(circle // 2, torch.where(hole[:, None, None], ends.flip(1), ends))
 
 
+@checked
 def printed(target: Target, errors: PrintErrors, count: int = 1, generator: torch.Generator | None = None) -> Prints:
     """``count`` prints of a target, each with errors of its own.
 

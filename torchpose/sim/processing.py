@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
 from torchpose.errors import ConfigError
+from torchpose.geometry.arguments import checked
 from torchpose.sim.sensor import GREY_MAX, toned
 
 _LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601, of red, green and blue
@@ -41,6 +42,7 @@ class Processing:
         return self.bayer or self.denoise > 0 or self.sharpen > 0 or self.jpeg is not None
 
 
+@checked
 def processed(
     raw: Float[Tensor, "B H W"], steps: Processing, bits: int = 8, gamma: float | Literal["srgb"] = 1.0
 ) -> Shaped[Tensor, "B H W"]:

@@ -21,6 +21,7 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.errors import ConfigError, FrameError
 from torchpose.geometry import rotations
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.quadrature import gauss_legendre
 from torchpose.geometry.segments import ragged_arange
 from torchpose.sim import boundary
@@ -102,6 +103,7 @@ class Imaging:
     texture: Texture | None = None
 
 
+@checked
 def render(
     camera: Camera, target: Target | Prints | Shapes, R: Tensor, t: Tensor, **imaging: Any
 ) -> Float[Tensor, "B H W"]:

@@ -10,6 +10,7 @@ from torch.nn.functional import interpolate
 
 from torchpose.camera import Camera
 from torchpose.errors import ConfigError
+from torchpose.geometry.arguments import checked
 
 GREY_MAX = 255.0  # grey levels of rendered frames, whatever the bit depth of the sensor
 _GAIN_STEP = 8  # px between the points where the light is computed
@@ -83,6 +84,7 @@ def _irradiance(x: Tensor, light: Tensor, normal: Tensor) -> Tensor:
     return (-(to_light * normal).sum(-1)).clamp_min(0) / (squared * squared.sqrt())
 
 
+@checked
 def add_noise(
     frames: Tensor,
     sigma: float | Tensor,

@@ -20,6 +20,7 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.detect.reduce import reduction_for
 from torchpose.geometry import blur as blurs
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.blurred_edge import LEAST
 from torchpose.geometry.least_squares import (
     Normal,
@@ -53,6 +54,7 @@ _PRODUCTS = 7 * 8  # of derivatives by pose and gain with each other and the err
 _CUT_FLOOR = 0.02  # px, added to the cut: what pixels alias to (convention)
 
 
+@checked
 def refine_edges(
     sight: Sight, rotation: Tensor, translation: Tensor, *, prior: Tensor | None = None, thorough: bool = True
 ) -> Refined:

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from torchpose.detect.reduce import reduction_for
 from torchpose.geometry import blur as blurs
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.blurred_edge import LEAST, MOST, Kind, Spread
 from torchpose.geometry.least_squares import (
     Block,
@@ -91,6 +92,7 @@ _QUICK = (_Stage(3, coarse=True), _Stage(1))
 _THOROUGH = (_Stage(3, coarse=True, wary=True), _Stage(2, wary=True), _Stage(2, wary=True, tempered=True))
 
 
+@checked
 def refine_photometric(
     sight: Sight, rotation: Tensor, translation: Tensor, *, prior: Tensor | None = None, thorough: bool = True
 ) -> Refined:
