@@ -23,6 +23,7 @@ from torchpose.pose import (
     solve_poses,
 )
 from torchpose.pose.excess import CAMERA, OF_EDGES, OF_MARKER, excess_of
+from torchpose.results import Misfit
 from torchpose.target import Target
 
 CAMERA_FILE = pinhole()
@@ -161,9 +162,7 @@ def test_what_is_off_is_told_and_measured(kind: str) -> None:
     found = excess_of(*problem(200, 1, deviation, 20.0 if kind == "scatter" else 1.0))
     size = {"print": found.deviation[:, 0], "camera": found.deviation[:, -1], "scatter": found.factor}
     true = {"print": 0.02, "camera": 0.5, "scatter": 20.0}[kind]
-    told = torch.stack([v > (1 if k == "scatter" else 0) for k, v in size.items()], -1)
-    assert told[:, list(size).index(kind)].double().mean() > 0.95
-    assert told.sum(-1).double().mean() < 1.1
+    assert (found.misfit == Misfit[kind.upper()]).double().mean() > 0.95
     assert true / 1.5 < size[kind].median() < 1.5 * true
     assert found.explained.double().mean() > 0.97
 

@@ -22,6 +22,7 @@ from torch import Tensor
 from torchpose.geometry.least_squares import LEAST_DIRECTION
 from torchpose.geometry.robust import of_chance, quantile
 from torchpose.geometry.rows import Rows
+from torchpose.results import Misfit
 
 OF_MARKER = 5  # two along the print, one across, and two turns of a ring that goes with the plate's bend
 # edge gain of the print; the same in the picture (wrong tone, light that floods), by as many px all round; and how far
@@ -38,11 +39,12 @@ _OFF = (  # what may be off of a camera's numbers, in the order of `CAMERA`: one
     (1, 1, 1, 1, 1, 1, 1, 1),
 )
 # how large each may be, from below any noise: mm, places and edges of an office print (50 to 100 um);
-# px at the corner of the frame, of a camera file that is a mistake beyond; of variances, as a factor
-_PRINT, _CAMERA, _SCALE = (1e-4, 0.15), (1e-3, 30.0), (1.0, 1e3)
-_SURE = 2.33  # deviations: one row in 100 that is as its files say is made wider in vain, by a factor of two (derived)
-_GRID = 16  # values, logarithmic: the closest are a factor of 1.5 apart, which a few residuals do not tell
+# px at the corner of the frame, where a file without distortion may be off by a hundred; of variances, as a factor
+_PRINT, _CAMERA, _SCALE = (1e-4, 0.15), (1e-3, 300.0), (1.0, 1e3)
+SURE = 2.33  # deviations: one row in 100 that is as its files say is made wider in vain, by a factor of two (derived)
+_GRID = 16  # values, logarithmic, apart by a factor of 1.5, of a camera 2.3, which few residuals do not tell
 _COARSE = 10  # of each of three: 2.3
+_FEW_FACTORS = 4  # of ten, of the scatter beside a camera (convention)
 _AT_ONCE = 10_000_000  # numbers: 80 MB
 
 
@@ -103,6 +105,7 @@ def excess_of(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) 
     at = torch.arange(len(row), device=row.device)
     deviation, factor, chi2 = (torch.stack([f[k] for f in families], 1)[at, best] for k in (1, 2, 3))
     explained = chi2 < _most(none.freedom[row])
+    misfit = torch.where((best == 0) & _is_tone(deviation), int(Misfit.TONE), best + 1)
     return none.replaced(
         row,
         replace(
@@ -110,10 +113,16 @@ def excess_of(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) 
             deviation=deviation,
             printed=families[0].deviation,
             factor=factor,
-            misfit=best + 1,
+            misfit=misfit,
             explained=explained,
         ),
     )
+
+
+def _is_tone(deviation: Tensor) -> Tensor:
+    """Prints (N,) bool by whose deviations (N, E) it is edges in the picture that are off, more than all else."""
+    places, (gain, bloom, _) = deviation[:, : -CAMERA - OF_EDGES], deviation[:, -CAMERA - OF_EDGES : -CAMERA].T
+    return bloom > torch.maximum(gain, places.amax(-1))
 
 
 def no_excess(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) -> Excess:
@@ -124,7 +133,7 @@ def no_excess(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) 
 def _none(right: Tensor, modes: _Modes) -> Excess:
     chi2, freedom = modes.residual.square().sum(-1), modes.there.sum(-1)
     zero, one = torch.zeros_like(right), torch.ones_like(chi2)
-    by_chance = chi2 < quantile(freedom.clamp_min(1), _SURE)
+    by_chance = chi2 < quantile(freedom.clamp_min(1), SURE)
     return Excess(zero, zero, one, torch.zeros_like(freedom), by_chance, chi2, freedom)
 
 
@@ -161,13 +170,27 @@ def _print(modes: _Modes) -> _Family:
 
 
 def _camera(modes: _Modes) -> _Family:
-    """One thing may be off, or all: of another focal length alone the mean over all tells too little."""
+    """One thing may be off, or all: of another focal length alone the mean over all tells too little.
+
+    What a large one bends beyond these numbers scatters besides.
+    """
     variance = _values(_CAMERA, modes).square()
     every = (variance.new_tensor(_OFF)[:, None] * variance[:, None]).flatten(0, 1)  # (S G, CAMERA)
-    evidence, weight, chi2 = _weighed(modes, modes.by[..., -CAMERA:], every)
+    factors = _values(_SCALE, modes, _FEW_FACTORS)
+    evidences, deviations, chi2s = [], [], []
+    for factor in factors:
+        scaled = _Modes(modes.residual / factor.sqrt(), modes.by / factor.sqrt(), modes.there)
+        evidence, weight, chi2 = _weighed(scaled, scaled.by[..., -CAMERA:], every)
+        # the more, the less likely beforehand: nothing tells a small camera error and scatter from scatter alone
+        evidences.append(evidence - (0.5 * modes.there.sum(-1) + 1) * factor.log())
+        deviations.append(weight[:, 0] @ every)
+        chi2s.append(chi2)
+    likelihood = torch.stack(evidences, -1)
+    weight = torch.softmax(likelihood, -1)
     deviation = torch.zeros_like(modes.by[:, 0])
-    deviation[:, -CAMERA:] = (weight[:, 0] @ every).sqrt()
-    return _Family(evidence, deviation, torch.ones_like(evidence), chi2)
+    deviation[:, -CAMERA:] = (weight[..., None] * torch.stack(deviations, 1)).sum(1).sqrt()
+    chi2 = (weight * torch.stack(chi2s, -1)).sum(-1)
+    return _Family(_mean(likelihood), deviation, (weight * factors).sum(-1), chi2)
 
 
 def _scatter(modes: _Modes) -> _Family:

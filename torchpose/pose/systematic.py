@@ -137,7 +137,7 @@ def on_print(
     lens = torch.cat([by_camera, beside[..., -CAMERA:]], -1) if wide else by_camera
     joint = _Joint.of(normals.over(excess.factor), own, _among(printed, n), _among(lens, n), estimate)
     place = look = _places(printed, joint, R, excess.deviation)
-    other = (excess.misfit > Misfit.PRINT).nonzero()[:, 0]
+    other = ((excess.misfit == Misfit.CAMERA) | (excess.misfit == Misfit.SCATTER)).nonzero()[:, 0]
     if other.numel():
         # a fit that looks for the markers where they are not may only seem to scatter
         if_printed = torch.cat([by_target, (further * excess.printed[:, None, None])[..., :-CAMERA]], -1)[other]
