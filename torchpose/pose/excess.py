@@ -121,8 +121,14 @@ def excess_of(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) 
 
 def _is_tone(deviation: Tensor) -> Tensor:
     """Prints (N,) bool by whose deviations (N, E) it is edges in the picture that are off, more than all else."""
-    places, (gain, bloom, _) = deviation[:, : -CAMERA - OF_EDGES], deviation[:, -CAMERA - OF_EDGES : -CAMERA].T
-    return bloom > torch.maximum(gain, places.amax(-1))
+    markers, edges, _ = by_kind(deviation)
+    return edges[:, 1] > torch.maximum(edges[:, 0], markers.amax(-1))
+
+
+def by_kind(unknowns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Further unknowns (..., E) as those of markers, edges and camera."""
+    markers, edges, camera = unknowns.tensor_split([-CAMERA - OF_EDGES, -CAMERA], -1)
+    return markers, edges, camera
 
 
 def no_excess(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) -> Excess:
@@ -155,7 +161,7 @@ def _modes(information: Tensor, right: Tensor) -> _Modes:
 
 def _print(modes: _Modes) -> _Family:
     """A print bends by no less than it stretches: across it the variance of the places along it counts, and more."""
-    markers, edges, _ = modes.by.tensor_split([-CAMERA - OF_EDGES, -CAMERA], -1)
+    markers, edges, camera = by_kind(modes.by)
     markers = markers.unflatten(-1, (-1, OF_MARKER))
     values = _values(_PRINT, modes, _COARSE).square()
     places = torch.cartesian_prod(values, values)  # along, across
@@ -164,7 +170,7 @@ def _print(modes: _Modes) -> _Family:
     evidence, weight, chi2 = _weighed(modes, edges, of_edges, parts)
     every, bent = (weight.sum(-1) @ places).split(1, -1)
     of_marker = torch.cat([every, every, every + bent, bent, bent], -1).repeat(1, markers.shape[-2])
-    none = torch.zeros_like(modes.by[:, 0, -CAMERA:])
+    none = torch.zeros_like(camera[:, 0])
     deviation = torch.cat([of_marker, weight.sum(1) @ of_edges, none], -1).sqrt()
     return _Family(evidence, deviation, torch.ones_like(evidence), chi2)
 

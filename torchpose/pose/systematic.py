@@ -28,7 +28,7 @@ from torchpose.geometry.rotations import plane_axes
 from torchpose.geometry.rows import Rows
 from torchpose.pose.covariance import center_jacobian, derivative
 from torchpose.pose.evidence import Evidence
-from torchpose.pose.excess import CAMERA, OF_EDGES, OF_MARKER, Excess, excess_of, no_excess
+from torchpose.pose.excess import CAMERA, OF_EDGES, OF_MARKER, Excess, by_kind, excess_of, no_excess
 from torchpose.results import Misfit
 
 POSE = 6
@@ -158,7 +158,7 @@ def _places(printed: Tensor, joint: _Joint, R: Tensor, deviation: Tensor) -> Ten
     by = torch.cat([R.mT[:, None] @ printed[:, :, :3], printed[:, :, POSE:]], 2)
     by = torch.nn.functional.pad(by, (0, 0, 0, 1))
     if bool((deviation > 0).any()):
-        gain, bloom, size = deviation[:, -CAMERA - OF_EDGES : -CAMERA].T
+        gain, bloom, size = by_kind(deviation)[1].T
         edges = by[..., -OF_EDGES:].zero_()
         edges[:, :, POSE - 3], edges[:, :, POSE - 2] = (
             torch.stack(parts, -1)[:, None] for parts in ((gain, bloom, 0 * size), (0 * gain, 0 * bloom, size))
