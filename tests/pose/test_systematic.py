@@ -22,7 +22,7 @@ from torchpose.pose import (
     on_print,
     solve_poses,
 )
-from torchpose.pose.excess import CAMERA, OF_EDGES, OF_MARKER, excess_of
+from torchpose.pose.excess import OF_CAMERA, OF_EDGES, OF_MARKER, excess_of
 from torchpose.results import Misfit
 from torchpose.target import Target
 
@@ -131,9 +131,9 @@ def test_prints_of_many_rows_are_covered(place: float) -> None:
 def problem(rows: int, seed: int, deviation: Tensor, factor: float = 1.0) -> tuple[Tensor, Tensor]:
     """Information about markers, edges and a camera, and right sides of true ones of these deviations, with noise."""
     g = torch.Generator().manual_seed(seed)
-    by = torch.randn(rows, 40, ALONG + CAMERA, dtype=F64, generator=g) * 3000
+    by = torch.randn(rows, 40, ALONG + OF_CAMERA, dtype=F64, generator=g) * 3000
     by[..., ALONG:] *= 1e-3
-    true = deviation * torch.randn(rows, ALONG + CAMERA, dtype=F64, generator=g)
+    true = deviation * torch.randn(rows, ALONG + OF_CAMERA, dtype=F64, generator=g)
     noise = factor**0.5 * torch.randn(rows, 40, dtype=F64, generator=g)
     measured = (by @ true[..., None])[..., 0] + noise
     return by.mT @ by, (by.mT @ measured[..., None])[..., 0]
@@ -142,7 +142,7 @@ def problem(rows: int, seed: int, deviation: Tensor, factor: float = 1.0) -> tup
 def of_places(size: float) -> Tensor:
     """Deviations of places, all three ways."""
     marker = torch.tensor([size] * 3 + [0.0] * (OF_MARKER - 3), dtype=F64)
-    return torch.cat([marker.repeat(MARKERS), torch.zeros(OF_EDGES + CAMERA, dtype=F64)])
+    return torch.cat([marker.repeat(MARKERS), torch.zeros(OF_EDGES + OF_CAMERA, dtype=F64)])
 
 
 def test_noise_alone_is_explained() -> None:

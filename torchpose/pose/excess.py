@@ -28,9 +28,9 @@ OF_MARKER = 5  # two along the print, one across, and two turns of a ring that g
 # edge gain of the print; the same in the picture (wrong tone, light that floods), by as many px all round; and how far
 # both edges of a ring lie further out
 OF_EDGES = 3
-CAMERA = 8  # numbers of a camera that may be off: linear (focal length, aspect, skew), principal point, k1, p1, p2
+OF_CAMERA = 8  # numbers of a camera that may be off: linear (focal length, aspect, skew), principal point, k1, p1, p2
 _EDGES_OFF = ((1, 0, 0), (0, 1, 0), (1, 0, 1))  # what may be off of the edges, in that order
-_OFF = (  # what may be off of a camera's numbers, in the order of `CAMERA`: one thing, or all
+_OFF = (  # what may be off of a camera's numbers, in the order of `OF_CAMERA`: one thing, or all
     (1, 0, 0, 0, 0, 0, 0, 0),
     (1, 1, 1, 0, 0, 0, 0, 0),
     (0, 0, 0, 1, 1, 0, 0, 0),
@@ -127,7 +127,7 @@ def _is_tone(deviation: Tensor) -> Tensor:
 
 def by_kind(unknowns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Further unknowns (..., E) as those of markers, edges and camera."""
-    markers, edges, camera = unknowns.tensor_split([-CAMERA - OF_EDGES, -CAMERA], -1)
+    markers, edges, camera = unknowns.tensor_split([-OF_CAMERA - OF_EDGES, -OF_CAMERA], -1)
     return markers, edges, camera
 
 
@@ -181,20 +181,20 @@ def _camera(modes: _Modes) -> _Family:
     What a large one bends beyond these numbers scatters besides.
     """
     variance = _values(_CAMERA, modes).square()
-    every = (variance.new_tensor(_OFF)[:, None] * variance[:, None]).flatten(0, 1)  # (S G, CAMERA)
+    every = (variance.new_tensor(_OFF)[:, None] * variance[:, None]).flatten(0, 1)  # (S G, OF_CAMERA)
     factors = _values(_SCALE, modes, _FEW_FACTORS)
     evidences, deviations, chi2s = [], [], []
     for factor in factors:
         scaled = _Modes(modes.residual / factor.sqrt(), modes.by / factor.sqrt(), modes.there)
-        evidence, weight, chi2 = _weighed(scaled, scaled.by[..., -CAMERA:], every)
+        evidence, weight, chi2 = _weighed(scaled, by_kind(scaled.by)[2], every)
         # the more, the less likely beforehand: nothing tells a small camera error and scatter from scatter alone
         evidences.append(evidence - (0.5 * modes.there.sum(-1) + 1) * factor.log())
         deviations.append(weight[:, 0] @ every)
         chi2s.append(chi2)
     likelihood = torch.stack(evidences, -1)
     weight = torch.softmax(likelihood, -1)
-    deviation = torch.zeros_like(modes.by[:, 0])
-    deviation[:, -CAMERA:] = (weight[..., None] * torch.stack(deviations, 1)).sum(1).sqrt()
+    markers, edges, _ = by_kind(torch.zeros_like(modes.by[:, 0]))
+    deviation = torch.cat([markers, edges, (weight[..., None] * torch.stack(deviations, 1)).sum(1).sqrt()], -1)
     chi2 = (weight * torch.stack(chi2s, -1)).sum(-1)
     return _Family(_mean(likelihood), deviation, (weight * factors).sum(-1), chi2)
 
