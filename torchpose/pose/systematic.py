@@ -137,13 +137,13 @@ def on_print(
         printed = torch.cat([by_target, beside[..., :-OF_CAMERA]], -1)
         lens = torch.cat([by_camera, beside[..., -OF_CAMERA:]], -1)
     joint = _Joint.of(normals.over(excess.factor), own, _among(printed, n), _among(lens, n), estimate)
-    place = look = _places(printed, joint, R, excess.deviation)
+    place = look = _places(printed, joint, setting, excess.deviation)
     other = ((excess.misfit == Misfit.CAMERA) | (excess.misfit == Misfit.SCATTER)).nonzero()[:, 0]
     if other.numel() and further is not None:
         # a fit that looks for the markers where they are not may only seem to scatter
         if_printed = torch.cat([by_target, (further * excess.printed[:, None, None])[..., :-OF_CAMERA]], -1)[other]
         alone = _Joint.of(normals[other], own[other], _among(if_printed, n), _among(lens[other], n), True)
-        look = place.index_copy(0, other, _places(if_printed, alone, R[other], excess.printed[other]))
+        look = place.index_copy(0, other, _places(if_printed, alone, setting.of_rows(other), excess.printed[other]))
     sure = joint.known & (torch.linalg.cholesky_ex(joint.covariance)[1] == 0)
     parts = (joint.by_camera[..., : by_camera.shape[-1]], joint.by_print[..., : by_target.shape[-1]])
     common = torch.cat(parts, -1)
@@ -151,12 +151,15 @@ def on_print(
     return OnPrint(*found, excess.misfit, excess.explained, excess.chi2, excess.freedom, sure)
 
 
-def _places(printed: Tensor, joint: _Joint, R: Tensor, deviation: Tensor) -> Tensor:
+def _places(printed: Tensor, joint: _Joint, setting: Setting, deviation: Tensor) -> Tensor:
     """Places (N, M, 5) of markers moved by the numbers of a solution, by their motions (N, M, 7, L).
 
     Where these go beyond what is stated, the last ones are those of edges, see `excess.OF_EDGES`.
     """
-    by = torch.cat([R.mT[:, None] @ printed[:, :, :3], printed[:, :, POSE:]], 2)
+    # a motion turns about the target's origin: what it does to a centre is both of its parts
+    arm = (setting.R[:, None] @ setting.evidence.points[..., None]).expand_as(printed[:, :, 3:POSE])
+    aside = printed[:, :, :3] + torch.linalg.cross(printed[:, :, 3:POSE], arm, dim=-2)
+    by = torch.cat([setting.R.mT[:, None] @ aside, printed[:, :, POSE:]], 2)
     by = torch.nn.functional.pad(by, (0, 0, 0, 1))
     if bool((deviation > 0).any()):
         gain, bloom, size = by_kind(deviation)[1].T
