@@ -377,10 +377,10 @@ TRAPS = {
     "colmap nan": ("1 PINHOLE 640 480 650 nan 320 240\n", "camera 1: PARAMS: holds NaN or infinity; "),
     "colmap signaling nan": ("1 PINHOLE 640 480 650 sNaN 320 240\n", "camera 1: PARAMS: not all are numbers; "),
     "colmap huge": ("1 PINHOLE 640 480 650 650 1e9999999 240\n", "camera 1: PARAMS: not all are numbers; "),
-    "explicit tag": (replaced("640", "!!timestamp 640"), "line 2: !!timestamp is a kind"),
+    "explicit tag": (replaced("640", "!!timestamp 640"), "line 1: !!timestamp is a kind"),
     "colmap width": ("1 PINHOLE 64.5 480 650 650 320 240\n", "camera 1: WIDTH: is '64.5'; "),
     "colmap id": (COLMAP + "x PINHOLE 4 4 1 1 1 1\n", "CAMERA_ID: is 'x'; write one line for each camera, "),
-    "long key": (PLAIN_JSON[:-1] + ', "a\\n' + "b" * 2000 + '_model": "omni"}', "a b+ [.][.][.] .* is not supported; "),
+    "long key": (PLAIN_JSON[:-1] + ', "a\\n' + "b" * 2000 + '_model": "omni"}', "a.+b+.* is not supported; "),
     "colmap twice": ("1 PINHOLE 4 4 1 1 1 1\n1 PINHOLE 4 4 1 1 1 1\n", "CAMERA_ID: given twice; "),
 }
 

@@ -31,8 +31,11 @@ def check_table_path(path: Path, option: str) -> None:
         raise ConfigError(f"{path}: {option}: is a folder; give a file")
     if not path.parent.is_dir():
         raise ConfigError(f"{path}: {option}: folder {path.parent} does not exist; create it or choose another")
-    probe = _temporary(path.with_name(f"{path.name}.run.json"))  # the longest name of what a run writes
+    longest = path.with_name(f"{path.name}.run.json")  # of what a run writes
+    probe = _temporary(longest)
     try:
+        with contextlib.suppress(FileNotFoundError):
+            longest.lstat()  # the name may be too long
         probe.touch()
         probe.unlink()
     except OSError as error:
