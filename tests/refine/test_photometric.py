@@ -190,3 +190,21 @@ def test_rows_do_not_depend_on_each_other() -> None:
         alone = run(torch.tensor([k]))
         assert (alone.t[0] - together.t[k]).abs().max() < 1e-9
         assert (alone.R[0] - together.R[k]).abs().max() < 1e-9
+
+
+@pytest.mark.parametrize(("spoilt", "all_again"), [(1, False), (3, True)])
+def test_rows_that_are_alike_are_treated_alike(spoilt: int, all_again: bool) -> None:
+    """Four frames of which some are partly covered; the last one follows the model."""
+    r, t = random_poses(4, 30, (150, 170), seed=4)
+    frames = render(CAMERA, QUAD, r, t, psf_sigma=0.8, plate=PLATE)
+    rings = exact_ellipses(QUAD, CAMERA, r, t)
+    for k in range(spoilt):
+        u, v, a = (int(x) for x in rings[k, 0, 0, :3])
+        frames[k, v : v + a, u : u + 2 * a] = 60.0
+    frames = add_noise(frames, 2.0)
+    sight = Sight.of(frames, CAMERA, QUAD, torch.arange(4), rings)
+    alone, together = (refine_photometric(sight, r, t, alike=alike) for alike in (False, True))
+    same = (alone.t == together.t).all(-1)
+    assert same.tolist() == [k < spoilt or not all_again for k in range(4)]
+    bound = pose_crlb(CAMERA, QUAD, r, t, psf_sigma=0.8, noise_sigma=2.0)
+    assert nees(errors(together, r, t), bound)[-1] < 40, "the second look harms no row"

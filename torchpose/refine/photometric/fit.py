@@ -88,13 +88,20 @@ _MATTERS = 0.004
 _FEWER = 0.02
 # of what would close the smallest hole, or the thinnest ring (convention)
 _MOST_GAIN = 0.5
+_MOST_IN_DOUBT = 0.5  # of rows that are alike, from which all are (convention)
 _QUICK = (_Stage(3, coarse=True), _Stage(1))
 _THOROUGH = (_Stage(3, coarse=True, wary=True), _Stage(2, wary=True), _Stage(2, wary=True, tempered=True))
 
 
 @checked
 def refine_photometric(
-    sight: Sight, rotation: Tensor, translation: Tensor, *, prior: Tensor | None = None, thorough: bool = True
+    sight: Sight,
+    rotation: Tensor,
+    translation: Tensor,
+    *,
+    prior: Tensor | None = None,
+    thorough: bool = True,
+    alike: bool = False,
 ) -> Refined:
     """Refines N poses on the grey values around the rings of their markers.
 
@@ -106,9 +113,12 @@ def refine_photometric(
             from the robot, or to hold what is known. (N, 7, 7): the edge gain, mm, is an unknown too, and this is
             known of it, about zero.
         thorough: rows whose grey values contradict the model are refined once more, without what does not follow it.
+        alike: rows are marks of one print by one lens, to be compared: where most of them contradict the model, what
+            is wrong is of all, and all are refined once more. A row then depends on the others.
     """
     factor = reduction_for(blurs.axes(sight.common_blur)[0].clamp_min(0).sqrt(), _WIDEST)
-    return refined_by_blur(partial(_refined_in, thorough=thorough), sight, Pose(rotation, translation), prior, factor)
+    refine = partial(_refined_in, thorough=thorough, alike=alike)
+    return refined_by_blur(refine, sight, Pose(rotation, translation), prior, factor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +129,7 @@ class _Result(Rows):
     misshapen: Tensor
 
 
-def _refined_in(sight: Sight, start: Pose, known: PosePrior | None, thorough: bool) -> Refined:
+def _refined_in(sight: Sight, start: Pose, known: PosePrior | None, thorough: bool, alike: bool = False) -> Refined:
     """Rows refined in the frames as they are: again with a band or a shape of the blur that suits it better."""
     spread = Spread(blurs.limited(sight.common_blur, LEAST**2, MOST**2))
     band = band_width(spread)
@@ -153,10 +163,13 @@ def _refined_in(sight: Sight, start: Pose, known: PosePrior | None, thorough: bo
     wide = (kind == 0) & ~later & (band_width(Spread(result.refined.spread)) > band + 1)
     if bool(wide.any()):
         result, kind = shaped(result.replaced(*again(result, wide, "gauss", _QUICK)), kind)
+    doubt = result.refined.doubt
+    if alike:
+        doubt = doubt | (doubt.double().mean() > _MOST_IN_DOUBT)
     for number, name in enumerate(_KINDS if thorough else ()):
-        doubt = result.refined.doubt & (kind == number)
-        if bool(doubt.any()):
-            result = result.replaced(*again(result, doubt, name, _THOROUGH))
+        some = doubt & (kind == number)
+        if bool(some.any()):
+            result = result.replaced(*again(result, some, name, _THOROUGH))
     return result.refined
 
 
