@@ -88,7 +88,6 @@ _MATTERS = 0.004
 _FEWER = 0.02
 # of what would close the smallest hole, or the thinnest ring (convention)
 _MOST_GAIN = 0.5
-_MOST_IN_DOUBT = 0.5  # of rows that are alike, from which all are (convention)
 _QUICK = (_Stage(3, coarse=True), _Stage(1))
 _THOROUGH = (_Stage(3, coarse=True, wary=True), _Stage(2, wary=True), _Stage(2, wary=True, tempered=True))
 
@@ -164,8 +163,8 @@ def _refined_in(sight: Sight, start: Pose, known: PosePrior | None, thorough: bo
     if bool(wide.any()):
         result, kind = shaped(result.replaced(*again(result, wide, "gauss", _QUICK)), kind)
     doubt = result.refined.doubt
-    if alike:
-        doubt = doubt | (doubt.double().mean() > _MOST_IN_DOUBT)
+    if alike and len(doubt):
+        doubt = doubt | doubt.int().median().bool()
     for number, name in enumerate(_KINDS if thorough else ()):
         some = doubt & (kind == number)
         if bool(some.any()):
