@@ -78,11 +78,13 @@ class PixelBlocks(Rows):
         return replace(self, radii=self.radii + grown)
 
     def every(self, nth: int, most: int | None = None, whole: int = 0) -> PixelBlocks:
-        """The same with one pixel of ``nth``, or as many fewer as leave ``most`` of a marker; all of up to ``whole``.
+        """The same with one pixel of ``nth``, or as many fewer as leave ``most`` of a marker; all of up to ``whole``, of
+        which the padded length is a multiple.
 
         Of a marker 6 px wide a sixth of its pixels would not tell its 15 unknowns.
         """
-        count = self.grey.shape[1] // nth
+        grain = max(1, whole)
+        count = -(-self.grey.shape[1] // (nth * grain)) * grain
         count = count if most is None else min(count, most)
         i = torch.arange(count, device=self.row.device)
         stretched = torch.where(self.size <= min(whole, count), count, self.size.clamp_min(nth * count))
