@@ -18,11 +18,6 @@ def band_width(spread: Spread) -> Tensor:
     return (_PER_BLUR * most.sqrt()).clamp(BAND, _WIDEST)
 
 
-def suits(band: Tensor, other: Tensor) -> Tensor:
-    """Where (N,) bool a band is as good as another one: within a pixel."""
-    return (band - other).abs() <= 1
-
-
 def band_pixels(outer: Tensor, inner: Tensor, band: Tensor, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
     """Pixels within about ``band`` px of either ellipse of K rings, each once.
 

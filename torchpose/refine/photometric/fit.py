@@ -37,7 +37,7 @@ from torchpose.geometry.least_squares import (
 from torchpose.geometry.robust import of_chance
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import marked, segment_mean, segment_sum
-from torchpose.refine.photometric.band import band_width, suits
+from torchpose.refine.photometric.band import band_width
 from torchpose.refine.photometric.grey_levels import (
     TILE,
     columns_of,
@@ -157,7 +157,7 @@ class _Fits:
         """Those of the rows (N,) bool that could be refined once more from where they are, and what came out."""
         look, refined = result.look, result.refined
         band = band_width(Spread.of(refined.spread, KINDS[kind]))
-        band = band.where(~suits(band, self.band) & (self.sight.look is None), self.band)
+        band = band if self.sight.look is None else self.band
         begun = (look.kind == kind) & (look.band == band) & refined.good
         cases, parts = 2 * (band == self.band) + begun, []
         for case in cases[rows].unique().tolist():

@@ -78,8 +78,9 @@ class PixelBlocks(Rows):
         return replace(self, radii=self.radii + grown)
 
     def every(self, nth: int, most: int | None = None, whole: int = 0) -> PixelBlocks:
-        """The same with one pixel of ``nth``, or as many fewer as leave ``most`` of a marker; all of up to ``whole``, of
-        which the padded length is a multiple.
+        """The same with one pixel of ``nth``, or as many fewer as leave ``most`` of a marker; all of up to ``whole``.
+
+        The padded length is a multiple of ``whole``.
 
         Of a marker 6 px wide a sixth of its pixels would not tell its 15 unknowns.
         """
