@@ -91,7 +91,7 @@ _MOST_GAIN = 0.5
 _COARSELY = _Stage(3, coarse=True)
 _QUICK = (_Stage(1),)  # after the coarse steps
 _AGAIN = (_Stage(2),)  # from where a fit of the same rows ended
-_THOROUGH = (_Stage(2, wary=True), _Stage(2, wary=True, tempered=True))
+_THOROUGH = (_Stage(1, wary=True), _Stage(2, wary=True, tempered=True))
 
 
 @checked
@@ -159,7 +159,7 @@ class _Fits:
         band = band_width(Spread.of(refined.spread, KINDS[kind]))
         band = band if self.sight.look is None else self.band
         begun = (look.kind == kind) & (look.band == band) & refined.good
-        cases, parts = 2 * (band == self.band) + begun, []
+        cases, parts = 2 * (band == self.band) + begun, [(rows.nonzero()[:0, 0], result[:0])]
         for case in cases[rows].unique().tolist():
             some = (rows & (cases == case)).nonzero()[:, 0]
             fit = self.fit.of(some) if case > 1 else self._fit(some, band)
@@ -182,11 +182,29 @@ class _Fits:
         for kind, some in ((1, rows & long), (2, rows & ~long)):
             if not bool(some.any()):
                 continue
-            index, other = self.again(result, some, kind, _QUICK)
+            begun, worse = self._tried(result, some & result.refined.doubt, kind)
+            index, other = self.again(begun, some & ~worse, kind, _QUICK)
             better = other.refined.noise < result.refined.noise[index]
             better &= other.refined.kept > result.refined.kept[index] - _FEWER
             result = result.replaced(index[better], other[better])
         return result
+
+    def _tried(self, result: _Result, rows: Tensor, kind: int) -> tuple[_Result, Tensor]:
+        """The result with the rows (N,) bool begun with another kind of blur, on some pixels; and those of them that it
+        explains no better.
+
+        For rows in doubt: what is amiss may be no blur at all.
+        """
+        index = rows.nonzero()[:, 0]
+        if index.numel() == 0:
+            return result, rows
+        refined, fit = result.refined, self.fit.of(index)
+        pose, spread = Pose(refined.R[index], refined.t[index]), Spread.of(refined.spread[index], KINDS[kind])
+        unknowns = _minimised(fit, pose, spread, (_COARSELY,), result.look.levels[index][fit.mask]).unknowns
+        R, t = (x.index_copy(0, index, y) for x, y in ((refined.R, unknowns.pose.R), (refined.t, unknowns.pose.t)))
+        look = fit.look(cast(Spread, unknowns.own["blur"]), unknowns.values("levels"))
+        begun = replace(result, refined=replace(refined, R=R, t=t), look=result.look.replaced(index, look))
+        return begun, rows.index_copy(0, index, fit.variance.sqrt() > refined.noise[index])
 
     def widened(self, result: _Result, rows: Tensor) -> _Result:
         """With a wider band for the rows (N,) bool whose blur takes the levels beside the edge for its own."""
@@ -286,13 +304,14 @@ class _Fit:
         model = ring_model(part, pose.R, pose.t, spread, check=True)
         columns, slope = columns_of(part, model, levels)
         residual = columns[:, :, -2].flatten(1)
-        self.usable, self.weight = inliers(residual, part, model, levels)
+        noise = noise_spread(residual, part), model_misfit(levels)
+        self.usable, self.weight = inliers(residual, part, model, *noise)
         if stage.coarse:  # the first steps begin with what was seen so far, the others see for themselves
             self.weight = self.weight * part.seen
         else:
             self.misshapen = self._stands_out(residual, slope, levels)
             self.sectors = sum_sectors(residual, slope, self.usable, self.weight, part, model)
-            factor = self._trusted(noise_spread(residual, part), model_misfit(levels))
+            factor = self._trusted(*noise)
             self.factor = factor.to(self.weight.dtype)
             self.weight = self.weight * self.sectors.of_pixels(self.factor)
         self.sums = sum_products(columns, self.weight)
