@@ -48,8 +48,9 @@ class Misfit(IntEnum):
 
     NONE = 0
     PRINT = 1  # markers sit beside their places, or edges do
-    CAMERA = 2  # focal length, principal point or distortion are off, as far as one frame can tell
+    CAMERA = 2  # focal lengths, principal point or distortion are off, as far as one frame can tell
     SCATTER = 3  # neither: something else in the frame
+    TONE = 4  # edges lie elsewhere by as many px all round: grey values that are not linear, light that floods
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from torchpose.geometry import rotations
 from torchpose.identify import Identified, MarkerTable, Scene, identify
 from torchpose.pose import gather_evidence, solve_poses
 from torchpose.pose.evidence import predicted_circles
-from torchpose.pose.sizes import code_shift
+from torchpose.pose.sizes import sizes_beyond
 from torchpose.results import Status
 from torchpose.rings import Rings
 from torchpose.sim import add_noise, render
@@ -123,7 +123,7 @@ def test_sizes_tell_codes_apart_whatever_the_gain_is(gain: float) -> None:
         table = MarkerTable.of([taken])
         every = table[torch.zeros(COUNT, dtype=torch.int64)]
         evidence = gather_evidence(rings, torch.arange(4 * COUNT).view(COUNT, 4), every, CAMERA)
-        shift = code_shift(evidence, predicted_circles(evidence, r[:, None], t[:, None])[:, 0])
+        shift, _ = sizes_beyond(evidence, predicted_circles(evidence, r[:, None], t[:, None])[:, 0])
         # less what sizes may err by, 0.1 px of 30 in each of two radii, 0.07 codes here
         assert (shift - 0.93 * abs(step)).abs().max() < 0.05
 

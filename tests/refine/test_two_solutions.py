@@ -60,7 +60,7 @@ def solutions(r: Tensor, t: Tensor, r_alt: Tensor, t_alt: Tensor, status: Status
     mask = torch.ones(len(r), len(QUAD), dtype=torch.bool)
     covariance = torch.eye(6, dtype=F64).repeat(len(r), 1, 1)
     parts = (covariance, covariance, covariance[..., :0])
-    rest = (torch.zeros(*mask.shape, PLACE, dtype=F64), 0 * codes, 0 * one, 0 * codes)
+    rest = (torch.zeros(*mask.shape, PLACE, dtype=F64), 0 * codes, 0 * one, 0 * codes, 0 * one)
     return Solutions(r, t, *parts, one, 10 * one, r_alt, t_alt, 2 * one, 20 * one, codes, reasons, mask, *rest)
 
 

@@ -7,15 +7,24 @@ from typing import Any
 
 import numpy as np
 
+from torchpose.pose.excess import SURE
+
 _FEW = 3  # frames, with fewer of which nothing is the same in all
 _AXES = ("x", "y", "z", "edge", "size")
+_BY_CHANCE = 0.5 * math.erfc(SURE / math.sqrt(2))  # of rows that are as their files say, those that stand out
+_CAUSES = {
+    "print": "the print or the target file: torchpose calibrate --measure-target, or center_sigma and edge_gain_sigma",
+    "camera": "the camera file: torchpose calibrate, or intrinsics_covariance",
+    "tone": "grey values that are not linear: --tone, or the camera's gamma, sharpening and glare",
+    "scatter": "what moves or bends in the picture: a moving part, rolling shutter, lost lines, hot air, compression",
+}
 
 
 class Misfits:
     """Misfits of the ``ok`` rows of one target, and how many rows show it mirrored."""
 
     def __init__(self) -> None:
-        self.frames = self.mirrored = 0
+        self.frames = self.mirrored = self.refuted = 0
         self.kinds: Counter[str] = Counter()
         self._count: np.ndarray | int = 0
         self._sum: np.ndarray | float = 0.0
@@ -24,6 +33,7 @@ class Misfits:
     def add(self, row: dict[str, Any]) -> None:
         """Counts a row of `rows.POSE_SCHEMA`."""
         self.mirrored += row["reason"] == "mirrored"
+        self.refuted += row["status"] == "rejected" and row["reason"] in ("residual", "ring_shape")
         if row["status"] != "ok":
             return
         self.frames += 1
@@ -41,32 +51,60 @@ class Misfits:
     def lines(self, name: str, ids: Sequence[int]) -> list[str]:
         """What there is to tell of the target with markers ``ids``, in order; nothing where all is as its file says."""
         lines = []
-        if self.kinds:
+        number, chance = sum(self.kinds.values()), _BY_CHANCE * self.frames
+        if number > 1 + chance + 3 * math.sqrt(chance):
+            most, count = self.kinds.most_common(1)[0]
             kinds = ", ".join(f"{kind} {count}" for kind, count in self.kinds.most_common())
+            likely = f"; likely {_CAUSES[most]}" if 2 * count > number else ""
             lines.append(
-                f"{name}: {sum(self.kinds.values())} of {self.frames} ok rows show more than noise and the stated "
-                f"uncertainties ({kinds}); it is counted in s*"
+                f"{name}: {number} of {self.frames} ok rows show more than noise and the stated uncertainties "
+                f"({kinds}), which is counted in s*{likely}"
             )
+        if self.refuted > max(1, self.frames):
+            lines.append(
+                f"{name}: {self.refuted} rows are rejected because no pose explains their rings: look at the target "
+                "file (places, ring sizes, ids) and at the camera file"
+            )
+        if self.frames >= _FEW and np.ndim(self._count):
+            used = np.asarray(self._count)[: len(ids), 0]
+            unused = [str(marker) for marker, count in zip(ids, used, strict=False) if not count]
+            if unused:
+                lines.append(f"{name}: marker {', '.join(unused)} is used in none of {self.frames} ok rows")
+        return lines + self._same_in_all(name, ids)
+
+    def _same_in_all(self, name: str, ids: Sequence[int]) -> list[str]:
+        """Where markers and edges lie beside their places in all frames alike."""
         mean, scatter = self._common()
-        size = np.sqrt(np.nanmean(mean[: len(ids), :3] ** 2) * 3) if mean.size else 0.0
+        if not mean.size:
+            return []
+        mean, lines = mean[: len(ids)], []
         # the mean of n independent places would be sqrt(n) smaller than they are
-        if mean.size and size > 2 * scatter / math.sqrt(self.frames) and size > 0:
+        least = 2 * scatter / math.sqrt(self.frames)
+        parts = mean[:, :3], mean[:, 3:4], mean[:, 4:]
+        aside, edge, size = (math.sqrt(np.square(part).sum(-1).mean()) for part in parts)
+        if aside > least[0]:
             places = "; ".join(
                 f"{marker} ({', '.join(f'{axis} {1e3 * v:+.1f}' for axis, v in zip(_AXES, at, strict=True))})"
                 for marker, at in zip(ids, mean, strict=False)
             )
             lines.append(
-                f"{name}: markers sit {1e3 * size:.2g} um beside their places, the same in all {self.frames} frames: "
+                f"{name}: markers sit {1e3 * aside:.2g} um beside their places, the same in all {self.frames} frames: "
                 "the target or the camera file is off; torchpose calibrate --measure-target measures both. By marker, "
                 f"um: {places}"
             )
+        if max(edge, size) > max(*least[1:], 0.1 * aside):
+            gain, larger = 1e3 * mean[:, 3:].mean(0)
+            lines.append(
+                f"{name}: dark edges lie {gain:+.2g} um further out than the file says, rings are {larger:+.2g} um "
+                f"larger in radius, the same in all {self.frames} frames: ring sizes, dot gain or tone"
+            )
         return lines
 
-    def _common(self) -> tuple[np.ndarray, float]:
-        """Mean place (M, 5) of the markers, and the RMS length of what the single frames differ from it, mm."""
+    def _common(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean place (M, 5) of the markers; how much single frames differ from it (3,): place, edge, size; RMS, mm."""
         if self.frames < _FEW or not np.any(self._sum):
-            return np.zeros((0, len(_AXES))), 0.0
+            return np.zeros((0, len(_AXES))), np.zeros(3)
         count = np.maximum(np.asarray(self._count), 1)
         mean = np.asarray(self._sum) / count
-        variance = np.maximum(np.asarray(self._square) / count - mean**2, 0.0)
-        return mean, float(np.sqrt(3 * variance[:, :3].mean()))
+        variance = np.maximum(np.asarray(self._square) / count - mean**2, 0.0).mean(0)
+        return mean, np.sqrt([variance[:3].sum(), variance[3], variance[4]])

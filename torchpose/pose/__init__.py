@@ -7,7 +7,6 @@ from torchpose.pose.covariance import pose_covariance
 from torchpose.pose.doubt import crossed_out
 from torchpose.pose.evidence import CENTER_RMS, SHAPE_FLOOR, Evidence, center_rms, gather_evidence, shape_chi2
 from torchpose.pose.outcome import Found, outcome
-from torchpose.pose.sizes import size_beyond
 from torchpose.pose.solutions import AMBIGUOUS_CHI2, PLACE, Solutions
 from torchpose.pose.solve import solve_poses
 from torchpose.pose.systematic import MarkerNormals, OnPrint, Setting, center_normals, on_print
@@ -36,7 +35,6 @@ __all__ = [
     "raw_centers",
     "right_way_round",
     "shape_chi2",
-    "size_beyond",
     "solve_poses",
     "still_open",
 ]

@@ -22,14 +22,15 @@ from torch import Tensor
 from torchpose.geometry.least_squares import LEAST_DIRECTION
 from torchpose.geometry.robust import of_chance, quantile
 from torchpose.geometry.rows import Rows
+from torchpose.results import Misfit
 
 OF_MARKER = 5  # two along the print, one across, and two turns of a ring that goes with the plate's bend
 # edge gain of the print; the same in the picture (wrong tone, light that floods), by as many px all round; and how far
 # both edges of a ring lie further out
 OF_EDGES = 3
-CAMERA = 8  # numbers of a camera that may be off: linear (focal length, aspect, skew), principal point, k1, p1, p2
+OF_CAMERA = 8  # numbers of a camera that may be off: linear (focal length, aspect, skew), principal point, k1, p1, p2
 _EDGES_OFF = ((1, 0, 0), (0, 1, 0), (1, 0, 1))  # what may be off of the edges, in that order
-_OFF = (  # what may be off of a camera's numbers, in the order of `CAMERA`: one thing, or all
+_OFF = (  # what may be off of a camera's numbers, in the order of `OF_CAMERA`: one thing, or all
     (1, 0, 0, 0, 0, 0, 0, 0),
     (1, 1, 1, 0, 0, 0, 0, 0),
     (0, 0, 0, 1, 1, 0, 0, 0),
@@ -38,11 +39,12 @@ _OFF = (  # what may be off of a camera's numbers, in the order of `CAMERA`: one
     (1, 1, 1, 1, 1, 1, 1, 1),
 )
 # how large each may be, from below any noise: mm, places and edges of an office print (50 to 100 um);
-# px at the corner of the frame, of a camera file that is a mistake beyond; of variances, as a factor
-_PRINT, _CAMERA, _SCALE = (1e-4, 0.15), (1e-3, 30.0), (1.0, 1e3)
-_SURE = 2.33  # deviations: one row in 100 that is as its files say is made wider in vain, by a factor of two (derived)
-_GRID = 16  # values, logarithmic: the closest are a factor of 1.5 apart, which a few residuals do not tell
+# px at the corner of the frame, where a file without distortion may be off by a hundred; of variances, as a factor
+_PRINT, _CAMERA, _SCALE = (1e-4, 0.15), (1e-3, 300.0), (1.0, 1e3)
+SURE = 2.33  # deviations: one row in 100 that is as its files say is made wider in vain, by a factor of two (derived)
+_GRID = 16  # values, logarithmic, apart by a factor of 1.5, of a camera 2.3, which few residuals do not tell
 _COARSE = 10  # of each of three: 2.3
+_FEW_FACTORS = 4  # of ten, of the scatter beside a camera (convention)
 _AT_ONCE = 10_000_000  # numbers: 80 MB
 
 
@@ -103,6 +105,7 @@ def excess_of(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) 
     at = torch.arange(len(row), device=row.device)
     deviation, factor, chi2 = (torch.stack([f[k] for f in families], 1)[at, best] for k in (1, 2, 3))
     explained = chi2 < _most(none.freedom[row])
+    misfit = torch.where((best == 0) & _is_tone(deviation), int(Misfit.TONE), best + 1)
     return none.replaced(
         row,
         replace(
@@ -110,10 +113,22 @@ def excess_of(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) 
             deviation=deviation,
             printed=families[0].deviation,
             factor=factor,
-            misfit=best + 1,
+            misfit=misfit,
             explained=explained,
         ),
     )
+
+
+def _is_tone(deviation: Tensor) -> Tensor:
+    """Prints (N,) bool by whose deviations (N, E) it is edges in the picture that are off, more than all else."""
+    markers, edges, _ = by_kind(deviation)
+    return edges[:, 1] > torch.maximum(edges[:, 0], markers.amax(-1))
+
+
+def by_kind(unknowns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Further unknowns (..., E) as those of markers, edges and camera."""
+    markers, edges, camera = unknowns.tensor_split([-OF_CAMERA - OF_EDGES, -OF_CAMERA], -1)
+    return markers, edges, camera
 
 
 def no_excess(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) -> Excess:
@@ -124,7 +139,7 @@ def no_excess(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) 
 def _none(right: Tensor, modes: _Modes) -> Excess:
     chi2, freedom = modes.residual.square().sum(-1), modes.there.sum(-1)
     zero, one = torch.zeros_like(right), torch.ones_like(chi2)
-    by_chance = chi2 < quantile(freedom.clamp_min(1), _SURE)
+    by_chance = chi2 < quantile(freedom.clamp_min(1), SURE)
     return Excess(zero, zero, one, torch.zeros_like(freedom), by_chance, chi2, freedom)
 
 
@@ -146,7 +161,7 @@ def _modes(information: Tensor, right: Tensor) -> _Modes:
 
 def _print(modes: _Modes) -> _Family:
     """A print bends by no less than it stretches: across it the variance of the places along it counts, and more."""
-    markers, edges, _ = modes.by.tensor_split([-CAMERA - OF_EDGES, -CAMERA], -1)
+    markers, edges, camera = by_kind(modes.by)
     markers = markers.unflatten(-1, (-1, OF_MARKER))
     values = _values(_PRINT, modes, _COARSE).square()
     places = torch.cartesian_prod(values, values)  # along, across
@@ -155,19 +170,33 @@ def _print(modes: _Modes) -> _Family:
     evidence, weight, chi2 = _weighed(modes, edges, of_edges, parts)
     every, bent = (weight.sum(-1) @ places).split(1, -1)
     of_marker = torch.cat([every, every, every + bent, bent, bent], -1).repeat(1, markers.shape[-2])
-    none = torch.zeros_like(modes.by[:, 0, -CAMERA:])
+    none = torch.zeros_like(camera[:, 0])
     deviation = torch.cat([of_marker, weight.sum(1) @ of_edges, none], -1).sqrt()
     return _Family(evidence, deviation, torch.ones_like(evidence), chi2)
 
 
 def _camera(modes: _Modes) -> _Family:
-    """One thing may be off, or all: of another focal length alone the mean over all tells too little."""
+    """One thing may be off, or all: of another focal length alone the mean over all tells too little.
+
+    What a large one bends beyond these numbers scatters besides.
+    """
     variance = _values(_CAMERA, modes).square()
-    every = (variance.new_tensor(_OFF)[:, None] * variance[:, None]).flatten(0, 1)  # (S G, CAMERA)
-    evidence, weight, chi2 = _weighed(modes, modes.by[..., -CAMERA:], every)
-    deviation = torch.zeros_like(modes.by[:, 0])
-    deviation[:, -CAMERA:] = (weight[:, 0] @ every).sqrt()
-    return _Family(evidence, deviation, torch.ones_like(evidence), chi2)
+    every = (variance.new_tensor(_OFF)[:, None] * variance[:, None]).flatten(0, 1)  # (S G, OF_CAMERA)
+    factors = _values(_SCALE, modes, _FEW_FACTORS)
+    evidences, deviations, chi2s = [], [], []
+    for factor in factors:
+        scaled = _Modes(modes.residual / factor.sqrt(), modes.by / factor.sqrt(), modes.there)
+        evidence, weight, chi2 = _weighed(scaled, by_kind(scaled.by)[2], every)
+        # the more, the less likely beforehand: nothing tells a small camera error and scatter from scatter alone
+        evidences.append(evidence - (0.5 * modes.there.sum(-1) + 1) * factor.log())
+        deviations.append(weight[:, 0] @ every)
+        chi2s.append(chi2)
+    likelihood = torch.stack(evidences, -1)
+    weight = torch.softmax(likelihood, -1)
+    markers, edges, _ = by_kind(torch.zeros_like(modes.by[:, 0]))
+    deviation = torch.cat([markers, edges, (weight[..., None] * torch.stack(deviations, 1)).sum(1).sqrt()], -1)
+    chi2 = (weight * torch.stack(chi2s, -1)).sum(-1)
+    return _Family(_mean(likelihood), deviation, (weight * factors).sum(-1), chi2)
 
 
 def _scatter(modes: _Modes) -> _Family:

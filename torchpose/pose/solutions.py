@@ -17,7 +17,10 @@ AMBIGUOUS_CHI2 = 20.0  # contract: two poses are ambiguous where their chi-squar
 
 @dataclass(frozen=True, eq=False)
 class Solutions(Rows):
-    """Chosen pose of N rows; the fields as in `results.Poses`, and the markers (N, M) that it explains."""
+    """Chosen pose of N rows; the fields as in `results.Poses`, and the markers (N, M) that it explains.
+
+    larger: how far both edges of the rings lie further from their centres than the file says, mm, where it is certain.
+    """
 
     R: Float[Tensor, "N 3 3"]
     t: Float[Tensor, "N 3"]
@@ -37,6 +40,7 @@ class Solutions(Rows):
     misfit: Int[Tensor, " N"]
     residual_chi2: Float[Tensor, " N"]
     freedom: Int[Tensor, " N"]
+    larger: Float[Tensor, " N"]
 
     @property
     def solved(self) -> Tensor:

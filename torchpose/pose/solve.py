@@ -14,7 +14,7 @@ from torchpose.geometry.arguments import checked
 from torchpose.geometry.robust import CUT
 from torchpose.pose.covariance import pose_covariance
 from torchpose.pose.evidence import CENTER_RMS, Evidence, misfit_of_shapes, predicted_circles, visible
-from torchpose.pose.sizes import code_shift
+from torchpose.pose.sizes import sizes_beyond
 from torchpose.pose.solutions import AMBIGUOUS_CHI2, PLACE, Solutions
 from torchpose.results import Reason, Status
 
@@ -67,7 +67,7 @@ def _solve(evidence: Evidence, rough: tuple[Tensor, Tensor], compile: bool) -> S
     chi2, best = (of_centers + of_shapes).nan_to_num(nan=torch.inf).sort(1)  # NaN: no such minimum
     row = torch.arange(len(best), device=best.device)[:, None]
     R, t, rms, of_centers, of_shapes = (x[row, best] for x in (R, t, rms, of_centers, of_shapes))
-    shift = code_shift(evidence, circles[row[:, 0], best[:, 0]])
+    shift, larger = sizes_beyond(evidence, circles[row[:, 0], best[:, 0]])
     covariance, determined = pose_covariance(evidence, R[:, 0], t[:, 0])
     chi2_alt = torch.where(chi2[:, 1].isfinite(), chi2[:, 1], torch.nan)
     seen = evidence.mask.sum(-1)
@@ -93,7 +93,7 @@ def _solve(evidence: Evidence, rough: tuple[Tensor, Tensor], compile: bool) -> S
     parts = (covariance, covariance, alone)
     none = torch.zeros_like(status)
     unasked = torch.full_like(chi2[:, 0], torch.nan)
-    rest = (evidence.mask, one[1].new_zeros(*evidence.mask.shape, PLACE), none, unasked, none)
+    rest = (evidence.mask, one[1].new_zeros(*evidence.mask.shape, PLACE), none, unasked, none, larger)
     return Solutions(one[0], one[1], *parts, one[2], chi2[:, 0], *two, chi2_alt, status, reason, *rest)
 
 
@@ -108,7 +108,7 @@ def _no_solutions(evidence: Evidence, R: Tensor, t: Tensor) -> Solutions:
     """Of no rows: frames without a target cost nothing here."""
     one, code = t.new_empty(0), evidence.mask.new_empty(0, dtype=torch.int64)
     parts = (t.new_empty(0, 6, 6), t.new_empty(0, 6, 6), t.new_empty(0, 6, evidence.numbers))
-    rest = (evidence.mask, t.new_empty(*evidence.mask.shape, PLACE), code, one, code)
+    rest = (evidence.mask, t.new_empty(*evidence.mask.shape, PLACE), code, one, code, one)
     return Solutions(R, t, *parts, one, one, R, t, one, one, code, code, *rest)
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
 import torch
@@ -28,7 +28,7 @@ from torchpose.geometry.rotations import plane_axes
 from torchpose.geometry.rows import Rows
 from torchpose.pose.covariance import center_jacobian, derivative
 from torchpose.pose.evidence import Evidence
-from torchpose.pose.excess import CAMERA, OF_EDGES, OF_MARKER, Excess, excess_of, no_excess
+from torchpose.pose.excess import OF_CAMERA, OF_EDGES, OF_MARKER, Excess, by_kind, excess_of, no_excess
 from torchpose.results import Misfit
 
 POSE = 6
@@ -131,16 +131,17 @@ def on_print(
     by_camera, by_target = _by_camera(setting), _by_target(setting)
     stated = torch.cat([by_camera, by_target], -1)
     excess, further = _excess(normals, torch.cat([own, _among(stated, n)], -1), stated.shape[-1], setting)
-    beside = further * excess.deviation[:, None, None]
-    wide = bool((excess.deviation > 0).any())
-    printed = torch.cat([by_target, beside[..., :-CAMERA]], -1) if wide else by_target
-    lens = torch.cat([by_camera, beside[..., -CAMERA:]], -1) if wide else by_camera
+    printed, lens = by_target, by_camera
+    if further is not None:
+        beside = further * excess.deviation[:, None, None]
+        printed = torch.cat([by_target, beside[..., :-OF_CAMERA]], -1)
+        lens = torch.cat([by_camera, beside[..., -OF_CAMERA:]], -1)
     joint = _Joint.of(normals.over(excess.factor), own, _among(printed, n), _among(lens, n), estimate)
     place = look = _places(printed, joint, R, excess.deviation)
-    other = (excess.misfit > Misfit.PRINT).nonzero()[:, 0]
-    if other.numel():
+    other = ((excess.misfit == Misfit.CAMERA) | (excess.misfit == Misfit.SCATTER)).nonzero()[:, 0]
+    if other.numel() and further is not None:
         # a fit that looks for the markers where they are not may only seem to scatter
-        if_printed = torch.cat([by_target, (further * excess.printed[:, None, None])[..., :-CAMERA]], -1)[other]
+        if_printed = torch.cat([by_target, (further * excess.printed[:, None, None])[..., :-OF_CAMERA]], -1)[other]
         alone = _Joint.of(normals[other], own[other], _among(if_printed, n), _among(lens[other], n), True)
         look = place.index_copy(0, other, _places(if_printed, alone, R[other], excess.printed[other]))
     sure = joint.known & (torch.linalg.cholesky_ex(joint.covariance)[1] == 0)
@@ -158,7 +159,7 @@ def _places(printed: Tensor, joint: _Joint, R: Tensor, deviation: Tensor) -> Ten
     by = torch.cat([R.mT[:, None] @ printed[:, :, :3], printed[:, :, POSE:]], 2)
     by = torch.nn.functional.pad(by, (0, 0, 0, 1))
     if bool((deviation > 0).any()):
-        gain, bloom, size = deviation[:, -CAMERA - OF_EDGES : -CAMERA].T
+        gain, bloom, size = by_kind(deviation)[1].T
         edges = by[..., -OF_EDGES:].zero_()
         edges[:, :, POSE - 3], edges[:, :, POSE - 2] = (
             torch.stack(parts, -1)[:, None] for parts in ((gain, bloom, 0 * size), (0 * gain, 0 * bloom, size))
@@ -215,21 +216,24 @@ class _Joint(NamedTuple):
         return cls(step, numbers[..., 0], covariance, noise, held @ vectors.mT, lens, known & finite)
 
 
-def _excess(normals: MarkerNormals, known: Tensor, count: int, setting: Setting) -> tuple[Excess, Tensor]:
-    """What the residuals show beyond the ``known`` columns, and the motions (N, M, 7, E) of what may be behind it."""
-    n = known.shape[2]
-    further = _print_shifts(setting)
-    camera = further.new_zeros(*further.shape[:3], CAMERA)
-    every = torch.cat([further, camera], -1)
-    excess = no_excess(*_remaining(normals, known, _among(every, n), count))
-    wide = (~excess.explained).nonzero()[:, 0]
-    if wide.numel() == 0:
-        return excess, every
-    # only where the print alone would have to explain it, the camera is asked, too
-    camera = camera.index_copy(0, wide, _camera_shifts(setting.of_rows(wide)))
-    every = torch.cat([further, camera], -1)
-    again = excess_of(*_remaining(normals[wide], known[wide], _among(every[wide], n), count))
-    return excess.replaced(wide, again), every
+def _excess(normals: MarkerNormals, known: Tensor, count: int, setting: Setting) -> tuple[Excess, Tensor | None]:
+    """What the residuals show beyond the ``known`` columns, and the motions (N, M, 7, E) of what may be behind it.
+
+    Without them where the markers agree: then each of them alone, free to move, would not move far.
+    """
+    rows, markers, n = known.shape[:3]
+    alone = torch.eye(markers * (POSE + 1), dtype=known.dtype, device=known.device).unflatten(0, (markers, -1))
+    excess = no_excess(*_remaining(normals, known, _among(alone.expand(rows, -1, -1, -1), n), count))
+    odd = (~excess.explained).nonzero()[:, 0]
+    if odd.numel() == 0:
+        return excess, None
+    some = setting.of_rows(odd)
+    shifts = torch.cat([_print_shifts(some), _camera_shifts(some)], -1)
+    again = excess_of(*_remaining(normals[odd], known[odd], _among(shifts, n), count))
+    every = shifts.new_zeros(rows, *shifts.shape[1:]).index_copy(0, odd, shifts)
+    nothing = shifts.new_zeros(rows, shifts.shape[-1])
+    excess = replace(excess, deviation=nothing, printed=nothing)
+    return excess.replaced(odd, replace(again, chi2=excess.chi2[odd], freedom=excess.freedom[odd])), every
 
 
 def _by_target(setting: Setting) -> Tensor:
@@ -267,7 +271,7 @@ def _by_camera(setting: Setting) -> Tensor:
 
 
 def _camera_shifts(setting: Setting) -> Tensor:
-    """The same of what a camera may be off by (`excess.CAMERA`), each by 1 px at the frame's corner."""
+    """The same of what a camera may be off by (`excess.OF_CAMERA`), each by 1 px at the frame's corner."""
     camera = setting.camera
     focal = camera.matrix.diagonal()[:2]
     reach = 0.5 * math.hypot(camera.width, camera.height) / float(focal.mean())

@@ -20,7 +20,6 @@ from torchpose.pose import (
     common_center,
     compensate,
     on_print,
-    size_beyond,
 )
 from torchpose.refine.centers import refine_centers
 from torchpose.refine.decide import decide, decide_on_grey
@@ -109,7 +108,7 @@ def on_frames(refine: Callable[..., Refined]) -> Step:
 def _start(rows: Solutions, seen: Evidence, camera: Camera) -> tuple[Pose, Tensor]:
     """Poses, and places (N, M, 5) of markers beside those of the file, as `OnPrint.look`, by the ellipses."""
     start, place = Pose(rows.R, rows.t), -_beyond(rows.t.new_zeros(*seen.mask.shape, PLACE), seen)
-    place = torch.cat([place[..., :4], size_beyond(seen, rows.R, rows.t)[:, None, None].expand_as(place[..., 4:])], -1)
+    place = torch.cat([place[..., :4], rows.larger[:, None, None].expand_as(place[..., 4:])], -1)
     off = (rows.rms > _BESIDE).nonzero()[:, 0]
     if off.numel() == 0:
         return start, place
