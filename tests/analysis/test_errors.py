@@ -109,9 +109,9 @@ def test_poses_and_truth_are_what_is_compared() -> None:
     """The result type of the pipeline and the truth file fit the two arguments."""
     rows = 2
     zeros: dict[str, Any] = {
-        name: torch.zeros(rows, dtype=torch.float64) for name in ("rms", "chi2", "rms_alt", "chi2_alt")
+        name: torch.zeros(rows, dtype=torch.float64) for name in ("rms", "chi2", "rms_alt", "chi2_alt", "residual_chi2")
     }
-    names = ("frame", "target", "instance", "copies", "status", "reason", "markers", "misfit")
+    names = ("frame", "target", "instance", "copies", "status", "reason", "markers", "misfit", "freedom")
     whole: dict[str, Any] = {n: torch.zeros(rows, dtype=torch.int64) for n in names}
     eye = torch.eye(3, dtype=torch.float64).repeat(rows, 1, 1)
     t = torch.ones(rows, 3, dtype=torch.float64)
@@ -125,7 +125,7 @@ def test_poses_and_truth_are_what_is_compared() -> None:
         "covariance": covariance,
         "noise": covariance,
         "systematic": covariance[..., :0],
-        "place": covariance[:, :4, :4],
+        "place": covariance[:, :4, :5],
     }
     poses = Poses(R=eye, t=t, R_alt=eye, t_alt=t, detections=none, **parts, **zeros, **whole)
     truth = Truth(["a", "b"], ["x", "x"], torch.zeros_like(t), torch.zeros_like(t))

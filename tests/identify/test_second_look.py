@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor
 import torchpose as tp
 from tests.exact import pinhole, random_poses
 from torchpose import pipeline
-from torchpose.detect import Candidates, Wanted, find_candidates
+from torchpose.detect import Candidates, find_candidates
 from torchpose.sim import add_noise, render
 from torchpose.target import Target
 
@@ -33,8 +34,8 @@ def estimate(monkeypatch: pytest.MonkeyPatch, scene: Scene, lost: int, frames: T
     camera, target, r, t, pictures = scene
     pictures = pictures if frames is None else frames
 
-    def lossy(frames: Tensor, *, wanted: Wanted, coarse: Candidates | None = None) -> tp.detect.Candidates:
-        found = find_candidates(frames, wanted=wanted, coarse=coarse)
+    def lossy(frames: Tensor, *, coarse: Candidates | None = None, **options: Any) -> tp.detect.Candidates:
+        found = find_candidates(frames, coarse=coarse, **options)
         for marker in range(len(target) - lost, len(target)):
             at = camera.project((r @ target.centers[marker]) + t)
             found = found[torch.linalg.vector_norm(found.ellipse[:, :2] - at[found.frame], dim=-1) > 20]

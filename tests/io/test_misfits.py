@@ -12,11 +12,11 @@ from torchpose.io.misfits import Misfits
 IDS = [0, 1, 2, 3]
 
 
-def told(rows: list[dict[str, Any]]) -> list[str]:
+def told(rows: list[dict[str, Any]], stated: tuple[float, float] = (0.0, 0.0)) -> list[str]:
     misfits = Misfits()
     for row in rows:
         misfits.add({"status": "ok", "reason": None, "misfit": None, "place": [[0.0] * 5] * 4} | row)
-    return misfits.lines("quad40", IDS)
+    return misfits.lines("quad40", IDS, stated)
 
 
 def test_what_chance_makes_stand_out_is_not_told() -> None:
@@ -39,6 +39,13 @@ def test_places_that_are_the_same_in_all_frames_are_told_by_marker() -> None:
     (line,) = told([{"place": place}] * 10)
     assert "markers sit 11 um beside their places, the same in all 10 frames" in line
     assert "0 (x +10.0, y -20.0, z +0.0, edge +0.0, size +0.0)" in line
+
+
+@pytest.mark.parametrize(("factor", "lines"), [(1.0, 0), (3.0, 2)])
+def test_what_the_file_states_is_not_told(factor: float, lines: int) -> None:
+    """A target that was measured to 0.2 um: the same nanometres in all frames are no news."""
+    place = [[1e-4 * factor, 1e-4 * factor, 1e-4 * factor, 3e-5 * factor, 0.0]] * 4
+    assert len(told([{"place": place}] * 10, (1e-4 * 3**0.5, 3e-5))) == lines
 
 
 def test_places_that_differ_from_frame_to_frame_are_not() -> None:

@@ -13,6 +13,7 @@ from tests.exact import F64, pinhole, random_poses
 from torchpose.geometry import rotations
 from torchpose.results import Misfit
 from torchpose.sim import add_noise, render
+from torchpose.sim.prints import PrintErrors, printed
 
 CAMERA = pinhole()
 PLATE = (70.0, 70.0)
@@ -29,10 +30,10 @@ def grown(target: tp.Target, gain: float) -> tp.Target:
     return dataclasses.replace(target, edge_gain=gain)
 
 
-def frames_of(printed: list[tp.Target], r: Tensor, t: Tensor, dark: float = 30.0, light: float = 220.0) -> Tensor:
+def frames_of(prints: list[tp.Target], r: Tensor, t: Tensor, dark: float = 30.0, light: float = 220.0) -> Tensor:
     clean = [
         render(CAMERA, p, r[k : k + 1], t[k : k + 1], psf_sigma=0.7, plate=PLATE, dark=dark, light=light)
-        for k, p in enumerate(printed)
+        for k, p in enumerate(prints)
     ]
     return add_noise(torch.cat(clean), 2.0, seed=3)
 
@@ -79,12 +80,36 @@ def test_places_come_out() -> None:
     """As far as a frame tells them: the places found lie on those of the print once both are laid over each other."""
     target = tp.Target.load("quad40")
     r, t = random_poses(1, 30, (140, 180), seed=12)
-    (printed,) = off(target, 0.02, 1)
-    poses = tp.PoseEstimator(CAMERA, known(target, 0.02, 0.0))(frames_of([printed], r, t))
+    (print_,) = off(target, 0.02, 1)
+    poses = tp.PoseEstimator(CAMERA, known(target, 0.02, 0.0))(frames_of([print_], r, t))
     found = target.centers + poses.place[0, :, :3]
-    apart = torch.cdist(printed.centers, printed.centers) - torch.cdist(target.centers, target.centers)
-    left = torch.cdist(printed.centers, printed.centers) - torch.cdist(found, found)
+    apart = torch.cdist(print_.centers, print_.centers) - torch.cdist(target.centers, target.centers)
+    left = torch.cdist(print_.centers, print_.centers) - torch.cdist(found, found)
     assert left.square().mean().sqrt() < 0.5 * apart.square().mean().sqrt()
+
+
+def test_rings_turned_by_a_bent_plate_are_where_they_are() -> None:
+    """A dome lifts all four alike, which is a pose. By their turns alone they would seem 80 um off."""
+    target = tp.Target.load("quad40")
+    r, t = random_poses(3, 30, (140, 180), seed=12)
+    bent = printed(target, PrintErrors(warp=0.04, shape="dome")).as_target()
+    poses = tp.PoseEstimator(CAMERA, target)(frames_of([bent] * 3, r, t))
+    assert poses.ok.all()
+    assert (poses.misfit == Misfit.PRINT).all()
+    assert poses.place[..., 2].abs().max() < 0.01
+
+
+def test_a_stated_height_states_how_rings_are_turned() -> None:
+    """A plate bent by 40 um with a file that says so is no misfit, and better than with a file that does not."""
+    target = tp.Target.load("quad40")
+    r, t = random_poses(3, 30, (140, 180), seed=12)
+    bent = printed(target, PrintErrors(warp=0.02, shape="cylinder", direction=0.6)).as_target()
+    frames = frames_of([bent] * 3, r, t)
+    poses, silent = (tp.PoseEstimator(CAMERA, one)(frames) for one in (known(target, 0.02, 0.0), target))
+    assert poses.ok.all()
+    assert (poses.misfit == Misfit.NONE).all()
+    assert (silent.misfit == Misfit.PRINT).all()
+    assert nees(poses, r, t).sum() < 43  # chi-squared of 18, once in 1000
 
 
 @pytest.mark.parametrize(("name", "gain"), [("quad40", 0.06), ("quad40", -0.06), ("quad40_dark", 0.06)])

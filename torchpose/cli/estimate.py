@@ -301,8 +301,17 @@ def _tell_misfits(misfits: dict[str, Misfits], work: _Work) -> None:
             err=True,
         )
     for target in work.rows_of:
-        for line in misfits[target.name].lines(target.name, target.ids.tolist()) if target.name in misfits else ():
-            say(f"torchpose: {line}", err=True)
+        if target.name in misfits:
+            for line in misfits[target.name].lines(target.name, target.ids.tolist(), _stated(target)):
+                say(f"torchpose: {line}", err=True)
+
+
+def _stated(target: Target) -> tuple[float, float]:
+    """Deviations of places (RMS length) and edge gain that the target's file states, mm."""
+    if target.covariance is None:
+        return 0.0, 0.0
+    variance = target.covariance.diagonal()
+    return float((variance[:-1].sum() / len(target)).sqrt()), float(variance[-1].sqrt())
 
 
 def _records(batch: reader.Batch, estimator: PoseEstimator, work: _Work, painter: pictures.Overlay | None) -> list[Row]:

@@ -17,7 +17,7 @@ from torchpose.errors import ConfigError
 from torchpose.geometry.arguments import checked
 from torchpose.geometry.projection import by_pose
 from torchpose.identify import MarkerTable
-from torchpose.pose import Evidence, Setting, on_print
+from torchpose.pose import PLACE, Evidence, Setting, on_print
 from torchpose.refine import Refined, Sight, refine_photometric
 from torchpose.sim import Defocus, add_noise, render
 from torchpose.target import Target
@@ -178,7 +178,7 @@ def _stated(refined: Refined, camera: Camera, target: Target) -> Float[Tensor, "
     )  # what was measured is in the normal equations
     normals = replace(refined.normals, right=torch.zeros_like(refined.normals.right))
     setting = Setting(evidence, refined.R, refined.t, camera, on_rims=True)
-    return on_print(normals, setting, nothing.new_zeros(rows, markers, 4)).covariance
+    return on_print(normals, setting, nothing.new_zeros(rows, markers, PLACE)).covariance
 
 
 def rims(target: Target) -> Float[Tensor, "circles samples 3"]:

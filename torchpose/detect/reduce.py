@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Float, Int, Real, Shaped
 from torch import Tensor
 
+from torchpose.geometry.arguments import checked
+
 # upper bound of the reduced frame's size when the factor is chosen automatically: 2 MP are halved (convention)
 REDUCED_PIXELS = 1_300_000
 _MOST_REDUCTION = 4  # of frames that are looked at from farther away: of wider blurs rings are not read
@@ -18,6 +20,7 @@ _OPENCV_LANES = 16  # columns that its widest vectors take at a time
 _Grid = TypeVar("_Grid", np.ndarray, Tensor)
 
 
+@checked
 def reduction_factor(height: int, width: int) -> int:
     """Smallest integer factor that brings a frame to at most 1.3 megapixels (20 MP: 4, 5 MP: 2, 2 MP: 2, 1 MP: 1)."""
     factor = 1

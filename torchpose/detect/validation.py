@@ -16,6 +16,7 @@ from torch import Tensor
 from torchpose.detect.arcs import cells_at, perimeter_samples
 from torchpose.detect.regions import AGREE_COS, ON_EDGE, Gradient
 from torchpose.geometry import conics
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.sectors import MOST
 from torchpose.geometry.segments import marked, members, near_pairs, positions, segment_sum
@@ -174,6 +175,7 @@ def log10_nfa(log_tests: float | Tensor, size: Tensor, total: Tensor) -> Tensor:
     return log_tests + size * total.clamp_min(1e-12).log10() - torch.lgamma(size + 1) / math.log(10)
 
 
+@checked
 def merge_duplicates(found: Candidates, tolerance: float = SAME, *, explain: bool = False) -> Candidates:
     """Of candidates that are the same ellipse the one with the fewest false alarms, sorted by frame and false alarms.
 
@@ -193,6 +195,7 @@ def merge_duplicates(found: Candidates, tolerance: float = SAME, *, explain: boo
     return replace(found, verdict=torch.where(again, int(Verdict.DUPLICATE), found.verdict))
 
 
+@checked
 def same_ellipses(ones: Candidates, others: Candidates, tolerance: float = SAME) -> tuple[Tensor, Tensor]:
     """Pairs (i, j) that are the same ellipse of the same frame, to within a part of the minor axis of ``ones``."""
     reach = 1.0 + tolerance * ones.ellipse[:, 3]

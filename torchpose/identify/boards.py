@@ -15,6 +15,7 @@ from torchpose.camera import Camera
 from torchpose.detect import Candidates
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import blur as blurs
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.sectors import SECTORS
 from torchpose.geometry.segments import marked, near_pairs
 from torchpose.grids import LEAST_MARKS, Grid, order_marks, place_patches
@@ -29,6 +30,7 @@ _UNKNOWN = 1e3  # px, of a circle that was not measured: its ellipse tells nothi
 _START_BLUR = 0.8  # px, of marks whose edges nothing has told yet
 
 
+@checked
 def identify_boards(
     scene: Scene, rings: Rings, identified: Identified, candidates: Candidates
 ) -> tuple[Rings, Identified]:

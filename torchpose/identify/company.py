@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.segments import marked, near_pairs
 from torchpose.identify.assignments import propose
 from torchpose.identify.hypotheses import PLACE_TOLERANCE, SIZE_TOLERANCE
@@ -15,6 +16,7 @@ from torchpose.identify.scene import MarkerTable
 from torchpose.rings import Rings
 
 
+@checked
 def in_company(rings: Rings, table: MarkerTable, matrix: Tensor) -> Bool[Tensor, " K"]:
     """Which rings have another of their frame and polarity as far away as the markers of a target are from each other.
 
@@ -51,6 +53,7 @@ def in_company(rings: Rings, table: MarkerTable, matrix: Tensor) -> Bool[Tensor,
     return marked(i[((least < widest) & (most > narrowest)).any(1)], len(rings))
 
 
+@checked
 def named(rings: Rings, table: MarkerTable, matrix: Tensor) -> Bool[Tensor, " K"]:
     """Which rings have the code of a marker; arguments as for `in_company`."""
     return marked(propose(rings, table, matrix).ring, len(rings))

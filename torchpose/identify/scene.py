@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.camera import Camera
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.least_squares import covariance_factor
 from torchpose.geometry.rows import Rows, shared
 from torchpose.grids import Grid
@@ -91,6 +92,7 @@ class MarkerTable(Rows):
         )
 
 
+@checked
 def drawn_radii(target: Target) -> Tensor:
     """(M, 2), see `MarkerTable.radii`."""
     outer, inner = target.printed_radii.unbind(-1)

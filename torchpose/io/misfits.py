@@ -12,6 +12,7 @@ from torchpose.pose.excess import SURE
 _FEW = 3  # frames, with fewer of which nothing is the same in all
 _AXES = ("x", "y", "z", "edge", "size")
 _BY_CHANCE = 0.5 * math.erfc(SURE / math.sqrt(2))  # of rows that are as their files say, those that stand out
+_STATED = 2.0  # deviations, within which all is as the file says (convention)
 _CAUSES = {
     "print": "the print or the target file: torchpose calibrate --measure-target, or center_sigma and edge_gain_sigma",
     "camera": "the camera file: torchpose calibrate, or intrinsics_covariance",
@@ -48,8 +49,14 @@ class Misfits:
             return
         self._count, self._sum, self._square = self._count + seen, self._sum + place, self._square + place**2
 
-    def lines(self, name: str, ids: Sequence[int]) -> list[str]:
-        """What there is to tell of the target with markers ``ids``, in order; nothing where all is as its file says."""
+    def lines(self, name: str, ids: Sequence[int], stated: tuple[float, float] = (0.0, 0.0)) -> list[str]:
+        """What there is to tell of a target; nothing where all is as its file says.
+
+        Args:
+            name: of the target.
+            ids: of its markers, in order.
+            stated: deviations that its file states, mm: of the places (RMS length) and of the edge gain.
+        """
         lines = []
         number, chance = sum(self.kinds.values()), _BY_CHANCE * self.frames
         if number > 1 + chance + 3 * math.sqrt(chance):
@@ -70,10 +77,10 @@ class Misfits:
             unused = [str(marker) for marker, count in zip(ids, used, strict=False) if not count]
             if unused:
                 lines.append(f"{name}: marker {', '.join(unused)} is used in none of {self.frames} ok rows")
-        return lines + self._same_in_all(name, ids)
+        return lines + self._same_in_all(name, ids, stated)
 
-    def _same_in_all(self, name: str, ids: Sequence[int]) -> list[str]:
-        """Where markers and edges lie beside their places in all frames alike."""
+    def _same_in_all(self, name: str, ids: Sequence[int], stated: tuple[float, float]) -> list[str]:
+        """Where markers and edges lie beside their places in all frames alike, further than the file states."""
         mean, scatter = self._common()
         if not mean.size:
             return []
@@ -82,7 +89,7 @@ class Misfits:
         least = 2 * scatter / math.sqrt(self.frames)
         parts = mean[:, :3], mean[:, 3:4], mean[:, 4:]
         aside, edge, size = (math.sqrt(np.square(part).sum(-1).mean()) for part in parts)
-        if aside > least[0]:
+        if aside > max(least[0], _STATED * stated[0]):
             places = "; ".join(
                 f"{marker} ({', '.join(f'{axis} {1e3 * v:+.1f}' for axis, v in zip(_AXES, at, strict=True))})"
                 for marker, at in zip(ids, mean, strict=False)
@@ -92,7 +99,7 @@ class Misfits:
                 "the target or the camera file is off; torchpose calibrate --measure-target measures both. By marker, "
                 f"um: {places}"
             )
-        if max(edge, size) > max(*least[1:], 0.1 * aside):
+        if max(edge * (edge > _STATED * stated[1]), size) > max(*least[1:], 0.1 * aside):
             gain, larger = 1e3 * mean[:, 3:].mean(0)
             lines.append(
                 f"{name}: dark edges lie {gain:+.2g} um further out than the file says, rings are {larger:+.2g} um "

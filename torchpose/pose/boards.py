@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.geometry import rotations
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.robust import of_chance
 from torchpose.grids import Grid
 from torchpose.identify import Scene
@@ -22,6 +23,7 @@ Solve = Callable[[Int[Tensor, " R"], Int[Tensor, "R M"]], Found]
 """Evidence and solutions of some of the rows, with other rings for their markers."""
 
 
+@checked
 def right_way_round(scene: Scene, found: Found, solve: Solve) -> Found:
     """Rows whose boards may be turned, turned where that explains what was seen better; then no more `turnable`.
 
@@ -75,6 +77,7 @@ def _renumbered(ring: Int[Tensor, "R M"], ids: Int[Tensor, " m"], numbers: Int[T
     return turned
 
 
+@checked
 def still_open(scene: Scene, found: Found) -> Solutions:
     """The solutions with the board turned for the other one where nothing tells which way round it is."""
     solutions, row = found.solutions, found.solvable
