@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, Self
+from typing import Literal, NamedTuple, Self, get_args
 
 import torch
 from jaxtyping import Float
@@ -27,6 +27,7 @@ from torchpose.geometry.quadrature import disc_chords, gauss_legendre
 from torchpose.geometry.rows import Rows, shared
 
 Kind = Literal["gauss", "line", "disc"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
 BLUR = 3  # numbers of a blur
 # of a radius of curvature: blurs up to there, and pixels no nearer to the centre, see one edge and not all sides of it
 # (convention; what the second order leaves: tests/geometry/test_blur.py)

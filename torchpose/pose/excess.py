@@ -12,6 +12,7 @@ few residuals tell a variance to a factor only, and the mean counts that, as Stu
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -100,7 +101,11 @@ def excess_of(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) 
     if row.numel() == 0:
         return none
     some = _Modes(*(x[row] for x in modes))
-    families = (_print(some), _camera(some), _scatter(some))  # in the order of `Misfit`
+    families = (
+        _beside_scatter(_print, some),
+        _beside_scatter(_camera, some),
+        _scatter(some),
+    )  # in the order of `Misfit`
     best = torch.stack([f.evidence for f in families], -1).argmax(-1)
     at = torch.arange(len(row), device=row.device)
     deviation, factor, chi2 = (torch.stack([f[k] for f in families], 1)[at, best] for k in (1, 2, 3))
@@ -159,6 +164,20 @@ def _modes(information: Tensor, right: Tensor) -> _Modes:
     return _Modes(residual, root[..., None] * vectors.mT, there)
 
 
+def _beside_scatter(explain: Callable[[_Modes], _Family], modes: _Modes) -> _Family:
+    """An explanation with scatter besides: what large errors bend beyond the numbers that explain them.
+
+    The more of it, the less likely beforehand: nothing tells small errors and scatter from scatter alone.
+    """
+    factors = _values(_SCALE, modes, _FEW_FACTORS)
+    each = [explain(_Modes(modes.residual / f.sqrt(), modes.by / f.sqrt(), modes.there)) for f in factors]
+    evidence, deviation, _, chi2 = (torch.stack(part, 1) for part in zip(*each, strict=True))
+    evidence = evidence - (0.5 * modes.there.sum(-1, keepdim=True) + 1) * factors.log()
+    weight = torch.softmax(evidence, -1)
+    deviation = (weight[..., None] * deviation.square()).sum(1).sqrt()
+    return _Family(_mean(evidence), deviation, (weight * factors).sum(-1), (weight * chi2).sum(-1))
+
+
 def _print(modes: _Modes) -> _Family:
     """A print bends by no less than it stretches: across it the variance of the places along it counts, and more."""
     markers, edges, camera = by_kind(modes.by)
@@ -176,27 +195,13 @@ def _print(modes: _Modes) -> _Family:
 
 
 def _camera(modes: _Modes) -> _Family:
-    """One thing may be off, or all: of another focal length alone the mean over all tells too little.
-
-    What a large one bends beyond these numbers scatters besides.
-    """
+    """One thing may be off, or all: of another focal length alone the mean over all tells too little."""
     variance = _values(_CAMERA, modes).square()
     every = (variance.new_tensor(_OFF)[:, None] * variance[:, None]).flatten(0, 1)  # (S G, OF_CAMERA)
-    factors = _values(_SCALE, modes, _FEW_FACTORS)
-    evidences, deviations, chi2s = [], [], []
-    for factor in factors:
-        scaled = _Modes(modes.residual / factor.sqrt(), modes.by / factor.sqrt(), modes.there)
-        evidence, weight, chi2 = _weighed(scaled, by_kind(scaled.by)[2], every)
-        # the more, the less likely beforehand: nothing tells a small camera error and scatter from scatter alone
-        evidences.append(evidence - (0.5 * modes.there.sum(-1) + 1) * factor.log())
-        deviations.append(weight[:, 0] @ every)
-        chi2s.append(chi2)
-    likelihood = torch.stack(evidences, -1)
-    weight = torch.softmax(likelihood, -1)
+    evidence, weight, chi2 = _weighed(modes, by_kind(modes.by)[2], every)
     markers, edges, _ = by_kind(torch.zeros_like(modes.by[:, 0]))
-    deviation = torch.cat([markers, edges, (weight[..., None] * torch.stack(deviations, 1)).sum(1).sqrt()], -1)
-    chi2 = (weight * torch.stack(chi2s, -1)).sum(-1)
-    return _Family(_mean(likelihood), deviation, (weight * factors).sum(-1), chi2)
+    deviation = torch.cat([markers, edges, (weight[:, 0] @ every).sqrt()], -1)
+    return _Family(evidence, deviation, torch.ones_like(evidence), chi2)
 
 
 def _scatter(modes: _Modes) -> _Family:

@@ -93,14 +93,14 @@ def outcome(scene: Scene, found: Found) -> Poses:
 
 
 def _vouched(solutions: Solutions, identified: Tensor) -> Solutions:
-    """Solutions that left a marker out of those ``identified`` (S, M) only where the others agree.
+    """Solutions that left a marker out of those ``identified`` (S, M) only where the others are no worse than a print is.
 
-    Three centres agree with any pose: if their rings do not, it is not known which marker is wrong.
+    Three centres agree with any pose: if their rings scatter, it is not known which marker is wrong.
     """
     few = solutions.mask.sum(-1) <= MIN_MARKERS
     left_out = (identified & ~solutions.mask).any(-1)
     return solutions.marked(
-        solutions.ok & few & left_out & (solutions.misfit != Misfit.NONE), Status.REJECTED, Reason.RESIDUAL
+        solutions.ok & few & left_out & (solutions.misfit == Misfit.SCATTER), Status.REJECTED, Reason.RESIDUAL
     )
 
 
