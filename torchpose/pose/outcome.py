@@ -93,7 +93,7 @@ def outcome(scene: Scene, found: Found) -> Poses:
 
 
 def _vouched(solutions: Solutions, identified: Tensor) -> Solutions:
-    """Solutions that left a marker out of those ``identified`` (S, M) only where the others are no worse than a print is.
+    """Solutions that left a marker out of those ``identified`` (S, M) only where the others may be of a print.
 
     Three centres agree with any pose: if their rings scatter, it is not known which marker is wrong.
     """
