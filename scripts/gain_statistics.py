@@ -13,6 +13,7 @@ gain: outer radius + gain, inner radius - gain. The estimator gets the nominal f
     wrong     of these, those in which some ring is taken for another marker
     depth um  RMS error of the depth, of the right ones
     worst     largest |error| / claimed sigma of any right one
+    NEES      mean squared error of the right ones by their covariance; 6 where it is right
 """
 
 from __future__ import annotations
@@ -96,16 +97,20 @@ def run(name: str, gain: float, distance: str, frames: int, hidden: int, keys: l
             right = named_right(poses, target, lens, r[s], t[s])
             errors = pose_errors(poses, _Pose(r[s], t[s]))
             claimed = (torch.cat([errors.translation, errors.rotation], -1).abs() / poses.std).amax(1)
-            parts[key].append(torch.stack([poses.ok.double(), right.double(), errors.translation[:, 2], claimed], 1))
+            columns = [poses.ok.double(), right.double(), errors.translation[:, 2], claimed, errors.nees]
+            parts[key].append(torch.stack(columns, 1))
     out = []
     for key in keys:
-        ok, right, depth, worst = torch.cat(parts[key]).unbind(1)
+        ok, right, depth, worst, nees = torch.cat(parts[key]).unbind(1)
         good = (ok > 0) & (right > 0)
-        rms = f"{1e3 * depth[good].square().mean().sqrt():8.1f} {worst[good].max():7.1f}" if good.any() else ""
+        told = ""
+        if good.any():
+            rms, most = 1e3 * depth[good].square().mean().sqrt(), worst[good].max()
+            told = f"{rms:8.1f} {most:7.1f} {nees[good].mean():7.1f}"
         wrong = int(((ok > 0) & (right == 0)).sum())
         out.append(
             f"{name:7} {1e3 * gain:6.0f} {distance:5} {key:7} {int(ok.sum()):3}/{frames} {int(good.sum()):5} "
-            f"{wrong:5} {rms}"
+            f"{wrong:5} {told}"
         )
     return out
 
@@ -125,7 +130,7 @@ def main() -> None:
     parser.add_argument("--hide", type=int, default=0, choices=[0, 1], help="markers that are not printed")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    print("target  gain um dist key     ok    right wrong depth um  worst", flush=True)
+    print("target  gain um dist key     ok    right wrong depth um  worst    NEES", flush=True)
     for name in options.target:
         all_gains = sorted({s * g for g in GAINS[name] for s in (-1, 0, 1)})
         gains = all_gains if options.gains_um is None else [g / 1e3 for g in options.gains_um]

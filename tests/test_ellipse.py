@@ -14,6 +14,7 @@ from scipy.linalg import eigh
 from scipy.stats import chi2
 from skimage.measure import EllipseModel
 
+from scripts import arc_statistics
 from torchpose import ellipse
 from torchpose.geometry import conics
 
@@ -358,3 +359,31 @@ def test_every_layout_gives_the_same_fit(generator: torch.Generator, method: ell
     more, at = torch.cat([xy[:7], xy]), torch.cat([index[:7], index])
     weights = torch.cat([torch.zeros(7), torch.ones(len(index))])
     assert_same_ellipses(ellipse.fit(more, at, 9, weights, method=method), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(("arc_deg", "noise"), [(90, 0.05), (90, 0.1), (60, 0.05)])
+def test_taubin_is_nearly_the_geometric_fit(arc_deg: float, noise: float) -> None:
+    """Against scipy's least squares of the true distances on short arcs; scripts/arc_statistics.py has more of them."""
+    g = torch.Generator().manual_seed(3)
+    truth, count = torch.tensor([50.3, 50.7, *arc_statistics.AXES, 0.4], dtype=torch.float64).expand(3, 5), 40
+    xy, index = sample(truth, count, g, math.radians(arc_deg), noise)
+    found, points = ellipse.fit(xy, index, 3, method="taubin").numpy(), xy.view(3, count, 2).numpy()
+    ratios = []
+    for k in range(3):
+        if np.isfinite(found[k]).all():
+            best = arc_statistics.geometric(points[k], truth[k].numpy())
+            costs = [np.square(arc_statistics.foot(one, points[k])[0]).sum() for one in (found[k], best)]
+            assert costs[1] <= costs[0] * (1 + 1e-4), "the geometric fit is the best one"
+            ratios.append(math.sqrt(costs[0] / costs[1]))
+    assert len(ratios) >= 2
+    assert max(ratios) < 1.01
+
+
+def test_distances_to_an_ellipse_are_those_of_a_search(generator: torch.Generator) -> None:
+    """The reference itself: the nearest of 200,000 points of the ellipse."""
+    truth = torch.tensor([[50.3, 50.7, 30, 22, 0.4]], dtype=torch.float64)
+    xy, _ = sample(truth, 25, generator, noise=0.5)
+    dense = conics.points_on(truth.expand(200_000, 5), torch.linspace(0, 2 * math.pi, 200_000).double())
+    nearest = torch.stack([(dense - point).norm(dim=-1).amin() for point in xy])
+    found = np.abs(arc_statistics.foot(truth[0].numpy(), xy.numpy())[0])
+    np.testing.assert_allclose(found, nearest.numpy(), atol=6e-4)  # half a step of the search, the most

@@ -64,9 +64,10 @@ def fit(
 
     "halir-flusser" minimises the weighted sum of squared algebraic distances subject to 4AC - B^2 = 1 (Fitzgibbon 1999
     in the stable form of Halir and Flusser 1998): always an ellipse, but too small on short noisy arcs. "taubin" takes
-    the mean squared gradient for the constraint (Taubin 1991): nearly unbiased on arcs, dearer, and NaN where the best
-    conic is no ellipse. On whole ellipses both agree within a fraction of the noise. Points of one ellipse need not
-    follow each other, but are fitted faster where the index is sorted.
+    the mean squared gradient for the constraint (Taubin 1991): nearly the fit of least distances, dearer, and NaN where
+    the best conic is no ellipse. What arcs cost: `scripts/arc_statistics.py`, its table in docs/precision.md. On whole
+    ellipses both agree within a fraction of the noise. Points of one ellipse need not follow each other, but are fitted
+    faster where the index is sorted.
 
     Args:
         points: px; those of weight 0 may be NaN.

@@ -131,3 +131,23 @@ def test_steps_of_a_spread_stay_a_blur() -> None:
     start = Spread(turned(0.5, 0.6, 0.3))
     moved = start.moved(torch.tensor([[-50.0, 30.0, -60.0]], dtype=F64))
     assert blurs.axes(moved.values)[0] >= 0.3**2 - 1e-12
+
+
+@pytest.mark.parametrize("sigma", [0.9, 1.25, 2.0])
+def test_steps_come_to_rest_at_a_blur_that_is_no_disc(sigma: float) -> None:
+    """Gauss-Newton on noisy edges under a Gaussian: the disc shrinks to nothing, and the sum is known all the way."""
+    count, pixels = 20, 300
+    g = torch.Generator().manual_seed(2)
+    distance = (10 * torch.rand(count, pixels, generator=g) - 5).double()
+    shown = 0.5 * torch.erfc(-distance / (sigma * math.sqrt(2))) + 0.015 * torch.randn(count, pixels, generator=g)
+    row, flat = torch.arange(count), torch.zeros(count, pixels)
+    spread = Spread.of(blurs.isotropic(torch.full((count,), sigma, dtype=F64)), "disc")
+    for _ in range(12):
+        edge = spread.at(row, flat, flat)(distance.float(), flat)
+        jacobian = torch.stack(edge.by_blur[:2], -1).double()
+        information = jacobian.mT @ jacobian + 1e-4 * 0.015**2 * torch.eye(2, dtype=F64)
+        right = jacobian.mT @ (shown - edge.fraction)[..., None]
+        step = torch.linalg.solve(information, right).squeeze(-1)
+        spread = spread.moved(torch.nn.functional.pad(step, (0, 1)))
+        assert ((spread.covariance[:, 0] / sigma**2 - 1).abs() < 0.3).all()
+    assert (spread.covariance[:, 0] / sigma**2 - 1).abs().mean() < 0.04

@@ -71,7 +71,7 @@ def test_noise_hides_no_better_minimum(kind: str) -> None:
     image = image + 0.3 * torch.randn(image.shape, generator=torch.Generator().manual_seed(7), dtype=F64)
     found = pnp.solve(points, image, MATRIX, sigma_px=0.3)
     near = pnp.solve(points, image, MATRIX, sigma_px=0.3, initial=(r, t))
-    assert int(missed(found, near).sum()) <= 1, "scripts/pnp_statistics.py has the rates"
+    assert int(missed(found, near).sum()) <= 1, "scripts/pnp_degenerate.py has the rates"
     assert float((found.code <= PnPCode.AMBIGUOUS).double().mean()) > 0.95
     for k in range(60):
         if int(found.code[k]) <= PnPCode.AMBIGUOUS:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -190,3 +192,53 @@ def test_rows_do_not_depend_on_each_other() -> None:
         alone = run(torch.tensor([k]))
         assert (alone.t[0] - together.t[k]).abs().max() < 1e-9
         assert (alone.R[0] - together.R[k]).abs().max() < 1e-9
+
+
+@pytest.mark.parametrize(("spoilt", "all_again"), [(1, False), (3, True)])
+def test_rows_that_are_alike_are_treated_alike(spoilt: int, all_again: bool) -> None:
+    """Four frames of which some are partly covered; the last one follows the model."""
+    r, t = random_poses(4, 30, (150, 170), seed=4)
+    frames = render(CAMERA, QUAD, r, t, psf_sigma=0.8, plate=PLATE)
+    rings = exact_ellipses(QUAD, CAMERA, r, t)
+    for k in range(spoilt):
+        u, v, a = (int(x) for x in rings[k, 0, 0, :3])
+        frames[k, v : v + a, u : u + 2 * a] = 60.0
+    frames = add_noise(frames, 2.0)
+    sight = Sight.of(frames, CAMERA, QUAD, torch.arange(4), rings)
+    alone, together = (refine_photometric(sight, r, t, alike=alike) for alike in (False, True))
+    same = (alone.t == together.t).all(-1)
+    assert same.tolist() == [k < spoilt or not all_again for k in range(4)]
+    bound = pose_crlb(CAMERA, QUAD, r, t, psf_sigma=0.8, noise_sigma=2.0)
+    assert nees(errors(together, r, t), bound)[-1] < 40, "the second look harms no row"
+
+
+def test_a_further_fit_begins_where_the_last_one_ended() -> None:
+    """A sharp, a smeared and a defocused frame: 20 um beside, the kind of blur known, as before to half a deviation.
+
+    Alone and in a batch to 1e-9.
+    """
+    r, t = random_poses(3, 40, (140, 160), seed=11)
+    imaging: list[dict[str, Any]] = [{}, {"smear": (6.0, 4.0)}, {"disc": 3.0}]
+    shown = [
+        render(CAMERA, QUAD, r[k, None], t[k, None], psf_sigma=0.7, plate=PLATE, **i) for k, i in enumerate(imaging)
+    ]
+    frames = add_noise(torch.cat(shown), 2.0)
+    rows, round_ = torch.arange(3), 0.7**2 + 1 / 12
+    blur = torch.tensor([[0, 0, 0], [36 / 12, 24 / 12, 16 / 12], [9 / 4, 0, 9 / 4]], dtype=F64)
+    blur = blur + torch.tensor([round_, 0.0, round_], dtype=F64)
+    sight = replace(
+        Sight.of(frames, CAMERA, QUAD, rows, exact_ellipses(QUAD, CAMERA, r, t)), blur=blur[:, None].expand(3, 4, 3)
+    )
+    first = refine_photometric(sight, r, t)
+    assert first.look is not None
+    assert first.look.kind.tolist() == [0, 1, 2]
+    sight = replace(sight, look=first.look)
+    again = refine_photometric(sight, r, t + 0.02)
+    deviation = first.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    assert ((again.t - first.t).abs() < 0.5 * deviation[:, :3]).all()
+    assert again.look is not None
+    assert again.look.kind.tolist() == [0, 1, 2]
+    assert (again.noise - math.hypot(2.0, 0.29)).abs().max() < 0.1
+    for k in range(3):
+        alone = refine_photometric(sight[k : k + 1], r[k, None], t[k, None] + 0.02)
+        assert (alone.t[0] - again.t[k]).abs().max() < 1e-9

@@ -101,7 +101,8 @@ def measure_centers(
         _grey(frames),
         camera,
     )
-    refined = refine_photometric(sight, rotation, arm + poses.t[found.frame], prior=torch.diag_embed(prior))
+    start = arm + poses.t[found.frame]
+    refined = refine_photometric(sight, rotation, start, prior=torch.diag_embed(prior), alike=True)
     xy = refined.t[:, :2] / refined.t[:, 2:]
     jacobian = camera.J_distort(xy) @ image_by_point(xy, refined.t[:, 2])
     covariance = jacobian @ refined.covariance[:, :3, :3] @ jacobian.mT

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, Self
+from typing import Literal, NamedTuple, Self, get_args
 
 import torch
 from jaxtyping import Float
@@ -27,6 +27,7 @@ from torchpose.geometry.quadrature import disc_chords, gauss_legendre
 from torchpose.geometry.rows import Rows, shared
 
 Kind = Literal["gauss", "line", "disc"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
 BLUR = 3  # numbers of a blur
 # of a radius of curvature: blurs up to there, and pixels no nearer to the centre, see one edge and not all sides of it
 # (convention; what the second order leaves: tests/geometry/test_blur.py)
@@ -90,10 +91,31 @@ class Spread(Rows):
             long = torch.linalg.vector_norm(step, dim=-1, keepdim=True)
             step = step * (limit / long.clamp_min(1e-12)).clamp_max(1.0)
             return replace(self, values=blurs.limited(self.values + step, LEAST**2, MOST**2))
-        core, one, two = (self.values + step).unbind(-1)
-        core = core.maximum(0.25 * self.values[:, 0]).minimum(4 * self.values[:, 0]).clamp(LEAST**2, MOST**2)
-        one = one.abs() if self.kind == "disc" else one
-        return replace(self, values=torch.stack([core, one, two], -1))
+        place = self._moved_disc(step) if self.kind == "disc" else self._moved_line(step)
+        return replace(self, values=place)
+
+    def _moved_line(self, step: Tensor) -> Tensor:
+        core, line = self.values[:, 0], self.values[:, 1:]
+        limit = _MOST_STEP * (line.square().sum(-1) + 12 * core).sqrt()
+        share = (limit / torch.linalg.vector_norm(step[:, 1:], dim=-1).clamp_min(1e-12)).clamp_max(1.0)
+        return torch.cat([self._core(core + step[:, 0])[:, None], line + share[:, None] * step[:, 1:]], -1)
+
+    def _moved_disc(self, step: Tensor) -> Tensor:
+        """What the image of a small disc tells is its mean square together with the core's, not its radius: so the sum
+        moves as the step says, in which the square of the radius is linear, and the disc has what the core leaves."""
+        core, radius, _ = self.values.unbind(-1)
+        square = radius.square() / 4
+        change = step[:, 0] + 0.5 * radius * step[:, 1]
+        limit = _MOST_STEP * (core + square)
+        total = core + square + change.clamp(-limit, limit)
+        disc = (total - self._core(core + step[:, 0])).maximum(square / 4)
+        core = self._core(total - disc)
+        return torch.stack([core, 2 * disc.sqrt(), torch.zeros_like(core)], -1)
+
+    def _core(self, wanted: Tensor) -> Tensor:
+        """Variances (N,) of the core, within what a step may change them by."""
+        core = self.values[:, 0]
+        return wanted.maximum(core / 4).minimum(4 * core).clamp(LEAST**2, MOST**2)
 
     def at(self, row: Tensor, nu: Tensor, nv: Tensor) -> Callable[[Tensor, Tensor], Edge]:
         """Edges, of distances and curvatures (..., K, P), under the blurs of rows (K,) where the normals are nu, nv."""

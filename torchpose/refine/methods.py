@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -27,7 +26,7 @@ from torchpose.refine.decide import decide, decide_on_grey
 from torchpose.refine.edges.fit import refine_edges
 from torchpose.refine.photometric.fit import refine_photometric
 from torchpose.refine.sight import LEAST_KEPT, Refined, Sight
-from torchpose.results import Misfit, Reason, Status
+from torchpose.results import Reason, Status
 
 # of the pixels, where the pose stays near: of wires over half of every ring 0.27 (measured: `wires 3` of
 # `scripts/corruption_statistics.py`)
@@ -85,19 +84,19 @@ def on_frames(refine: Callable[..., Refined]) -> Step:
         for number in range(_ROUNDS):
             some = rows[active], seen[active], sight[active].displaced(_beyond(place[active], seen[active]))
             # what seems to contradict the model may be a marker beside its place
-            now, joint, held, doubt = _refined(
-                partial(refine, thorough=number > 0), *some, start[active], place[active]
-            )
-            if number > 0:
+            refined = refine(some[2], start.R[active], start.t[active], thorough=number > 0)
+            now, joint, held = _on_print(refined, *some, place[active])
+            if number == 0:
+                sight = replace(sight, look=refined.look)
+            else:
                 # markers looked for where they are leave less to noise: if not, they are elsewhere
                 held &= torch.logdet(now.noise) < torch.logdet(found.noise[active])
             better = held.nonzero()[:, 0]
             found, good = found.replaced(active[better], now[better]), good.index_fill(0, active[better], True)
             beside = (joint.look - place[active]).abs().amax((-1, -2)) * seen.matrix[0, 0] / now.t[:, 2]
             start, place = start.replaced(active, Pose(now.R, now.t)), place.index_copy(0, active, joint.look)
-            # at first, whatever is amiss is looked at once more with the markers where the print would have them
-            amiss = (doubt | (held & (joint.misfit != Misfit.NONE))) & (number == 0)
-            active = active[(held & (beside > _BESIDE)) | amiss]
+            # at first, what is in doubt is looked at once more with the markers where the print would have them
+            active = active[(held & (beside > _BESIDE)) | (refined.doubt & (number == 0))]
             if active.numel() == 0:
                 break
         bad = (~good).nonzero()[:, 0]
@@ -125,24 +124,15 @@ def _beyond(place: Tensor, seen: Evidence) -> Tensor:
     return torch.cat([place[..., :3], place[..., 3:4] - seen.gain[:, None, None], place[..., 4:]], -1)
 
 
-def _refined(
-    refine: Callable[..., Refined],
-    rows: Solutions,
-    seen: Evidence,
-    sight: Sight,
-    start: Pose,
-    place: Tensor,
-) -> tuple[Solutions, OnPrint, Tensor, Tensor]:
-    """Rows refined on frames with markers displaced to ``place``, then on the print.
-
-    Also where that holds (N,) bool, and where something contradicts the model (N,) bool.
-    """
-    refined = refine(sight, start.R, start.t)
+def _on_print(
+    refined: Refined, rows: Solutions, seen: Evidence, sight: Sight, place: Tensor
+) -> tuple[Solutions, OnPrint, Tensor]:
+    """Rows refined on frames with markers displaced to ``place``, then on the print; and where that holds (N,) bool."""
     joint = on_print(refined.normals, Setting(seen, refined.R, refined.t, sight.camera, True), place)
     found = _of_joint(rows, seen, Pose(refined.R, refined.t), joint)
     near = found.rms < torch.maximum(rows.rms, torch.full_like(rows.rms, CENTER_RMS))
     kept = (refined.kept > LEAST_KEPT) | (near & (refined.kept > _LEAST_KEPT_NEAR))
-    return found, joint, refined.good & joint.known & kept, refined.doubt
+    return found, joint, refined.good & joint.known & kept
 
 
 def _by_centers(rows: Solutions, seen: Evidence, camera: Camera) -> tuple[Solutions, OnPrint]:

@@ -25,6 +25,25 @@ _START_BLUR = 0.8  # px, of rows whose rings tell of none
 
 
 @dataclass(frozen=True, eq=False)
+class Look(Rows):
+    """How a fit saw its N rows of M markers, in px of the reduced frames; another fit of the same rows begins with it.
+
+    Attributes:
+        kind: of the blur, its number in `geometry.blurred_edge.KINDS`.
+        blur: as `geometry.blurred_edge.Spread.values`.
+        levels: grey levels of the markers, as `refine.photometric.light` has them.
+        band: on either side of the edges.
+        reduction: of the frames, by block means.
+    """
+
+    kind: Int[Tensor, " N"]
+    blur: Float[Tensor, "N 3"]
+    levels: Float[Tensor, "N M 6"]
+    band: Float[Tensor, " N"]
+    reduction: Int[Tensor, " N"]
+
+
+@dataclass(frozen=True, eq=False)
 class Sight(Rows):
     """N rows of M markers seen in frames, and where.
 
@@ -41,6 +60,7 @@ class Sight(Rows):
         camera: with distortion.
         reduction: of the frames, by block means: their rounding counts for less.
         seen: sectors of every ring in which it was seen so far, see `geometry.sectors`; None where nothing is known.
+        look: of an earlier fit, with which to begin.
     """
 
     frame: Int[Tensor, " N"]
@@ -55,6 +75,7 @@ class Sight(Rows):
     blur: Float[Tensor, "N M 3"] | None = None
     reduction: int = shared(1)
     seen: Bool[Tensor, "N M 48"] | None = None
+    look: Look | None = None
 
     @classmethod
     def of(cls, frames: Tensor, camera: Camera, target: Target, frame: Tensor, rings: Tensor) -> Self:
@@ -109,17 +130,23 @@ def refined_by_blur(
     prior: Tensor | None,
     factor: Int[Tensor, " N"],
 ) -> Refined:
-    """N rows refined in parts, each in frames reduced by its ``factor``; blurs in px of the frames themselves.
+    """N rows refined in parts, by the kind of their blur, in frames reduced by their ``factor``; blurs in px of the
+    frames themselves.
 
     Args:
         prior: (N, 6, 6), information about the pose where it starts, or (N, 7, 7) with an edge gain of zero.
+        factor: for rows without a look.
     """
     known = None if prior is None else PosePrior(prior, start)
+    kind = torch.zeros_like(factor)
+    if sight.look is not None:
+        factor, kind = sight.look.reduction, sight.look.kind
+    each = torch.stack([factor, kind], -1)
     order, parts = [], []
-    for value in factor.unique().tolist() or [1]:
-        index = (factor == value).nonzero()[:, 0]
-        some = refine(sight[index].reduced(value), start[index], None if known is None else known[index])
-        parts.append(some if value == 1 else replace(some, spread=blurs.enlarged(some.spread, value)))
+    for both in each.unique(dim=0).tolist() or [[1, 0]]:
+        index, by = (each == each.new_tensor(both)).all(-1).nonzero()[:, 0], both[0]
+        some = refine(sight[index].reduced(by), start[index], None if known is None else known[index])
+        parts.append(some if by == 1 else replace(some, spread=blurs.enlarged(some.spread, by)))
         order.append(index)
     return Refined.cat(parts)[torch.argsort(torch.cat(order))]
 
@@ -139,6 +166,7 @@ class Refined(Rows):
         doubt: something in the frame contradicts the model of the rings.
         normals: what each marker tells, at the pose.
         gain: by which every dark edge lies outwards, mm, where it was an unknown.
+        look: where the fit may have seen its rows in several ways.
     """
 
     R: Float[Tensor, "N 3 3"]
@@ -151,6 +179,7 @@ class Refined(Rows):
     doubt: Bool[Tensor, " N"]
     normals: MarkerNormals
     gain: Float[Tensor, " N"] | None = None
+    look: Look | None = None
 
     @property
     def blur(self) -> Float[Tensor, " N"]:

@@ -141,7 +141,7 @@ def fit_alone(sight: Sight, start: Pose, size: float = _SIZE) -> Refined:
     # a size is a distance; the centre does not move along the ray
     ray = start.t / (start.t.square().sum(-1, keepdim=True) * size)
     held[:, :3, :3] += ray[:, :, None] * ray[:, None]
-    return refine_photometric(sight, start.R, start.t, prior=held)
+    return refine_photometric(sight, start.R, start.t, prior=held, alike=True)
 
 
 def _poses(marks: Marks, grid: Grid, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:

@@ -11,6 +11,7 @@ are padded blocks of pixels: one sequence of tensor operations for the whole bat
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple, cast
@@ -21,7 +22,7 @@ from torch import Tensor
 from torchpose.detect.reduce import reduction_for
 from torchpose.geometry import blur as blurs
 from torchpose.geometry.arguments import checked
-from torchpose.geometry.blurred_edge import LEAST, MOST, Kind, Spread
+from torchpose.geometry.blurred_edge import KINDS, LEAST, MOST, Spread
 from torchpose.geometry.least_squares import (
     Block,
     Eliminated,
@@ -35,7 +36,7 @@ from torchpose.geometry.least_squares import (
 )
 from torchpose.geometry.robust import of_chance
 from torchpose.geometry.rows import Rows
-from torchpose.geometry.segments import segment_mean, segment_sum
+from torchpose.geometry.segments import marked, segment_mean, segment_sum
 from torchpose.refine.photometric.band import band_width
 from torchpose.refine.photometric.grey_levels import (
     TILE,
@@ -57,9 +58,9 @@ from torchpose.refine.photometric.sectors import (
     sum_sectors,
     trust,
 )
-from torchpose.refine.sight import Refined, Sight, refined_by_blur
+from torchpose.refine.sight import Look, Refined, Sight, refined_by_blur
 
-_COARSE = 6  # the first steps take one pixel of so many; both are whole numbers of tiles
+_COARSE = 6  # the first steps take one pixel of so many
 # px, of a blur's minor axis, in frames as they are: a pixel twice as wide adds 4 % of its variance (derived)
 _WIDEST = 2.4
 _MOST_COARSE = 512  # of a marker whose edges are sharp: the last step, on all pixels, mends what they leave
@@ -78,7 +79,6 @@ class _Stage(NamedTuple):
     tempered: bool = False
 
 
-_KINDS: tuple[Kind, ...] = ("gauss", "line", "disc")
 # variance along the major axis over the minor one: a motion of 2 px, from which on it may be a line (derived)
 _LONG = 1.7
 # of the contrast, RMS at the edges: that of a disc of 2 px, which costs a tenth in the covariance (measured:
@@ -88,13 +88,21 @@ _MATTERS = 0.004
 _FEWER = 0.02
 # of what would close the smallest hole, or the thinnest ring (convention)
 _MOST_GAIN = 0.5
-_QUICK = (_Stage(3, coarse=True), _Stage(1))
-_THOROUGH = (_Stage(3, coarse=True, wary=True), _Stage(2, wary=True), _Stage(2, wary=True, tempered=True))
+_COARSELY = _Stage(2, coarse=True)
+_QUICK = (_Stage(1),)  # after the coarse steps
+_AGAIN = (_Stage(2),)  # from where a fit of the same rows ended
+_THOROUGH = (_Stage(1, wary=True), _Stage(2, wary=True, tempered=True))
 
 
 @checked
 def refine_photometric(
-    sight: Sight, rotation: Tensor, translation: Tensor, *, prior: Tensor | None = None, thorough: bool = True
+    sight: Sight,
+    rotation: Tensor,
+    translation: Tensor,
+    *,
+    prior: Tensor | None = None,
+    thorough: bool = True,
+    alike: bool = False,
 ) -> Refined:
     """Refines N poses on the grey values around the rings of their markers.
 
@@ -106,63 +114,124 @@ def refine_photometric(
             from the robot, or to hold what is known. (N, 7, 7): the edge gain, mm, is an unknown too, and this is
             known of it, about zero.
         thorough: rows whose grey values contradict the model are refined once more, without what does not follow it.
+        alike: rows are marks of one print by one lens, to be compared: where most of them contradict the model, what
+            is wrong is of all, and all are refined once more. A row then depends on the others.
     """
     factor = reduction_for(blurs.axes(sight.common_blur)[0].clamp_min(0).sqrt(), _WIDEST)
-    return refined_by_blur(partial(_refined_in, thorough=thorough), sight, Pose(rotation, translation), prior, factor)
+    refine = partial(_refined_in, thorough=thorough, alike=alike)
+    return refined_by_blur(refine, sight, Pose(rotation, translation), prior, factor)
 
 
 @dataclass(frozen=True, eq=False)
 class _Result(Rows):
-    """Refined rows, and whether their residuals stand out at the edges."""
+    """Refined rows, how they were seen, and whether their residuals stand out at the edges."""
 
     refined: Refined
+    look: Look
     misshapen: Tensor
 
 
-def _refined_in(sight: Sight, start: Pose, known: PosePrior | None, thorough: bool) -> Refined:
-    """Rows refined in the frames as they are: again with a band or a shape of the blur that suits it better."""
-    spread = Spread(blurs.limited(sight.common_blur, LEAST**2, MOST**2))
-    band = band_width(spread)
-    result = _refined(_Fit(sight, band, known, _MOST_COARSE), start, spread, _QUICK)
+def _refined_in(sight: Sight, start: Pose, known: PosePrior | None, thorough: bool, alike: bool) -> Refined:
+    """Rows of one kind of blur refined in the frames as they are."""
+    fits, look = _Fits(sight, start, known), sight.look
+    result = fits.first()
+    if look is None:
+        result = fits.shaped(result, torch.ones_like(result.misshapen))
+        later = result.refined.doubt & thorough  # a wider band is theirs then
+        result = fits.widened(result, ~later)
+    doubt = result.refined.doubt
+    if alike and len(doubt):
+        doubt = doubt | doubt.int().median().bool()
+    for kind in range(len(KINDS) if thorough else 0):
+        some = doubt & (result.look.kind == kind)
+        if bool(some.any()):
+            result = result.replaced(*fits.again(result, some, kind, _THOROUGH))
+    return replace(result.refined, look=result.look)
 
-    def again(result: _Result, rows: Tensor, kind: Kind, stages: tuple[_Stage, ...]) -> tuple[Tensor, _Result]:
-        index = rows.nonzero()[:, 0]
-        refined = result.refined[index]
-        spread = Spread.of(refined.spread, kind)
-        fit = _Fit(sight[index], band_width(spread), None if known is None else known[index])
-        other = _refined(fit, start[index].where(~refined.good, Pose(refined.R, refined.t)), spread, stages)
+
+class _Fits:
+    """The fits of N rows: the first one, and those with a band or a kind of blur that suits some rows better."""
+
+    def __init__(self, sight: Sight, start: Pose, known: PosePrior | None) -> None:
+        self.sight, self.start, self.known = sight, start, known
+        blur, look = blurs.limited(sight.common_blur, LEAST**2, MOST**2), sight.look
+        self.spread = Spread(blur) if look is None else Spread(look.blur, KINDS[int(look.kind[:1].sum())])
+        self.band = band_width(self.spread) if look is None else look.band
+        self.fit = _Fit(sight, self.band, known, _MOST_COARSE)
+
+    def first(self) -> _Result:
+        look = self.sight.look
+        if look is None:
+            return _refined(self.fit, self.start, self.spread, (_COARSELY, *_QUICK))
+        return _refined(self.fit, self.start, self.spread, _AGAIN, look.levels)
+
+    def again(self, result: _Result, rows: Tensor, kind: int, stages: tuple[_Stage, ...]) -> tuple[Tensor, _Result]:
+        """Those of the rows (N,) bool that could be refined once more from where they are, and what came out."""
+        look, refined = result.look, result.refined
+        band = band_width(Spread.of(refined.spread, KINDS[kind]))
+        band = band if self.sight.look is None else self.band
+        begun = (look.kind == kind) & (look.band == band) & refined.good
+        cases, parts = 2 * (band == self.band) + begun, [(rows.nonzero()[:0, 0], result[:0])]
+        for case in cases[rows].unique().tolist():
+            some = (rows & (cases == case)).nonzero()[:, 0]
+            fit = self.fit.of(some) if case > 1 else self._fit(some, band)
+            if case % 2:
+                spread, levels, steps = Spread(look.blur[some], KINDS[kind]), look.levels[some], stages
+            else:
+                spread, levels, steps = Spread.of(refined.spread[some], KINDS[kind]), None, (_COARSELY, *stages)
+            begin = self.start[some].where(~refined.good[some], Pose(refined.R[some], refined.t[some]))
+            parts.append((some, _refined(fit, begin, spread, steps, levels)))
+        index, other = torch.cat([some for some, _ in parts]), _Result.cat([part for _, part in parts])
         return index[other.refined.good], other[other.refined.good]
 
-    def shaped(result: _Result, kind: Tensor) -> tuple[_Result, Tensor]:
-        """With the shape of the blur that explains misshapen rows better, where there is one."""
+    def _fit(self, rows: Tensor, band: Tensor) -> _Fit:
+        return _Fit(self.sight[rows], band[rows], None if self.known is None else self.known[rows])
+
+    def shaped(self, result: _Result, rows: Tensor) -> _Result:
+        """With the kind of blur that explains misshapen ones of the rows (N,) bool better, where there is one."""
         least, most = blurs.axes(result.refined.spread)
-        long, open_ones = most > _LONG * least, result.misshapen & (kind == 0)
-        for number, rows in ((1, open_ones & long), (2, open_ones & ~long)):
-            if not bool(rows.any()):
+        long, rows = most > _LONG * least, rows & result.misshapen & (result.look.kind == 0)
+        for kind, some in ((1, rows & long), (2, rows & ~long)):
+            if not bool(some.any()):
                 continue
-            index, other = again(result, rows, _KINDS[number], _QUICK)
+            begun, worse = self._tried(result, some & result.refined.doubt, kind)
+            index, other = self.again(begun, some & ~worse, kind, _QUICK)
             better = other.refined.noise < result.refined.noise[index]
             better &= other.refined.kept > result.refined.kept[index] - _FEWER
             result = result.replaced(index[better], other[better])
-            kind = kind.index_fill(0, index[better], number)
-        return result, kind
+        return result
 
-    result, kind = shaped(result, torch.zeros_like(sight.frame))
-    # a wide blur needs a wider band, or it takes the levels on both sides of the edge for its own
-    later = result.refined.doubt & thorough  # a wider band is theirs then
-    wide = (kind == 0) & ~later & (band_width(Spread(result.refined.spread)) > band + 1)
-    if bool(wide.any()):
-        result, kind = shaped(result.replaced(*again(result, wide, "gauss", _QUICK)), kind)
-    for number, name in enumerate(_KINDS if thorough else ()):
-        doubt = result.refined.doubt & (kind == number)
-        if bool(doubt.any()):
-            result = result.replaced(*again(result, doubt, name, _THOROUGH))
-    return result.refined
+    def _tried(self, result: _Result, rows: Tensor, kind: int) -> tuple[_Result, Tensor]:
+        """The result with the rows (N,) bool begun with another kind of blur, on some pixels; and those of them that it
+        explains no better.
+
+        For rows in doubt: what is amiss may be no blur at all.
+        """
+        index = rows.nonzero()[:, 0]
+        if index.numel() == 0:
+            return result, rows
+        refined, fit = result.refined, self.fit.of(index)
+        pose, spread = Pose(refined.R[index], refined.t[index]), Spread.of(refined.spread[index], KINDS[kind])
+        unknowns = _minimised(fit, pose, spread, (_COARSELY,), result.look.levels[index][fit.mask]).unknowns
+        R, t = (x.index_copy(0, index, y) for x, y in ((refined.R, unknowns.pose.R), (refined.t, unknowns.pose.t)))
+        look = fit.look(cast(Spread, unknowns.own["blur"]), unknowns.values("levels"))
+        begun = replace(result, refined=replace(refined, R=R, t=t), look=result.look.replaced(index, look))
+        return begun, rows.index_copy(0, index, fit.variance.sqrt() > refined.noise[index])
+
+    def widened(self, result: _Result, rows: Tensor) -> _Result:
+        """With a wider band for the rows (N,) bool whose blur takes the levels beside the edge for its own."""
+        wide = rows & (result.look.kind == 0) & (band_width(Spread(result.refined.spread)) > self.band + 1)
+        if not bool(wide.any()):
+            return result
+        index, other = self.again(result, wide, 0, _QUICK)
+        return self.shaped(result.replaced(index, other), marked(index, len(wide)))
 
 
-def _refined(fit: _Fit, start: Pose, spread: Spread, stages: tuple[_Stage, ...]) -> _Result:
-    """Rows refined in stages from poses and blurs."""
-    found = _minimised(fit, start, spread, stages)
+def _refined(
+    fit: _Fit, start: Pose, spread: Spread, stages: tuple[_Stage, ...], levels: Tensor | None = None
+) -> _Result:
+    """Rows refined in stages from poses and blurs, and from levels (N, M, 6) where there are any."""
+    found = _minimised(fit, start, spread, stages, None if levels is None else levels[fit.mask])
     pose, owner, rows = found.unknowns.pose, fit.blocks.row, len(spread)
     wider = overdispersion(fit.sectors.scaled(fit.factor), fit.variance[owner], owner, rows)
     covariance, determined = found.covariance()
@@ -178,17 +247,17 @@ def _refined(fit: _Fit, start: Pose, spread: Spread, stages: tuple[_Stage, ...])
     noise, kept = fit.variance.sqrt(), kept / usable
     gain = found.unknowns.values("gain")[:, 0] if fit.gain else None
     refined = Refined(pose.R, pose.t, covariance, spread.covariance, noise, kept, good, doubt, normals, gain)
-    return _Result(refined, fit.misshapen)
+    return _Result(refined, fit.look(spread, found.unknowns.values("levels")), fit.misshapen)
 
 
-def _minimised(fit: _Fit, start: Pose, spread: Spread, stages: tuple[_Stage, ...]) -> Minimum:
+def _minimised(fit: _Fit, start: Pose, spread: Spread, stages: tuple[_Stage, ...], levels: Tensor | None) -> Minimum:
     own: dict[str, Block] = {"pose": start, "blur": spread}
     if fit.gain:
         outer, inner = fit.blocks.radii.unbind(-1)
         hole = torch.where(inner > 0, inner, outer)
         most = _MOST_GAIN * torch.minimum(hole, 0.5 * (outer - inner)).amin().reshape(1)
         own["gain"] = Vector(torch.zeros_like(start.t[:, :1]), low=-most, high=most)
-    levels = first_levels(fit.coarse, start.R, start.t, spread)
+    levels = first_levels(fit.coarse, start.R, start.t, spread) if levels is None else levels
     unknowns = Unknowns(own, {"levels": Vector(levels)}, fit.blocks.row)
     for stage in stages:
         if stage.tempered:
@@ -213,8 +282,8 @@ class _Fit:
     misshapen: Tensor
 
     def __init__(self, sight: Sight, band: Tensor, prior: PosePrior | None, most_coarse: int | None = None) -> None:
-        self.mask = sight.mask
-        self.blocks = gather_pixels(sight, band, TILE * _COARSE)
+        self.mask, self.band, self.by = sight.mask, band, sight.reduction
+        self.blocks = gather_pixels(sight, band, TILE)
         self.coarse = self.blocks.every(_COARSE, most_coarse, whole=TILE)
         self.prior = prior
         self.gain = prior is not None and prior.more
@@ -222,6 +291,21 @@ class _Fit:
         self.variance = torch.ones_like(band)
         self.least = torch.full_like(band, sight.quantisation)
         self.usable = self.weight = self.blocks.valid
+
+    def of(self, rows: Tensor) -> _Fit:
+        """Of these rows (K,) alone, on the same pixels."""
+        fit = copy(self)
+        number = torch.full_like(self.band, -1, dtype=torch.int64).index_copy(
+            0, rows, torch.arange(len(rows), device=rows.device)
+        )
+        blocks = self.blocks[number[self.blocks.row] >= 0]
+        fit.blocks = replace(blocks, row=number[blocks.row])
+        fit.coarse = fit.blocks.every(_COARSE, whole=TILE)
+        fit.prior = None if self.prior is None else self.prior[rows]
+        fit.mask, fit.band, fit.variance, fit.least = (
+            x[rows] for x in (self.mask, self.band, self.variance, self.least)
+        )
+        return fit
 
     def __call__(self, unknowns: Unknowns) -> Normal:
         stage, part, pose = self.stage, self.coarse if self.stage.coarse else self.blocks, unknowns.pose
@@ -232,19 +316,26 @@ class _Fit:
         model = ring_model(part, pose.R, pose.t, spread, check=True)
         columns, slope = columns_of(part, model, levels)
         residual = columns[:, :, -2].flatten(1)
-        self.usable, self.weight = inliers(residual, part, model, levels)
+        noise = noise_spread(residual, part), model_misfit(levels)
+        self.usable, self.weight = inliers(residual, part, model, *noise)
         if stage.coarse:  # the first steps begin with what was seen so far, the others see for themselves
             self.weight = self.weight * part.seen
         else:
             self.misshapen = self._stands_out(residual, slope, levels)
             self.sectors = sum_sectors(residual, slope, self.usable, self.weight, part, model)
-            factor = self._trusted(noise_spread(residual, part), model_misfit(levels))
+            factor = self._trusted(*noise)
             self.factor = factor.to(self.weight.dtype)
             self.weight = self.weight * self.sectors.of_pixels(self.factor)
         self.sums = sum_products(columns, self.weight)
         used, known = self.weight.sum(-1), self._known(unknowns)
         normal, self.variance = normal_equations(self.sums, used, levels, part.row, self.least, known, gain=self.gain)
         return normal
+
+    def look(self, spread: Spread, levels: Tensor) -> Look:
+        """With the blurs of rows and the levels (K, L) of their markers."""
+        kind, by = (torch.full_like(self.mask[:, 0], v, dtype=torch.int64) for v in (KINDS.index(spread.kind), self.by))
+        laid = levels.new_zeros(*self.mask.shape, LEVELS).masked_scatter(self.mask[..., None], levels[:, :LEVELS])
+        return Look(kind, spread.values, laid, self.band, by)
 
     def _known(self, unknowns: Unknowns) -> tuple[Tensor, Tensor] | None:
         """The prior's information (N, n, n) about the frames' unknowns, and how far these moved from it (N, n)."""

@@ -46,9 +46,10 @@ def grey_chi2(sight: Sight, one: Refined, two: Refined) -> tuple[Tensor, Tensor,
         for _ in range(_LEVEL_STEPS):
             columns, slope = columns_of(blocks, model, levels)
             residual = columns[:, :, -2].flatten(1)
-            usable, weight = inliers(residual, blocks, model, levels)
+            noise = noise_spread(residual, blocks), model_misfit(levels)
+            usable, weight = inliers(residual, blocks, model, *noise)
             sectors = sum_sectors(residual, slope, usable, weight, blocks, model)
-            clear = clear_sectors(sectors, noise_spread(residual, blocks), model_misfit(levels))
+            clear = clear_sectors(sectors, *noise)
             every, weight = weight, weight * sectors.of_pixels(clear.to(weight.dtype))
             sums = sum_products(columns, weight)
             levels = levels + solve_scaled(sums[:, POSE:-2, POSE:-2], sums[:, POSE:-2, -2]).squeeze(-1)

@@ -100,16 +100,22 @@ def sum_products(columns: Tensor, weight: Tensor) -> Tensor:
     return (weighted @ columns.mT).double().sum(1)
 
 
-def inliers(residual: Tensor, blocks: PixelBlocks, model: RingModel, levels: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixels (K, P) whose noise is not clipped, by what they should show, and of these the ones that do show it."""
-    spread = noise_spread(residual, blocks)[:, None]
+def inliers(
+    residual: Tensor, blocks: PixelBlocks, model: RingModel, spread: Tensor, misfit: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Pixels (K, P) whose noise is not clipped, by what they should show, and of these the ones that do show it.
+
+    Args:
+        spread: (K,), as `noise_spread`. misfit: (K,), as `model_misfit`.
+    """
+    spread = spread[:, None]
     predicted = blocks.grey - residual
     margin = _CLEAR_OF_LIMITS * spread
     low, high = blocks.limits[:, :1], blocks.limits[:, 1:]
     usable = blocks.valid * ((predicted > low + margin) & (predicted < high - margin))
     if model.sound is not None:
         usable = usable * model.sound
-    return usable, usable * (residual.abs() < CUT * spread + model_misfit(levels)[:, None])
+    return usable, usable * (residual.abs() < CUT * spread + misfit[:, None])
 
 
 def noise_spread(residual: Tensor, blocks: PixelBlocks) -> Tensor:

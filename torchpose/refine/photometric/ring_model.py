@@ -80,9 +80,12 @@ class PixelBlocks(Rows):
     def every(self, nth: int, most: int | None = None, whole: int = 0) -> PixelBlocks:
         """The same with one pixel of ``nth``, or as many fewer as leave ``most`` of a marker; all of up to ``whole``.
 
+        The padded length is a multiple of ``whole``.
+
         Of a marker 6 px wide a sixth of its pixels would not tell its 15 unknowns.
         """
-        count = self.grey.shape[1] // nth
+        grain = max(1, whole)
+        count = -(-self.grey.shape[1] // (nth * grain)) * grain
         count = count if most is None else min(count, most)
         i = torch.arange(count, device=self.row.device)
         stretched = torch.where(self.size <= min(whole, count), count, self.size.clamp_min(nth * count))
