@@ -26,7 +26,7 @@ from torchpose.refine.decide import decide, decide_on_grey
 from torchpose.refine.edges.fit import refine_edges
 from torchpose.refine.photometric.fit import refine_photometric
 from torchpose.refine.sight import LEAST_KEPT, Refined, Sight
-from torchpose.results import Reason, Status
+from torchpose.results import Misfit, Reason, Status
 
 # of the pixels, where the pose stays near: of wires over half of every ring 0.27 (measured: `wires 3` of
 # `scripts/corruption_statistics.py`)
@@ -95,8 +95,9 @@ def on_frames(refine: Callable[..., Refined]) -> Step:
             found, good = found.replaced(active[better], now[better]), good.index_fill(0, active[better], True)
             beside = (joint.look - place[active]).abs().amax((-1, -2)) * seen.matrix[0, 0] / now.t[:, 2]
             start, place = start.replaced(active, Pose(now.R, now.t)), place.index_copy(0, active, joint.look)
-            # at first, what is in doubt is looked at once more with the markers where the print would have them
-            active = active[(held & (beside > _BESIDE)) | (refined.doubt & (number == 0))]
+            # at first, whatever is amiss is looked at once more with the markers where the print would have them
+            amiss = (refined.doubt | (held & (joint.misfit != Misfit.NONE))) & (number == 0)
+            active = active[(held & (beside > _BESIDE)) | amiss]
             if active.numel() == 0:
                 break
         bad = (~good).nonzero()[:, 0]
