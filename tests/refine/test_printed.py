@@ -89,7 +89,7 @@ def test_places_come_out() -> None:
 
 
 def test_rings_turned_by_a_bent_plate_are_where_they_are() -> None:
-    """A dome lifts all four alike, which is a pose. By their turns alone they would seem 80 um off."""
+    """A dome lifts all four alike, which is a pose: their turn is no place. By the turn alone they would be 80 um off."""
     target = tp.Target.load("quad40")
     r, t = random_poses(3, 30, (140, 180), seed=12)
     bent = printed(target, PrintErrors(warp=0.04, shape="dome")).as_target()
@@ -97,19 +97,6 @@ def test_rings_turned_by_a_bent_plate_are_where_they_are() -> None:
     assert poses.ok.all()
     assert (poses.misfit == Misfit.PRINT).all()
     assert poses.place[..., 2].abs().max() < 0.01
-
-
-def test_a_stated_height_states_how_rings_are_turned() -> None:
-    """A plate bent by 40 um with a file that says so is no misfit, and better than with a file that does not."""
-    target = tp.Target.load("quad40")
-    r, t = random_poses(3, 30, (140, 180), seed=12)
-    bent = printed(target, PrintErrors(warp=0.02, shape="cylinder", direction=0.6)).as_target()
-    frames = frames_of([bent] * 3, r, t)
-    poses, silent = (tp.PoseEstimator(CAMERA, one)(frames) for one in (known(target, 0.02, 0.0), target))
-    assert poses.ok.all()
-    assert (poses.misfit == Misfit.NONE).all()
-    assert (silent.misfit == Misfit.PRINT).all()
-    assert nees(poses, r, t).sum() < 43  # chi-squared of 18, once in 1000
 
 
 @pytest.mark.parametrize(("name", "gain"), [("quad40", 0.06), ("quad40", -0.06), ("quad40_dark", 0.06)])

@@ -71,9 +71,8 @@ class Evidence(Rows):
 
     @property
     def numbers(self) -> int:
-        """How many independent numbers are uncertain of camera and targets, two turns of every ring as well."""
-        stated = self.by_target.shape[-1]
-        return self.of_camera + stated + 2 * self.mask.shape[1] * (stated > 0)
+        """How many independent numbers are uncertain of camera and targets."""
+        return self.of_camera + self.by_target.shape[-1]
 
     def without(self, marker: Tensor) -> Evidence:
         """The same rows with one marker each, (N,) int64, taken as not seen."""

@@ -245,22 +245,11 @@ def _by_target(setting: Setting) -> Tensor:
     A target that is larger as a whole looks like the same one that is nearer: all markers move towards the camera.
     """
     moved, scale = _displaced(setting.R, setting.evidence.by_target), setting.evidence.scale_sigma
-    moved = torch.cat([_turned(setting), moved], -1)
     if not bool((scale > 0).any()):
         return moved
     nearer = moved.new_zeros(*moved.shape[:3])
     nearer[..., :3] = -(scale[:, None] * setting.t)[:, None]
     return torch.cat([moved[..., :-1], nearer[..., None]], -1)
-
-
-def _turned(setting: Setting) -> Tensor:
-    """The same (N, M, 7, 2 M) by turns of the rings: a plate that may be off in height is bent, and turns them."""
-    evidence = setting.evidence
-    if evidence.by_target.shape[-1] == 0:
-        return evidence.by_target.new_zeros(*evidence.mask.shape, POSE + 1, 0)
-    height = torch.linalg.vector_norm(evidence.normals[:, :, None] @ evidence.by_target[:, :, :3], dim=(-2, -1))
-    turns = _by_place(setting)[..., -2:] * height[:, None, None, :, None]
-    return torch.nn.functional.pad(turns.flatten(-2), (0, 0, 0, 1))
 
 
 def _displaced(R: Tensor, by: Tensor) -> Tensor:
@@ -305,18 +294,8 @@ def _camera_shifts(setting: Setting) -> Tensor:
 
 def _print_shifts(setting: Setting) -> Tensor:
     """The same (N, M, 7, E) of the numbers of a print in `excess`, by 1 mm each."""
-    rows, markers = setting.evidence.mask.shape
-    columns = setting.R.new_zeros(rows, markers, POSE + 1, OF_MARKER * markers + OF_EDGES)
-    columns[:, :, :POSE, :-OF_EDGES] = _by_place(setting).flatten(-2)
-    columns[:, :, -1, -3] = 1
-    columns[..., -2] = _by_bloom(setting)
-    columns[..., -1] = _by_size(setting)
-    return columns
-
-
-def _by_place(setting: Setting) -> Tensor:
-    """Motions (N, M, 6, M, OF_MARKER) of markers by those numbers of `excess` that each of them has, by 1 mm each."""
     evidence, R = setting.evidence, setting.R
+    rows, markers = evidence.mask.shape
     normal, seen = evidence.normals, evidence.mask[..., None].to(R)
     moved = R[:, None] @ torch.stack([*plane_axes(normal), normal], -1)
     away = (evidence.points - (seen * evidence.points).sum(1, keepdim=True) / seen.sum(1, keepdim=True)) * seen
@@ -325,8 +304,14 @@ def _by_place(setting: Setting) -> Tensor:
     arm = (R[:, None] @ evidence.points[..., None]).expand_as(turn)
     own = torch.cat([moved, torch.linalg.cross(arm, turn, dim=-2)], -1)
     own = torch.cat([own, torch.nn.functional.pad(turn, (3, 0))], -2)
-    each = torch.eye(seen.shape[1], dtype=R.dtype, device=R.device)
-    return each[:, None, :, None] * own[:, :, :, None]
+    each = torch.eye(markers, dtype=R.dtype, device=R.device)
+    own = (each[:, None, :, None] * own[:, :, :, None]).flatten(-2)
+    columns = R.new_zeros(rows, markers, POSE + 1, OF_MARKER * markers + OF_EDGES)
+    columns[:, :, :POSE, :-OF_EDGES] = own
+    columns[:, :, -1, -3] = 1
+    columns[..., -2] = _by_bloom(setting)
+    columns[..., -1] = _by_size(setting)
+    return columns
 
 
 def _by_bloom(setting: Setting) -> Tensor:
