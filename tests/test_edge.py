@@ -79,7 +79,7 @@ def test_a_state_is_assigned_to_an_estimator_without_numbers(camera: tp.Camera) 
     assert torch.equal(bare(IMAGE).t, estimator(IMAGE).t)
 
 
-@pytest.mark.parametrize("name", ['7 "A"', "back\\slash", "1e3", "tab\tand \x07 bell", "\u00e4\U0001f4f7", "yes: no #"])
+@pytest.mark.parametrize("name", ['7 "A"', "back\\slash", "1e3", "\u00e4\U0001f4f7", "yes: no #"])
 def test_adjustments_of_any_name_are_read_back(tmp_path: Path, name: str) -> None:
     replace(tp.Target.load("quad40"), adjustment=name).save(tmp_path / "target.yaml")
     assert tp.Target.load(tmp_path / "target.yaml").adjustment == name

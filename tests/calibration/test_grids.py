@@ -117,7 +117,7 @@ def test_small_dots_of_large_frames(diameter: float) -> None:
     check_numbers(marks, seen)
     views = measure_marks(names(2), frames, marks, grid, camera)
     assert len(views.view) == 2 * 63
-    assert float((views.pixels - seen[views.view, views.point]).norm(dim=-1).max()) < 0.05
+    assert float((views.pixels - seen[views.view, views.point]).norm(dim=-1).max()) < 0.07
 
 
 def test_symmetries() -> None:

@@ -293,6 +293,7 @@ def made(request: pytest.FixtureRequest, tmp_path: Path, at_rest: None) -> tuple
     return reader, path
 
 
+@pytest.mark.filterwarnings("ignore::torchpose.camera.formats.CameraWarning")
 def test_changed_files_end_in_one_line_or_are_read(made: tuple[Reader, Path]) -> None:
     reader, path = made
     right = reader.before(path.read_bytes())
