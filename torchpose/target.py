@@ -305,7 +305,7 @@ class Target:
             ConfigError: one line ``FILE: FIELD: what is wrong; the fix``.
         """
         source = Path(path)
-        if not source.exists():
+        if not os.path.exists(source):  # names that no file can have, too
             if os.fspath(path) in cls.builtin_names():
                 with resources.as_file(resources.files("torchpose") / "targets" / f"{os.fspath(path)}.yaml") as builtin:
                     return cls._read(builtin)

@@ -82,7 +82,8 @@ def read_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
 def beside(path: Path, name: str) -> str:
     """What the configuration file ``path`` calls ``name``: relative to it, or else a name of its own (built-in)."""
     file = path.parent / name
-    return str(file) if file.with_name(file.name.split("#")[0]).exists() or "/" in name else name
+    there = os.path.exists(file.with_name(file.name.split("#")[0]))  # False, too, of a name that no file can have
+    return str(file) if there or "/" in name else name
 
 
 def format_number(value: float) -> str:
