@@ -28,6 +28,7 @@ from torch import Tensor
 import torchpose as tp
 from torchpose.analysis import pose_errors
 from torchpose.geometry import rotations
+from torchpose.geometry.least_squares import Pose
 from torchpose.sim import add_noise, render
 
 F64 = torch.float64
@@ -95,7 +96,7 @@ def run(name: str, gain: float, distance: str, frames: int, hidden: int, keys: l
         for key in keys:
             poses = tp.PoseEstimator(lens, files[key])(pictures)
             right = named_right(poses, target, lens, r[s], t[s])
-            errors = pose_errors(poses, _Pose(r[s], t[s]))
+            errors = pose_errors(poses, Pose(r[s], t[s]))
             claimed = (torch.cat([errors.translation, errors.rotation], -1).abs() / poses.std).amax(1)
             columns = [poses.ok.double(), right.double(), errors.translation[:, 2], claimed, errors.nees]
             parts[key].append(torch.stack(columns, 1))
@@ -113,11 +114,6 @@ def run(name: str, gain: float, distance: str, frames: int, hidden: int, keys: l
             f"{wrong:5} {told}"
         )
     return out
-
-
-class _Pose:
-    def __init__(self, R: Tensor, t: Tensor) -> None:
-        self.R, self.t = R, t
 
 
 def main() -> None:

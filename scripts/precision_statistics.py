@@ -34,6 +34,7 @@ from torch import Tensor
 import torchpose as tp
 from torchpose.analysis import pose_crlb, pose_errors
 from torchpose.geometry import rotations
+from torchpose.geometry.least_squares import Pose
 from torchpose.io.writers import write_rows
 from torchpose.pipeline import Method
 from torchpose.sim import (
@@ -325,7 +326,7 @@ def run(name: str, case: Case, methods: list[Method], frames: int, seed: int) ->
         bounds.append(bound_of(case, camera, r[s], t[s]))
         for key, estimator in estimators.items():
             poses = estimator(noisy)
-            e = pose_errors(poses, _Pose(r[s], t[s]))
+            e = pose_errors(poses, Pose(r[s], t[s]))
             claimed = poses.covariance.diagonal(dim1=-2, dim2=-1)
             parts[key].append((poses.status, e.translation, e.rotation, e.nees, claimed))
         if sys.stderr.isatty():
@@ -358,12 +359,6 @@ def run(name: str, case: Case, methods: list[Method], frames: int, seed: int) ->
             "inside_99": float((nees[ok] < limit).double().mean()),
         })  # fmt: skip
     return rows
-
-
-@dataclass(frozen=True)
-class _Pose:
-    R: Tensor
-    t: Tensor
 
 
 def main() -> None:

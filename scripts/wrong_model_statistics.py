@@ -30,6 +30,7 @@ from torch import Tensor
 import torchpose as tp
 from torchpose.analysis import pose_errors
 from torchpose.geometry import rotations
+from torchpose.geometry.least_squares import Pose
 from torchpose.io.misfits import Misfits
 from torchpose.io.rows import pose_rows
 from torchpose.sim import PrintErrors, Processing, SensorPattern
@@ -131,7 +132,10 @@ def swapped(a: int, b: int) -> Targets:
 
 
 def rows_moved(offset: Callable[[int], np.ndarray]) -> Pictures:
-    """Every row displaced along u by its offset in px, by the shift theorem."""
+    """Every row displaced along u by its offset in px, by the shift theorem.
+
+    As `torchpose.sim.disturbances.lines_moved`, with a margin for shifts of a px and more.
+    """
 
     def read(light: Tensor) -> Tensor:
         wide = torch.nn.functional.pad(light[:, None], (32, 32, 0, 0), mode="reflect")[:, 0]
@@ -248,12 +252,6 @@ MODELS = {
 }
 
 
-@dataclass(frozen=True)
-class _Pose:
-    R: Tensor
-    t: Tensor
-
-
 def run(model: WrongModel, frames: int, seed: int, method: Any = "photometric") -> dict[str, Any]:
     """The line of a case."""
     g = torch.Generator().manual_seed(seed)
@@ -269,7 +267,7 @@ def run(model: WrongModel, frames: int, seed: int, method: Any = "photometric") 
         clean = model.light(picture(case, camera, what, r[s], t[s], model.twist))
         noisy = model.file(photographed(case, clean, seed, torch.arange(a, s.stop)))
         poses = estimator(noisy)
-        e = pose_errors(poses, _Pose(r[s], t[s]))
+        e = pose_errors(poses, Pose(r[s], t[s]))
         errors.append(torch.cat([e.translation, e.rotation], -1))
         claimed.append(poses.std)
         spread.append(poses.residual_chi2 / poses.freedom)

@@ -43,8 +43,8 @@ POSE_SCHEMA: Schema = {
 t in mm, rotation vector r in rad, standard deviations s* of t and of the rotation about the camera axes, of everything,
 and n* of the noise of the frame alone; instance counts the copies of a target in its frame from the left, copies says
 how many it shows, if any; misfit is `Misfit` where the residuals show any, chi2 and dof what they amount to (see
-`Poses.residual_chi2`); covariance and noise_covariance 6x6 (t, then
-rotation), systematic and place as in `Poses`, quaternion w, x, y, z, and the one or two solutions, the row's own first.
+`Poses.residual_chi2`); covariance and noise_covariance 6x6 (t, then rotation), systematic and place as in `Poses`,
+quaternion w, x, y, z, and the one or two solutions, the row's own first.
 """
 
 BASE_SCHEMA: Schema = {

@@ -45,7 +45,7 @@ _PRINT, _CAMERA, _SCALE = (1e-4, 0.15), (1e-3, 300.0), (1.0, 1e3)
 SURE = 2.33  # deviations: one row in 100 that is as its files say is made wider in vain, by a factor of two (derived)
 _GRID = 16  # values, logarithmic, apart by a factor of 1.5, of a camera 2.3, which few residuals do not tell
 _COARSE = 10  # of each of three: 2.3
-_FEW_FACTORS = 4  # of ten, of the scatter beside a camera (convention)
+_FEW_FACTORS = 4  # of ten, of the scatter beside a print or a camera (convention)
 _AT_ONCE = 10_000_000  # numbers: 80 MB
 
 
@@ -101,11 +101,8 @@ def excess_of(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) 
     if row.numel() == 0:
         return none
     some = _Modes(*(x[row] for x in modes))
-    families = (
-        _beside_scatter(_print, some),
-        _beside_scatter(_camera, some),
-        _scatter(some),
-    )  # in the order of `Misfit`
+    # in the order of `Misfit`
+    families = (_beside_scatter(_print, some), _beside_scatter(_camera, some), _scatter(some))
     best = torch.stack([f.evidence for f in families], -1).argmax(-1)
     at = torch.arange(len(row), device=row.device)
     deviation, factor, chi2 = (torch.stack([f[k] for f in families], 1)[at, best] for k in (1, 2, 3))

@@ -75,6 +75,11 @@ class Setting(NamedTuple):
     camera: Camera
     on_rims: bool
 
+    @property
+    def arms(self) -> Tensor:
+        """The markers (N, M, 3) as seen from the target's origin, camera axes, mm."""
+        return (self.R[:, None] @ self.evidence.points[..., None])[..., 0]
+
     def of_rows(self, index: Tensor) -> Self:
         return self._replace(evidence=self.evidence[index], R=self.R[index], t=self.t[index])
 
@@ -157,16 +162,15 @@ def _places(printed: Tensor, joint: _Joint, setting: Setting, deviation: Tensor)
     Where these go beyond what is stated, the last ones are those of edges, see `excess.OF_EDGES`.
     """
     # a motion turns about the target's origin: what it does to a centre is both of its parts
-    arm = (setting.R[:, None] @ setting.evidence.points[..., None]).expand_as(printed[:, :, 3:POSE])
+    arm = setting.arms[..., None].expand_as(printed[:, :, 3:POSE])
     aside = printed[:, :, :3] + torch.linalg.cross(printed[:, :, 3:POSE], arm, dim=-2)
     by = torch.cat([setting.R.mT[:, None] @ aside, printed[:, :, POSE:]], 2)
     by = torch.nn.functional.pad(by, (0, 0, 0, 1))
     if bool((deviation > 0).any()):
         gain, bloom, size = by_kind(deviation)[1].T
         edges = by[..., -OF_EDGES:].zero_()
-        edges[:, :, POSE - 3], edges[:, :, POSE - 2] = (
-            torch.stack(parts, -1)[:, None] for parts in ((gain, bloom, 0 * size), (0 * gain, 0 * bloom, size))
-        )
+        edges[:, :, 3, :2] = torch.stack([gain, bloom], -1)[:, None]
+        edges[:, :, 4, 2] = size[:, None]
     return (by @ joint.numbers[:, None, :, None])[..., 0]
 
 
@@ -301,7 +305,7 @@ def _print_shifts(setting: Setting) -> Tensor:
     away = (evidence.points - (seen * evidence.points).sum(1, keepdim=True) / seen.sum(1, keepdim=True)) * seen
     reach = torch.linalg.vector_norm(away, dim=-1).amax(-1)[:, None, None, None]
     turn = 2 * moved[..., :2] / reach  # of a plate that is bent by 1 mm at its rim
-    arm = (R[:, None] @ evidence.points[..., None]).expand_as(turn)
+    arm = setting.arms[..., None].expand_as(turn)
     own = torch.cat([moved, torch.linalg.cross(arm, turn, dim=-2)], -1)
     own = torch.cat([own, torch.nn.functional.pad(turn, (3, 0))], -2)
     each = torch.eye(markers, dtype=R.dtype, device=R.device)
@@ -321,17 +325,14 @@ def _by_bloom(setting: Setting) -> Tensor:
     jacobian, _, weight = _rim_jacobian(setting.evidence, setting.R, setting.t)
     across = torch.nn.functional.normalize(weight @ jacobian[..., -1:], dim=-2)
     mm = setting.evidence.matrix.diagonal()[:2].mean() / setting.t[:, 2]
-    markers, weighted = setting.evidence.mask.shape[1], jacobian.mT @ weight
-    right = _by_marker(weighted @ across, markers) * mm[:, None, None, None]
-    moved = solve_scaled(_by_marker(weighted @ jacobian, markers), right)[..., 0]
-    return torch.where(setting.evidence.mask[..., None], moved, 0.0)
+    return _least_squares(setting, jacobian, weight, across)[..., 0] * mm[:, None, None]
 
 
 def _by_size(setting: Setting) -> Tensor:
     """Motions (N, M, 7) that do to a ring what both its edges do 1 mm further out: it is nearer, with less gain."""
     evidence = setting.evidence
     outer, inner = evidence.radii.unbind(-1)
-    x = (setting.R[:, None] @ evidence.points[..., None])[..., 0] + setting.t[:, None]
+    x = setting.arms + setting.t[:, None]
     nearer = -2 / (outer + inner)[..., None] * x
     less = -evidence.polarity[:, None] * (outer - inner) / (outer + inner)
     return torch.cat([nearer, torch.zeros_like(x), less[..., None]], -1)
@@ -344,11 +345,15 @@ def _as_motions(setting: Setting, by: Callable[[Tensor], Tensor]) -> Tensor:
     """
     evidence, camera = setting.evidence, setting.camera
     jacobian, xy, weight = (_rim_jacobian if setting.on_rims else _center_jacobian)(evidence, setting.R, setting.t)
-    weighted = jacobian.mT @ weight
     ideal = camera.matrix.diagonal()[:2, None] * torch.linalg.inv(camera.J_distort(xy))
-    markers = evidence.mask.shape[1]
-    moved = solve_scaled(_by_marker(weighted @ jacobian, markers), _by_marker(weighted @ ideal @ by(xy), markers))
-    return torch.where(evidence.mask[..., None, None], moved, 0.0)
+    return _least_squares(setting, jacobian, weight, ideal @ by(xy))
+
+
+def _least_squares(setting: Setting, jacobian: Tensor, weight: Tensor, pixels: Tensor) -> Tensor:
+    """Motions (N, M, 7, n) of single markers that move points best as by the columns ``pixels`` (N, P, 2, n)."""
+    mask, weighted = setting.evidence.mask, jacobian.mT @ weight
+    both = (_by_marker(weighted @ what, mask.shape[1]) for what in (jacobian, pixels))
+    return torch.where(mask[..., None, None], solve_scaled(*both), 0.0)
 
 
 def _remaining(normals: MarkerNormals, known: Tensor, excess: Tensor, count: int) -> tuple[Tensor, Tensor]:

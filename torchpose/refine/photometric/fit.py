@@ -168,8 +168,8 @@ class _Fits:
     def again(self, result: _Result, rows: Tensor, kind: int, stages: tuple[_Stage, ...]) -> tuple[Tensor, _Result]:
         """Those of the rows (N,) bool that could be refined once more from where they are, and what came out."""
         look, refined = result.look, result.refined
-        band = band_width(Spread.of(refined.spread, KINDS[kind]))
-        band = band if self.sight.look is None else self.band
+        fresh = self.sight.look is None
+        band = band_width(Spread.of(refined.spread, KINDS[kind])) if fresh else self.band
         begun = (look.kind == kind) & (look.band == band) & refined.good
         cases, parts = 2 * (band == self.band) + begun, [(rows.nonzero()[:0, 0], result[:0])]
         for case in cases[rows].unique().tolist():
