@@ -52,6 +52,16 @@ def ellipse_from_conic(conic: Conic) -> Ellipse:
     return torch.where(valid[..., None], ellipse, torch.nan)
 
 
+def axes_of(square: Float[Tensor, "*N 2 2"]) -> Float[Tensor, "*N 3"]:
+    """Semi-axes and angle a, b, theta of ellipses by the square S S^T of their `shape_matrix`, positive definite."""
+    s11, s12, s22 = square[..., 0, 0], square[..., 0, 1], square[..., 1, 1]
+    large = 0.5 * (s11 + s22 + torch.hypot(s11 - s22, 2 * s12))
+    small = (s11 * s22 - s12.square()) / large  # a difference would cancel for slender ones
+    theta = torch.remainder(0.5 * torch.atan2(2 * s12, s11 - s22), torch.pi)
+    theta = torch.where(theta >= torch.pi, 0.0, theta)  # a tiny negative angle is rounded up to pi
+    return torch.cat([torch.stack([large, small.minimum(large)], -1).sqrt(), theta[..., None]], -1)
+
+
 def conic_from_ellipse(ellipse: Ellipse) -> Conic:
     """Conic coefficients, negative inside, of ellipses; scaled to -1 at the centre."""
     cx, cy, a, b, theta = ellipse.unbind(-1)
