@@ -291,7 +291,9 @@ class PoseEstimator(nn.Module):
         if len(circles) == 0:
             return circles
         rough, at = rough_rings(circles, scene.camera), (scene.table, scene.camera.matrix)
-        return circles[in_company(rough, *at) | (_legible(circles.inside.blur) & named(rough, *at))]
+        beside = in_company(rough, *at)
+        circles = replace(circles, alone=~beside)
+        return circles[beside | (_legible(circles.inside.blur) & named(rough, *at))]
 
     def _rings(self, scene: Scene, circles: Circles, *, hopeful: bool = False) -> tuple[Rings, Tensor]:
         return measure_circles(scene.frames, circles, scene.camera, correct=self._recipe.correct, hopeful=hopeful)
