@@ -189,11 +189,12 @@ def measure_exactly(frames: Tensor, rings: Rings, camera: Camera) -> tuple[Rings
 
 
 class _How(NamedTuple):
-    """correct, hopeful: as for `measure_circles`. begun: as for `fit_small_rings`."""
+    """correct, hopeful: as for `measure_circles`. begun: as for `fit_small_rings`. reduced: in frames that are."""
 
     correct: bool
     hopeful: bool = False
     begun: bool = False
+    reduced: bool = False
 
 
 def _measured(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tuple[Rings, Tensor]:
@@ -212,7 +213,7 @@ def _measured(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
         outer, inner = (conics.rescaled(e[index], 1 / value) for e in (candidates.ellipse, inside.ellipse))
         some = replace(candidates[index], frame=own, ellipse=outer)
         part = replace(inside[index], ellipse=inner, blur=blurs.reduced(inside.blur[index], value))
-        found, of = _measure(small, Circles(some, part, circles.alone[index]), camera.reduced(value), how)
+        found, of = _measure(small, Circles(some, part, circles.alone[index]), camera.reduced(value), how._replace(reduced=value > 1))
         rings.append(_enlarged(replace(found, frame=frame[found.frame]), value))
         which.append(index[of])
     if not rings:
@@ -250,7 +251,8 @@ def _measure(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tup
         return _as_a_whole(frames, circles, camera, how)
     # ... and so do two edges with less than a pixel beside it
     narrow = torch.minimum((1 - ratio) * outer[:, 3] - 1, ratio * outer[:, 3]) < _SMALL
-    small = narrow & (outer[:, 3] < _LARGE)
+    # a frame was reduced because a mask sees little of such edges; the whole ring tells as much, and its blur as well
+    small = (narrow | (how.reduced & how.correct)) & (outer[:, 3] < _LARGE)
     parts, index = [], (~small).nonzero()[:, 0]
     if index.numel():
         rings, of = _by_edges(frames, circles[index], camera, how)
