@@ -146,7 +146,8 @@ def store(folder: Path, arguments: argparse.Namespace) -> None:
                 (table / one.name).write_bytes((out / one.name).read(1 << 30))
             found = Counter(row["frame"] for row in rows(table))
             print(
-                f"{count // share} frames: exit {os.waitstatus_to_exitcode(status)}, {time.perf_counter() - start:.0f} s, "
+                f"{count // share} frames: exit {os.waitstatus_to_exitcode(status)}, "
+                f"{time.perf_counter() - start:.0f} s, "
                 f"{len(found)} of them have rows, {sum(found.values()) - len(found)} twice, "
                 f"{application.failed - before[1]} of {application.asked - before[0]} requests failed, "
                 f"driver {used.ru_maxrss // 1024} MB",
