@@ -6,7 +6,6 @@ table. Ray places the work, holds decoding back where it runs ahead, and does ag
 
 from __future__ import annotations
 
-import json
 import pickle
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -82,7 +81,7 @@ class Measure:
             self._detections.write(block.name, (row for r in records for row in r["detections"]), stamps)
         # the last: where it is there, the block is done
         self._poses.write(block.name, (row for r in records for row in r["rows"]), stamps)
-        rows = json.dumps([[record["frame"], record["rows"]] for record in records])
+        rows = pickle.dumps([(record["frame"], record["rows"]) for record in records])
         return {"rows": np.array([rows], dtype=object)}
 
 
@@ -131,4 +130,4 @@ def measured(
         compute=ray.data.ActorPoolStrategy(min_size=1, max_size=workers),
     )
     for row in blocks_done(data):
-        yield [(frame, rows) for frame, rows in json.loads(row["rows"])]
+        yield pickle.loads(row["rows"])

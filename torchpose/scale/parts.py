@@ -89,7 +89,7 @@ class Parts:
     def _check_origin(self, origin: Mapping[str, Any]) -> None:
         try:
             before = parse_json((self.folder / _ORIGIN).read(_MOST_ORIGIN))
-            changed = [name for name, value in json.loads(json.dumps(origin)).items() if before.get(name) != value]
+            changed = [name for name, value in parse_json(json.dumps(origin)).items() if before.get(name) != value]
         except (StorageError, ValueError, AttributeError):
             raise ConfigError(
                 f"{self.folder / _ORIGIN}: --resume: missing or damaged, so what the rows were made from is not known; "
