@@ -77,7 +77,7 @@ def test_another_code_is_no_marker(monkeypatch: pytest.MonkeyPatch, scene: Scene
 
 
 def test_what_is_blurred_is_not_looked_at_again(monkeypatch: pytest.MonkeyPatch, scene: Scene) -> None:
-    """A ring of another code where a marker is missing: under such a blur no other scale, and no second look, shows more."""
+    """A ring of another code where a marker is missing: under such a blur no other look shows more."""
     camera, target, r, t, _ = scene
     radii = target.radii.clone()
     radii[3, 1] = 4.0

@@ -25,8 +25,10 @@ from torchpose.rings import Rings, mapped, measure_predicted
 
 
 class Views(NamedTuple):
-    """Where N rows of M markers may be: seen (N, M) bool, the markers that fit; R (N, S, 3, 3) and t (N, S, 3), S possible
-    poses of each row, NaN where there are fewer."""
+    """Where N rows of M markers may be.
+
+    seen (N, M) bool: the markers that fit. R (N, S, 3, 3), t (N, S, 3): S possible poses, NaN where there are fewer.
+    """
 
     seen: Tensor
     R: Tensor

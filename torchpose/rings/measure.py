@@ -213,7 +213,9 @@ def _measured(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
         outer, inner = (conics.rescaled(e[index], 1 / value) for e in (candidates.ellipse, inside.ellipse))
         some = replace(candidates[index], frame=own, ellipse=outer)
         part = replace(inside[index], ellipse=inner, blur=blurs.reduced(inside.blur[index], value))
-        found, of = _measure(small, Circles(some, part, circles.alone[index]), camera.reduced(value), how._replace(reduced=value > 1))
+        found, of = _measure(
+            small, Circles(some, part, circles.alone[index]), camera.reduced(value), how._replace(reduced=value > 1)
+        )
         rings.append(_enlarged(replace(found, frame=frame[found.frame]), value))
         which.append(index[of])
     if not rings:

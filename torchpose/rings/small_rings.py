@@ -31,6 +31,7 @@ from torchpose.geometry import conics
 from torchpose.geometry.blurred_edge import BLUR, MOST, Spread
 from torchpose.geometry.blurred_ellipse import nodes_of_each
 from torchpose.geometry.least_squares import (
+    Block,
     Normal,
     Unknowns,
     Vector,
@@ -224,8 +225,9 @@ def _fitted(window: _Window, begun: _Start, scheme: _Scheme) -> _Fit:
     """Fits of K rings to the pixels of their windows."""
     middle = torch.nn.functional.pad(window.middle, (0, RING - 2))
     limits = [begun.theta.new_tensor(x) for x in (_LEAST, _MOST, _MOST_MOVE)]
-    own = {"ring": Vector(begun.theta - middle, *limits), "blur": begun.spread}
-    unknowns = Unknowns({**own, "levels": Vector(middle.new_zeros(len(middle), _LEVELS))})  # only how they move with the others counts
+    own: dict[str, Block] = {"ring": Vector(begun.theta - middle, *limits), "blur": begun.spread}
+    own["levels"] = Vector(middle.new_zeros(len(middle), _LEVELS))  # only how they move with the others counts
+    unknowns = Unknowns(own)
     pixels = _Pixels(window, unknowns.values("ring"), begun, scheme)
     for stage in scheme.stages:
         pixels.stage = stage
