@@ -29,7 +29,7 @@ def first_levels(blocks: PixelBlocks, R: Tensor, t: Tensor, spread: Spread) -> T
     A third of a ring may be covered: a least-squares fit of gradients would bend towards the cover and stay there.
     """
     model = ring_model(blocks, R, t, spread)
-    columns = _tiled(torch.stack([*_basis(model), blocks.grey]))
+    columns = _tiled((*_basis(model), blocks.grey))
     none = torch.zeros_like(model.fraction[:, 0])
     ring, paper = _pure_levels(blocks, model.fraction)
     levels = torch.stack([ring, none, none, paper, none, none], -1).nan_to_num(0.0, 0.0, 0.0).double()
@@ -75,8 +75,8 @@ def columns_of(blocks: PixelBlocks, model: RingModel, levels: Tensor) -> tuple[T
     residual = blocks.grey - (ring + contrast * model.fraction)
     basis = _basis(model, bool(curved))
     by_blur = (contrast * v for v in model.by_blur)
-    rest = torch.stack([*by_blur, *basis, residual, contrast * model.by_gain])
-    return _tiled(torch.cat([by_d * model.by_pose, rest])), by_d
+    by_pose = (by_d * model.by_pose).unbind(0)
+    return _tiled((*by_pose, *by_blur, *basis, residual, contrast * model.by_gain)), by_d
 
 
 def _basis(model: RingModel, curved: bool = False) -> tuple[Tensor, ...]:
@@ -89,9 +89,9 @@ def _basis(model: RingModel, curved: bool = False) -> tuple[Tensor, ...]:
     return (*flat, *(ring * p for p in squares), *(paper * p for p in squares))
 
 
-def _tiled(planes: Tensor) -> Tensor:
-    """Planes (n, K, P) as (K, P / 256, n, 256)."""
-    return planes.unflatten(2, (-1, TILE)).permute(1, 2, 0, 3).contiguous()
+def _tiled(planes: tuple[Tensor, ...]) -> Tensor:
+    """Planes (K, P) as (K, P / 256, planes, 256)."""
+    return torch.stack([p.unflatten(1, (-1, TILE)) for p in planes], 2)
 
 
 def sum_products(columns: Tensor, weight: Tensor) -> Tensor:
