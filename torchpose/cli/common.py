@@ -16,11 +16,14 @@ if TYPE_CHECKING:
     from torchpose.io.sources import Source
 
 INTERRUPTED = 130  # as shells have it: 128 + SIGINT
+CLOSED = 141  # 128 + SIGPIPE: nobody reads on, as behind `| head`
 
 MOST_SEED = 2**63 - 1  # of torch's generators
 _MOST_THREADS = 256  # (convention) more than any machine of today gains from; thousands of stacks end the process
 _MOST_BATCH = 4096  # frames (convention): of 20 megapixels they fill 80 GB
-Threads = Annotated[int | None, typer.Option(min=1, max=_MOST_THREADS, help="Threads to use; by default one a core.")]
+Threads = Annotated[
+    int | None, typer.Option("--threads", "-j", min=1, max=_MOST_THREADS, help="Threads to use; by default one a core.")
+]
 Tone = Annotated[
     str | None,
     typer.Option(
@@ -52,11 +55,28 @@ def use_threads(threads: int | None, *, share: float = 1.0) -> int:
     return wanted
 
 
-def frames_of(inputs: Sequence[Path]) -> list[Source]:
-    """Frames of the INPUTs; what is passed over is told on stderr."""
+def frames_of(inputs: Sequence[Path], listed: Sequence[Path] = ()) -> list[Source]:
+    """Frames of the INPUTs, and of a list of further ones; what is passed over is told on stderr."""
     from torchpose.io.sources import find_sources
 
-    return find_sources(inputs, lambda line: say(f"torchpose: {line}", err=True))
+    return find_sources(inputs, lambda line: say(f"torchpose: {line}", err=True), listed=listed)
+
+
+def listed_files(inputs: Sequence[Path], files_from: Path | None) -> list[Path]:
+    """What --files-from names. ConfigError: there is no INPUT either."""
+    from torchpose.io.lists import read_list
+
+    if files_from is not None:
+        return read_list(files_from)
+    if not inputs:
+        raise ConfigError("INPUT: is missing; give image files, folders or a capture manifest, or --files-from")
+    return []
+
+
+def built_in_targets(incomplete: str) -> list[str]:
+    """Names of built-in targets that begin so, for the shell to complete."""
+    places = (Path(__file__).parents[1] / "targets").glob("*.yaml")
+    return sorted(path.stem for path in places if path.stem.startswith(incomplete))
 
 
 def check_outputs(

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchpose.cli.common import say
+from torchpose.cli.options import camera_option, folder_option, target_option
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:  # imported where they are used: torch takes more than a second, which --help need not wait for
@@ -39,9 +40,9 @@ _TONE = "Tone around the rings: dark rings on light, or the reverse."
 
 
 def design(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for target file, print sheet, table and map.")],
-    camera: Annotated[str | None, typer.Option(help="Camera file, as for estimate.")] = None,
-    target: Annotated[str | None, typer.Option(help=_TARGET)] = None,
+    out: Annotated[Path, folder_option("Folder for target file, print sheet, table and map.")],
+    camera: Annotated[str | None, camera_option("Camera file, as for estimate.")] = None,
+    target: Annotated[str | None, target_option(_TARGET)] = None,
     distance: Annotated[float | None, typer.Option(help="Distance of the target, mm.")] = None,
     distance_range: Annotated[tuple[float, float] | None, typer.Option(metavar="NEAR FAR", help=_RANGE)] = None,
     tilt: Annotated[float, typer.Option(help=_TILT)] = 0.0,

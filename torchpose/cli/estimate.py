@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchpose.cli.common import (
+    CLOSED,
     Batch,
     Overlay,
     Silent,
@@ -20,58 +21,59 @@ from torchpose.cli.common import (
     ended,
     frames_of,
     interrupted,
+    listed_files,
     say,
     use_threads,
     with_tone,
 )
+from torchpose.cli.options import (
+    CameraFile,
+    FilesFrom,
+    HandEyeFile,
+    Instances,
+    LastStage,
+    RelativeTo,
+    Targets,
+    Upright,
+)
+from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:  # imported where they are used: torch takes more than a second, which --help need not wait for
     from torchpose.camera import Camera
     from torchpose.handeye import HandEye
     from torchpose.io.estimates import Estimation
     from torchpose.io.misfits import Misfits
+    from torchpose.io.project import Settings
     from torchpose.io.sources import Source
     from torchpose.io.store import ResultStore
+    from torchpose.io.stream import StreamedRows
+    from torchpose.io.tally import Tally
     from torchpose.target import Target
 
 _INPUTS = (
-    "Image files (PNG, TIFF, BMP, JPEG, PGM; 8 or 16 bit, grey or colour), folders of them, searched recursively and "
-    "taken in natural order, or capture manifests (.jsonl)."
+    "Image files (PNG, TIFF, BMP, JPEG, PGM; 8 or 16 bit, grey or colour), films (.mp4, .avi, .mov, .mkv, .webm), "
+    "folders of both, searched recursively and taken in natural order, or capture manifests (.jsonl)."
 )
-_CAMERA = (
-    "Camera file: OpenCV YAML, JSON or XML, ROS camera_info, Kalibr camchain, COLMAP cameras.txt and others "
-    "(docs/cameras.md). FILE#cam1 or FILE#2 picks one of several."
-)
-_METHODS = "photometric|edges|centers|paper"  # torchpose.pipeline.Method, which takes a second to import
-_METHOD = "Last stage: grey values, edge points, ring centres, or the paper's own chain."
-_HAND_EYE = "Calibrated camera-to-base or camera-to-tool transform; adds the poses in the robot base."
+_OUT = "Table of the poses: .csv, .jsonl or .parquet; or `-`: JSON lines on standard output."
 _JUDGED = 16  # frames that the tone is judged by
 _RESUME = "Keep the frames that an earlier run finished and do the rest."
-_INSTANCES = "Most copies of a target in a frame (a tray of equal parts): up to as many rows, column instance."
-_TARGET = (
-    "Target file or name of a built-in target, or a board of equal marks: rings:10x7:20mm:6mm:3mm (columns, rows, "
-    "pitch, radii), circles:7x6:20mm:4mm, acircles:4x11:20mm:4mm (pitch, radius); repeat for several."
-)
-_UPRIGHT = (
-    "Boards that look the same after a turn have their rows to the right. Without, they are ambiguous unless measured."
-)
-_RELATIVE = "Name of a target: give the poses of the others (of their parts) in its frame (that of its part)."
 _DETECTIONS = "Table of the markers found: .csv, .jsonl or .parquet."
 
 
 def estimate(
-    inputs: Annotated[list[Path], typer.Argument(metavar="INPUT...", help=_INPUTS)],
-    camera: Annotated[str, typer.Option(help=_CAMERA)],
-    target: Annotated[list[str], typer.Option(help=_TARGET)],
-    out: Annotated[Path, typer.Option(help="Table of the poses: .csv, .jsonl or .parquet.")],
-    detections: Annotated[Path | None, typer.Option(help=_DETECTIONS)] = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help=_OUT)],
+    inputs: Annotated[list[Path] | None, typer.Argument(metavar="INPUT...", help=_INPUTS)] = None,
+    camera: CameraFile = None,
+    target: Targets = None,
+    files_from: FilesFrom = None,
+    detections: Annotated[Path | None, typer.Option("--detections", "-d", help=_DETECTIONS)] = None,
     overlay: Overlay = None,
-    instances: Annotated[int, typer.Option(min=1, max=1000, metavar="K", help=_INSTANCES)] = 1,
-    assume_upright: Annotated[bool, typer.Option("--assume-upright", help=_UPRIGHT)] = False,
+    instances: Instances = None,
+    assume_upright: Upright = None,
     resume: Annotated[bool, typer.Option("--resume", help=_RESUME)] = False,
-    hand_eye: Annotated[Path | None, typer.Option(help=_HAND_EYE)] = None,
-    relative_to: Annotated[str | None, typer.Option(metavar="NAME", help=_RELATIVE)] = None,
-    method: Annotated[str, typer.Option(metavar=_METHODS, help=_METHOD)] = "photometric",
+    hand_eye: HandEyeFile = None,
+    relative_to: RelativeTo = None,
+    method: LastStage = None,
     tone: Tone = None,
     srgb: Annotated[bool, typer.Option("--srgb", help="The same as --tone srgb.")] = False,
     batch: Batch = None,
@@ -83,35 +85,68 @@ def estimate(
     One row a frame and target, or with --instances one a copy: status, translation in mm, rotation vector in rad
     (target to camera), their standard deviations, reprojection RMS in px, number of markers.
     """
-    from torchpose.camera import Camera
     from torchpose.cli.terminal import native_stderr_silenced
-    from torchpose.io.estimates import Estimation
+    from torchpose.io.project import settings
+    from torchpose.io.stream import is_standard
     from torchpose.io.writers import check_table_path
+
+    if is_standard(out) and (resume or detections is not None):
+        other = "--resume" if resume else "--detections"
+        raise ConfigError(f"--out: - is standard output, which has no {other}; give a file, or leave {other} out")
+    tables = [path for path in (out, detections) if path is not None and not is_standard(path)]
+    for path in tables:
+        check_table_path(path, "--out" if path is out else "--detections")
+    given = list(inputs or [])
+    listed = listed_files(given, files_from)
+    stated = settings(
+        [*given, *listed],
+        camera=camera,
+        target=target,
+        method=method,
+        tone="srgb" if srgb and tone is None else tone,
+        instances=instances,
+        hand_eye=hand_eye,
+        relative_to=relative_to,
+        assume_upright=assume_upright,
+    )
+    sources = frames_of(given, listed)
+    work = estimation(stated, sources)
+    check_outputs([*given, *listed], sources, tables, overlay)
+    with native_stderr_silenced():
+        how: dict[str, Any] = {"resume": resume, "batch": batch, "threads": threads or cores(), "quiet": quiet}
+        return _run(work, sources, out, detections, overlay, **how, told=stated.told)
+
+
+def estimation(stated: Settings, sources: Sequence[Source]) -> Estimation:
+    """What the rows depend on, by the options. ConfigError: one is missing, or they do not go together."""
+    from torchpose.camera import Camera
+    from torchpose.io.estimates import Estimation
     from torchpose.target import Target
 
-    for path, option in ((out, "--out"), (detections, "--detections")):
-        if path is not None:
-            check_table_path(path, option)
-    lens, targets, sources = Camera.load(camera), [Target.load(name) for name in target], frames_of(inputs)
-    if assume_upright:
+    lens = Camera.load(stated.needed("camera"))
+    targets = [Target.load(name) for name in stated.needed("target")]
+    if stated["assume_upright"]:
         targets = [one.upright() for one in targets]
-    lens = with_tone(lens, "srgb" if srgb and tone is None else tone)
-    lens = lens if lens.tone is not None else _with_judged_tone(lens, targets[0], sources)
-    _check_relative(relative_to, targets, hand_eye, instances)
-    base = _load_hand_eye(hand_eye, sources)
-    work = Estimation(lens, targets, base, method, instances, relative_to, assume_upright)
-    check_outputs(inputs, sources, [p for p in (out, detections) if p is not None], overlay)
-    with native_stderr_silenced():
-        return _run(
-            work, sources, out, detections, overlay, resume=resume, batch=batch, threads=threads or cores(), quiet=quiet
-        )
+    lens = with_tone(lens, stated["tone"])
+    lens = lens if lens.tone is not None else with_judged_tone(lens, targets[0], sources)
+    instances = stated["instances"] or 1
+    _check_relative(stated["relative_to"], targets, stated["hand_eye"], instances)
+    return Estimation(
+        lens,
+        targets,
+        _load_hand_eye(stated["hand_eye"], sources),
+        stated["method"] or "photometric",
+        instances,
+        stated["relative_to"],
+        bool(stated["assume_upright"]),
+    )
 
 
-def _with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -> Camera:
+def with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -> Camera:
     """The camera with the tone that the frames tell, where their kind of file makes one likely; says what it took."""
     from torchpose.io.images import UnreadableImageError, WrongSizeError, likely_encoded
 
-    if not sources or not likely_encoded(sources[0].path):
+    if not sources or not (sources[0].film or likely_encoded(sources[0].path)):
         return lens
     from dataclasses import replace
 
@@ -122,7 +157,8 @@ def _with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -
     from torchpose.camera import LINEAR
 
     images = []
-    for source in sources[:: (len(sources) - 1) // _JUDGED + 1]:
+    step = 1 if sources[0].film else (len(sources) - 1) // _JUDGED + 1  # a film is read from its beginning
+    for source in sources[: step * _JUDGED : step]:
         try:
             image = source.decode(size=(lens.width, lens.height))
         except (UnreadableImageError, WrongSizeError):
@@ -137,8 +173,8 @@ def _with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -
         "too few rings to tell" if shift is None else f"as linear ones their edges would be {abs(shift.px):.2g} px off"
     )
     say(
-        f"torchpose: {sources[0].name}: JPEG or colour, and neither the camera file nor --tone says its tone: taken as "
-        f"{tone or LINEAR} ({told})",
+        f"torchpose: {sources[0].name}: JPEG, film or colour, and neither the camera file nor --tone says its tone: "
+        f"taken as {tone or LINEAR} ({told})",
         err=True,
     )
     return replace(lens, tone=tone or LINEAR)
@@ -155,6 +191,7 @@ def _run(
     batch: int | None,
     threads: int,
     quiet: bool,
+    told: str,
 ) -> int:
     """Estimates what is not done yet and writes the tables; returns the exit code."""
     import cv2
@@ -163,6 +200,7 @@ def _run(
     from torchpose.camera import LINEAR
     from torchpose.cli.terminal import FrameProgress
     from torchpose.io.reader import FrameReader, default_batch, in_batches
+    from torchpose.io.stream import is_standard
     from torchpose.report.overlay import Overlay
 
     cv2.setNumThreads(1)  # frames are decoded side by side; threads inside of one would only compete
@@ -186,12 +224,17 @@ def _run(
                 progress.advance(len(new), store.counts)
         store.finish([source.name for source in sources])
     except KeyboardInterrupt:
-        return interrupted(f"{len(store)} of {len(sources)} frames are kept; add --resume to go on")
+        kept = "are out; standard output has no --resume" if is_standard(out) else "are kept; add --resume to go on"
+        return interrupted(f"{len(store)} of {len(sources)} frames {kept}")
+    except BrokenPipeError:
+        return CLOSED
     finally:
         store.close()
     progress.summary(store.counts, out)
     _tell_mistakes(store, out, work)
     if not quiet:
+        if told:
+            say(f"torchpose: {told}", err=True)
         _tell_crowded(store, len(sources), work)
         _tell_misfits(store.misfits, work)
     return ended(store.unreadable)
@@ -199,17 +242,20 @@ def _run(
 
 def _opened(
     work: Estimation, sources: Sequence[Source], out: Path, detections: Path | None, resume: bool
-) -> ResultStore:
+) -> ResultStore | StreamedRows:
     """Where the rows go, with those of an earlier run."""
     from torchpose.io.store import ResultStore, stamp_of
+    from torchpose.io.stream import StreamedRows, is_standard
 
+    if is_standard(out):
+        return StreamedRows(work.schema)
     files = {source.name: stamp_of(source.path) for source in sources}  # before they are read
     kept: dict[str, Any] = {"schema": work.schema, "targets": len(work.rows_of), "files": files}
     origin = work.origin((str(source.root) for source in sources), detections=detections is not None)
     return ResultStore(out, detections, resume=resume, origin=origin, **kept)
 
 
-def _tell_mistakes(store: ResultStore, out: Path, work: Estimation) -> None:
+def _tell_mistakes(store: ResultStore | StreamedRows, out: Path, work: Estimation) -> None:
     """Tells, on stderr, what is wrong with the run as a whole."""
     for line in store.whole_run.lines(f"{work.camera.width}x{work.camera.height}"):
         say(f"torchpose: warning: {line}", err=True)
@@ -217,7 +263,7 @@ def _tell_mistakes(store: ResultStore, out: Path, work: Estimation) -> None:
         say(f"torchpose: {store.damaged} damaged lines of {out}.partial left out, their frames done again", err=True)
 
 
-def _tell_crowded(store: ResultStore, count: int, work: Estimation) -> None:
+def _tell_crowded(store: Tally, count: int, work: Estimation) -> None:
     """Tells, in a line on stderr, of copies that were seen in some of the frames and have no row."""
     frames, most = store.crowded, store.most
     if not frames:
@@ -278,8 +324,6 @@ def _load_hand_eye(path: Path | None, sources: Sequence[Source]) -> HandEye | No
 
 
 def _check_relative(name: str | None, targets: Sequence[Target], hand_eye: Path | None, instances: int) -> None:
-    from torchpose.errors import ConfigError
-
     if name is None:
         return
     names = [target.name for target in targets]

@@ -24,7 +24,9 @@ _PLOTS = "Folder for plots of errors, consistency and conditions."
 def evaluate(
     poses: Annotated[Path, typer.Argument(metavar="POSES", help=_POSES)],
     truth: Annotated[Path, typer.Argument(metavar="DIR_OR_TRUTH", help=_TRUTH)],
-    out: Annotated[Path | None, typer.Option(help="Table of the errors, one row a frame (.csv).")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Table of the errors, one row a frame (.csv).")
+    ] = None,
     plots: Annotated[Path | None, typer.Option(metavar="DIR", help=_PLOTS)] = None,
 ) -> int:
     """Compare poses with the truth: bias and spread of each axis beside its bound, success by status, NEES."""

@@ -36,7 +36,6 @@ INTERNAL_ERROR = 70  # EX_SOFTWARE of sysexits.h: none of the codes that say som
 app = typer.Typer(
     name="torchpose",
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode="markdown",
     context_settings={"help_option_names": ["-h", "--help"]},
 )

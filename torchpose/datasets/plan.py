@@ -331,4 +331,5 @@ def _floats(values: Any) -> Tensor:
 
 
 def _backgrounds(path: Path, name: str | None) -> list[Path]:
-    return [] if name is None else [source.path for source in find_sources([Path(beside(path, name))])]
+    sources = [] if name is None else find_sources([Path(beside(path, name))])
+    return [source.path for source in sources if source.film is None]

@@ -12,17 +12,20 @@ import numpy as np
 
 from torchpose.errors import ConfigError
 from torchpose.io import images
+from torchpose.io.films import FILM_SUFFIXES, Film, frames_of_film
+from torchpose.io.lists import common_folder
 from torchpose.io.manifest import read_manifest
 
 IMAGE_SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg", ".pgm")
 MANIFEST_SUFFIX = ".jsonl"
 _STACKS = (".tif", ".tiff")  # that may have several pages
-# pictures and films in a folder that are not read, so that a user is told: raw files of cameras among them
+FRAME_SUFFIXES = (*IMAGE_SUFFIXES, *FILM_SUFFIXES)
+# pictures in a folder that are not read, so that a user is told: raw files of cameras among them
 _OTHERS = frozenset(
     (  # noqa: SIM905  # a list would be five times as long
-        ".apng .arw .avi .avif .cr2 .cr3 .dib .dng .exr .fit .fits .gif .hdr .heic .heif .ico .j2c .j2k .jfif "
-        ".jif .jng .jp2 .jpc .jpe .jpf .jpx .jxl .jxr .mkv .mov .mp4 .nef .npy .npz .orf .pam .pbm .pcx .pfm "
-        ".pgx .pic .pnm .ppm .psd .raf .ras .raw .rw2 .sr .svg .tga .webp"
+        ".apng .arw .avif .cr2 .cr3 .dib .dng .exr .fit .fits .gif .hdr .heic .heif .ico .j2c .j2k .jfif "
+        ".jif .jng .jp2 .jpc .jpe .jpf .jpx .jxl .jxr .mpg .nef .npy .npz .orf .pam .pbm .pcx .pfm "
+        ".pgx .pic .pnm .ppm .psd .raf .ras .raw .rw2 .sr .svg .tga .webp .wmv"
     ).split()
 )
 _PIPE = "is a pipe or a device, no file"
@@ -38,7 +41,8 @@ class Source:
         path: where the image lies.
         root: the folder that ``name`` is relative to, resolved.
         robot_pose: tool in the robot base, mm and rad, if a manifest recorded it.
-        directory: of a TIFF file with several pages, see `images.pages`.
+        directory: of a TIFF file with several pages, see `images.pages`; the number of a film's frame, from 0.
+        film: that the frame is of.
     """
 
     name: str
@@ -46,9 +50,12 @@ class Source:
     root: Path
     robot_pose: tuple[float, ...] | None = None
     directory: int = 0
+    film: Film | None = None
 
     def decode(self, *, threads: int = 1, size: tuple[int, int] | None = None) -> np.ndarray:
-        """Grey values, see `images.decode`."""
+        """Grey values, see `images.decode` and `Film.decode`."""
+        if self.film is not None:
+            return self.film.decode(self.directory, threads=threads, size=size)
         return images.decode(self.path, threads=threads, directory=self.directory, size=size)
 
 
@@ -65,33 +72,38 @@ def natural_key(name: str) -> tuple[tuple[tuple[str | int, ...], ...], str]:
     return parts, name
 
 
-def find_sources(inputs: Sequence[Path], tell: Callable[[str], None] = _silent) -> list[Source]:
-    """Frames of image files, folders (searched recursively, in natural order) and capture manifests, input by input.
+def find_sources(
+    inputs: Sequence[Path], tell: Callable[[str], None] = _silent, *, listed: Sequence[Path] = ()
+) -> list[Source]:
+    """Frames of image files, folders (searched recursively, in natural order), films and manifests, input by input.
 
     In folders, hidden files and folders and everything without an image's suffix are passed over. A file with an
     image's suffix is listed whatever it holds: that it cannot be read is a result of its own. Every page of a TIFF file
-    is a frame; from the second on ``#2``, ``#3``, ... stands behind the file's name. A manifest has one frame a record.
+    is a frame; from the second on ``#2``, ``#3``, ... stands behind the file's name. So is every frame of a film, from
+    ``#1`` on. A manifest has one frame a record.
 
     Args:
         inputs: files, folders and manifests.
         tell: is given a line for pictures that are passed over.
+        listed: further inputs; files among them are called by their place below the folder that holds all of them.
 
     Raises:
         ConfigError: an input is missing, holds no image or is of another kind, or two frames have the same name.
     """
     sources: list[Source] = []
     seen: dict[str, Source] = {}
-    for given in inputs:
+    below = common_folder(listed) if listed else None
+    for given, root in ((given, root) for some, root in ((inputs, None), (listed, below)) for given in some):
         passed: Counter[str] = Counter()  # what, and how many of it
-        found = list(_sources_of(given, passed))
+        found = list(_sources_of(given, passed, root))
         if not found:
             also = f" but {_summary(passed)}" if passed.total() else ""
             raise ConfigError(
-                f"{given}: INPUT: holds no image{also}; give files that end in {', '.join(IMAGE_SUFFIXES)}"
+                f"{given}: INPUT: holds no image{also}; give files that end in {', '.join(FRAME_SUFFIXES)}"
             )
         if passed.total():
             tell(
-                f"{_text(str(given))}: passed over {_summary(passed)}; what is read ends in {', '.join(IMAGE_SUFFIXES)}"
+                f"{_text(str(given))}: passed over {_summary(passed)}; what is read ends in {', '.join(FRAME_SUFFIXES)}"
             )
         for source in found:
             twin = seen.setdefault(source.name, source)
@@ -109,27 +121,27 @@ def _summary(passed: Counter[str]) -> str:
     return ", ".join(f"{count} {kind}" for kind, count in kinds if count)
 
 
-def _sources_of(given: Path, passed: Counter[str]) -> Iterator[Source]:
-    """Frames of an input; pictures that are not read are counted in ``passed``."""
+def _sources_of(given: Path, passed: Counter[str], below: Path | None) -> Iterator[Source]:
+    """Frames of an input, files called by their place ``below``; what is not read is counted in ``passed``."""
     if _state(given) == "folder":
         root = given.resolve()
         pairs = [(_text(path.relative_to(given).as_posix()), path) for path in _walk(given, passed)]
         for name, path in sorted(pairs, key=lambda pair: natural_key(pair[0])):
-            yield from _pages(name, path, root)
+            yield from sources_of_file(name, path, root)
         return
     name, _, camera = given.name.partition(f"{MANIFEST_SUFFIX}#")  # FILE#CAMERA
     path = given.with_name(f"{name}{MANIFEST_SUFFIX}") if camera else given
-    state, suffixes = _state(path), (*IMAGE_SUFFIXES, MANIFEST_SUFFIX)
+    state, suffixes = _state(path), (*FRAME_SUFFIXES, MANIFEST_SUFFIX)
     if path.suffix.lower() not in suffixes and state in ("file", _PIPE):
-        raise ConfigError(
-            f"{given}: INPUT: of an unknown kind; give a folder or a file that ends in {', '.join(suffixes)}"
-        )
+        why = "of a kind that is not read" if path.suffix.lower() in _OTHERS else "of an unknown kind"
+        raise ConfigError(f"{given}: INPUT: {why}; give a folder or a file that ends in {', '.join(suffixes)}")
     if state != "file":
         raise ConfigError(f"{path}: INPUT: {state}; give image files, folders or a capture manifest")
     if path.suffix.lower() == MANIFEST_SUFFIX:
         yield from _recorded(path, camera or None, passed)
     else:
-        yield from _pages(_text(given.name), given, given.parent.resolve())
+        name = given.name if below is None else Path(os.path.relpath(given, below)).as_posix()
+        yield from sources_of_file(_text(name), given, (below or given.parent).resolve())
 
 
 def _recorded(manifest: Path, camera: str | None, passed: Counter[str]) -> Iterator[Source]:
@@ -137,16 +149,27 @@ def _recorded(manifest: Path, camera: str | None, passed: Counter[str]) -> Itera
     root = manifest.parent.resolve()
     for frame in read_manifest(manifest, camera):
         path = manifest.parent / frame.image
-        pages = list(_pages(frame.image, path, root))
+        pages = list(sources_of_file(frame.image, path, root))
         passed["pages behind the first"] += len(pages) - 1
         yield replace(pages[0], robot_pose=frame.robot_pose)
 
 
-def _pages(name: str, path: Path, root: Path) -> Iterator[Source]:
-    """The frames of a file."""
+def sources_of_file(name: str, path: Path, root: Path) -> Iterator[Source]:
+    """The frames of a file that is called ``name`` below ``root``."""
+    if path.suffix.lower() in FILM_SUFFIXES:
+        yield from _film(name, path, root)
+        return
     places = images.pages(path) if path.suffix.lower() in _STACKS else [0]
     for number, place in enumerate(places, start=1):
         yield Source(name if number == 1 else f"{name}#{number}", path, root, directory=place)
+
+
+def _film(name: str, path: Path, root: Path) -> Iterator[Source]:
+    """The frames of a film, and one more where it was to have more."""
+    count, broken = frames_of_film(path)
+    film = Film(path, count)
+    for number in range(count + broken):
+        yield Source(f"{name}#{number + 1}" if count else name, path, root, directory=number, film=film)
 
 
 def _state(path: Path) -> str:
@@ -182,7 +205,7 @@ def _walk(folder: Path, passed: Counter[str]) -> Iterator[Path]:
         for file in files:
             path = Path(base, file)
             suffix = path.suffix.lower()
-            if file.startswith(".") or suffix not in _OTHERS.union(IMAGE_SUFFIXES):
+            if file.startswith(".") or suffix not in _OTHERS.union(FRAME_SUFFIXES):
                 continue
             if suffix in _OTHERS:
                 passed[suffix] += 1

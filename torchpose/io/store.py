@@ -12,7 +12,6 @@ size, what was changed since, and what a damaged line of the journal held.
 """
 
 import json
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,10 +22,9 @@ from torchpose.config import parse_json, read_text
 from torchpose.errors import ConfigError
 from torchpose.io.cells import row_check
 from torchpose.io.journal import Journal, Place
-from torchpose.io.misfits import Misfits
 from torchpose.io.rows import DETECTION_SCHEMA, NEWER, Row, Schema
-from torchpose.io.whole_run import WholeRun
-from torchpose.io.writers import atomic_path, check_table_path, read_rows, write_rows
+from torchpose.io.tally import Tally
+from torchpose.io.writers import atomic_path, check_table_path, make_folder_of, read_rows, write_rows
 from torchpose.results import Status
 
 _UNSAID = {"--instances": 1}  # in what older runs were made from
@@ -58,7 +56,7 @@ class _Record(BaseModel):
     file: Stamp | None = None
 
 
-class ResultStore:
+class ResultStore(Tally):
     """Collects the rows of a run frame by frame and writes its tables.
 
     Args:
@@ -71,13 +69,9 @@ class ResultStore:
         files: stamps of the frames that there are now, by name. Of an earlier run's frames that are not among them all
             rows are kept, of the others those that were made from the same file.
 
+    What it counts includes the rows of an earlier run.
+
     Attributes:
-        counts: number of rows by status, those of an earlier run included.
-        unreadable: frames that could not be read, with their reason.
-        crowded: frames that show more copies of a target than they have rows.
-        most: by target, the most copies of it that one of these frames shows.
-        misfits: by target, what its rows say together of target and camera file.
-        whole_run: what only all rows together show.
         damaged: lines of the journal that were not as they had been written.
 
     Raises:
@@ -108,6 +102,7 @@ class ResultStore:
         self._files = dict(files or {})
         self._origin_path = out.with_name(out.name + ".run.json")
         self._forget()
+        make_folder_of(out, "--out")
         try:
             self._journal = Journal(out.with_name(out.name + ".partial"))
             try:
@@ -120,12 +115,7 @@ class ResultStore:
 
     def _forget(self) -> None:
         """No frame is done."""
-        self.counts: Counter[str] = Counter()
-        self.unreadable: dict[str, str] = {}
-        self.crowded: set[str] = set()
-        self.most: dict[str, int] = {}
-        self.misfits: dict[str, Misfits] = {}
-        self.whole_run = WholeRun()
+        Tally.__init__(self)
         self._places: dict[str, Place] = {}
         self._made_from: dict[str, Stamp | None] = {}
 
@@ -195,16 +185,7 @@ class ResultStore:
     def _note(self, record: Row) -> None:
         """Counts what a record says."""
         self._made_from[record["frame"]] = record["file"]
-        self.counts.update(row["status"] for row in record["rows"])
-        if record["rows"][0]["status"] == "unreadable":
-            self.unreadable[record["frame"]] = record["rows"][0]["reason"]
-        rows = Counter(row["target"] for row in record["rows"])
-        for row in record["rows"]:
-            self.misfits.setdefault(row["target"], Misfits()).add(row)
-            self.whole_run.add(row)
-            if (row.get("copies") or 0) > rows[row["target"]]:
-                self.crowded.add(record["frame"])
-                self.most[row["target"]] = max(self.most.get(row["target"], 0), row["copies"])
+        self.count(record)
 
     def _load(self) -> bool:
         """Reads the journal of a killed run; False if not even its first line is whole."""

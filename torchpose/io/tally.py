@@ -1,0 +1,41 @@
+"""What the rows of a run say together, whichever way they go out."""
+
+from collections import Counter
+
+from torchpose.io.misfits import Misfits
+from torchpose.io.rows import Row
+from torchpose.io.whole_run import WholeRun
+
+
+class Tally:
+    """Counts the rows of a run frame by frame.
+
+    Attributes:
+        counts: number of rows by status.
+        unreadable: frames that could not be read, with their reason.
+        crowded: frames that show more copies of a target than they have rows.
+        most: by target, the most copies of it that one of these frames shows.
+        misfits: by target, what its rows say together of target and camera file.
+        whole_run: what only all rows together show.
+    """
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self.unreadable: dict[str, str] = {}
+        self.crowded: set[str] = set()
+        self.most: dict[str, int] = {}
+        self.misfits: dict[str, Misfits] = {}
+        self.whole_run = WholeRun()
+
+    def count(self, record: Row) -> None:
+        """Counts a frame: ``{"frame": name, "rows": [...]}``."""
+        self.counts.update(row["status"] for row in record["rows"])
+        if record["rows"][0]["status"] == "unreadable":
+            self.unreadable[record["frame"]] = record["rows"][0]["reason"]
+        rows = Counter(row["target"] for row in record["rows"])
+        for row in record["rows"]:
+            self.misfits.setdefault(row["target"], Misfits()).add(row)
+            self.whole_run.add(row)
+            if (row.get("copies") or 0) > rows[row["target"]]:
+                self.crowded.add(record["frame"])
+                self.most[row["target"]] = max(self.most.get(row["target"], 0), row["copies"])
