@@ -24,6 +24,7 @@ from torchpose.cli.evaluate import evaluate
 from torchpose.cli.reproduce import reproduce
 from torchpose.cli.sensitivity import sensitivity
 from torchpose.cli.simulate import simulate
+from torchpose.cli.watch import watch
 from torchpose.errors import TorchposeError, plain, printable
 
 _HELP = Path(__file__).with_name("help")
@@ -57,7 +58,7 @@ def _torchpose(
 
 
 # what stands below the options: help/COMMAND.md
-for _command in (estimate, detect, simulate, evaluate, capture, sensitivity, reproduce, design, calibrate):
+for _command in (estimate, watch, detect, simulate, evaluate, capture, sensitivity, reproduce, design, calibrate):
     app.command(epilog=(_HELP / f"{_command.__name__}.md").read_text(encoding="utf-8"))(_command)
 
 

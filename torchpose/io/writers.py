@@ -9,7 +9,6 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import TextIO
 
 from torchpose.config import check_regular, parse_json
 from torchpose.errors import ConfigError
@@ -194,7 +193,7 @@ def _write_csv(path: Path, rows: Iterable[Row], schema: Schema) -> None:
         _to_csv(file, rows, schema, head=True)
 
 
-def _to_csv(file: TextIO, rows: Iterable[Row], schema: Schema, *, head: bool) -> None:
+def _to_csv(file: io.TextIOBase, rows: Iterable[Row], schema: Schema, *, head: bool) -> None:
     columns = _cells(schema)
     writer = csv.writer(file, lineterminator="\n")  # floats are written by repr, which reads back to the same bits
     if head:
