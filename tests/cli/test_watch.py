@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -48,9 +51,7 @@ def watch(*words: str) -> int | str | None:
     return end.value.code
 
 
-def test_a_table_grows_from_run_to_run(
-    folder: Path, picture: np.ndarray, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_table_grows_from_run_to_run(folder: Path, picture: np.ndarray, capfd: pytest.CaptureFixture[str]) -> None:
     Path("torchpose.yaml").write_text("method: centers\n")
     assert watch("-o", "new/p.csv", "--poll") == 0
     assert "in: waiting for pictures, read again and again" in (err := capfd.readouterr().err)
@@ -71,6 +72,28 @@ def test_a_table_grows_from_run_to_run(
     assert {row["frame"]: row["status"] for row in out} == rows
     assert watch("-o", "new/p.csv", "-m", "edges") == 2
     assert "were made with another --method" in capfd.readouterr().err
+
+
+def test_rows_go_to_those_who_listen(folder: Path, picture: np.ndarray) -> None:
+    client = pytest.importorskip("websockets.sync.client")
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        port = one.getsockname()[1]
+    heard: list[str] = []
+
+    def listen() -> None:
+        while not heard:
+            with contextlib.suppress(OSError), client.connect(f"ws://127.0.0.1:{port}") as rows:
+                cv2.imwrite("in/.late.png", picture)
+                Path("in/.late.png").rename("in/late.png")
+                heard.extend(rows)
+
+    listener = threading.Thread(target=listen)
+    listener.start()
+    assert watch("-o", "p.jsonl", "--websocket", str(port), "--idle", "3") == 0
+    listener.join(60)
+    assert json.loads(heard[-1])["frame"] == "late.png"
+    assert heard[-1] == Path("p.jsonl").read_text().splitlines()[-1]
 
 
 @pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM])

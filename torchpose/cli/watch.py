@@ -16,6 +16,7 @@ from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:  # imported where they are used: torch takes more than a second, which --help need not wait for
     from torchpose.io.estimates import Estimation
+    from torchpose.io.feeds import Feed
     from torchpose.io.growing import GrowingTable
     from torchpose.io.stream import StreamedRows
     from torchpose.io.watching import Watching
@@ -25,6 +26,10 @@ _OUT = "Table that grows: .jsonl or .csv; or `-`: JSON lines on standard output.
 _SETTLE = "A file that nobody says was closed is whole once it has not changed for so long."
 _POLL = "Read the folder again and again instead of asking the system for events (network drives)."
 _IDLE = "End after so long without a new picture; by default never."
+_WEBSOCKET = "Also give the rows over a WebSocket at this port (docs/shell.md)."
+_OPCUA = "Also give the latest rows over OPC UA at this port (docs/shell.md)."
+_HOST = "Address that --websocket and --opcua listen on; beyond this machine with --token alone."
+_TOKEN = "What clients of --websocket and --opcua have to know."
 
 
 def watch(
@@ -41,6 +46,10 @@ def watch(
     settle: Annotated[float, typer.Option(min=0.01, max=3600, metavar="SECONDS", help=_SETTLE)] = 1.0,
     poll: Annotated[bool, typer.Option("--poll", help=_POLL)] = False,
     idle: Annotated[float | None, typer.Option(min=0.1, metavar="SECONDS", help=_IDLE)] = None,
+    websocket: Annotated[int | None, typer.Option(min=1, max=65535, metavar="PORT", help=_WEBSOCKET)] = None,
+    opcua: Annotated[int | None, typer.Option(min=1, max=65535, metavar="PORT", help=_OPCUA)] = None,
+    host: Annotated[str, typer.Option(help=_HOST)] = "127.0.0.1",
+    token: Annotated[str, typer.Option(help=_TOKEN, envvar="TORCHPOSE_TOKEN")] = "",
     batch: Batch = None,
     threads: Threads = None,
     quiet: Silent = False,
@@ -56,6 +65,7 @@ def watch(
     from torchpose.cli.terminal import native_stderr_silenced
     from torchpose.io.arrivals import Arrivals
     from torchpose.io.project import settings
+    from torchpose.io.watching import Watching
 
     options: dict[str, Any] = {"camera": camera, "target": target, "method": method, "tone": tone}
     options |= {"instances": instances, "hand_eye": hand_eye, "relative_to": relative_to}
@@ -65,22 +75,22 @@ def watch(
         raise ConfigError(f"{hand_eye}: --hand-eye: is of a camera on the tool; pictures alone have no robot poses")
     cv2.setNumThreads(1)
     use_threads(threads, share=0.5)
-    arrivals = Arrivals(folder, settle=settle, events=not poll)
-    try:
+    with contextlib.ExitStack() as opened:
+        arrivals = Arrivals(folder, settle=settle, events=not poll)
+        opened.callback(arrivals.close)
         sink = _opened(work, folder, out)
-        try:
-            watching = _watching(work, arrivals, sink, threads=threads or cores(), batch=batch)
-            if not quiet:
-                _tell_start(folder, arrivals.by_events, stated.told)
-            with native_stderr_silenced(), _ended_by_signals(watching):
+        opened.callback(sink.close)
+        feeds = [opened.enter_context(feed) for feed in _feeds(work, websocket, opcua, (host, token))]
+        publish = [feed.publish for feed in feeds]
+        watching = Watching(work, arrivals, sink, publish, threads=threads or cores(), batch=batch)
+        if not quiet:
+            _tell_start(folder, arrivals.by_events, stated.told)
+        with native_stderr_silenced(), _ended_by_signals(watching):
+            try:
                 _with_tone(watching, sink, idle)
                 watching.run(idle=idle)
-        except BrokenPipeError:
-            return CLOSED
-        finally:
-            sink.close()
-    finally:
-        arrivals.close()
+            except BrokenPipeError:
+                return CLOSED
     if not quiet:
         counts = ", ".join(f"{count} {status}" for status, count in sink.counts.most_common())
         say(f"torchpose: {folder}: {sink.counts.total()} rows ({counts or 'no picture arrived'})", err=True)
@@ -100,12 +110,27 @@ def _opened(work: Estimation, folder: Path, out: Path) -> GrowingTable | Streame
     return GrowingTable(out, work.schema, origin)
 
 
-def _watching(
-    work: Estimation, arrivals: Any, sink: GrowingTable | StreamedRows, *, threads: int, batch: int | None
-) -> Watching:
-    from torchpose.io.watching import Watching
+def _feeds(work: Estimation, websocket: int | None, opcua: int | None, access: tuple[str, str]) -> list[Feed]:
+    """What else gives the rows; ``access`` is host and token. ConfigError: its library is missing."""
+    from importlib.util import find_spec
 
-    return Watching(work, arrivals, sink, threads=threads, batch=batch)
+    from torchpose.io.feeds import Place
+    from torchpose.io.feeds.opcua import OpcUaFeed
+    from torchpose.io.feeds.websocket import WebSocketFeed
+
+    for port, option, library, extra in (
+        (websocket, "--websocket", "websockets", "live"),
+        (opcua, "--opcua", "asyncua", "opcua"),
+    ):
+        if port is not None and find_spec(library) is None:
+            raise ConfigError(f"{option}: {library} is not installed; pip install 'torchpose[{extra}]'")
+    made: list[Feed] = []
+    if websocket is not None:
+        made.append(WebSocketFeed(Place(websocket, *access), schema=work.schema))
+    if opcua is not None:
+        names = [target.name for target in work.rows_of]
+        made.append(OpcUaFeed(Place(opcua, *access), targets=names, schema=work.schema))
+    return made
 
 
 def _with_tone(watching: Watching, sink: GrowingTable | StreamedRows, idle: float | None) -> None:
