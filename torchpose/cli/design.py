@@ -36,6 +36,9 @@ _PRINT = (
 _GAIN = "Most dot gain of the print, either way, um: room for it is left between codes; by default that of --print."
 _LEVELS = "Grey levels of print and paper."
 _APERTURE = "Aperture: counts the blur out of focus and notes the depth of field."
+_PAPER = (
+    "Also the sheet on office paper: one page, or tiles with marks to join them, each with bars to verify its scale."
+)
 _TONE = "Tone around the rings: dark rings on light, or the reverse."
 
 
@@ -61,13 +64,14 @@ def design(
     focal_length: Annotated[float | None, typer.Option(help="Of the lens, mm; with --f-number.")] = None,
     background: Annotated[str, typer.Option(metavar="light|dark", help=_TONE)] = "light",
     name: Annotated[str | None, typer.Option(help="Name of the target and of the files.")] = None,
+    paper: Annotated[str | None, typer.Option(metavar="a4|letter", help=_PAPER)] = None,
 ) -> int:
     """Choose a target for a camera, a working volume and an accuracy, and draw it at true scale (SVG, PDF).
 
     Standard deviations are those of the image noise, of the print (--print) and of what the camera file states of
     itself. The target is the one with the fewest rings that does, at the worst point of the volume.
     """
-    from torchpose.design import Need, make_sheet, plate_around, print_of
+    from torchpose.design import Need, make_sheet, plate_around, print_of, save_tiles
     from torchpose.report.files import make_folder
     from torchpose.target import Target
 
@@ -93,7 +97,8 @@ def design(
     else:
         chosen = existing if made is None else made.stated_by(existing)
         promise = None if scene is None else _Promise.of(scene, chosen)
-    written += make_sheet(chosen, sides or plate_around(chosen)).save(out, chosen.name)
+    sheet = make_sheet(chosen, sides or plate_around(chosen))
+    written += [*sheet.save(out, chosen.name), *([] if paper is None else [save_tiles(sheet, paper, out, chosen.name)])]
     if scene is not None and promise is not None:
         written += _tell_precision(chosen, scene, promise, need, out)
     for path in written:

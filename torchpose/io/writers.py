@@ -48,8 +48,13 @@ def check_folder_of(path: Path, option: str) -> None:
     """Raises ConfigError where the folder of ``path``, the argument of ``option``, cannot be made or is no folder."""
     there = _there(path)
     problem = "" if there.is_dir() else "is no folder"
-    if not path.parent.is_dir() and not os.access(there, os.W_OK | os.X_OK):
-        problem = "cannot be written"
+    if not problem and not path.parent.is_dir():
+        probe = there / path.absolute().relative_to(there).parts[0]
+        try:
+            probe.mkdir()
+            probe.rmdir()
+        except OSError as error:
+            problem = f"cannot be written ({error.strerror})"
     if problem:
         raise ConfigError(f"{path}: {option}: {there} {problem}; choose another place")
 
