@@ -14,6 +14,7 @@ from torchpose.errors import ConfigError, printable
 if TYPE_CHECKING:
     from torchpose import camera as cameras
     from torchpose.io.sources import Source
+    from torchpose.io.storage import Place
 
 INTERRUPTED = 130  # as shells have it: 128 + SIGINT
 CLOSED = 141  # 128 + SIGPIPE: nobody reads on, as behind `| head`
@@ -21,9 +22,8 @@ CLOSED = 141  # 128 + SIGPIPE: nobody reads on, as behind `| head`
 MOST_SEED = 2**63 - 1  # of torch's generators
 _MOST_THREADS = 256  # (convention) more than any machine of today gains from; thousands of stacks end the process
 _MOST_BATCH = 4096  # frames (convention): of 20 megapixels they fill 80 GB
-Threads = Annotated[
-    int | None, typer.Option("--threads", "-j", min=1, max=_MOST_THREADS, help="Threads to use; by default one a core.")
-]
+_THREADS = "Threads to use; by default one a core."
+Threads = Annotated[int | None, typer.Option("--threads", "-j", min=1, max=_MOST_THREADS, help=_THREADS)]
 Tone = Annotated[
     str | None,
     typer.Option(
@@ -55,14 +55,14 @@ def use_threads(threads: int | None, *, share: float = 1.0) -> int:
     return wanted
 
 
-def frames_of(inputs: Sequence[Path], listed: Sequence[Path] = ()) -> list[Source]:
+def frames_of(inputs: Sequence[Path | Place], listed: Sequence[Path] = ()) -> list[Source]:
     """Frames of the INPUTs, and of a list of further ones; what is passed over is told on stderr."""
     from torchpose.io.sources import find_sources
 
-    return find_sources(inputs, lambda line: say(f"torchpose: {line}", err=True), listed=listed)
+    return find_sources(inputs, lambda line: say(f"torchpose: {line}", err=True), more=listed)
 
 
-def listed_files(inputs: Sequence[Path], files_from: Path | None) -> list[Path]:
+def listed_files(inputs: Sequence[object], files_from: Path | None) -> list[Path]:
     """What --files-from names. ConfigError: there is no INPUT either."""
     from torchpose.io.lists import read_list
 
@@ -80,9 +80,10 @@ def built_in_targets(incomplete: str) -> list[str]:
 
 
 def check_outputs(
-    inputs: Sequence[Path], sources: Sequence[Source], tables: Sequence[Path], overlay: Path | None
+    given: Sequence[Path | Place], sources: Sequence[Source], tables: Sequence[Path], overlay: Path | None
 ) -> None:
     """Refuses outputs that would overwrite or mingle with inputs."""
+    inputs = [path for path in given if isinstance(path, Path)]
     read = {path.resolve() for path in inputs}
     for table in tables:
         if table.resolve() in read:
@@ -98,7 +99,8 @@ def check_outputs(
         )
     from torchpose.report.overlay import picture_path
 
-    frames = {Path(os.path.realpath(source.path)) for source in sources}  # which takes a loop of links, too
+    # which takes a loop of links, too
+    frames = {Path(os.path.realpath(source.path)) for source in sources if isinstance(source.path, Path)}
     places = [picture_path(place, source.name) for source in sources]  # refuses those that lie outside
     if any(path in frames for path in places):
         raise ConfigError(f"{overlay}: --overlay: its pictures would overwrite the frames; choose another folder")

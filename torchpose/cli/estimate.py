@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypedDict
 
 import typer
 
@@ -45,28 +47,40 @@ if TYPE_CHECKING:  # imported where they are used: torch takes more than a secon
     from torchpose.io.misfits import Misfits
     from torchpose.io.project import Settings
     from torchpose.io.sources import Source
+    from torchpose.io.storage import Place
     from torchpose.io.store import ResultStore
     from torchpose.io.stream import StreamedRows
     from torchpose.io.tally import Tally
     from torchpose.target import Target
 
+_OUT = (
+    "Table of the poses: .csv, .jsonl or .parquet, on a disk or in a store, with --engine ray a folder of parts; or "
+    "`-`: JSON lines on standard output."
+)
+_ENGINE = "What runs the work: this process, or the workers of a Ray cluster (extra: ray)."
+_ADDRESS = "With --engine ray: a cluster that is there; without it, one starts here and ends with the command."
 _INPUTS = (
     "Image files (PNG, TIFF, BMP, JPEG, PGM; 8 or 16 bit, grey or colour), films (.mp4, .avi, .mov, .mkv, .webm), "
-    "folders of both, searched recursively and taken in natural order, or capture manifests (.jsonl)."
+    "folders of both, searched recursively and taken in natural order, or capture manifests (.jsonl); paths, or URLs "
+    "such as s3://BUCKET/FOLDER."
 )
-_OUT = "Table of the poses: .csv, .jsonl or .parquet; or `-`: JSON lines on standard output."
 _JUDGED = 16  # frames that the tone is judged by
 _RESUME = "Keep the frames that an earlier run finished and do the rest."
 _DETECTIONS = "Table of the markers found: .csv, .jsonl or .parquet."
 
 
+class Engine(StrEnum):
+    local = "local"
+    ray = "ray"
+
+
 def estimate(
-    out: Annotated[Path, typer.Option("--out", "-o", help=_OUT)],
-    inputs: Annotated[list[Path] | None, typer.Argument(metavar="INPUT...", help=_INPUTS)] = None,
+    out: Annotated[str, typer.Option("--out", "-o", help=_OUT)],
+    inputs: Annotated[list[str] | None, typer.Argument(metavar="INPUT...", help=_INPUTS)] = None,
     camera: CameraFile = None,
     target: Targets = None,
     files_from: FilesFrom = None,
-    detections: Annotated[Path | None, typer.Option("--detections", "-d", help=_DETECTIONS)] = None,
+    detections: Annotated[str | None, typer.Option("--detections", "-d", help=_DETECTIONS)] = None,
     overlay: Overlay = None,
     instances: Instances = None,
     assume_upright: Upright = None,
@@ -78,6 +92,8 @@ def estimate(
     srgb: Annotated[bool, typer.Option("--srgb", help="The same as --tone srgb.")] = False,
     batch: Batch = None,
     threads: Threads = None,
+    engine: Annotated[Engine, typer.Option(help=_ENGINE)] = Engine.local,
+    address: Annotated[str | None, typer.Option(help=_ADDRESS)] = None,
     quiet: Silent = False,
 ) -> int:
     """Measure the pose of ring targets in every frame, with its uncertainty.
@@ -87,34 +103,26 @@ def estimate(
     """
     from torchpose.cli.terminal import native_stderr_silenced
     from torchpose.io.project import settings
-    from torchpose.io.stream import is_standard
-    from torchpose.io.writers import check_table_path
+    from torchpose.io.storage import place_of
 
-    if is_standard(out) and (resume or detections is not None):
-        other = "--resume" if resume else "--detections"
-        raise ConfigError(f"--out: - is standard output, which has no {other}; give a file, or leave {other} out")
-    tables = [path for path in (out, detections) if path is not None and not is_standard(path)]
-    for path in tables:
-        check_table_path(path, "--out" if path is out else "--detections")
-    given = list(inputs or [])
-    listed = listed_files(given, files_from)
-    stated = settings(
-        [*given, *listed],
-        camera=camera,
-        target=target,
-        method=method,
-        tone="srgb" if srgb and tone is None else tone,
-        instances=instances,
-        hand_eye=hand_eye,
-        relative_to=relative_to,
-        assume_upright=assume_upright,
-    )
-    sources = frames_of(given, listed)
+    places = [place_of(name) for name in inputs or []]
+    on_ray, tables = engine is Engine.ray, _Tables.of(out, detections)
+    _check_engine(address, overlay, on_ray=on_ray)
+    _check_stream(tables, resume=resume, on_ray=on_ray)
+    if not on_ray:
+        tables.check()
+    listed = listed_files(places, files_from)
+    options: dict[str, Any] = {"camera": camera, "target": target, "method": method, "instances": instances}
+    options |= {"hand_eye": hand_eye, "relative_to": relative_to, "assume_upright": assume_upright}
+    stated = settings([*places, *listed], **options, tone="srgb" if srgb and tone is None else tone)
+    sources = frames_of(places, listed)
     work = estimation(stated, sources)
-    check_outputs([*given, *listed], sources, tables, overlay)
+    check_outputs([*places, *listed], sources, tables.paths, overlay)
+    how: _How = {"resume": resume, "batch": batch, "threads": threads or cores(), "quiet": quiet, "told": stated.told}
     with native_stderr_silenced():
-        how: dict[str, Any] = {"resume": resume, "batch": batch, "threads": threads or cores(), "quiet": quiet}
-        return _run(work, sources, out, detections, overlay, **how, told=stated.told)
+        if on_ray:
+            return _run_on_ray(work, sources, tables, address, **how)
+        return _run(work, sources, tables, overlay, **how)
 
 
 def estimation(stated: Settings, sources: Sequence[Source]) -> Estimation:
@@ -142,11 +150,68 @@ def estimation(stated: Settings, sources: Sequence[Source]) -> Estimation:
     )
 
 
+class _How(TypedDict):
+    """Options that rows do not depend on."""
+
+    resume: bool
+    batch: int | None
+    threads: int
+    quiet: bool
+    told: str
+
+
+@dataclass(frozen=True)
+class _Tables:
+    """Where the tables of a run go: paths, or places in a store."""
+
+    out: Path | Place
+    detections: Path | Place | None
+
+    @classmethod
+    def of(cls, out: str, detections: str | None) -> _Tables:
+        from torchpose.io.storage import place_of
+
+        return cls(place_of(out), None if detections is None else place_of(detections))
+
+    @property
+    def paths(self) -> list[Path]:
+        """Those on a disk."""
+        from torchpose.io.stream import is_standard
+
+        return [path for path in (self.out, self.detections) if isinstance(path, Path) and not is_standard(path)]
+
+    def check(self) -> None:
+        """Raises ConfigError unless both can be written."""
+        from torchpose.io.stream import is_standard
+        from torchpose.io.writers import check_table_path
+
+        for path, option in ((self.out, "--out"), (self.detections, "--detections")):
+            if isinstance(path, Path) and not is_standard(path):
+                check_table_path(path, option)
+
+
+def _check_stream(tables: _Tables, *, resume: bool, on_ray: bool) -> None:
+    """Refuses what standard output cannot have."""
+    from torchpose.io.stream import is_standard
+
+    options = {"--resume": resume, "--detections": tables.detections is not None, "--engine ray": on_ray}
+    for option, given in options.items():
+        if given and isinstance(tables.out, Path) and is_standard(tables.out):
+            raise ConfigError(f"--out: - is standard output, which has no {option}; give a file, or leave {option} out")
+
+
+def _check_engine(address: str | None, overlay: Path | None, *, on_ray: bool) -> None:
+    if address is not None and not on_ray:
+        raise ConfigError("--address: is of --engine ray alone; add it or leave --address out")
+    if overlay is not None and on_ray:
+        raise ConfigError("--overlay: is not drawn by --engine ray; run a part of the frames with --engine local")
+
+
 def with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -> Camera:
     """The camera with the tone that the frames tell, where their kind of file makes one likely; says what it took."""
-    from torchpose.io.images import UnreadableImageError, WrongSizeError, likely_encoded
+    from torchpose.io.images import UnreadableImageError, WrongSizeError
 
-    if not sources or not (sources[0].film or likely_encoded(sources[0].path)):
+    if not sources or not sources[0].likely_encoded():
         return lens
     from dataclasses import replace
 
@@ -183,8 +248,7 @@ def with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) ->
 def _run(
     work: Estimation,
     sources: list[Source],
-    out: Path,
-    detections: Path | None,
+    tables: _Tables,
     overlay: Path | None,
     *,
     resume: bool,
@@ -200,7 +264,8 @@ def _run(
     from torchpose.camera import LINEAR
     from torchpose.cli.terminal import FrameProgress
     from torchpose.io.reader import FrameReader, default_batch, in_batches
-    from torchpose.io.stream import is_standard
+    from torchpose.io.staged import Staged
+    from torchpose.io.stream import StreamedRows
     from torchpose.report.overlay import Overlay
 
     cv2.setNumThreads(1)  # frames are decoded side by side; threads inside of one would only compete
@@ -210,7 +275,8 @@ def _run(
     camera, targets = work.camera, work.targets
     tone, estimator = camera.tone or LINEAR, work.estimator()
     painter = None if overlay is None else Overlay(camera, targets, overlay, threads=threads)
-    store = _opened(work, sources, out, detections, resume)
+    staged = Staged(tables.out, tables.detections, resume=resume)
+    store = _opened(work, sources, staged.out, staged.detections, resume)
     # a resumed run works on the same batches as one that was not interrupted, so that rows agree to the last bit
     batches = in_batches(sources, batch or default_batch(camera.width, camera.height))
     pending = [one for one in batches if any(source.name not in store for source in one)]
@@ -221,51 +287,105 @@ def _run(
                 records = work.records(frames, estimator, None if painter is None else painter.write)
                 new = [record for record in records if record["frame"] not in store]
                 store.append(new)
-                progress.advance(len(new), store.counts)
+                progress.advance(len(new), store.tally.counts)
         store.finish([source.name for source in sources])
+        staged.send()
     except KeyboardInterrupt:
-        kept = "are out; standard output has no --resume" if is_standard(out) else "are kept; add --resume to go on"
+        stream = isinstance(store, StreamedRows)
+        kept = "are out; standard output has no --resume" if stream else "are kept; add --resume to go on"
         return interrupted(f"{len(store)} of {len(sources)} frames {kept}")
     except BrokenPipeError:
         return CLOSED
     finally:
         store.close()
-    progress.summary(store.counts, out)
-    _tell_mistakes(store, out, work)
-    if not quiet:
-        if told:
-            say(f"torchpose: {told}", err=True)
-        _tell_crowded(store, len(sources), work)
-        _tell_misfits(store.misfits, work)
-    return ended(store.unreadable)
+    progress.summary(store.tally.counts, tables.out)
+    if store.damaged:
+        say(
+            f"torchpose: {store.damaged} damaged lines of {staged.out}.partial left out, their frames done again",
+            err=True,
+        )
+    return _told(store.tally, work, len(sources), quiet=quiet, told=told)
+
+
+def _run_on_ray(
+    work: Estimation,
+    sources: list[Source],
+    tables: _Tables,
+    address: str | None,
+    *,
+    resume: bool,
+    batch: int | None,
+    threads: int,
+    quiet: bool,
+    told: str,
+) -> int:
+    """The same on the workers of a Ray cluster."""
+    from torchpose.cli.terminal import FrameProgress
+    from torchpose.io.reader import default_batch
+    from torchpose.io.rows import DETECTION_SCHEMA
+    from torchpose.io.tally import Tally
+    from torchpose.scale.cluster import cluster
+    from torchpose.scale.estimate import measured, pending
+    from torchpose.scale.parts import Parts
+
+    poses, marks = Parts.at(tables.out, work.schema), None
+    if tables.detections is not None:
+        marks = Parts.at(tables.detections, DETECTION_SCHEMA, "--detections")
+    origin = work.origin((str(source.root) for source in sources), detections=marks is not None)
+    for parts in (poses, marks):
+        if parts is not None:
+            parts.begin(origin, resume=resume)
+    tally = Tally()
+    blocks = pending(sources, batch or default_batch(work.camera.width, work.camera.height), poses, tally)
+    left = sum(len(block.sources) for block in blocks)
+    with FrameProgress(len(sources), len(sources) - left, quiet=quiet) as progress:
+        try:
+            with cluster(address, threads) as workers:
+                for records in measured(work, blocks, poses, marks, workers=workers):
+                    for frame, rows in records:
+                        tally.add(frame, rows)
+                    left -= len(records)
+                    progress.advance(len(records), tally.counts)
+        except KeyboardInterrupt:
+            return interrupted(f"{len(sources) - left} of {len(sources)} frames are kept; add --resume to go on")
+    for parts in (marks, poses):
+        if parts is not None:
+            parts.finish()
+    progress.summary(tally.counts, tables.out)
+    return _told(tally, work, len(sources), quiet=quiet, told=told)
 
 
 def _opened(
     work: Estimation, sources: Sequence[Source], out: Path, detections: Path | None, resume: bool
 ) -> ResultStore | StreamedRows:
     """Where the rows go, with those of an earlier run."""
-    from torchpose.io.store import ResultStore, stamp_of
+    from torchpose.io.store import ResultStore
     from torchpose.io.stream import StreamedRows, is_standard
 
     if is_standard(out):
         return StreamedRows(work.schema)
-    files = {source.name: stamp_of(source.path) for source in sources}  # before they are read
+
+    files = {source.name: source.stamp() for source in sources}  # before they are read
     kept: dict[str, Any] = {"schema": work.schema, "targets": len(work.rows_of), "files": files}
     origin = work.origin((str(source.root) for source in sources), detections=detections is not None)
     return ResultStore(out, detections, resume=resume, origin=origin, **kept)
 
 
-def _tell_mistakes(store: ResultStore | StreamedRows, out: Path, work: Estimation) -> None:
-    """Tells, on stderr, what is wrong with the run as a whole."""
-    for line in store.whole_run.lines(f"{work.camera.width}x{work.camera.height}"):
+def _told(tally: Tally, work: Estimation, frames: int, *, quiet: bool, told: str) -> int:
+    """Tells, on stderr, what is wrong with the run as a whole and what its rows say together; the exit code."""
+    for line in tally.whole_run.lines(f"{work.camera.width}x{work.camera.height}"):
         say(f"torchpose: warning: {line}", err=True)
-    if store.damaged:
-        say(f"torchpose: {store.damaged} damaged lines of {out}.partial left out, their frames done again", err=True)
+    if not quiet:
+        if told:
+            say(f"torchpose: {told}", err=True)
+        _tell_crowded(tally, frames, work)
+        _tell_misfits(tally.misfits, work)
+    return ended(tally.unreadable)
 
 
-def _tell_crowded(store: Tally, count: int, work: Estimation) -> None:
+def _tell_crowded(tally: Tally, count: int, work: Estimation) -> None:
     """Tells, in a line on stderr, of copies that were seen in some of the frames and have no row."""
-    frames, most = store.crowded, store.most
+    frames, most = tally.crowded, tally.most
     if not frames:
         return
     seen = ", ".join(f"{number} of {target}" for target, number in most.items())

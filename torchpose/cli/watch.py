@@ -92,9 +92,9 @@ def watch(
             except BrokenPipeError:
                 return CLOSED
     if not quiet:
-        counts = ", ".join(f"{count} {status}" for status, count in sink.counts.most_common())
-        say(f"torchpose: {folder}: {sink.counts.total()} rows ({counts or 'no picture arrived'})", err=True)
-    return ended(sink.unreadable)
+        counts = ", ".join(f"{count} {status}" for status, count in sink.tally.counts.most_common())
+        say(f"torchpose: {folder}: {sink.tally.counts.total()} rows ({counts or 'no picture arrived'})", err=True)
+    return ended(sink.tally.unreadable)
 
 
 def _opened(work: Estimation, folder: Path, out: Path) -> GrowingTable | StreamedRows:

@@ -37,10 +37,8 @@ class _Batch(BaseModel):
     rows: int = Field(ge=0, le=0xFFFFFFFF)  # their CRC-32
 
 
-class GrowingTable(Tally):
+class GrowingTable:
     """The table at ``out``, made where it is missing, with the rows of earlier runs.
-
-    What it counts are the rows of this run alone.
 
     Args:
         out: the table, ``.csv`` or ``.jsonl``.
@@ -48,6 +46,7 @@ class GrowingTable(Tally):
         origin: what the rows are made from, as JSON values; those of an earlier run must agree.
 
     Attributes:
+        tally: of the rows of this run alone.
         tone: that earlier runs have judged; None where there was none.
         earlier: number of frames of earlier runs.
 
@@ -57,7 +56,7 @@ class GrowingTable(Tally):
     """
 
     def __init__(self, out: Path, schema: Schema, origin: Mapping[str, Any]) -> None:
-        super().__init__()
+        self.tally = Tally()
         if out.suffix.lower() not in GROWING_SUFFIXES:
             raise ConfigError(f"{out}: --out: cannot grow; give -, or a file that ends in .jsonl or .csv")
         make_folder_of(out, "--out")
@@ -120,7 +119,7 @@ class GrowingTable(Tally):
         self._end = end
         self._done.update(frames)
         for record in records:
-            self.count(record)
+            self.tally.add(record["frame"], record["rows"])
 
     def close(self) -> None:
         """Leaves table and journal to the next run."""

@@ -19,6 +19,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from torchpose.config import beside, read_yaml, validate
 from torchpose.config.kinds import Word
 from torchpose.errors import ConfigError, printable
+from torchpose.io.storage import Place
 from torchpose.pipeline import Method
 
 PROJECT_FILE = "torchpose.yaml"
@@ -57,7 +58,7 @@ class Settings(dict[str, Any]):
         return self[name]
 
 
-def settings(inputs: Sequence[Path], **given: Any) -> Settings:
+def settings(inputs: Sequence[Path | Place], **given: Any) -> Settings:
     """What the command line gives, and for the rest what the project file beside the frames says.
 
     The file lies in the folder of the frames (that which is an INPUT, or that of an INPUT which is a file), or else in
@@ -70,7 +71,7 @@ def settings(inputs: Sequence[Path], **given: Any) -> Settings:
     Raises:
         ConfigError: a project file cannot be read or has an unknown key, or INPUTs have several.
     """
-    path = _file(inputs)
+    path = _file([one for one in inputs if isinstance(one, Path)])
     result = Settings(given)
     if path is None:
         return result

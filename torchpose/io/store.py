@@ -38,15 +38,6 @@ _STAMPS = TypeAdapter(dict[str, Stamp | None])
 _AGAIN = {status.name.lower() for status in (Status.UNREADABLE, Status.WRONG_SIZE)}
 
 
-def stamp_of(path: Path) -> Stamp | None:
-    """The stamp of a file; None where there is none."""
-    try:
-        found = path.stat()
-    except (OSError, ValueError):
-        return None
-    return [found.st_size, found.st_mtime_ns]
-
-
 class _Record(BaseModel):
     """A line of a journal behind the first, as `ResultStore.append` takes it."""
 
@@ -56,7 +47,7 @@ class _Record(BaseModel):
     file: Stamp | None = None
 
 
-class ResultStore(Tally):
+class ResultStore:
     """Collects the rows of a run frame by frame and writes its tables.
 
     Args:
@@ -69,9 +60,8 @@ class ResultStore(Tally):
         files: stamps of the frames that there are now, by name. Of an earlier run's frames that are not among them all
             rows are kept, of the others those that were made from the same file.
 
-    What it counts includes the rows of an earlier run.
-
     Attributes:
+        tally: of all rows, those of an earlier run included.
         damaged: lines of the journal that were not as they had been written.
 
     Raises:
@@ -115,7 +105,7 @@ class ResultStore(Tally):
 
     def _forget(self) -> None:
         """No frame is done."""
-        Tally.__init__(self)
+        self.tally = Tally()
         self._places: dict[str, Place] = {}
         self._made_from: dict[str, Stamp | None] = {}
 
@@ -185,7 +175,7 @@ class ResultStore(Tally):
     def _note(self, record: Row) -> None:
         """Counts what a record says."""
         self._made_from[record["frame"]] = record["file"]
-        self.count(record)
+        self.tally.add(record["frame"], record["rows"])
 
     def _load(self) -> bool:
         """Reads the journal of a killed run; False if not even its first line is whole."""

@@ -30,17 +30,20 @@ def print_rows(rows: Sequence[Row], schema: Schema) -> None:
         raise
 
 
-class StreamedRows(Tally):
+class StreamedRows:
     """Takes the rows of a run as `ResultStore` does, and hands them on.
 
     Args:
         schema: columns of the rows.
+
+    Attributes:
+        tally: of all rows.
     """
 
     damaged = 0
 
     def __init__(self, schema: Schema) -> None:
-        super().__init__()
+        self.tally = Tally()
         self._schema = schema
         self._frames = 0
 
@@ -53,7 +56,7 @@ class StreamedRows(Tally):
     def append(self, records: Sequence[Row]) -> None:
         """Hands on finished frames. BrokenPipeError: nobody reads on."""
         for record in records:
-            self.count(record)
+            self.tally.add(record["frame"], record["rows"])
         self._frames += len(records)
         print_rows([row for record in records for row in record["rows"]], self._schema)
 

@@ -1,6 +1,7 @@
-"""What the rows of a run say together, whichever way they go out."""
+"""What the rows of a run amount to, however they come in: the same for every engine."""
 
 from collections import Counter
+from collections.abc import Sequence
 
 from torchpose.io.misfits import Misfits
 from torchpose.io.rows import Row
@@ -8,7 +9,7 @@ from torchpose.io.whole_run import WholeRun
 
 
 class Tally:
-    """Counts the rows of a run frame by frame.
+    """Counts rows frame by frame.
 
     Attributes:
         counts: number of rows by status.
@@ -27,15 +28,15 @@ class Tally:
         self.misfits: dict[str, Misfits] = {}
         self.whole_run = WholeRun()
 
-    def count(self, record: Row) -> None:
-        """Counts a frame: ``{"frame": name, "rows": [...]}``."""
-        self.counts.update(row["status"] for row in record["rows"])
-        if record["rows"][0]["status"] == "unreadable":
-            self.unreadable[record["frame"]] = record["rows"][0]["reason"]
-        rows = Counter(row["target"] for row in record["rows"])
-        for row in record["rows"]:
+    def add(self, frame: str, rows: Sequence[Row]) -> None:
+        """Counts the rows of a frame, one at least."""
+        self.counts.update(row["status"] for row in rows)
+        if rows[0]["status"] == "unreadable":
+            self.unreadable[frame] = rows[0]["reason"]
+        of_target = Counter(row["target"] for row in rows)
+        for row in rows:
             self.misfits.setdefault(row["target"], Misfits()).add(row)
             self.whole_run.add(row)
-            if (row.get("copies") or 0) > rows[row["target"]]:
-                self.crowded.add(record["frame"])
+            if (row.get("copies") or 0) > of_target[row["target"]]:
+                self.crowded.add(frame)
                 self.most[row["target"]] = max(self.most.get(row["target"], 0), row["copies"])
