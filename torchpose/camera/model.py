@@ -16,6 +16,7 @@ from torch.nn.functional import pad
 
 from torchpose.camera.fold import polynomial_fold, rational_fold
 from torchpose.camera.tone import Tone
+from torchpose.config import example
 from torchpose.errors import ConfigError
 from torchpose.geometry.covariance import covariance_fault
 
@@ -147,7 +148,7 @@ class Camera:
         """Reads a camera file, see `torchpose.camera.formats.load`; ``FILE#cam1`` picks one of several."""
         from torchpose.camera import formats
 
-        return formats.load(path)
+        return formats.load(example(path, "cameras"))
 
     def save(
         self, path: str | os.PathLike[str], format: Literal["opencv", "json", "ros", "kalibr", "colmap"] | None = None

@@ -71,7 +71,7 @@ def design(
     Standard deviations are those of the image noise, of the print (--print) and of what the camera file states of
     itself. The target is the one with the fewest rings that does, at the worst point of the volume.
     """
-    from torchpose.design import Need, make_sheet, plate_around, print_of, save_tiles
+    from torchpose.design import Need, print_of
     from torchpose.report.files import make_folder
     from torchpose.target import Target
 
@@ -97,13 +97,21 @@ def design(
     else:
         chosen = existing if made is None else made.stated_by(existing)
         promise = None if scene is None else _Promise.of(scene, chosen)
-    sheet = make_sheet(chosen, sides or plate_around(chosen))
-    written += [*sheet.save(out, chosen.name), *([] if paper is None else [save_tiles(sheet, paper, out, chosen.name)])]
+    written += _sheets(chosen, sides, paper, out)
     if scene is not None and promise is not None:
         written += _tell_precision(chosen, scene, promise, need, out)
     for path in written:
         say(str(path))
     return 0
+
+
+def _sheets(target: Target, sides: tuple[float, float] | None, paper: str | None, out: Path) -> list[Path]:
+    """Writes the print sheet, and that on office paper where it is wanted."""
+    from torchpose.design import make_sheet, plate_around, save_tiles
+
+    sheet = make_sheet(target, sides or plate_around(target))
+    written = sheet.save(out, target.name)
+    return written if paper is None else [*written, save_tiles(sheet, paper, out, target.name)]
 
 
 def _check(needed: dict[str, object], target: str | None, chosen: tuple[object, ...]) -> None:

@@ -21,6 +21,7 @@ from torchpose.cli.design import design
 from torchpose.cli.detect import detect
 from torchpose.cli.estimate import estimate
 from torchpose.cli.evaluate import evaluate
+from torchpose.cli.examples import examples
 from torchpose.cli.reproduce import reproduce
 from torchpose.cli.sensitivity import sensitivity
 from torchpose.cli.simulate import simulate
@@ -58,7 +59,9 @@ def _torchpose(
 
 
 # what stands below the options: help/COMMAND.md
-for _command in (estimate, watch, detect, simulate, evaluate, capture, sensitivity, reproduce, design, calibrate):
+_MEASURING = (estimate, watch, detect, simulate, evaluate, capture)
+_COMMANDS = (*_MEASURING, sensitivity, reproduce, design, calibrate, examples)
+for _command in _COMMANDS:
     app.command(epilog=(_HELP / f"{_command.__name__}.md").read_text(encoding="utf-8"))(_command)
 
 

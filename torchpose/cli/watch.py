@@ -92,8 +92,7 @@ def watch(
             except BrokenPipeError:
                 return CLOSED
     if not quiet:
-        counts = ", ".join(f"{count} {status}" for status, count in sink.tally.counts.most_common())
-        say(f"torchpose: {folder}: {sink.tally.counts.total()} rows ({counts or 'no picture arrived'})", err=True)
+        _tell_end(folder, sink)
     return ended(sink.tally.unreadable)
 
 
@@ -159,6 +158,11 @@ def _tell_start(folder: Path, by_events: bool, told: str) -> None:
     say(f"torchpose: {folder}: waiting for pictures{how}; Ctrl-C or SIGTERM ends it", err=True)
     if told:
         say(f"torchpose: {told}", err=True)
+
+
+def _tell_end(folder: Path, sink: GrowingTable | StreamedRows) -> None:
+    counts = ", ".join(f"{count} {status}" for status, count in sink.tally.counts.most_common())
+    say(f"torchpose: {folder}: {sink.tally.counts.total()} rows ({counts or 'no picture arrived'})", err=True)
 
 
 @contextlib.contextmanager

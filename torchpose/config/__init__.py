@@ -4,6 +4,7 @@ Every error is a `ConfigError` of the form ``FILE: FIELD: what is wrong; the fix
 """
 
 from torchpose.config.documents import parse_json, parse_mapping
+from torchpose.config.examples import example
 from torchpose.config.files import (
     MOST_TABLE_BYTES,
     beside,
@@ -22,6 +23,7 @@ __all__ = [
     "MOST_TABLE_BYTES",
     "beside",
     "check_regular",
+    "example",
     "format_list",
     "format_number",
     "is_inside",

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.camera import Camera
-from torchpose.config import beside, read_yaml, validate, within
+from torchpose.config import beside, example, read_yaml, validate, within
 from torchpose.datasets.plan_file import MOST_FRAMES, PlanFile, Random
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
@@ -118,7 +118,7 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
         ConfigError: one line ``FILE: FIELD: what is wrong; the fix``. A frame with a marker out of view or a target out
             of the depth range is an error unless the plan says ``out_of_view: mark``.
     """
-    path = Path(path)
+    path = example(path, "plans")
     file = validate(PlanFile, read_yaml(path), path)
     camera = Camera.load(beside(path, file.camera))
     target = Target.load(beside(path, file.target))
