@@ -77,8 +77,7 @@ def design(
 
     sides = None if plate is None else _sides(plate)
     _check({"--plate": plate, "--accuracy-um": accuracy_um}, target, (name, markers, print_gain))
-    existing = None if target is None else Target.load(target)
-    scene = None
+    existing, scene = None if target is None else Target.load(target), None
     if existing is None or camera is not None or distance is not None or distance_range is not None:
         volume = _volume(distance, distance_range, tilt, roll, offset)
         scene = _Scene(_camera(camera), volume, _imaging(volume, blur, noise, levels, f_number, focal_length))

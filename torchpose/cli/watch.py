@@ -86,14 +86,20 @@ def watch(
         if not quiet:
             _tell_start(folder, arrivals.by_events, stated.told)
         with native_stderr_silenced(), _ended_by_signals(watching):
-            try:
-                _with_tone(watching, sink, idle)
-                watching.run(idle=idle)
-            except BrokenPipeError:
-                return CLOSED
-    if not quiet:
+            closed = _run(watching, sink, idle)
+    if not (quiet or closed):
         _tell_end(folder, sink)
-    return ended(sink.tally.unreadable)
+    return CLOSED if closed else ended(sink.tally.unreadable)
+
+
+def _run(watching: Watching, sink: GrowingTable | StreamedRows, idle: float | None) -> bool:
+    """Takes what arrives, to the end; whether that is because nobody reads standard output any more."""
+    try:
+        _with_tone(watching, sink, idle)
+        watching.run(idle=idle)
+    except BrokenPipeError:
+        return True
+    return False
 
 
 def _opened(work: Estimation, folder: Path, out: Path) -> GrowingTable | StreamedRows:
