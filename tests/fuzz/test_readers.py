@@ -309,6 +309,19 @@ def test_changed_files_end_in_one_line_or_are_read(made: tuple[Reader, Path]) ->
     one()
 
 
+# cases of the long run below that once failed, by their number
+FOUND = [("plan.yaml", 13657)]  # 65,536 frames took 1.2 s to look for their markers
+
+
+@pytest.mark.parametrize(("name", "number"), FOUND)
+def test_what_the_long_run_found(name: str, number: int, tmp_path: Path, at_rest: None) -> None:
+    reader = next(reader for reader in READERS if reader.name == name)
+    path = tmp_path / name
+    reader.make(path)
+    right = reader.before(path.read_bytes())
+    check(reader, path, reader.after(changed(right, drawn(random.Random(number)))))
+
+
 @pytest.mark.fuzz
 @pytest.mark.timeout(0)
 def test_very_many_changed_files(made: tuple[Reader, Path]) -> None:
