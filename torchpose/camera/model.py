@@ -306,8 +306,7 @@ class Camera:
         return m.diagonal()[:2], m[:2, 2]
 
     def _warp(self, x: Tensor, y: Tensor, *, slopes: bool = True) -> tuple[Tensor, ...]:
-        """Distorted normalised x, y and, with ``slopes``, the entries xx, xy, yy of their Jacobian, which is symmetric in
-        both models."""
+        """Distorted normalised x, y; with ``slopes`` the xx, xy, yy of the Jacobian, symmetric in both models."""
         r2 = x * x + y * y
         if self.model == "kannala_brandt":
             k1, k2, k3, k4 = self.distortion.to(x).unbind()
