@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from torchpose.config import real
 from torchpose.errors import ConfigError
 from torchpose.io import images
 from torchpose.io.manifest import read_manifest
@@ -112,7 +113,7 @@ def _summary(passed: Counter[str]) -> str:
 def _sources_of(given: Path, passed: Counter[str]) -> Iterator[Source]:
     """Frames of an input; pictures that are not read are counted in ``passed``."""
     if _state(given) == "folder":
-        root = given.resolve()
+        root = real(given)
         pairs = [(_text(path.relative_to(given).as_posix()), path) for path in _walk(given, passed)]
         for name, path in sorted(pairs, key=lambda pair: natural_key(pair[0])):
             yield from _pages(name, path, root)
@@ -129,12 +130,12 @@ def _sources_of(given: Path, passed: Counter[str]) -> Iterator[Source]:
     if path.suffix.lower() == MANIFEST_SUFFIX:
         yield from _recorded(path, camera or None, passed)
     else:
-        yield from _pages(_text(given.name), given, given.parent.resolve())
+        yield from _pages(_text(given.name), given, real(given.parent))
 
 
 def _recorded(manifest: Path, camera: str | None, passed: Counter[str]) -> Iterator[Source]:
     """The frames of a manifest: one a record, so what a file holds behind its first page is passed over."""
-    root = manifest.parent.resolve()
+    root = real(manifest.parent)
     for frame in read_manifest(manifest, camera):
         path = manifest.parent / frame.image
         pages = list(_pages(frame.image, path, root))
