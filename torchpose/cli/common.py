@@ -14,6 +14,7 @@ from torchpose.errors import ConfigError, printable
 if TYPE_CHECKING:
     from torchpose import camera as cameras
     from torchpose.io.sources import Source
+    from torchpose.io.storage import Place
 
 INTERRUPTED = 130  # as shells have it: 128 + SIGINT
 
@@ -52,7 +53,7 @@ def use_threads(threads: int | None, *, share: float = 1.0) -> int:
     return wanted
 
 
-def frames_of(inputs: Sequence[Path]) -> list[Source]:
+def frames_of(inputs: Sequence[Path | Place]) -> list[Source]:
     """Frames of the INPUTs; what is passed over is told on stderr."""
     from torchpose.io.sources import find_sources
 
@@ -60,11 +61,12 @@ def frames_of(inputs: Sequence[Path]) -> list[Source]:
 
 
 def check_outputs(
-    inputs: Sequence[Path], sources: Sequence[Source], tables: Sequence[Path], overlay: Path | None
+    given: Sequence[Path | Place], sources: Sequence[Source], tables: Sequence[Path], overlay: Path | None
 ) -> None:
     """Refuses outputs that would overwrite or mingle with inputs."""
     from torchpose.config import real
 
+    inputs = [path for path in given if isinstance(path, Path)]
     read = {real(path) for path in inputs}
     for table in tables:
         if real(table) in read:
@@ -80,7 +82,7 @@ def check_outputs(
         )
     from torchpose.report.overlay import picture_path
 
-    frames = {real(source.path) for source in sources}
+    frames = {real(source.path) for source in sources if isinstance(source.path, Path)}
     places = [picture_path(place, source.name) for source in sources]  # refuses those that lie outside
     if any(path in frames for path in places):
         raise ConfigError(f"{overlay}: --overlay: its pictures would overwrite the frames; choose another folder")
