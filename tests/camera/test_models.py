@@ -310,6 +310,7 @@ def test_a_pole_outside_the_frame_costs_nothing() -> None:
     assert share_without_ray(camera) == 0
     # division model: a pincushion with a true pole, beyond which nothing is imaged
     assert share_without_ray(Camera(1824, 1216, K, [0, 0, 0, 0, 0, -0.3, 0, 0])) == 0
+    assert Camera(1824, 1216, K, [-2.2e-313, 0, 0, 0]).fold_radius == math.inf
 
 
 @pytest.mark.parametrize(

@@ -68,8 +68,9 @@ def _roots(polynomial: Polynomial) -> list[float]:
     """Positive real roots, ascending."""
     # the reciprocals of the roots are those of the polynomial from its constant term on, however small the others
     roots = np.roots(polynomial.coef)
-    # a double root comes out as a pair beside the axis, by the root of the rounding
-    positive = roots.real[(np.abs(roots.imag) <= 1e-6 * np.abs(roots)) & (roots.real > 0)]
+    # a double root comes out as a pair beside the axis, by the root of the rounding; what is tiny is a root at infinity
+    real = np.abs(roots.imag) <= 1e-6 * np.abs(roots)
+    positive = roots.real[real & (roots.real > np.finfo(float).tiny)]
     return sorted(1 / positive)
 
 
