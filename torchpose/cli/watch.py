@@ -104,12 +104,13 @@ def _run(watching: Watching, sink: GrowingTable | StreamedRows, idle: float | No
 
 def _opened(work: Estimation, folder: Path, out: Path) -> GrowingTable | StreamedRows:
     """Where the rows go. The tone is part of what they are made from only where somebody has stated it."""
+    from torchpose.config import real
     from torchpose.io.growing import GrowingTable
     from torchpose.io.stream import StreamedRows, is_standard
 
     if is_standard(out):
         return StreamedRows(work.schema)
-    origin = work.origin([str(folder.resolve())], detections=False)
+    origin = work.origin([str(real(folder))], detections=False)
     if work.camera.tone is None:
         del origin["--tone"]
     return GrowingTable(out, work.schema, origin)

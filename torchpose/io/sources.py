@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from torchpose.config import real
 from torchpose.errors import ConfigError
 from torchpose.io import images, remote
 from torchpose.io.films import FILM_SUFFIXES, Film, frames_of_film
@@ -148,7 +149,7 @@ def _sources_of(given: Path | Place, passed: Counter[str], below: Path | None) -
         yield from _stored(given, passed)
         return
     if _state(given) == "folder":
-        root = given.resolve()
+        root = real(given)
         pairs = [(_text(path.relative_to(given).as_posix()), path) for path in _walk(given, passed)]
         for name, path in sorted(pairs, key=lambda pair: natural_key(pair[0])):
             yield from sources_of_file(name, path, root)
@@ -165,7 +166,7 @@ def _sources_of(given: Path | Place, passed: Counter[str], below: Path | None) -
         yield from _recorded(path, camera or None, passed)
     else:
         name = given.name if below is None else Path(os.path.relpath(given, below)).as_posix()
-        yield from sources_of_file(_text(name), given, (below or given.parent).resolve())
+        yield from sources_of_file(_text(name), given, real(below or given.parent))
 
 
 def _stored(given: Place, passed: Counter[str]) -> Iterator[Source]:
@@ -201,7 +202,7 @@ def _recorded_in_store(manifest: Place, camera: str | None, passed: Counter[str]
 
 def _recorded(manifest: Path, camera: str | None, passed: Counter[str]) -> Iterator[Source]:
     """The frames of a manifest: one a record, so what a file holds behind its first page is passed over."""
-    root = manifest.parent.resolve()
+    root = real(manifest.parent)
     for frame in read_manifest(manifest, camera):
         path = manifest.parent / frame.image
         pages = list(sources_of_file(frame.image, path, root))

@@ -29,11 +29,11 @@ def check_table_path(path: Path, option: str) -> None:
     """Raises ConfigError unless a table can be written to ``path``, the argument of ``option``."""
     if path.suffix.lower() not in TABLE_SUFFIXES:
         raise ConfigError(f"{path}: {option}: of an unknown type; give a file that ends in {', '.join(TABLE_SUFFIXES)}")
-    if path.is_dir():
+    if os.path.isdir(path):
         raise ConfigError(f"{path}: {option}: is a folder; give a file")
     check_folder_of(path, option)
     longest = path.with_name(f"{path.name}.run.json")  # of what a run writes
-    if not path.parent.is_dir():  # `make_folder_of` makes it once there is something to write
+    if not os.path.isdir(path.parent):  # `make_folder_of` makes it once there is something to write
         longest = Path(_there(path), longest.name)
     probe = _temporary(longest)
     try:
@@ -48,14 +48,14 @@ def check_table_path(path: Path, option: str) -> None:
 def check_folder_of(path: Path, option: str) -> None:
     """Raises ConfigError where the folder of ``path``, the argument of ``option``, cannot be made or is no folder."""
     there = _there(path)
-    problem = "" if there.is_dir() else "is no folder"
-    if not problem and not path.parent.is_dir():
+    problem = "" if os.path.isdir(there) else "is no folder"
+    if not problem and not os.path.isdir(path.parent):
         probe = there / path.absolute().relative_to(there).parts[0]
         try:
             probe.mkdir()
             probe.rmdir()
-        except OSError as error:
-            problem = f"cannot be written ({error.strerror})"
+        except (OSError, ValueError) as error:
+            problem = f"cannot be written ({getattr(error, 'strerror', None) or error})"
     if problem:
         raise ConfigError(f"{path}: {option}: {there} {problem}; choose another place")
 
