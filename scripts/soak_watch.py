@@ -88,7 +88,7 @@ def run(folder: Path, files: int, kills: int, *, table: str = "poses.jsonl", pau
     Camera.ideal(WIDTH, HEIGHT, 260.0).save(folder / "camera.yaml")
     data, out = pictures(TARGETS), folder / table
     writers = [
-        threading.Thread(target=write_all, args=(folder / "in", list(range(one, files, WRITERS)), data, pause, one))
+        threading.Thread(target=write_all, args=(folder / "in", list(range(one, files - 1, WRITERS)), data, pause, one))
         for one in range(WRITERS)
     ]
     chance = random.Random(0)
@@ -106,6 +106,9 @@ def run(folder: Path, files: int, kills: int, *, table: str = "poses.jsonl", pau
         child = watcher(folder, out)
     for thread in writers:
         thread.join()
+    drop(
+        folder / "in" / f"{files - 1:06d}.png", data[(files - 1) % len(data)], 0, 0.0
+    )  # its row: the last one has started
     end = time.monotonic() + 60.0 + files
     while rows_in(out) < files and time.monotonic() < end and child.poll() is None:
         time.sleep(0.1)
