@@ -329,12 +329,16 @@ def _by_bloom(setting: Setting) -> Tensor:
 
 
 def _by_size(setting: Setting) -> Tensor:
-    """Motions (N, M, 7) that do to a ring what both its edges do 1 mm further out: it is nearer, with less gain."""
+    """Motions (N, M, 7) that do to a ring what both its edges do 1 mm further out: it is nearer, with less gain.
+
+    A disc has one edge, and nothing but gain.
+    """
     evidence = setting.evidence
     outer, inner = evidence.radii.unbind(-1)
     x = setting.arms + setting.t[:, None]
-    nearer = -2 / (outer + inner)[..., None] * x
-    less = -evidence.polarity[:, None] * (outer - inner) / (outer + inner)
+    ring = inner > 0
+    nearer = torch.where(ring, -2 / (outer + inner), 0.0)[..., None] * x
+    less = -evidence.polarity[:, None] * torch.where(ring, (outer - inner) / (outer + inner), -1.0)
     return torch.cat([nearer, torch.zeros_like(x), less[..., None]], -1)
 
 
