@@ -248,7 +248,7 @@ def _by_target(setting: Setting) -> Tensor:
 
     A target that is larger as a whole looks like the same one that is nearer: all markers move towards the camera.
     """
-    moved, scale = _displaced(setting.R, setting.evidence.by_target), setting.evidence.scale_sigma
+    moved, scale = displaced(setting.R, setting.arms, setting.evidence.by_target), setting.evidence.scale_sigma
     if not bool((scale > 0).any()):
         return moved
     nearer = moved.new_zeros(*moved.shape[:3])
@@ -256,10 +256,22 @@ def _by_target(setting: Setting) -> Tensor:
     return torch.cat([moved[..., :-1], nearer[..., None]], -1)
 
 
-def _displaced(R: Tensor, by: Tensor) -> Tensor:
-    """Motions (N, M, 7, L) of markers whose places (target frame) and edge gain vary so (N, M, 4, L)."""
-    aside = R[:, None] @ by[:, :, :3]
-    return torch.cat([aside, torch.zeros_like(aside), by[:, :, 3:]], 2)
+@checked
+def displaced(
+    R: Float[Tensor, "N 3 3"], arms: Float[Tensor, "N M 3"], by: Float[Tensor, "*N M 7 L"]
+) -> Float[Tensor, "N M 7 L"]:
+    """How markers seem moved, each as a pose of its own, and their edge gain, by places and turns on the print.
+
+    Args:
+        R: target to camera.
+        arms: the markers as seen from the target's origin, camera axes, mm.
+        by: as `MarkerTable.by_print`.
+    """
+    R = R[:, None]
+    aside, turn = R @ by[..., :3, :], R @ by[..., 3:6, :]
+    # a pose turns about the target's origin, a ring about its own centre
+    aside = aside + torch.linalg.cross(arms[..., None].expand_as(turn), turn, dim=-2)
+    return torch.cat([aside, turn, by[..., 6:, :].expand(*turn.shape[:2], 1, -1)], -2)
 
 
 def _by_camera(setting: Setting) -> Tensor:
@@ -274,7 +286,7 @@ def _by_camera(setting: Setting) -> Tensor:
     factor = covariance_factor(camera.covariance.to(like))
     moved = _as_motions(setting, lambda xy: by_intrinsics(camera, xy)[..., : len(factor)] @ factor)
     together = setting.evidence.by_camera  # of a target that was measured by this camera
-    return moved + _displaced(setting.R, together) if together.shape[-1] else moved
+    return moved + displaced(setting.R, setting.arms, together) if together.shape[-1] else moved
 
 
 def _camera_shifts(setting: Setting) -> Tensor:
