@@ -116,7 +116,12 @@ class OnPrint(Rows):
 
 @checked
 def on_print(
-    normals: MarkerNormals, setting: Setting, moved: Float[Tensor, "N M 5"], *, estimate: bool = True
+    normals: MarkerNormals,
+    setting: Setting,
+    moved: Float[Tensor, "N M 5"],
+    *,
+    estimate: bool = True,
+    even: Float[Tensor, " N"] | None = None,
 ) -> OnPrint:
     """The joint problem of N rows.
 
@@ -126,6 +131,7 @@ def on_print(
         moved: where the markers were looked for beside their places, when the normal equations were formed.
         estimate: find poses; without, those that noise alone weighs stay, and their covariance counts what the rest
             does to them.
+        even: see `excess.excess_of`.
     """
     R, n = setting.R, normals.right.shape[-1]
     aside = (R[:, None] @ moved[..., :3, None])[..., 0]
@@ -135,7 +141,8 @@ def on_print(
     own = torch.eye(n, dtype=right.dtype, device=right.device)[:, :-1].expand(*right.shape[:2], n, n - 1)
     by_camera, by_target = _by_camera(setting), _by_target(setting)
     stated = torch.cat([by_camera, by_target], -1)
-    excess, further = _excess(normals, torch.cat([own, _among(stated, n)], -1), stated.shape[-1], setting)
+    known = torch.cat([own, _among(stated, n)], -1)
+    excess, further = _excess(normals, known, stated.shape[-1], setting, even)
     printed, lens = by_target, by_camera
     if further is not None:
         beside = further * excess.deviation[:, None, None]
@@ -149,6 +156,9 @@ def on_print(
         if_printed = torch.cat([by_target, (further * excess.printed[:, None, None])[..., :-OF_CAMERA]], -1)[other]
         alone = _Joint.of(normals[other], own[other], _among(if_printed, n), _among(lens[other], n), True)
         look = place.index_copy(0, other, _places(if_printed, alone, setting.of_rows(other), excess.printed[other]))
+        noisy = normals[other].over(excess.printed_factor[other])
+        alone = _Joint.of(noisy, own[other], _among(if_printed, n), _among(lens[other], n), estimate)
+        joint = joint.perhaps(other, alone, excess.maybe[other])
     sure = joint.known & (torch.linalg.cholesky_ex(joint.covariance)[1] == 0)
     parts = (joint.by_camera[..., : by_camera.shape[-1]], joint.by_print[..., : by_target.shape[-1]])
     common = torch.cat(parts, -1)
@@ -222,8 +232,17 @@ class _Joint(NamedTuple):
         step = step[..., 0] * float(estimate)
         return cls(step, numbers[..., 0], covariance, noise, held @ vectors.mT, lens, known & finite)
 
+    def perhaps(self, rows: Tensor, other: Self, share: Tensor) -> Self:
+        """With the covariance about these poses of solutions of which some ``rows`` are the ``other`` by a share."""
+        apart = (other.step - self.step[rows])[..., None]
+        there = other.covariance + apart @ apart.mT
+        mean = self.covariance[rows] + share[:, None, None] * (there - self.covariance[rows])
+        return self._replace(covariance=self.covariance.index_copy(0, rows, mean))
 
-def _excess(normals: MarkerNormals, known: Tensor, count: int, setting: Setting) -> tuple[Excess, Tensor | None]:
+
+def _excess(
+    normals: MarkerNormals, known: Tensor, count: int, setting: Setting, even: Tensor | None
+) -> tuple[Excess, Tensor | None]:
     """What the residuals show beyond the ``known`` columns, and the motions (N, M, 7, E) of what may be behind it.
 
     Without them where the markers agree: then each of them alone, free to move, would not move far.
@@ -236,7 +255,9 @@ def _excess(normals: MarkerNormals, known: Tensor, count: int, setting: Setting)
         return excess, None
     some = setting.of_rows(odd)
     shifts = torch.cat([_print_shifts(some), _camera_shifts(some)], -1)
-    again = excess_of(*_remaining(normals[odd], known[odd], _among(shifts, n), count))
+    again = excess_of(
+        *_remaining(normals[odd], known[odd], _among(shifts, n), count), None if even is None else even[odd]
+    )
     every = shifts.new_zeros(rows, *shifts.shape[1:]).index_copy(0, odd, shifts)
     nothing = shifts.new_zeros(rows, shifts.shape[-1])
     excess = replace(excess, deviation=nothing, printed=nothing)
