@@ -231,13 +231,13 @@ def _camera(modes: _Modes) -> _Family:
 
 
 def _scatter(modes: _Modes, even: Tensor) -> _Family:
-    """Of ``even`` (N,) residuals beside these the mean square is 1."""
+    """Of ``even`` (N,) residuals beside these the mean square is 1: they speak against it, and not of how large it is."""
     factor, freedom = _values(_SCALE, modes), modes.there.sum(-1, keepdim=True)
     square = modes.residual.square().sum(-1, keepdim=True)
-    likelihood = -0.5 * ((square + even[:, None]) / factor + (freedom + even[:, None]) * factor.log())
-    likelihood = likelihood + 0.5 * even[:, None]  # as likely as for the others, which leave the noise alone
+    likelihood = -0.5 * (square / factor + freedom * factor.log())
     mean = (torch.softmax(likelihood, -1) * factor).sum(-1)
-    return _Family(_mean(likelihood), torch.zeros_like(modes.by[:, 0]), mean, square[:, 0] / mean)
+    against = 0.5 * even[:, None] * (1 / factor + factor.log() - 1)
+    return _Family(_mean(likelihood - against), torch.zeros_like(modes.by[:, 0]), mean, square[:, 0] / mean)
 
 
 _Part = tuple[Tensor, Tensor]
