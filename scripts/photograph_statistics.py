@@ -56,7 +56,9 @@ def with_left_out(found: Measurement) -> str:
         for k in out
     ]
     share = float(chi2.sum()) / (fit.degrees + 2 * len(out))
-    return f"with all {len(chi2)}: chi-squared over freedom {share:.2f}; left out were {', '.join(named + lost) or 'none'}"
+    return (
+        f"with all {len(chi2)}: chi-squared over freedom {share:.2f}; left out were {', '.join(named + lost) or 'none'}"
+    )
 
 
 def main() -> None:

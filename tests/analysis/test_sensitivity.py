@@ -165,9 +165,7 @@ def test_what_a_target_shares_with_its_camera_counts_once() -> None:
     assert opposite.sources["calibration"][0, 2, 2].sqrt() < 0.002
 
 
-@pytest.mark.parametrize(
-    ("place", "gain"), [(0.001, 0.001), (0.01, 0.015), (0.05, 0.05), ((0.02, 0.02, 0.06), 0.02)]
-)
+@pytest.mark.parametrize(("place", "gain"), [(0.001, 0.001), (0.01, 0.015), (0.05, 0.05), ((0.02, 0.02, 0.06), 0.02)])
 @pytest.mark.parametrize("name", ["quad40", "hexa50"])
 def test_the_budget_of_rings_is_what_estimate_states(name: str, place: float | tuple[float, ...], gain: float) -> None:
     """Of rendered frames: all three sources, each where it counts, and the noise of the frame alone.

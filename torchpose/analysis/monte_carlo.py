@@ -122,9 +122,7 @@ class _Draws(NamedTuple):
         matrix[[0, 1], [0, 1]], matrix[:2, 2] = self.focal[draw].to(matrix), self.center[draw].to(matrix)
         camera = replace(self.camera, matrix=matrix, distortion=self.distortion[draw], covariance=None)
         exact = replace(self.target, edge_gain=0.0, covariance=None, cross_covariance=None)
-        return camera, replace(
-            exact, centers=self.centers[draw], normals=self.normals[draw], radii=self.radii[draw]
-        )
+        return camera, replace(exact, centers=self.centers[draw], normals=self.normals[draw], radii=self.radii[draw])
 
 
 def _draw(camera: Camera, target: Target, uncertainty: Uncertainty, draws: int, generator: torch.Generator) -> _Draws:

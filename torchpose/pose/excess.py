@@ -8,8 +8,8 @@ Of every row three explanations are weighed by their evidence (the likelihood, a
 - all else: whatever it is, it makes the scatter larger by one factor (Birge 1932).
 
 The likeliest becomes part of the row's problem with the variance that it has on average over what remains possible: a
-few residuals tell a variance to a factor only, and the mean counts that, as Student's t does. Where it is scatter, it may
-yet be a print whose residuals are small by chance, and the pose's covariance is the mean of both.
+few residuals tell a variance to a factor only, and the mean counts that, as Student's t does. Where it is scatter, it
+may yet be a print whose residuals are small by chance, and the pose's covariance is the mean of both.
 """
 
 import math
@@ -231,7 +231,7 @@ def _camera(modes: _Modes) -> _Family:
 
 
 def _scatter(modes: _Modes, even: Tensor) -> _Family:
-    """Of ``even`` (N,) residuals beside these the mean square is 1: they speak against it, and not of how large it is."""
+    """Of ``even`` (N,) other residuals the mean square is 1: they speak against it, and not of how large it is."""
     factor, freedom = _values(_SCALE, modes), modes.there.sum(-1, keepdim=True)
     square = modes.residual.square().sum(-1, keepdim=True)
     likelihood = -0.5 * (square / factor + freedom * factor.log())
