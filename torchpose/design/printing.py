@@ -95,8 +95,8 @@ def measured(camera: Camera, target: Target, volume: WorkingVolume, imaging: Ima
 
     `MEASURING_VIEWS` views from the middle of the volume, tilted in all directions, tell of them what is left when each
     view has a pose of its own, and every ring its turn; what no view tells stays as the file states it. The frame is
-    the one that fits the places of the file best, so shift, turn and scale have no part: a millimetre is that of the file
-    (`scale_deviation`). The camera is taken as known.
+    the one that fits the places of the file best, so shift, turn and scale have no part: a millimetre is that of the
+    file (`scale_deviation`). The camera is taken as known.
     """
     target = replace(target, adjustment=None, cross_covariance=None)
     z = float(volume.middle[1][0, 2])
