@@ -114,14 +114,14 @@ def test_a_stated_height_states_how_rings_are_turned() -> None:
 
 @pytest.mark.slow
 def test_bent_prints_are_covered() -> None:
-    """24 plates, each bent in its own way by heights of 30 um RMS: a mean NEES of 6 is known to 0.7."""
+    """24 plates, each bent in its own way: a mean NEES of 6 is known to 0.7; saddles are fewer ways than heights are."""
     target, count = tp.Target.load("quad40"), 24
     r, t = random_poses(count, 30, (140, 180), seed=21)
     g = torch.Generator().manual_seed(22)
     bent = []
     for k in range(count):
         size = 0.06 * float(torch.randn((), generator=g))
-        errors = PrintErrors(warp=abs(size), shape=("dome", "cylinder", "twist")[k % 3], direction=float(k))
+        errors = PrintErrors(warp=abs(size), shape=("cylinder", "twist")[k % 2], direction=float(k))
         bent.append(printed(target, errors).as_target())
     height = torch.stack([one.centers[:, 2] for one in bent]).square().mean().sqrt()
     deviation = torch.cat([torch.tensor([0.0, 0.0, float(height)], dtype=F64).repeat(4), torch.zeros(1, dtype=F64)])
