@@ -29,6 +29,7 @@ FLOW = [
     ["datasets"],
     ["design", "calibration", "rig"],
     ["report"],
+    ["live"],
     ["studies"],
     ["cli"],
     ["__main__"],

@@ -21,6 +21,7 @@ from torchpose.cli.design import design
 from torchpose.cli.detect import detect
 from torchpose.cli.estimate import estimate
 from torchpose.cli.evaluate import evaluate
+from torchpose.cli.live import live
 from torchpose.cli.reproduce import reproduce
 from torchpose.cli.sensitivity import sensitivity
 from torchpose.cli.simulate import simulate
@@ -58,7 +59,7 @@ def _torchpose(
 
 
 # what stands below the options: help/COMMAND.md
-for _command in (estimate, detect, simulate, evaluate, capture, sensitivity, reproduce, design, calibrate):
+for _command in (estimate, live, detect, simulate, evaluate, capture, sensitivity, reproduce, design, calibrate):
     app.command(epilog=(_HELP / f"{_command.__name__}.md").read_text(encoding="utf-8"))(_command)
 
 
