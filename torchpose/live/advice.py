@@ -9,7 +9,7 @@ from statistics import median
 from typing import Literal
 
 from torchpose.io.rows import Row
-from torchpose.live.measures import PictureMeasures, RingMeasures
+from torchpose.live.measures import CLIPPED_SOME, PictureMeasures, RingMeasures, usable_blurs
 
 Level = Literal["good", "fair", "bad", "none"]
 
@@ -17,7 +17,7 @@ Level = Literal["good", "fair", "bad", "none"]
 _SHARP_PX, _SOFT_PX = 1.1, 2.0  # blur: the information of an edge goes with 1 / blur
 _UNEVEN = 1.6  # of the sharpest ring's blur, above a third of a pixel of difference
 _BRIGHT, _DIM = 0.5, 0.25  # light side of the rings, shares of full scale
-_CLIPPED_SOME, _CLIPPED_MUCH = 0.002, 0.05  # shares of the pixels around the rings
+_CLIPPED_MUCH = 0.05  # share of the pixels around the rings
 _CONTRAST, _LITTLE_CONTRAST = 0.35, 0.15  # of full scale
 _TILTED, _STEEP = 50.0, 65.0  # degrees
 _LARGE_PX, _SMALL_PX = 30.0, 16.0  # outer diameter
@@ -160,6 +160,8 @@ def _focus(rings: Sequence[RingMeasures], picture: PictureMeasures | None, sharp
     best = "" if sharpest is None else f" Sharpest so far {sharpest:.2f} px."
     level: Level = "good" if blur <= _SHARP_PX else "fair" if blur <= _SOFT_PX else "bad"
     text = "Sharp." if level == "good" else "Turn the focus until this is least."
+    if len(usable_blurs(rings)) < len(blurs):
+        return Advice("focus", "Blur", f"{blur:.2f}", "px", level, "Less than it is: the light side is clipped.")
     if most > _UNEVEN * least and most - least > 1 / 3:
         level = "fair" if level == "good" else level
         text = f"Uneven, {least:.2f} to {most:.2f} px: the target leaves the depth of field."
@@ -180,7 +182,7 @@ def _exposure(rings: Sequence[RingMeasures], picture: PictureMeasures | None) ->
         return Advice("exposure", "Light side", value, "%", "none", f"Of the whole picture; {share}.")
     light = median(lights)
     value, share = f"{100 * light:.0f}", f"{100 * clipped:.1f} % clipped at the rings"
-    if clipped > _CLIPPED_SOME:
+    if clipped > CLIPPED_SOME:
         level: Level = "bad" if clipped > _CLIPPED_MUCH else "fair"
         return Advice("exposure", "Light side", value, "%", level, f"Over-exposed, {share}: shorten the exposure.")
     if light < _BRIGHT:

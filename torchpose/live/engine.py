@@ -27,6 +27,7 @@ from torchpose.live.measures import (
     picture_measures,
     ring_measures,
     tilt_deg,
+    usable_blurs,
     white_of,
 )
 from torchpose.live.recording import Recorder
@@ -47,8 +48,8 @@ _NOISE_RANGE = (0.3, 60.0)  # grey levels of 0 to 255: rounding alone, and what 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Standard deviations of the worst axis of the place, um: stated, of the frame's noise alone, and predicted for this
-    pose with a sharp and well lit picture; and that axis."""
+    """Standard deviations of the position along its worst axis, um: stated, of the frame's noise alone, and predicted
+    for this pose with a sharp and well lit picture; and that axis."""
 
     axis: str
     stated_um: float
@@ -241,7 +242,7 @@ class Live:
         self._times.append(time.monotonic())
         span = self._times[-1] - self._times[0]
         self._points.append(point_of(sight))
-        self._blurs.extend([median(blurs)] if (blurs := [r.blur for r in sight.rings if r.blur is not None]) else [])
+        self._blurs.extend([median(blurs)] if (blurs := usable_blurs(sight.rings)) else [])
         self._publish(
             Snapshot(
                 before.version + 1,

@@ -9,6 +9,7 @@ flat; a table of the same area under cut-off Gaussian steps undoes that.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -40,6 +41,7 @@ _RADII, _ANGLES = 24, 64  # samples there
 _NOISE_SIDE = 512  # px, of the patch in which the noise is measured
 _NOISE_KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)  # Immerkaer 1996: blind to planes
 _MEDIAN_OF_NORMAL = 0.6745  # of |x|, standard deviations
+CLIPPED_SOME = 0.002  # share of the pixels around a ring (convention), beyond single hot ones
 _LOOKED_AT = 640  # px, longer side of the reduced picture in which the sharpest edges are sought
 _NEIGHBOURHOOD = 9  # px there: steps are taken across it
 _STRONG = 0.5  # of the largest step: those that count
@@ -63,8 +65,8 @@ class RingMeasures:
 @dataclass(frozen=True)
 class PictureMeasures:
     """Of the whole frame: shares of pixels at full scale and at zero, grey levels below which 1 and 99 of 100 pixels
-    lie and noise as shares of full scale, and the blur of its sharpest edges, px, coarse: from a picture that was reduced
-    ``scale`` times."""
+    lie and noise as shares of full scale, and the blur of its sharpest edges, px, coarse: from a picture that was
+    reduced ``scale`` times."""
 
     clipped: float
     black: float
@@ -210,6 +212,11 @@ def ring_measures(frame: Shaped[Tensor, "H W"], found: Detections, white: float)
         for (marker, blur, low, high, dark, light, clip), size in zip(numbers, sizes, strict=True)
     ]
     return sorted(rings, key=lambda ring: ring.marker)
+
+
+def usable_blurs(rings: Sequence[RingMeasures]) -> list[float]:
+    """Blurs of rings whose light side is not clipped, which makes edges look steeper than they are."""
+    return [ring.blur for ring in rings if ring.blur is not None and ring.clipped <= CLIPPED_SOME]
 
 
 def _clipped_around(frame: Tensor, outer: Tensor, white: float) -> Tensor:

@@ -74,6 +74,8 @@ def _seen(sight: Sight, snapshot: Snapshot, wanted_um: float | None) -> Row:
     level, meaning, hint = status_of(sight.row, sight.picture, sight.missing)
     blurs = {ring.marker: ring.blur for ring in sight.rings}
     lines = advise(sight.rings, sight.picture, sight.tilt_deg, snapshot.sharpest)
+    if level == "good" and (wrong := next((line for line in lines if line.level == "bad"), None)):
+        level, hint = "fair", f"{wrong.name} {wrong.value} {wrong.unit}: {wrong.text}"
     return {
         "taken_s": sight.shot.taken_s,
         "ready_s": snapshot.ready_s,

@@ -115,10 +115,13 @@ class Strips {
     pen.lineWidth = 1;
     pen.strokeStyle = colour("line");
     pen.fillStyle = colour("soft");
-    for (const tick of ticks(low, high, strip.log)) {
-      const at = Math.round(y(tick)) + 0.5;
+    let written = -Infinity;
+    for (const tick of ticks(low, high, strip.log).reverse()) { // from the top down
+      const at = Math.round(y(tick)) + 0.5, text = at < 12 ? at + 10 : at - 2;
       pen.beginPath(); pen.moveTo(0, at); pen.lineTo(width, at); pen.stroke();
-      pen.fillText(number(tick), 2, at < 12 ? at + 10 : at - 2);
+      if (text < written + 10) continue;
+      pen.fillText(number(tick), 2, text);
+      written = text;
     }
     if (wanted) {
       pen.strokeStyle = colour("ink"); pen.setLineDash([4, 3]);
