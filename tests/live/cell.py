@@ -96,7 +96,12 @@ def looking(frames: Frames, folder: Path, lines: list[str], camera: Camera = CAM
 
 def answers_of(live: Live, lines: list[str], wanted_um: float | None = 1.0) -> Answers:
     camera = live.observer.camera
-    shown = {"version": "test", "source": live.frames.kind, "target": TARGET.name, "wanted_um": wanted_um}
+    shown: dict[str, Any] = {
+        "version": "test",
+        "source": live.frames.kind,
+        "target": TARGET.name,
+        "wanted_um": wanted_um,
+    }
     shown |= {"width": camera.width, "height": camera.height, "markers": TARGET.ids.tolist()}
     return Answers(live, shown, wanted_um, lines.append)
 

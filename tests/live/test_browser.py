@@ -26,7 +26,9 @@ from torchpose.rig.twin.scene import Scene
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
 pytest.importorskip("pypylon.pylon", reason="needs pypylon: pip install '.[rig]'")
-CHROMIUM = next((path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), "")
+CHROMIUM = next(
+    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), ""
+)
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(not CHROMIUM, reason="needs a Chromium: apt-get install chromium"),
@@ -139,7 +141,10 @@ def test_picture_pose_and_status_within_two_seconds(browser: Any, page: Page) ->
 def test_overlay_lies_on_the_rings(browser: Any, page: Page) -> None:
     """Where the overlay has a ring the picture has an edge: dark inside of it, light outside."""
     tab = opened(browser, page)
-    until(tab, "document.querySelectorAll('#overlay .outer').length === 4 && document.querySelector('#picture').naturalWidth")
+    until(
+        tab,
+        "document.querySelectorAll('#overlay .outer').length === 4 && document.querySelector('#picture').naturalWidth",
+    )
     grey = tab.evaluate(
         """() => {
         const image = document.querySelector('#picture'), canvas = document.createElement('canvas');
@@ -150,7 +155,8 @@ def test_overlay_lies_on_the_rings(browser: Any, page: Page) -> None:
           const [x, y, a] = ['cx', 'cy', 'rx'].map((name) => Number(ring.getAttribute(name)));
           for (const share of [0.9, 1.1]) for (let k = 0; k < 12; k++) {
             const u = x + share * a * Math.cos(k * Math.PI / 6), v = y + share * a * Math.sin(k * Math.PI / 6);
-            const at = [(u - box.x) / box.width * canvas.width, (v - box.y) / box.height * canvas.height].map(Math.floor);
+            const to = (w, low, wide, size) => Math.floor((w - low) / wide * size);
+            const at = [to(u, box.x, box.width, canvas.width), to(v, box.y, box.height, canvas.height)];
             found.push([share, pen.getImageData(...at, 1, 1).data[0]]);
           }
         }
@@ -194,7 +200,10 @@ def test_it_changes_with_the_scene(browser: Any, page: Page, world: World) -> No
     shoot(tab, "bright")
 
     world.look = {}
-    until(tab, f"{WORD} === 'ok' && {turn('exposure')}.dataset.level === 'good' && {turn('focus')}.dataset.level === 'good'")
+    until(
+        tab,
+        f"{WORD} === 'ok' && {turn('exposure')}.dataset.level === 'good' && {turn('focus')}.dataset.level === 'good'",
+    )
     assert tab.problems == []
     shoot(tab, "back")
     tab.context.close()
@@ -224,9 +233,7 @@ def test_a_recording_made_on_the_page_is_estimated(browser: Any, page: Page, tmp
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(390, "light"), (390, "dark"), (320, "light"), (768, "light")])
-def test_a_phone_scrolls_in_one_direction(
-    browser: Any, page: Page, world: World, width: int, scheme: str
-) -> None:
+def test_a_phone_scrolls_in_one_direction(browser: Any, page: Page, world: World, width: int, scheme: str) -> None:
     tab = opened(browser, page, width, 844, scheme)
     until(tab, f"{WORD} === 'ok' && document.querySelector('#picture').naturalWidth > 0")
     assert tab.evaluate("document.documentElement.scrollWidth") <= width

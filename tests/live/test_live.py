@@ -188,7 +188,12 @@ def test_pictures_are_made_only_for_those_who_look(tmp_path: Path, monkeypatch: 
 
     made: list[int] = []
     encode = pictures.encode
-    monkeypatch.setattr(pictures, "encode", lambda snapshot: made.append(snapshot.version) or encode(snapshot))
+
+    def counted(snapshot: engine.Snapshot) -> bytes:
+        made.append(snapshot.version)
+        return encode(snapshot)
+
+    monkeypatch.setattr(pictures, "encode", counted)
     with served(Scene(gap_s=0.02), tmp_path) as page:
         page.until(lambda: page.live.snapshot.number > 5, 30)
         assert made == []
@@ -209,7 +214,7 @@ def test_events_tell_the_history_and_then_every_frame(tmp_path: Path) -> None:
             points = json.loads(next(lines).removeprefix("data: "))["points"]
             assert len(points) >= 2
             assert len(points[0]) == 18
-            numbers = []
+            numbers: list[int] = []
             while len(numbers) < 3:
                 if next(lines) == "event: frame":
                     state = json.loads(next(lines).removeprefix("data: "))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,7 +37,7 @@ def test_blur_of_every_ring_is_that_of_the_lens(sigma: float) -> None:
 def test_blur_has_a_direction_where_the_camera_moves() -> None:
     image = picture(psf_sigma=0.7).astype(np.float32)
     moved = np.mean([np.roll(image, shift, axis=1) for shift in range(-3, 4)], axis=0)  # 7 px along u
-    seen = sight(np.round(moved).astype(np.uint8))
+    seen = sight(np.asarray(np.round(moved), np.uint8))
     least, most = seen.rings[0].blur_axes or (0.0, 0.0)
     assert least == pytest.approx(0.7, abs=0.2)
     assert most == pytest.approx(math.hypot(0.7, 2.0), rel=0.15)  # a box of 7 px has a deviation of 2
@@ -86,7 +87,7 @@ def test_prediction_for_a_sharp_picture_is_below_what_a_soft_one_has() -> None:
     assert sharp.stated_um == pytest.approx(sharp.reachable_um, rel=0.4)
 
 
-CASES = {
+CASES: dict[str, tuple[dict[str, Any], str, str, str]] = {
     "good": ({}, "ok", "good", ""),
     "covered": ({"cover": 1}, "ok", "fair", "Marker 1 is not found"),
     "gone": ({"t": (300.0, 0.0, 150.0)}, "no_target", "bad", "into view"),
@@ -100,7 +101,7 @@ CASES = {
 def test_what_is_said_of_a_frame(name: str) -> None:
     look, status, level, hint = CASES[name]
     cover = look.get("cover")
-    image = picture(**{key: value for key, value in look.items() if key != "cover"})  # type: ignore[arg-type]
+    image = picture(**{key: value for key, value in look.items() if key != "cover"})
     if cover is not None:
         image[60:130, 290:380] = 110
     seen = sight(image)

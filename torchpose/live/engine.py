@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from torchpose.camera import Camera
-from torchpose.design.precision import Imaging, edge_covariance
+from torchpose.design.predict import Imaging, edge_covariance
 from torchpose.errors import TorchposeError
 from torchpose.io.rows import Row, fault_row, pose_rows
 from torchpose.live.measures import (
@@ -42,7 +42,7 @@ AGAIN_S = 2.0  # after which a camera that failed is opened anew
 _KEPT = 600  # points of the strips (convention): two minutes at five frames a second
 _RATED = 8  # frames over which the rate is told
 # what focus and light can reach: a sharp lens, and print and paper at the ends of the range (convention)
-_WELL = {"psf_sigma": 0.7, "dark": 25.0, "light": 230.0}
+_WELL = Imaging(psf_sigma=0.7, dark=25.0, light=230.0)
 _NOISE_RANGE = (0.3, 60.0)  # grey levels of 0 to 255: rounding alone, and what a prediction takes
 
 
@@ -155,7 +155,7 @@ class Observer:
         stated = {axis: 1e3 * row[f"s{axis}"] for axis in "xyz"}
         worst = max(stated, key=stated.__getitem__)
         low, high = _NOISE_RANGE
-        imaging = Imaging(noise=min(max(255 * picture.noise, low), high), **_WELL)
+        imaging = replace(_WELL, noise=min(max(255 * picture.noise, low), high))
         variance = edge_covariance(self.camera, self.target, poses.R, poses.t, imaging).diagonal(dim1=1, dim2=2)
         least = 1e3 * float(variance[0, "xyz".index(worst)].sqrt())
         return Accuracy(worst, stated[worst], 1e3 * row[f"n{worst}"], least if math.isfinite(least) else None)

@@ -236,7 +236,7 @@ def _known(value: float) -> float | None:
 
 def picture_measures(image: NDArray[np.integer], white: float) -> PictureMeasures:
     """Of a frame (H, W), uint8 or uint16."""
-    clipped = cv2.countNonZero(cv2.compare(image, white, cv2.CMP_GE)) / image.size
+    clipped = np.count_nonzero(image >= int(white)) / image.size
     black = 1 - cv2.countNonZero(image) / image.size
     scale = max(1, max(image.shape) // _LOOKED_AT)
     small = cv2.resize(image, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA).astype(np.float32)

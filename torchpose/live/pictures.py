@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from typing import Any
 
 import cv2
 
@@ -17,7 +18,7 @@ LEAST_AGE_S = 0.1  # between two pictures (convention): an eye takes ten a secon
 def encode(snapshot: Snapshot) -> bytes:
     """JPEG of a snapshot's frame, which has one; nothing is drawn on it."""
     assert snapshot.sight is not None
-    image = snapshot.sight.shot.image
+    image: Any = snapshot.sight.shot.image
     assert image is not None
     factor = max(1, -(-max(image.shape) // LONGEST))
     if factor > 1:

@@ -136,7 +136,7 @@ class Server:
         app = application(answers, host, token, tell)
         self._server = uvicorn.Server(
             uvicorn.Config(
-                app,  # type: ignore[arg-type]  # uvicorn's own types of messages are narrower
+                app,
                 interface="asgi3",
                 http=watched(tell),
                 ws="none",

@@ -175,7 +175,7 @@ class Film:
         name, now = f"{self._path.name}#{self._at}", time.time()
         if not there:
             return Shot(name, now, None, Fault(Status.UNREADABLE, "corrupt"), passed)
-        image: NDArray[np.integer[Any]] = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+        image: Any = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
         if image.shape[::-1] != self._size:
             return Shot(name, now, None, Fault(Status.WRONG_SIZE, f"{image.shape[1]}x{image.shape[0]}"), passed)
         return Shot(name, now, image, passed_over=passed)
