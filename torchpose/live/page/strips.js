@@ -2,6 +2,7 @@
 "use strict";
 
 const WINDOW_S = 60;
+const GUTTER = 34; // px at the left, for the numbers of the scale
 const P = { time: 0, status: 1, q: 2, tx: 3, ty: 4, tz: 5, sx: 6, sy: 7, sz: 8, srx: 9, sry: 10, srz: 11,
             nx: 12, ny: 13, nz: 14, nrx: 15, nry: 16, nrz: 17 };
 const MDEG = 180e3 / Math.PI;
@@ -108,25 +109,27 @@ class Strips {
     if (strip.log) { low /= 1.3; high *= 1.3; } else { const room = 0.12 * (high - low) || 1; low -= room; high += room; }
     const scale = strip.log ? Math.log : (v) => v;
     const base = height - 6;
-    const x = (time) => width * (1 - (end - time) / WINDOW_S);
+    const x = (time) => GUTTER + (width - GUTTER) * (1 - (end - time) / WINDOW_S);
     const y = (value) => 2 + (base - 4) * (1 - (scale(value) - scale(low)) / (scale(high) - scale(low)));
     const colour = (name) => resolved(style.getPropertyValue("--" + name), canvas);
     pen.font = "10px system-ui, sans-serif";
     pen.lineWidth = 1;
     pen.strokeStyle = colour("line");
     pen.fillStyle = colour("soft");
+    pen.textAlign = "right";
+    pen.textBaseline = "middle";
     let written = -Infinity;
     for (const tick of ticks(low, high, strip.log).reverse()) { // from the top down
-      const at = Math.round(y(tick)) + 0.5, text = at < 12 ? at + 10 : at - 2;
-      pen.beginPath(); pen.moveTo(0, at); pen.lineTo(width, at); pen.stroke();
-      if (text < written + 10) continue;
-      pen.fillText(number(tick), 2, text);
-      written = text;
+      const at = Math.round(y(tick)) + 0.5;
+      pen.beginPath(); pen.moveTo(GUTTER, at); pen.lineTo(width, at); pen.stroke();
+      if (at < written + 10) continue;
+      pen.fillText(number(tick), GUTTER - 5, Math.max(6, at));
+      written = at;
     }
     if (wanted) {
       pen.strokeStyle = colour("ink"); pen.setLineDash([4, 3]);
-      pen.beginPath(); pen.moveTo(0, y(wanted)); pen.lineTo(width, y(wanted)); pen.stroke(); pen.setLineDash([]);
-      pen.fillStyle = colour("ink"); pen.fillText("wanted", width - 40, y(wanted) < 12 ? y(wanted) + 11 : y(wanted) - 3);
+      pen.beginPath(); pen.moveTo(GUTTER, y(wanted)); pen.lineTo(width, y(wanted)); pen.stroke(); pen.setLineDash([]);
+      pen.fillStyle = colour("ink"); pen.fillText("wanted", width - 2, y(wanted) < 14 ? y(wanted) + 8 : y(wanted) - 7);
     }
     for (const line of lines) {
       pen.strokeStyle = pen.fillStyle = colour(line.axis);
@@ -144,7 +147,7 @@ class Strips {
     }
     let before = null;
     for (const p of points) { // what became of each frame, along the bottom
-      const left = before === null ? x(p[P.time]) - 3 : x(before);
+      const left = Math.max(GUTTER, before === null ? x(p[P.time]) - 3 : x(before));
       pen.fillStyle = colour(p[P.status] === "ok" ? "good" : p[P.status] === "ambiguous" ? "fair" : "bad");
       pen.fillRect(left, height - 3, Math.max(1, x(p[P.time]) - left), 3);
       before = p[P.time];
