@@ -7,7 +7,8 @@ Frames of the simulated target are played as fast as the estimator takes them, a
 has the one before. They run in a process of their own. Latency is from the moment at which a frame is there to the one
 at which a viewer has its numbers, and its picture.
 
-The soak plays small frames as fast as they can be looked at, with one viewer, and tells the memory as it goes.
+The soak plays small frames as fast as they can be looked at, with one viewer, and tells the memory as it goes;
+`--remembered` looks at each of the three pictures once and plays what was seen, so that all but the estimator works.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ import torch
 
 from torchpose.camera import Camera
 from torchpose.live.app import Answers
-from torchpose.live.engine import Live, Observer
+from torchpose.live.engine import Live, Observer, Sight
 from torchpose.live.recording import Recorder
 from torchpose.live.server import Server, listen
 from torchpose.live.sources import Shot
@@ -75,15 +76,27 @@ def frames_of(camera: Camera, target: Target, distance: float) -> list[np.ndarra
     return [np.asarray(add_noise(ideal, 1.0, seed)[0]) for seed in range(FRAMES)]
 
 
+class Remembering(Observer):
+    """Sees in a picture what it saw in it the first time."""
+
+    def look(self, shot: Shot) -> Sight:
+        self._seen: dict[int, Sight] = getattr(self, "_seen", {})
+        if id(shot.image) not in self._seen:
+            self._seen[id(shot.image)] = super().look(shot)
+        sight = self._seen[id(shot.image)]
+        return replace(sight, shot=shot, row=sight.row | {"frame": shot.name})
+
+
 @contextmanager
-def served(camera: Camera, target: Target, frames: Played, folder: Path) -> Iterator[tuple[Live, int]]:
+def served(observer: Observer, target: Target, frames: Played, folder: Path) -> Iterator[tuple[Live, int]]:
+    camera = observer.camera
     images = {"camera": [camera.width, camera.height, "as taken"]}
     about = {"source": "folder", "target": target.name, "emulated": True, "images": images}
     shown = {"version": "", "source": "", "target": target.name, "width": camera.width, "height": camera.height}
     tell = Lines()
     with (
         Recorder(folder, **about) as recorder,
-        Live(frames, Observer(camera, target), recorder, tell) as live,
+        Live(frames, observer, recorder, tell) as live,
         listen("127.0.0.1", 0) as listening,
     ):
         server = Server(Answers(live, shown | {"markers": []}, None, tell), "127.0.0.1", None, tell)
@@ -136,7 +149,7 @@ def latencies(seconds: float) -> None:
         camera = Camera.load(ROOT / "configs/cameras" / name)
         with tempfile.TemporaryDirectory() as folder:
             frames = Played(frames_of(camera, target, 150.0))
-            with served(camera, target, frames, Path(folder)) as (live, port):
+            with served(Observer(camera, target), target, frames, Path(folder)) as (live, port):
                 while live.snapshot.number < 3:
                     time.sleep(0.1)
                 for count in (0, 1, 10):
@@ -154,7 +167,7 @@ def latencies(seconds: float) -> None:
                     )
 
 
-def soak(count: int) -> None:
+def soak(count: int, kind: type[Observer]) -> None:
     """Prints memory over many small frames, with one viewer."""
     camera = Camera(
         320, 240, torch.tensor([[480.0, 0, 159.5], [0, 480.0, 119.5], [0, 0, 1]], dtype=torch.float64), torch.zeros(5)
@@ -162,7 +175,7 @@ def soak(count: int) -> None:
     target = Target.load("quad40")
     with tempfile.TemporaryDirectory() as folder:
         frames = Played(frames_of(camera, target, 150.0))
-        with served(camera, target, frames, Path(folder)) as (live, port):
+        with served(kind(camera, target), target, frames, Path(folder)) as (live, port):
             began, told = time.monotonic(), 0
             command = [sys.executable, VIEWERS, str(port), "1", "1e9"]
             viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL)
@@ -193,10 +206,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=20.0, help="of each row of the table")
     parser.add_argument("--soak", type=int, metavar="FRAMES", help="only play so many small frames")
+    parser.add_argument("--remembered", action="store_true", help="without the estimator")
     given = parser.parse_args()
     torch.set_num_threads(1)
     if given.soak:
-        soak(given.soak)
+        soak(given.soak, Remembering if given.remembered else Observer)
     else:
         latencies(given.seconds)
 

@@ -336,7 +336,7 @@ def test_viewers_have_a_limit(tmp_path: Path) -> None:
             assert next(heard[-1]) == "event: history"
         with http.stream("GET", "/api/events") as refused:
             assert refused.status_code == 503
-        assert [line for line in page.lines if "refused 503" in line]
+        page.until(lambda: any("refused 503" in line for line in page.lines))
 
 
 def test_connections_without_a_request_make_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

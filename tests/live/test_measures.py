@@ -90,6 +90,7 @@ def test_prediction_for_a_sharp_picture_is_below_what_a_soft_one_has() -> None:
 CASES: dict[str, tuple[dict[str, Any], str, str, str]] = {
     "good": ({}, "ok", "good", ""),
     "covered": ({"cover": 1}, "ok", "fair", "Marker 1 is not found"),
+    "mostly covered": ({"cover": 2}, "too_few_markers", "bad", "Markers 1, 2 are not found"),
     "gone": ({"t": (300.0, 0.0, 150.0)}, "no_target", "bad", "into view"),
     "over-exposed": ({"light": 2000.0, "surround": 900.0, "dark": 400.0}, "no_target", "bad", "shorten the exposure"),
     "dark": ({"light": 4.0, "surround": 3.0, "dark": 2.0}, "no_target", "bad", "The picture is dark"),
@@ -103,7 +104,7 @@ def test_what_is_said_of_a_frame(name: str) -> None:
     cover = look.get("cover")
     image = picture(**{key: value for key, value in look.items() if key != "cover"})
     if cover is not None:
-        image[60:130, 290:380] = 110
+        image[60 : 130 if cover == 1 else 360, 290:380] = 110
     seen = sight(image)
     assert seen.row["status"] == status
     said = status_of(seen.row, seen.picture, seen.missing)

@@ -54,6 +54,7 @@ _STATUS = {
     "unreadable": ("bad", "The frame could not be read."),
     "wrong_size": ("bad", "The frame has not the size of the camera file."),
 }
+_ELSE = "Bring the target into view, uncover it, or check that it is the one of the target file."
 _REASONS = {
     "residual": "The centres do not fit the target: a mix-up, damage, or another camera or target file.",
     "ring_shape": "The rings' shapes contradict the pose: motion blur, or a mix-up.",
@@ -76,7 +77,8 @@ def status_of(row: Row, picture: PictureMeasures | None, missing: Sequence[int])
     level, meaning = _STATUS[row["status"]]
     hint = _REASONS.get(row["reason"] or "", "")
     if row["status"] in ("no_target", "too_few_markers") and picture is not None:
-        hint = _why_nothing(picture)
+        some = f"{_markers(missing)} not found: covered, or out of the picture."
+        hint = _why_nothing(picture) or (some if row["status"] == "too_few_markers" else _ELSE)
     elif row["status"] in ("ok", "ambiguous") and missing:
         level, hint = "fair", f"{_markers(missing)} not found: covered, or out of the picture."
     return _level(level), meaning, hint
@@ -94,7 +96,7 @@ def _markers(missing: Sequence[int]) -> str:
 
 
 def _why_nothing(picture: PictureMeasures) -> str:
-    """The likeliest reason that a picture itself shows."""
+    """The likeliest reason that a picture itself shows; nothing where it is as it should be."""
     if picture.clipped > _WHITE_PICTURE:
         return f"{100 * picture.clipped:.0f} % of the picture is clipped: shorten the exposure or close the aperture."
     if picture.high < _DARK_PICTURE:
@@ -103,7 +105,7 @@ def _why_nothing(picture: PictureMeasures) -> str:
         return "Nothing stands out: bring the target into view; look for a cap, fog or stray light."
     if picture.blur is not None and picture.blur > _BLURRED_PICTURE * picture.scale:
         return "Nothing in the picture is sharp: turn the focus."
-    return "Bring the target into view, uncover it, or check that it is the one of the target file."
+    return ""
 
 
 def advise(

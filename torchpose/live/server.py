@@ -25,69 +25,72 @@ _UNSENT = 1 << 17  # bytes that wait for a client, a picture or so
 _UNSENT_BY_SYSTEM = 1 << 18  # bytes of a socket's own buffer: what waits there is old when it comes
 
 
+class _Watched(H11Protocol):
+    """HTTP over connections that end where a client is silent, stalls, or sends what is no HTTP."""
+
+    _tell: Callable[[str], None]
+    _since = 0.0  # when the silence, or the stalling, began
+    _watch: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: Any) -> None:
+        super().connection_made(transport)
+        transport.set_write_buffer_limits(high=_UNSENT)
+        self._since = self.loop.time()
+        self._watch = self.loop.call_later(_WATCH_S, self._look)
+        if len(self.connections) > MOST_CONNECTIONS:
+            self._make_room()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if self._watch is not None:
+            self._watch.cancel()
+        super().connection_lost(exc)
+
+    @property
+    def idle(self) -> bool:
+        """Whether no request is under way."""
+        return self.cycle is None or self.cycle.response_complete
+
+    def _look(self) -> None:
+        now = self.loop.time()
+        sending = not self.idle and not self.cycle.more_body
+        if sending and not self.flow.write_paused:
+            self._since = now
+        elif now - self._since > (STALLED_S if sending else SILENT_S):
+            # a connection that is kept for a next request may go without a word
+            self._drop("takes nothing" if sending else "sends no whole request" if not self._kept() else "")
+            return
+        self._watch = self.loop.call_later(_WATCH_S, self._look)
+
+    def _kept(self) -> bool:
+        return self.cycle is not None and self.idle and not self.conn.trailing_data[0]
+
+    def _make_room(self) -> None:
+        """Drops the connection without a request that has been there longest; this one where all have one."""
+        idle = [c for c in self.connections if isinstance(c, _Watched) and c.idle and c is not self]
+        oldest = min(idle, key=lambda connection: connection._since, default=self)
+        oldest._drop(f"one of more than {MOST_CONNECTIONS} connections")
+
+    def _drop(self, why: str) -> None:
+        if why:
+            self._tell(f"dropped {(self.client or ('unknown',))[0]}: {why}")
+        self.connections.discard(self)
+        self.transport.abort()
+
+    def send_400_response(self, msg: str) -> None:
+        self._tell(f"refused 400 {(self.client or ('unknown',))[0]}: no HTTP, or too long a head")
+        super().send_400_response(msg)
+
+    def _unsupported_upgrade_warning(self) -> None:
+        pass  # there is no WebSocket here; the request is answered as what it else is
+
+
 def watched(tell: Callable[[str], None]) -> type[H11Protocol]:
-    """A protocol of HTTP whose connections end where a client is silent, stalls, or sends what is no HTTP.
+    """A protocol of HTTP that gives ``tell`` a line for each connection that it ends."""
 
-    Args:
-        tell: is given a line for each.
-    """
+    class Told(_Watched):
+        _tell = staticmethod(tell)
 
-    class Watched(H11Protocol):
-        _since = 0.0  # when the silence, or the stalling, began
-        _watch: asyncio.TimerHandle | None = None
-
-        def connection_made(self, transport: Any) -> None:
-            super().connection_made(transport)
-            transport.set_write_buffer_limits(high=_UNSENT)
-            self._since = self.loop.time()
-            self._watch = self.loop.call_later(_WATCH_S, self._look)
-            if len(self.connections) > MOST_CONNECTIONS:
-                self._make_room()
-
-        def connection_lost(self, exc: Exception | None) -> None:
-            if self._watch is not None:
-                self._watch.cancel()
-            super().connection_lost(exc)
-
-        @property
-        def idle(self) -> bool:
-            """Whether no request is under way."""
-            return self.cycle is None or self.cycle.response_complete
-
-        def _look(self) -> None:
-            now = self.loop.time()
-            sending = not self.idle and not self.cycle.more_body
-            if sending and not self.flow.write_paused:
-                self._since = now
-            elif now - self._since > (STALLED_S if sending else SILENT_S):
-                # a connection that is kept for a next request may go without a word
-                self._drop("takes nothing" if sending else "sends no whole request" if not self._kept() else "")
-                return
-            self._watch = self.loop.call_later(_WATCH_S, self._look)
-
-        def _kept(self) -> bool:
-            return self.cycle is not None and self.idle and not self.conn.trailing_data[0]
-
-        def _make_room(self) -> None:
-            """Drops the connection without a request that has been there longest; this one where all have one."""
-            idle = [c for c in self.connections if isinstance(c, Watched) and c.idle and c is not self]
-            oldest = min(idle, key=lambda connection: connection._since, default=self)
-            oldest._drop(f"one of more than {MOST_CONNECTIONS} connections")
-
-        def _drop(self, why: str) -> None:
-            if why:
-                tell(f"dropped {(self.client or ('unknown',))[0]}: {why}")
-            self.connections.discard(self)
-            self.transport.abort()
-
-        def send_400_response(self, msg: str) -> None:
-            tell(f"refused 400 {(self.client or ('unknown',))[0]}: no HTTP, or too long a head")
-            super().send_400_response(msg)
-
-        def _unsupported_upgrade_warning(self) -> None:
-            pass  # there is no WebSocket here; the request is answered as what it else is
-
-    return Watched
+    return Told
 
 
 class _Lines(logging.Handler):

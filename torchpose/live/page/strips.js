@@ -139,7 +139,7 @@ class Strips {
       for (const p of points) {
         const value = line.at(p);
         if (value === null || (strip.log && value <= 0)) { open = false; continue; }
-        if (open) pen.lineTo(x(p[P.time]), y(value)); else pen.moveTo(x(p[P.time]), y(value));
+        if (open) pen.lineTo(x(p[P.time]), y(value)); else { pen.moveTo(x(p[P.time]) - 1, y(value)); pen.lineTo(x(p[P.time]), y(value)); }
         open = true;
       }
       pen.stroke();
