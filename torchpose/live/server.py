@@ -150,7 +150,7 @@ class Server:
                 server_header=False,
                 proxy_headers=False,
                 timeout_keep_alive=int(SILENT_S),
-                timeout_graceful_shutdown=1,
+                timeout_graceful_shutdown=3,
                 h11_max_incomplete_event_size=MOST_HEAD,
             )
         )
