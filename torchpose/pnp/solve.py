@@ -274,8 +274,8 @@ def _solve_chunk(
         poses = _centred(problem, torch.cat([r.permute(2, 3, 1, 0), t.permute(2, 1, 0)[:, None]], 1))
     elif not planes(problem):
         poses = starts(problem)
-    # of several starts that are given, the minimum of each is wanted
-    if max_iterations <= EVALUATIONS or (initial is not None and initial[0].ndim == 4):
+    # the first pass has room for two starts
+    if max_iterations <= EVALUATIONS or (poses is not None and poses.shape[2] > 2):
         poses = starts(problem) if poses is None else poses
         options, batch = poses.shape[2:]
         every = problem.final.select(torch.arange(batch, device=poses.device).repeat(options))
