@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, replace
+from functools import partial
 from itertools import combinations
 from os import PathLike
 from typing import Any, Literal, NamedTuple, get_args
@@ -34,6 +35,7 @@ from torchpose.identify import (
     MarkerTable,
     Scene,
     Views,
+    beside_another,
     held,
     identify,
     identify_boards,
@@ -57,7 +59,16 @@ from torchpose.pose import (
 )
 from torchpose.refine import METHODS, Recipe, Sight
 from torchpose.results import Poses, Reason, Status
-from torchpose.rings import Circles, Rings, find_circles, measure_circles, measure_exactly, rough_rings
+from torchpose.rings import (
+    Circles,
+    Rings,
+    find_circles,
+    ideal_pixels,
+    mapped,
+    measure_circles,
+    measure_exactly,
+    rough_rings,
+)
 from torchpose.target import Target
 
 _LEAST_CANDIDATE = (
@@ -251,7 +262,8 @@ class PoseEstimator(nn.Module):
         rest, number = (~settled).nonzero()[:, 0], (~settled).cumsum(0) - 1
         known = coarse[~settled[coarse.frame]]
         known = replace(known, frame=number[known.frame])
-        finer = find_candidates(frames[rest], wanted=wanted, coarse=known, float_range=255.0)
+        hopeful = partial(_hopeful, scene, len(rest))
+        finer = find_candidates(frames[rest], wanted=wanted, coarse=known, hopeful=hopeful, float_range=255.0)
         circles = self._useful(scene, replace(finer, frame=rest[finer.frame]))
         every = Rings.cat([rings[settled[rings.frame]], self._measured(scene, circles, tried)])
         return *self._read(scene, every, copies), Rings.cat([tried.rings, every])
@@ -394,6 +406,13 @@ class PoseEstimator(nn.Module):
         for step in self._recipe.steps:
             solutions = step(solutions, evidence, sight)
         return solutions
+
+
+def _hopeful(scene: Scene, frames: int, found: Candidates) -> Tensor:
+    """Frames (B,) bool in which two of these rings may be markers of one target."""
+    ideal = mapped(found.ellipse, lambda points: ideal_pixels(scene.camera, points))
+    together = beside_another((found.frame, found.polarity, ideal), scene.table, scene.camera.matrix)
+    return marked(found.frame[together], frames)
 
 
 def _legible(blur: Tensor) -> Tensor:

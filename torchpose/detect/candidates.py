@@ -1,6 +1,7 @@
 """Candidate ellipses of a batch of frames: fits to level-line regions and chained arcs, validated a contrario."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -56,6 +57,9 @@ _PART_ROUNDS = 2  # of following the ellipse of a region that is only a part of 
 _RING_SETTLE = 2  # fits of a ring to what agrees: its edges are measured later
 
 
+Hope = Callable[[Candidates], Bool[Tensor, " B"]]
+
+
 @checked
 def find_candidates(
     frames: Frames,
@@ -64,6 +68,7 @@ def find_candidates(
     explain: bool = False,
     wanted: Wanted = ANYTHING,
     coarse: Candidates | None = None,
+    hopeful: Hope | None = None,
     float_range: float | None = None,
 ) -> Candidates:
     """Ellipses in grey frames, one pass for the whole batch.
@@ -78,6 +83,8 @@ def find_candidates(
         explain: also return what was looked at and rejected, see `Candidates.verdict`.
         wanted: what is asked for; of other ellipses only whole ones are found, and left out.
         coarse: what `find_coarse` found in these frames, if it is known.
+        hopeful: which frames (B,) may show what is wanted, given rings that are seen there, full px: the ``coarse`` ones
+            and those that single regions of the finer scale follow. In the others no arcs are put together.
         float_range: white in floating-point frames; by default 1.0 where none of their values exceeds it, else 255.0.
 
     Raises:
@@ -88,7 +95,14 @@ def find_candidates(
     factor = reduction_factor(*frames.shape[-2:]) if factor is None else factor
     reduced = area_reduce(frames, factor)
     grad = gradient(reduced)
-    sharp = find_ellipses(grad, wanted.reduced(factor))
+    onward: Hope | None = None
+    if hopeful is not None and coarse is not None:
+        seen, ask = coarse, hopeful
+
+        def onward(found: Candidates) -> Tensor:
+            return ask(Candidates.cat([replace(found, ellipse=conics.rescaled(found.ellipse, factor)), seen]))
+
+    sharp = find_ellipses(grad, wanted.reduced(factor), onward=onward)
     # rings are found without (docs/tried.md)
     found = [find_finer(frames, factor, grad, sharp, wanted)] if factor > 1 and not wanted.concentric else []
     found.append(replace(sharp, ellipse=conics.rescaled(sharp.ellipse, factor)))
@@ -148,11 +162,14 @@ def find_finer(
     return finer[finer.log10_nfa < 0]
 
 
-def find_ellipses(grad: Gradient, wanted: Wanted = ANYTHING, known: Candidates | None = None) -> Candidates:
+def find_ellipses(
+    grad: Gradient, wanted: Wanted = ANYTHING, known: Candidates | None = None, *, onward: Hope | None = None
+) -> Candidates:
     """Ellipses of one scale, in its own pixels, with what became of them.
 
     What is not ``wanted`` is among them where it is seen whole, and explains its edges.
     ``known`` are accepted ellipses of a finer scale in the pixels of this one, which may explain edges better.
+    ``onward`` tells of rings that single regions follow which frames arcs are put together in.
     """
     cell, least = strong_cells(grad), MIN_CELLS
     if wanted.concentric:
@@ -163,7 +180,12 @@ def find_ellipses(grad: Gradient, wanted: Wanted = ANYTHING, known: Candidates |
         fit, arcs = sorted_out(regions, grad.centers(regions.cell), wanted.polarity)
         regions, aside = regions.of(fit), regions.cells_of(arcs)
     whole, explained = fit_regions(grad, regions, wanted)
-    rest = torch.cat([regions.cell[~explained], aside]).sort().values
+    rest, hope = torch.cat([regions.cell[~explained], aside]), None
+    if onward is not None:
+        single = accepted(whole)
+        hope = onward(single[rings(grad, single)])
+        rest = rest[hope[grad.frame(rest)]]
+    rest = rest.sort().values
     pieces = fit_arcs(grad, level_line_regions(grad, rest, least, SECTORS, PHASE), wanted)
     found = merge_duplicates(Candidates.cat([whole, pieces]), explain=True)
     if known is not None:
@@ -171,6 +193,8 @@ def find_ellipses(grad: Gradient, wanted: Wanted = ANYTHING, known: Candidates |
     part = found.verdict == Verdict.ACCEPTED
     if wanted.concentric:  # what stands beside a ring that is seen whole is left out when its edges are measured
         part = part & (found.cover <= WHOLE)
+    if hope is not None:
+        part = part & hope[found.frame]
     valid = positions(asked_for(grad, found, wanted, part))
     some = found[valid]
     settle = _RING_SETTLE if wanted.concentric else SETTLE

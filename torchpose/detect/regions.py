@@ -64,6 +64,10 @@ class Gradient(Rows):
         column, row = self.grid(cells)
         return torch.stack([column.double() + 0.5, row.double() + 0.5]).mT
 
+    def frame(self, cells: Int[Tensor, " P"]) -> Int[Tensor, " P"]:
+        """The frames of flat cells."""
+        return torch.div(cells, self.shape[1] * self.shape[2], rounding_mode="floor")
+
     def grid(self, cells: Int[Tensor, " P"]) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"]]:
         """Columns and rows of flat cells in their frames."""
         _, height, width = self.shape

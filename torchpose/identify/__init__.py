@@ -2,7 +2,7 @@
 
 from torchpose.identify.alike import indistinguishable
 from torchpose.identify.boards import identify_boards
-from torchpose.identify.company import in_company, named
+from torchpose.identify.company import beside_another, in_company, named
 from torchpose.identify.copies import MIN_MARKERS
 from torchpose.identify.markers import Identified, identify
 from torchpose.identify.scene import MarkerTable, Scene, drawn_radii
@@ -14,6 +14,7 @@ __all__ = [
     "MarkerTable",
     "Scene",
     "Views",
+    "beside_another",
     "drawn_radii",
     "held",
     "identify",

@@ -5,7 +5,7 @@ as two markers of a target. What has no such ring beside it is in no pose.
 """
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.geometry.arguments import checked
@@ -25,10 +25,19 @@ def in_company(rings: Rings, table: MarkerTable, matrix: Tensor) -> Bool[Tensor,
         table: the targets.
         matrix: of the camera.
     """
-    if len(rings) == 0:
-        return rings.polarity > 0
+    return beside_another((rings.frame, rings.polarity, rings.outer.params), table, matrix)
+
+
+@checked
+def beside_another(
+    circles: tuple[Int[Tensor, " K"], Float[Tensor, " K"], Float[Tensor, "K 5"]], table: MarkerTable, matrix: Tensor
+) -> Bool[Tensor, " K"]:
+    """`in_company` of outer circles: frame, polarity and ellipse in ideal pixels. None lies across another one."""
+    frame, polarity, outer = circles
+    if len(outer) == 0:
+        return polarity > 0
     (narrowest, widest), radius = _extents(table)
-    outer, focal = rings.outer.params, matrix[0, 0]
+    focal = matrix[0, 0]
     ray = torch.nn.functional.pad(outer[:, :2], (0, 1), value=1.0) @ torch.linalg.inv(matrix).mT
     length = torch.linalg.vector_norm(ray, dim=-1, keepdim=True)  # of a ray that is 1 deep
     # semi-major axes are those of `hypotheses._miss`, of rings that are a little off yet: (K, T) mm along the ray
@@ -39,8 +48,10 @@ def in_company(rings: Rings, table: MarkerTable, matrix: Tensor) -> Bool[Tensor,
     reach = focal * widest * length / (nearest / length - widest).clamp_min(0)
     extent = (outer[:, :2].amax(0) - outer[:, :2].amin(0)).sum()
     reach = reach.amax(1).minimum(extent)
-    i, j = near_pairs(outer[:, :2], outer[:, :2], reach, (rings.frame, rings.frame))
-    other = (i != j) & (rings.polarity[i] == rings.polarity[j])
+    i, j = near_pairs(outer[:, :2], outer[:, :2], reach, (frame, frame))
+    step = torch.linalg.vector_norm(outer[i, :2] - outer[j, :2], dim=-1)
+    # what is seen beside the other lies outside the discs that both ellipses hold: else it is the same ring once more
+    other = (step + spare >= outer[i, 3] + outer[j, 3]) & (polarity[i] == polarity[j]) & (i != j)
     i, j = i[other], j[other]
     cos = (ray[i] * ray[j]).sum(-1, keepdim=True) / (length[i] * length[j])
     one, two, far_one, far_two = nearest[i], nearest[j], farthest[i], farthest[j]
@@ -50,7 +61,7 @@ def in_company(rings: Rings, table: MarkerTable, matrix: Tensor) -> Bool[Tensor,
     )
     ends = ((one, far_two), (far_one, two), (far_one, far_two))
     most = torch.stack([_apart(*pair, cos) for pair in ends]).amax(0)
-    return marked(i[((least < widest) & (most > narrowest)).any(1)], len(rings))
+    return marked(i[((least < widest) & (most > narrowest)).any(1)], len(outer))
 
 
 @checked
