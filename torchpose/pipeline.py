@@ -36,7 +36,6 @@ from torchpose.identify import (
     Scene,
     Views,
     beside_another,
-    held,
     identify,
     identify_boards,
     in_company,
@@ -250,13 +249,13 @@ class PoseEstimator(nn.Module):
             scene, found = self._found_with_boards(scene)
             return scene, found, found.rings
         if self.instances > 1:  # a copy may be too small for the coarse scale
-            circles = self._useful(scene, find_candidates(frames, wanted=wanted, float_range=255.0))
-            scene, found = self._read(scene, self._measured(scene, circles))
+            circles, others = self._useful(scene, find_candidates(frames, wanted=wanted, float_range=255.0))
+            scene, found = self._read(scene, Rings.cat([self._measured(scene, circles), others]))
             return scene, found, found.rings
         coarse = find_coarse(frames, wanted=wanted, float_range=255.0)
         rings, copies, tried = self._likely(scene, coarse)
         first = self._read(scene, rings, copies)
-        settled = self._settled(*first, tried.rings)
+        settled = self._settled(*first)
         if bool(settled.all()):
             return *first, tried.rings
         rest, number = (~settled).nonzero()[:, 0], (~settled).cumsum(0) - 1
@@ -264,8 +263,8 @@ class PoseEstimator(nn.Module):
         known = replace(known, frame=number[known.frame])
         hopeful = partial(_hopeful, scene, len(rest))
         finer = find_candidates(frames[rest], wanted=wanted, coarse=known, hopeful=hopeful, float_range=255.0)
-        circles = self._useful(scene, replace(finer, frame=rest[finer.frame]))
-        every = Rings.cat([rings[settled[rings.frame]], self._measured(scene, circles, tried)])
+        circles, others = self._useful(scene, replace(finer, frame=rest[finer.frame]))
+        every = Rings.cat([rings[settled[rings.frame]], self._measured(scene, circles, tried), others])
         return *self._read(scene, every, copies), Rings.cat([tried.rings, every])
 
     def _found_with_boards(self, scene: Scene) -> tuple[Scene, Found]:
@@ -274,38 +273,36 @@ class PoseEstimator(nn.Module):
         candidates = find_candidates(scene.frames, factor)
         while True:
             found = self._read(scene, self._measured(scene, self._circles(scene, candidates)), None, candidates)
-            rest = (~self._settled(*found, found[1].rings)).nonzero()[:, 0]
+            rest = (~self._settled(*found, whole=True)).nonzero()[:, 0]
             factor //= 2
             if factor < 1 or rest.numel() == 0:
                 return found
             more = find_candidates(scene.frames[rest], factor)
             candidates = merge_duplicates(Candidates.cat([candidates, replace(more, frame=rest[more.frame])]))
 
-    def _settled(self, scene: Scene, found: Found, tried: Rings) -> Tensor:
-        """Frames (B,) bool in which every target has a row with all of its markers and a pose that they agree on.
+    def _settled(self, scene: Scene, found: Found, *, whole: bool = False) -> Tensor:
+        """Frames (B,) bool in which every target has a pose that its markers agree on, with ``whole`` all of them.
 
-        A marker in whose place a blurred ring was measured counts: no finer scale shows more of it.
+        Rings that are missing are looked for where the pose puts them: a search of the whole frame finds no more.
         """
-        agreed = marked(found.solvable[found.solutions.status == Status.OK], len(scene.frame))
-        missing = scene.table.valid[scene.target] & (found.identified.ring < 0)
-        if bool((agreed & missing.any(1)).any()):
-            missing &= ~held(scene, found.identified, _views(found), _much_blurred(tried))
-        good = agreed & ~missing.any(1)
+        good = marked(found.solvable[found.solutions.status == Status.OK], len(scene.frame))
+        if whole:  # marks of boards are not looked for again
+            good &= ~(scene.table.valid[scene.target] & (found.identified.ring < 0)).any(1)
         return marked(scene.group[good], scene.groups).view(len(scene.frames), len(scene.table)).all(1)
 
     def _circles(self, scene: Scene, candidates: Candidates) -> Circles:
         candidates = candidates[torch.isin(candidates.polarity, scene.table.polarity)]
         return find_circles(scene.frames, candidates, scene.camera)
 
-    def _useful(self, scene: Scene, candidates: Candidates) -> Circles:
-        """The circles that may be of a pose, and those that tell by their code alone that a target is there."""
+    def _useful(self, scene: Scene, candidates: Candidates) -> tuple[Circles, Rings]:
+        """The circles that may be of a pose, and rough rings that only tell by their codes that a target is there."""
         circles = self._circles(scene, candidates)
         if len(circles) == 0:
-            return circles
+            return circles, rough_rings(circles, scene.camera)
         rough, at = rough_rings(circles, scene.camera), (scene.table, scene.camera.matrix)
         beside = in_company(rough, *at)
-        circles = replace(circles, alone=~beside)
-        return circles[beside | (_legible(circles.inside.blur) & named(rough, *at))]
+        alone = rough[~beside & _legible(rough.blur)]
+        return circles[beside], alone[named(alone, *at)]
 
     def _rings(self, scene: Scene, circles: Circles, *, hopeful: bool = False) -> tuple[Rings, Tensor]:
         return measure_circles(scene.frames, circles, scene.camera, correct=self._recipe.correct, hopeful=hopeful)
@@ -410,6 +407,8 @@ class PoseEstimator(nn.Module):
 
 def _hopeful(scene: Scene, frames: int, found: Candidates) -> Tensor:
     """Frames (B,) bool in which two of these rings may be markers of one target."""
+    if len(found) == 0:  # frames without any cost nothing here
+        return found.frame.new_zeros(frames, dtype=torch.bool)
     ideal = mapped(found.ellipse, lambda points: ideal_pixels(scene.camera, points))
     together = beside_another((found.frame, found.polarity, ideal), scene.table, scene.camera.matrix)
     return marked(found.frame[together], frames)

@@ -83,8 +83,8 @@ def find_candidates(
         explain: also return what was looked at and rejected, see `Candidates.verdict`.
         wanted: what is asked for; of other ellipses only whole ones are found, and left out.
         coarse: what `find_coarse` found in these frames, if it is known.
-        hopeful: which frames (B,) may show what is wanted, given rings that are seen there, full px: the ``coarse`` ones
-            and those that single regions of the finer scale follow. In the others no arcs are put together.
+        hopeful: which frames (B,) may show what is wanted, given rings (full px) that are seen there: the ``coarse``
+            ones and those that single regions of the finer scale follow. In the others no arcs are put together.
         float_range: white in floating-point frames; by default 1.0 where none of their values exceeds it, else 255.0.
 
     Raises:
@@ -210,6 +210,8 @@ def fit_regions(grad: Gradient, regions: Regions, wanted: Wanted = ANYTHING) -> 
     """Ellipses that single regions follow, and which of the cells (P,) bool of the regions they explain."""
     xy = grad.centers(regions.cell)
     count = regions.frame.numel()
+    if count == 0:  # frames without any cost nothing here
+        return Candidates.unscored(regions.frame, xy.new_zeros(0, 5), xy.new_zeros(0)), regions.cell > 0
     gx, gy = regions.gradient.unbind(-1)
     magnitude = (gx * gx + gy * gy).sqrt().double()
     params = ellipse.fit(xy, regions.region, count, magnitude)

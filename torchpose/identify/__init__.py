@@ -6,7 +6,7 @@ from torchpose.identify.company import beside_another, in_company, named
 from torchpose.identify.copies import MIN_MARKERS
 from torchpose.identify.markers import Identified, identify
 from torchpose.identify.scene import MarkerTable, Scene, drawn_radii
-from torchpose.identify.second_look import Views, held, look_again
+from torchpose.identify.second_look import Views, look_again
 
 __all__ = [
     "MIN_MARKERS",
@@ -16,7 +16,6 @@ __all__ = [
     "Views",
     "beside_another",
     "drawn_radii",
-    "held",
     "identify",
     "identify_boards",
     "in_company",

@@ -88,15 +88,6 @@ def look_again(
     return Rings.cat([rings, found[index]]), more
 
 
-@checked
-def held(scene: Scene, identified: Identified, views: Views, blurred: Rings) -> Tensor:
-    """Missing markers (N, M) bool in whose place, at any of the poses, one of the ``blurred`` rings is."""
-    there = _missing(scene, identified, views)
-    there = there.where(_occupied(scene, there, blurred))
-    number = there.row * identified.ring.shape[1] + there.marker
-    return marked(number, identified.ring.numel()).view_as(identified.ring)
-
-
 def _missing(scene: Scene, identified: Identified, views: Views) -> _Missing:
     """The places in the frames where the views put markers that they lack."""
     markers, camera, seen = scene.table[scene.target], scene.camera, views.seen
