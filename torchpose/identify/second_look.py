@@ -15,7 +15,7 @@ from torchpose.camera import Camera
 from torchpose.detect import Candidates
 from torchpose.geometry import conics
 from torchpose.geometry.arguments import checked
-from torchpose.geometry.segments import marked, near_pairs
+from torchpose.geometry.segments import near_pairs
 from torchpose.identify.assignments import Codes, Marks
 from torchpose.identify.copies import MIN_MARKERS
 from torchpose.identify.hypotheses import PLACE_TOLERANCE, SIZE_TOLERANCE
