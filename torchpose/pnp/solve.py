@@ -29,7 +29,7 @@ from torchpose.pnp.result import PnPCode, PnPError, PnPResult
 from torchpose.pnp.second_pass import second_pass
 from torchpose.pnp.starts import as_poses, batch_first, of_planes, planes, starts
 from torchpose.pnp.third_pass import every_start, firm, start_roughly, third_pass, verdicts
-from torchpose.pnp.verdict import Bad, Found, Minima, Table, choose, write
+from torchpose.pnp.verdict import Bad, Found, Minima, Table, choose, relevant, write
 
 Method = Literal["iterative", "planar", "dlt", "p3p", "epnp", "posit"]
 _CLOSED_FORMS: dict[str, Callable[[Tensor, Tensor, Tensor | None], Candidates]] = {
@@ -77,7 +77,7 @@ def solve(
         weights: (N,) or (B, N), factors on the information of the points.
         mask: (B, N) bool, True where the point was seen; what a missing point holds is ignored.
         initial: R (B, 3, 3), t (B, 3) to start from, with method "iterative", or S starts (B, S, 3, 3), (B, S, 3) each;
-            only their own minima are then found.
+            only their own minima are then found, and a start far above another one is left when it gains nothing.
         huber: residual, in standard deviations, above which the cost of a point grows linearly.
         max_iterations: of Levenberg-Marquardt, float32 and float64 together about.
         compile: one C++ loop (`torchpose.kernels`), made in seconds for each number of points; on the CPU, up to 128.
@@ -274,12 +274,19 @@ def _solve_chunk(
         poses = _centred(problem, torch.cat([r.permute(2, 3, 1, 0), t.permute(2, 1, 0)[:, None]], 1))
     elif not planes(problem):
         poses = starts(problem)
-    # the first pass has room for two starts
-    if max_iterations <= EVALUATIONS or (poses is not None and poses.shape[2] > 2):
+    # of several starts that are given, the minimum of each is wanted that may matter beside the best of them
+    if max_iterations <= EVALUATIONS or (initial is not None and initial[0].ndim == 4):
         poses = starts(problem) if poses is None else poses
         options, batch = poses.shape[2:]
         every = problem.final.select(torch.arange(batch, device=poses.device).repeat(options))
-        flat = minimise(every, upright(poses.double()).flatten(2), max_iterations=max_iterations, compile=compile)
+        cost = normal_equations(problem.final.each(), poses.double())[COST].nan_to_num(nan=torch.inf)
+        flat = minimise(
+            every,
+            upright(poses.double()).flatten(2),
+            max_iterations=max_iterations,
+            enough=relevant(cost.amin(0)).repeat(options),
+            compile=compile,
+        )
         ends = (flat.pose, flat.normal[COST], flat.iterations, flat.converged)
         minima = choose(problem.final, Found(*(v.unflatten(-1, (options, batch)) for v in ends)), compile)
         _finish(problem, minima, _bad(problem, poses, least), table, compile)
