@@ -54,6 +54,14 @@ class MarkerNormals(Rows):
         """Of noise with so many times the variance."""
         return type(self)(self.information / variance[:, None, None, None], self.right / variance[:, None, None])
 
+    def scattered(self, by: Float[Tensor, "N M n e"]) -> Self:
+        """Of markers that each have e more numbers of unit variance that move it by these columns (Woodbury 1950)."""
+        told = self.information @ by
+        inner = by.mT @ told
+        inner.diagonal(dim1=-2, dim2=-1).add_(1)
+        taken = told @ torch.linalg.solve(inner, torch.cat([told.mT, by.mT @ self.right[..., None]], -1))
+        return type(self)(self.information - taken[..., :-1], self.right - taken[..., -1])
+
     @classmethod
     def laid_out(cls, information: Tensor, right: Tensor, mask: Tensor) -> Self:
         """Of the parts (K, n, n), (K, n) of the markers seen, in the order of the mask (N, M)."""

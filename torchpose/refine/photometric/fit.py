@@ -54,6 +54,8 @@ from torchpose.refine.photometric.sectors import (
     away_from_unclear,
     clear_sectors,
     doubtful,
+    in_step,
+    of_more,
     overdispersion,
     sum_sectors,
     trust,
@@ -237,12 +239,18 @@ def _refined(
     if stages[-1].tempered:  # its weights have what the rims scatter by
         even = overdispersion(fit.sectors.scaled(fit.clear.to(fit.factor)), fit.variance[owner], owner, rows)[1]
     covariance, determined = found.covariance()
-    covariance = wider[:, None, None] * covariance[:, :6, :6]
+    covariance = wider[:, None, None] * covariance
     kept, usable = (segment_sum((x > 0).sum(-1), owner, rows) for x in (fit.weight, fit.usable))
-    good = determined & covariance.isfinite().all(-1).all(-1)
     spread = cast(Spread, found.unknowns.own["blur"])
     part = cast(Eliminated, found.normal.eliminated)
     normals = of_markers(fit.sums, fit.variance, part, fit.mask, found.step.own).over(wider)
+    if bool((even == 0).any()):
+        by = _shifts(fit, pose, wider, even == 0)
+        at = covariance[:, None, :6] @ (normals.information @ by)[..., : covariance.shape[-1], :]
+        covariance = covariance[:, :6, :6] + (at @ at.mT).sum(1)
+        normals = normals.scattered(by)
+    covariance = covariance[:, :6, :6]
+    good = determined & covariance.isfinite().all(-1).all(-1)
     seen, of_them = (segment_sum(b.valid.sum(-1).double(), owner, rows) for b in (fit.blocks, fit.coarse))
     more = (seen / of_them.clamp_min(1)).clamp_min(1)
     doubt = doubtful(fit.sectors, fit.clear, fit.variance[owner], owner, found.step.own_chi2, more)
@@ -250,6 +258,23 @@ def _refined(
     gain = found.unknowns.values("gain")[:, 0] if fit.gain else None
     refined = Refined(pose.R, pose.t, covariance, spread.covariance, noise, kept, good, doubt, normals, gain, even)
     return _Result(refined, fit.look(spread, found.unknowns.values("levels")), fit.misshapen)
+
+
+def _shifts(fit: _Fit, pose: Pose, wider: Tensor, rows: Tensor) -> Tensor:
+    """Motions (N, M, n, 2) of single markers by one deviation of the shifts along u and v that rings of the rows (N,)
+    bool have beyond the scatter of their edges, by which their noise is ``wider`` (N,): see `sectors.in_step`.
+    """
+    row = fit.blocks.row
+    factor, freedom, alone = in_step(
+        fit.sectors.scaled(fit.factor), fit.variance[row], fit.blocks.rings, row, len(wider)
+    )
+    beyond = (factor - wider[:, None]).clamp_min(0)
+    beyond = torch.where(rows[:, None] & of_more(factor, freedom), beyond, 0.0)
+    arm = (pose.R[row] @ fit.blocks.center[..., None])[..., 0]
+    away = arm[:, 2:] + pose.t[row, 2:]
+    mm = (beyond[row] * alone).sqrt() * away / fit.focal
+    by = torch.nn.functional.pad(torch.diag_embed(mm), (0, 0, 0, POSE - 1))
+    return by.new_zeros(*fit.mask.shape, POSE + 1, 2).index_put(tuple(fit.mask.nonzero().unbind(-1)), by)
 
 
 def _minimised(fit: _Fit, start: Pose, spread: Spread, stages: tuple[_Stage, ...], levels: Tensor | None) -> Minimum:
@@ -287,6 +312,7 @@ class _Fit:
         self.mask, self.band, self.by = sight.mask, band, sight.reduction
         self.blocks = gather_pixels(sight, band, TILE)
         self.coarse = self.blocks.every(_COARSE, most_coarse, whole=TILE)
+        self.focal = sight.camera.matrix.diagonal()[:2]
         self.prior = prior
         self.gain = prior is not None and prior.more
         self.stage = _QUICK[0]
