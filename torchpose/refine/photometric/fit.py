@@ -37,6 +37,7 @@ from torchpose.geometry.least_squares import (
 from torchpose.geometry.robust import of_chance
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import marked, segment_mean, segment_sum
+from torchpose.pose import MarkerNormals
 from torchpose.refine.photometric.band import band_width
 from torchpose.refine.photometric.grey_levels import (
     TILE,
@@ -47,7 +48,7 @@ from torchpose.refine.photometric.grey_levels import (
     noise_spread,
     sum_products,
 )
-from torchpose.refine.photometric.light import LEVELS, POSE, normal_equations, of_markers
+from torchpose.refine.photometric.light import LEVELS, POSE, normal_equations, of_markers, pulled_by_levels
 from torchpose.refine.photometric.ring_model import gather_pixels, ring_model
 from torchpose.refine.photometric.sectors import (
     Sectors,
@@ -55,6 +56,7 @@ from torchpose.refine.photometric.sectors import (
     clear_sectors,
     doubtful,
     in_step,
+    level_scatter,
     of_more,
     overdispersion,
     sum_sectors,
@@ -244,11 +246,12 @@ def _refined(
     spread = cast(Spread, found.unknowns.own["blur"])
     part = cast(Eliminated, found.normal.eliminated)
     normals = of_markers(fit.sums, fit.variance, part, fit.mask, found.step.own).over(wider)
-    if bool((even == 0).any()):
-        by = _shifts(fit, pose, wider, even == 0)
-        at = covariance[:, None, :6] @ (normals.information @ by)[..., : covariance.shape[-1], :]
-        covariance = covariance[:, :6, :6] + (at @ at.mT).sum(1)
-        normals = normals.scattered(by)
+    rough = even == 0
+    if bool(rough.any()):
+        more = _beyond_rims(fit, found, normals, wider) * rough[:, None, None, None]
+        n = covariance.shape[-1]
+        covariance = covariance + covariance @ more.sum(1)[:, :n, :n] @ covariance
+        normals = normals.scattered(more)
     covariance = covariance[:, :6, :6]
     good = determined & covariance.isfinite().all(-1).all(-1)
     seen, of_them = (segment_sum(b.valid.sum(-1).double(), owner, rows) for b in (fit.blocks, fit.coarse))
@@ -260,21 +263,22 @@ def _refined(
     return _Result(refined, fit.look(spread, found.unknowns.values("levels")), fit.misshapen)
 
 
-def _shifts(fit: _Fit, pose: Pose, wider: Tensor, rows: Tensor) -> Tensor:
-    """Motions (N, M, n, 2) of single markers by one deviation of the shifts along u and v that rings of the rows (N,)
-    bool have beyond the scatter of their edges, by which their noise is ``wider`` (N,): see `sectors.in_step`.
+def _beyond_rims(fit: _Fit, found: Minimum, normals: MarkerNormals, wider: Tensor) -> Tensor:
+    """Covariance (N, M, n, n) of the right sides of the normals by noise that the scatter along the rims, by which it
+    is ``wider`` (N,), does not show: in step along lines, and in the levels of ring and paper.
     """
-    row = fit.blocks.row
-    factor, freedom, alone = in_step(
-        fit.sectors.scaled(fit.factor), fit.variance[row], fit.blocks.rings, row, len(wider)
-    )
-    beyond = (factor - wider[:, None]).clamp_min(0)
-    beyond = torch.where(rows[:, None] & of_more(factor, freedom), beyond, 0.0)
-    arm = (pose.R[row] @ fit.blocks.center[..., None])[..., 0]
-    away = arm[:, 2:] + pose.t[row, 2:]
+    row, pose, rows = fit.blocks.row, found.unknowns.pose, len(wider)
+    factor, freedom, alone = in_step(fit.sectors.scaled(fit.factor), fit.variance[row], fit.blocks.rings, row, rows)
+    beyond = torch.where(of_more(factor, freedom), (factor - wider[:, None]).clamp_min(0), 0.0)
+    away = (pose.R[row] @ fit.blocks.center[..., None])[:, 2] + pose.t[row, 2:]
     mm = (beyond[row] * alone).sqrt() * away / fit.focal
-    by = torch.nn.functional.pad(torch.diag_embed(mm), (0, 0, 0, POSE - 1))
-    return by.new_zeros(*fit.mask.shape, POSE + 1, 2).index_put(tuple(fit.mask.nonzero().unbind(-1)), by)
+    shifts = torch.nn.functional.pad(torch.diag_embed(mm), (0, 0, 0, POSE - 1))
+    every = shifts.new_zeros(*fit.mask.shape, POSE + 1, 2).index_put(tuple(fit.mask.nonzero().unbind(-1)), shifts)
+    shares = (fit.of_ring, 1 - fit.of_ring)
+    spread = [level_scatter(fit.sectors, fit.weight * s, fit.residual, fit.variance[row], row, rows) for s in shares]
+    levels = (torch.stack(spread, -1) / wider[:, None] - 1).clamp_min(0)[row]
+    part = cast(Eliminated, found.normal.eliminated)
+    return normals.by_motions(every) + pulled_by_levels(fit.sums, wider * fit.variance, part, fit.mask, levels)
 
 
 def _minimised(fit: _Fit, start: Pose, spread: Spread, stages: tuple[_Stage, ...], levels: Tensor | None) -> Minimum:
@@ -344,6 +348,7 @@ class _Fit:
         model = ring_model(part, pose.R, pose.t, spread, check=True)
         columns, slope = columns_of(part, model, levels)
         residual = columns[:, :, -2].flatten(1)
+        self.residual, self.of_ring = residual, columns[:, :, POSE].flatten(1)
         noise = noise_spread(residual, part), model_misfit(levels)
         self.usable, self.weight = inliers(residual, part, model, *noise)
         if stage.coarse:  # the first steps begin with what was seen so far, the others see for themselves

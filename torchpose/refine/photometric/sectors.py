@@ -159,12 +159,8 @@ def overdispersion(sectors: Sectors, variance: Tensor, row: Tensor, rows: int) -
     pull, hold = (v.double().unflatten(1, (2, -1, _CELL)).sum(-1) for v in (sectors.pull, sectors.hold))
     hold = hold / variance[:, None, None]
     error = torch.where(hold > 0, pull / variance[:, None, None] / hold.clamp_min(_TINY), 0.0)
-    basis = _harmonics(hold)
-    weighted = hold[..., None] * basis
-    right = (weighted * error[..., None]).sum(-2)
-    taken = (solve_scaled((weighted.mT @ basis).flatten(0, 1), right.flatten(0, 1)).view_as(right) * right).sum(-1)
-    chi2 = segment_sum(((hold * error.square()).sum(-1) - taken).sum(-1), row, rows)
-    freedom = segment_sum(((hold > 0).sum(-1) - basis.shape[-1]).clamp_min(0).sum(-1).double(), row, rows).clamp_min(1)
+    each, free = _beyond_harmonics(error, hold)
+    chi2, freedom = segment_sum(each, row, rows), segment_sum(free, row, rows).clamp_min(1)
     factor = chi2 / freedom
     more = of_more(factor, freedom)
     return torch.where(more, factor, 1.0), torch.where(more, 0.0, freedom)
@@ -176,6 +172,18 @@ def of_more(factor: Tensor, freedom: Tensor) -> Tensor:
     A wrong factor costs little, and comes once in forty frames.
     """
     return factor > 1 + 0.5 * CUT * (2 / freedom.clamp_min(1)).sqrt()
+
+
+def _beyond_harmonics(error: Tensor, hold: Tensor) -> tuple[Tensor, Tensor]:
+    """Chi-squared (K,) of errors (K, 2, C) around two circles, of variance 1 / hold, with a mean and two harmonics of
+    each taken off, and its degrees of freedom (K,).
+    """
+    basis = _harmonics(hold)
+    weighted = hold[..., None] * basis
+    right = (weighted * error[..., None]).sum(-2)
+    taken = (solve_scaled((weighted.mT @ basis).flatten(0, 1), right.flatten(0, 1)).view_as(right) * right).sum(-1)
+    free = ((hold > 0).sum(-1) - basis.shape[-1]).clamp_min(0).sum(-1).double()
+    return ((hold * error.square()).sum(-1) - taken).sum(-1), free
 
 
 def _harmonics(around: Tensor) -> Tensor:
@@ -227,6 +235,28 @@ def in_step(
     total = expected.sum(1).clamp_min(_TINY)
     freedom = total.square() / expected.square().sum(1).clamp_min(_TINY)
     return found.square().sum(1) / total, freedom, 1 / alone.sum((-1, -2)).mT.clamp_min(_TINY)
+
+
+def level_scatter(
+    sectors: Sectors, weight: Tensor, residual: Tensor, variance: Tensor, row: Tensor, rows: int
+) -> Tensor:
+    """Mean square (N,) of the sums of residuals over cells, over that of independent pixels.
+
+    Correlated noise pulls at the levels of ring and paper by more than at an edge, which it shifts only where it
+    differs from one side to the other. What the levels themselves may take is taken off as in `overdispersion`.
+
+    Args:
+        weight: (K, P) of the pixels, by their share of the ring, or of the paper. residual: (K, P), grey levels.
+            variance: (K,) of noise. row: (K,) of ``rows``.
+    """
+    planes = weight * residual, weight.square() * variance[:, None].to(weight)
+    flat, empty = sectors.cell.flatten(), torch.zeros_like(sectors.used)
+    sums, usual = (
+        empty.flatten().scatter_add(0, flat, plane.flatten()).view(len(row), 2, -1, _CELL).sum(-1).double()
+        for plane in planes
+    )
+    chi2, freedom = _beyond_harmonics(torch.where(usual > 0, sums / usual.clamp_min(_TINY), 0.0), usual)
+    return segment_sum(chi2, row, rows) / segment_sum(freedom, row, rows).clamp_min(1)
 
 
 def _edges(rings: Tensor) -> tuple[Tensor, Tensor]:
