@@ -21,7 +21,7 @@ from mkdocs.structure.files import File, Files
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PACKAGE = ROOT / "torchpose"
-TOP_PAGES = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md", "README.md": "index.md"}
+TOP_PAGES = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md", "README.md": "readme.md"}
 # rooms in the order in which a frame passes them; those of the program itself (cli, report, studies) are no library
 ROOMS = [
     *("pipeline", "results", "camera", "target", "handeye", "errors", "ellipse", "pnp", "detect", "rings", "identify"),
@@ -60,7 +60,7 @@ def on_files(files: Files, *, config: Any) -> Files:
     """Adds the pages that are made."""
     pages = {"commands.md": command_reference(), "api/index.md": api_index()}
     pages |= {f"api/{room}.md": api_page(room) for room in rooms()}
-    pages |= {place: top_page(name) for name, place in TOP_PAGES.items() if place != "index.md"}
+    pages |= {place: top_page(name) for name, place in TOP_PAGES.items()}
     for path in notebooks():
         files.remove(files.src_uris[f"notebooks/{path.name}"])  # its page is enough
         text, pictures = notebook_page(path)
@@ -140,13 +140,22 @@ def homes(path: Path) -> dict[str, str]:
     return {alias.name: node.module for node in imports for alias in node.names if node.module}
 
 
-def enums(module: str) -> set[str]:
-    """Classes of a module that are lists of names."""
+def enum_members(module: str, name: str) -> str:
+    """A table of the members of a class that is a list of names, with the comments beside them; nothing for others."""
     path = ROOT / f"{module.replace('.', '/')}.py"
     if not path.exists():
-        return set()
-    classes = [n for n in ast.parse(path.read_text(encoding="utf-8")).body if isinstance(n, ast.ClassDef)]
-    return {node.name for node in classes if any("Enum" in ast.unparse(base) for base in node.bases)}
+        return ""
+    text = path.read_text(encoding="utf-8")
+    classes = [n for n in ast.parse(text).body if isinstance(n, ast.ClassDef) and n.name == name]
+    members = [
+        (node.targets[0], node.value, text.splitlines()[node.lineno - 1].partition("  # ")[2])
+        for found in classes
+        if any("Enum" in ast.unparse(base) for base in found.bases)
+        for node in found.body
+        if isinstance(node, ast.Assign)
+    ]
+    rows = "".join(f"| `{ast.unparse(key)}` | {ast.unparse(value)} | {told} |\n" for key, value, told in members)
+    return f"| name | value | |\n| --- | --- | --- |\n{rows}\n" if rows else ""
 
 
 def about(path: Path) -> str:
@@ -178,11 +187,8 @@ def api_page(room: str) -> str:
 
 def _entry(module: str, name: str, home: str) -> str:
     """One name under the module that hands it on, which is where a user imports it from."""
-    options = {"heading": f"{module}.{name}", "toc_label": name}
-    if name in enums(home):
-        options |= {"show_if_no_docstring": "true", "show_attribute_values": "true"}
-    lines = "".join(f"      {key}: {value}\n" for key, value in options.items())
-    return f"::: {home}.{name}\n    options:\n{lines}\n"
+    options = f"      heading: {module}.{name}\n      toc_label: {name}\n"
+    return f"::: {home}.{name}\n    options:\n{options}\n{enum_members(home, name)}"
 
 
 # --- commands
