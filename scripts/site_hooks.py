@@ -124,7 +124,7 @@ def module_file(room: str) -> Path:
 
 
 def exported(path: Path) -> list[str]:
-    """Public names of a module, read without importing it: those of `__all__`, or what it defines without underscore."""
+    """Public names of a module, read without importing it: those of `__all__`, or what it defines."""
     body = ast.parse(path.read_text(encoding="utf-8")).body
     for node in body:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
@@ -169,7 +169,7 @@ def api_index() -> str:
     return (
         "# API\n\nWhat every function and class of the library takes and returns, from its docstring. "
         "What `torchpose` itself exports is public. A stage is usable alone, but may still change.\n\n"
-        "Shapes stand in the annotations: `Float[Tensor, \"B 3 3\"]` is a floating-point tensor of B matrices. "
+        'Shapes stand in the annotations: `Float[Tensor, "B 3 3"]` is a floating-point tensor of B matrices. '
         "Lengths are mm, angles rad; [Conventions](../conventions.md) has the rest.\n\n"
         f"| room | what is in it |\n| --- | --- |\n{rows}"
     )

@@ -1,7 +1,7 @@
 """What the documentation shows works: its commands, its Python, its files, page by page, as a reader would type them.
 
-Pages that lead a reader (the tutorial, tasks, explanations) run as they stand, block after block in one folder. Of all other
-pages every command line has to be one that the program takes.
+Pages that lead a reader (the tutorial, tasks, explanations) run as they stand, block after block in one folder. Of all
+other pages every command line has to be one that the program takes.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ GIVEN = {  # what the text around a page's blocks says is there already
     "prints.md": """
 import cv2, torch
 import torchpose as tp
-estimator = tp.PoseEstimator(tp.Camera.load("data/sample/camera.yaml"), [tp.Target.load("quad40"), tp.Target.load("hexa50")])
+targets = [tp.Target.load("quad40"), tp.Target.load("hexa50")]
+estimator = tp.PoseEstimator(tp.Camera.load("data/sample/camera.yaml"), targets)
 names = [f"data/sample/frames/{k:03d}.png" for k in range(2)]
 poses = estimator(torch.stack([torch.from_numpy(cv2.imread(name, cv2.IMREAD_GRAYSCALE)) for name in names]))
 i, j = 0, 2

@@ -56,8 +56,8 @@ def _plot_places(panel: Any, found: Measurement) -> None:
     )
     for marker, at, z, known in zip(found.target.ids.tolist(), nominal, off[:, 2], sigma[:, 2], strict=True):
         text = f"{marker}: z {1e3 * float(z):+.1f} +- {1e3 * float(known):.1f} um"
-        panel.annotate(text, at[:2].tolist(), xytext=(4, -10), textcoords="offset points", fontsize=7)
-    room = 1.5 * _LONGEST * extent
+        panel.annotate(text, at[:2].tolist(), xytext=(0, -16), textcoords="offset points", fontsize=8, ha="center")
+    room = 2 * _LONGEST * extent  # for the longest arrow and the numbers
     (left, top), (right, bottom) = ((nominal[:, :2].amin(0) - room).tolist(), (nominal[:, :2].amax(0) + room).tolist())
     panel.set(xlim=(left, right), ylim=(bottom, top), xlabel="x, mm", ylabel="y, mm")
     panel.set_aspect("equal", "box")
@@ -88,7 +88,8 @@ def _plot_residuals(panel: Any, found: Measurement) -> None:
 def _plot_correlation(panel: Any, found: Measurement) -> None:
     names, whole = _whole(found)
     scale = whole.diagonal().clamp_min(1e-300).rsqrt()
-    panel.imshow((whole * scale[:, None] * scale).tolist(), cmap="RdBu_r", vmin=-1, vmax=1)
+    shown = panel.imshow((whole * scale[:, None] * scale).tolist(), cmap="RdBu_r", vmin=-1, vmax=1)
+    panel.figure.colorbar(shown, ax=panel, shrink=0.8)
     size = max(3, min(8, 240 // len(names)))
     panel.set_xticks(range(len(names)), names, rotation=90, fontsize=size)
     panel.set_yticks(range(len(names)), names, fontsize=size)
