@@ -33,7 +33,8 @@ def plot_precision(found: PrecisionMap, title: str, volume: WorkingVolume | None
             panel.plot(*zip(*ends, strict=True), "*", **_MARK, clip_on=False)
     for k, panel in enumerate(axes[1] if with_places else ()):
         _plot(panel, *by_place, found.by_place[..., k], _PANELS[k])
-        panel.set_title(f"at {float(found.distance[-1]):g} mm, all tilts", fontsize=10)
+        far = float(found.distance[-1]) if volume is None else volume.distance[1]
+        panel.set_title(f"at {far:g} mm, all tilts", fontsize=10)
         if len(found.x) > 1 and len(found.y) > 1:
             panel.invert_yaxis()  # as in the frame
     asked = "" if volume is None or surroundings(volume) == volume else "; stars: what was asked for"
