@@ -22,8 +22,9 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PACKAGE = ROOT / "torchpose"
 TOP_PAGES = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md", "README.md": "readme.md"}
-# rooms in the order in which a frame passes them; those of the program itself (cli, report, studies) are no library
-ROOMS = [
+NO_LIBRARY = {"cli", "config", "report", "studies", "__init__", "__main__"}  # parts of the program itself
+# in the order in which a frame passes them; others follow
+ORDER = [
     *("pipeline", "results", "camera", "target", "handeye", "errors", "ellipse", "pnp", "detect", "rings", "identify"),
     *("pose", "refine", "geometry", "grids", "kernels", "sim", "datasets", "analysis", "design", "calibration"),
     *("io", "rig"),
@@ -116,7 +117,9 @@ def title(path: Path) -> str:
 
 
 def rooms() -> list[str]:
-    return ROOMS
+    """Every part of the package that is a library."""
+    there = {path.stem for path in PACKAGE.glob("*.py")} | {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
+    return [*(room for room in ORDER if room in there), *sorted(there - {*ORDER} - NO_LIBRARY)]
 
 
 def module_file(room: str) -> Path:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypedDict
 
 import typer
 
@@ -29,19 +30,20 @@ from torchpose.cli.common import (
 if TYPE_CHECKING:  # imported where they are used: torch takes more than a second, which --help need not wait for
     from torchpose.camera import Camera
     from torchpose.handeye import HandEye
-    from torchpose.io import reader
+    from torchpose.io.estimates import Estimation
     from torchpose.io.misfits import Misfits
-    from torchpose.io.rows import Row
     from torchpose.io.sources import Source
+    from torchpose.io.storage import Place
     from torchpose.io.store import ResultStore
-    from torchpose.pipeline import PoseEstimator
-    from torchpose.report import overlay as pictures
-    from torchpose.results import Poses
+    from torchpose.io.tally import Tally
     from torchpose.target import Target
 
+_OUT = "Table of the poses: .csv, .jsonl or .parquet, on a disk or in a store; with --engine ray a folder of parts."
+_ENGINE = "What runs the work: this process, or the workers of a Ray cluster (extra: ray)."
+_ADDRESS = "With --engine ray: a cluster that is there; without it, one starts here and ends with the command."
 _INPUTS = (
     "Image files (PNG, TIFF, BMP, JPEG, PGM; 8 or 16 bit, grey or colour), folders of them, searched recursively and "
-    "taken in natural order, or capture manifests (.jsonl)."
+    "taken in natural order, or capture manifests (.jsonl); paths, or URLs such as s3://BUCKET/FOLDER."
 )
 _CAMERA = (
     "Camera file: OpenCV YAML, JSON or XML, ROS camera_info, Kalibr camchain, COLMAP cameras.txt and others "
@@ -64,12 +66,17 @@ _RELATIVE = "Name of a target: give the poses of the others (of their parts) in 
 _DETECTIONS = "Table of the markers found: .csv, .jsonl or .parquet."
 
 
+class Engine(StrEnum):
+    local = "local"
+    ray = "ray"
+
+
 def estimate(
-    inputs: Annotated[list[Path], typer.Argument(metavar="INPUT...", help=_INPUTS)],
+    inputs: Annotated[list[str], typer.Argument(metavar="INPUT...", help=_INPUTS)],
     camera: Annotated[str, typer.Option(help=_CAMERA)],
     target: Annotated[list[str], typer.Option(help=_TARGET)],
-    out: Annotated[Path, typer.Option(help="Table of the poses: .csv, .jsonl or .parquet.")],
-    detections: Annotated[Path | None, typer.Option(help=_DETECTIONS)] = None,
+    out: Annotated[str, typer.Option(help=_OUT)],
+    detections: Annotated[str | None, typer.Option(help=_DETECTIONS)] = None,
     overlay: Overlay = None,
     instances: Annotated[int, typer.Option(min=1, max=1000, metavar="K", help=_INSTANCES)] = 1,
     assume_upright: Annotated[bool, typer.Option("--assume-upright", help=_UPRIGHT)] = False,
@@ -81,6 +88,8 @@ def estimate(
     srgb: Annotated[bool, typer.Option("--srgb", help="The same as --tone srgb.")] = False,
     batch: Batch = None,
     threads: Threads = None,
+    engine: Annotated[Engine, typer.Option(help=_ENGINE)] = Engine.local,
+    address: Annotated[str | None, typer.Option(help=_ADDRESS)] = None,
     quiet: Silent = False,
 ) -> int:
     """Measure the pose of ring targets in every frame, with its uncertainty.
@@ -90,31 +99,81 @@ def estimate(
     """
     from torchpose.camera import Camera
     from torchpose.cli.terminal import native_stderr_silenced
-    from torchpose.io.writers import check_table_path
+    from torchpose.io.estimates import Estimation
+    from torchpose.io.storage import place_of
     from torchpose.target import Target
 
-    for path, option in ((out, "--out"), (detections, "--detections")):
-        if path is not None:
-            check_table_path(path, option)
-    lens, targets, sources = Camera.load(camera), [Target.load(name) for name in target], frames_of(inputs)
+    places = [place_of(name) for name in inputs]
+    on_ray, tables = engine is Engine.ray, _Tables.of(out, detections)
+    _check_engine(address, overlay, on_ray=on_ray)
+    if not on_ray:
+        tables.check()
+    lens, targets, sources = Camera.load(camera), [Target.load(name) for name in target], frames_of(places)
     if assume_upright:
         targets = [one.upright() for one in targets]
     lens = with_tone(lens, "srgb" if srgb and tone is None else tone)
     lens = lens if lens.tone is not None else _with_judged_tone(lens, targets[0], sources)
     _check_relative(relative_to, targets, hand_eye, instances)
-    work = _Work(
-        lens, targets, sources, _load_hand_eye(hand_eye, sources), method, instances, relative_to, assume_upright
-    )
-    check_outputs(inputs, sources, [p for p in (out, detections) if p is not None], overlay)
+    base = _load_hand_eye(hand_eye, sources)
+    work = Estimation(lens, targets, base, method, instances, relative_to, assume_upright)
+    check_outputs(places, sources, tables.paths, overlay)
+    how: _How = {"resume": resume, "batch": batch, "threads": threads or cores(), "quiet": quiet}
     with native_stderr_silenced():
-        return _run(work, out, detections, overlay, resume=resume, batch=batch, threads=threads or cores(), quiet=quiet)
+        if on_ray:
+            return _run_on_ray(work, sources, tables, address, **how)
+        return _run(work, sources, tables, overlay, **how)
+
+
+class _How(TypedDict):
+    """Options that rows do not depend on."""
+
+    resume: bool
+    batch: int | None
+    threads: int
+    quiet: bool
+
+
+@dataclass(frozen=True)
+class _Tables:
+    """Where the tables of a run go: paths, or places in a store."""
+
+    out: Path | Place
+    detections: Path | Place | None
+
+    @classmethod
+    def of(cls, out: str, detections: str | None) -> _Tables:
+        from torchpose.io.storage import place_of
+
+        return cls(place_of(out), None if detections is None else place_of(detections))
+
+    @property
+    def paths(self) -> list[Path]:
+        """Those on a disk."""
+        return [path for path in (self.out, self.detections) if isinstance(path, Path)]
+
+    def check(self) -> None:
+        """Raises ConfigError unless both can be written."""
+        from torchpose.io.writers import check_table_path
+
+        for path, option in ((self.out, "--out"), (self.detections, "--detections")):
+            if isinstance(path, Path):
+                check_table_path(path, option)
+
+
+def _check_engine(address: str | None, overlay: Path | None, *, on_ray: bool) -> None:
+    from torchpose.errors import ConfigError
+
+    if address is not None and not on_ray:
+        raise ConfigError("--address: is of --engine ray alone; add it or leave --address out")
+    if overlay is not None and on_ray:
+        raise ConfigError("--overlay: is not drawn by --engine ray; run a part of the frames with --engine local")
 
 
 def _with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -> Camera:
     """The camera with the tone that the frames tell, where their kind of file makes one likely; says what it took."""
-    from torchpose.io.images import UnreadableImageError, WrongSizeError, likely_encoded
+    from torchpose.io.images import UnreadableImageError, WrongSizeError
 
-    if not sources or not likely_encoded(sources[0].path):
+    if not sources or not sources[0].likely_encoded():
         return lens
     from dataclasses import replace
 
@@ -147,47 +206,10 @@ def _with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -
     return replace(lens, tone=tone or LINEAR)
 
 
-@dataclass(frozen=True)
-class _Work:
-    """What the rows depend on."""
-
-    camera: Camera
-    targets: list[Target]
-    sources: list[Source]
-    hand_eye: HandEye | None
-    method: str
-    instances: int
-    relative_to: str | None
-    upright: bool
-
-    @property
-    def rows_of(self) -> list[Target]:
-        """Targets that have rows."""
-        return [target for target in self.targets if target.name != self.relative_to]
-
-    def origin(self, detections: bool) -> dict[str, Any]:
-        """The same for `ResultStore`. Names are those that its error messages shall say."""
-        from importlib.metadata import version
-
-        return {
-            "torchpose version": version("torchpose"),
-            "--camera": _digest(self.camera),
-            "--target": [[target.name, _digest(target)] for target in self.targets],
-            "--hand-eye": None if self.hand_eye is None else _digest(self.hand_eye),
-            "--method": self.method,
-            "--tone": str(self.camera.tone or "linear"),
-            "--instances": self.instances,
-            "--relative-to": self.relative_to,
-            "--assume-upright": self.upright,
-            "--detections": detections,
-            "INPUT": sorted({str(source.root) for source in self.sources}),
-        }
-
-
 def _run(
-    work: _Work,
-    out: Path,
-    detections: Path | None,
+    work: Estimation,
+    sources: list[Source],
+    tables: _Tables,
     overlay: Path | None,
     *,
     resume: bool,
@@ -202,16 +224,18 @@ def _run(
     from torchpose.camera import LINEAR
     from torchpose.cli.terminal import FrameProgress
     from torchpose.io.reader import FrameReader, default_batch, in_batches
+    from torchpose.io.staged import Staged
     from torchpose.report.overlay import Overlay
 
     cv2.setNumThreads(1)  # frames are decoded side by side; threads inside of one would only compete
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     # decoding is the larger part of the work; torch's threads wait actively and would take its cores away
     use_threads(threads, share=0.5)
-    camera, targets, sources = work.camera, work.targets, work.sources
-    tone, estimator = camera.tone or LINEAR, _estimator(work)
+    camera, targets = work.camera, work.targets
+    tone, estimator = camera.tone or LINEAR, work.estimator()
     painter = None if overlay is None else Overlay(camera, targets, overlay, threads=threads)
-    store = _opened(work, out, detections, resume)
+    staged = Staged(tables.out, tables.detections, resume=resume)
+    store = _opened(work, sources, staged.out, staged.detections, resume)
     # a resumed run works on the same batches as one that was not interrupted, so that rows agree to the last bit
     batches = in_batches(sources, batch or default_batch(camera.width, camera.height))
     pending = [one for one in batches if any(source.name not in store for source in one)]
@@ -219,68 +243,110 @@ def _run(
     try:
         with FrameProgress(len(sources), len(store), quiet=quiet) as progress, torch.inference_mode():
             for frames in reader:
-                records = _records(frames, estimator, work, painter)
+                records = work.records(frames, estimator, None if painter is None else painter.write)
                 new = [record for record in records if record["frame"] not in store]
                 store.append(new)
-                progress.advance(len(new), store.counts)
+                progress.advance(len(new), store.tally.counts)
         store.finish([source.name for source in sources])
+        staged.send()
     except KeyboardInterrupt:
         return interrupted(f"{len(store)} of {len(sources)} frames are kept; add --resume to go on")
     finally:
         store.close()
-    progress.summary(store.counts, out)
-    _tell_mistakes(store, out, work)
-    if not quiet:
-        _tell_crowded(store.crowded, store.most, work)
-        _tell_misfits(store.misfits, work)
-    return ended(store.unreadable)
-
-
-def _opened(work: _Work, out: Path, detections: Path | None, resume: bool) -> ResultStore:
-    """Where the rows go, with those of an earlier run."""
-    from torchpose.io.rows import BASE_SCHEMA, POSE_SCHEMA
-    from torchpose.io.store import ResultStore, stamp_of
-
-    files = {source.name: stamp_of(source.path) for source in work.sources}  # before they are read
-    schema = POSE_SCHEMA | (BASE_SCHEMA if work.hand_eye else {})
-    kept: dict[str, Any] = {"schema": schema, "targets": len(work.rows_of), "files": files}
-    return ResultStore(out, detections, resume=resume, origin=work.origin(detections is not None), **kept)
-
-
-def _tell_mistakes(store: ResultStore, out: Path, work: _Work) -> None:
-    """Tells, on stderr, what is wrong with the run as a whole."""
-    for line in store.whole_run.lines(f"{work.camera.width}x{work.camera.height}"):
-        say(f"torchpose: warning: {line}", err=True)
+    progress.summary(store.tally.counts, tables.out)
     if store.damaged:
-        say(f"torchpose: {store.damaged} damaged lines of {out}.partial left out, their frames done again", err=True)
+        say(
+            f"torchpose: {store.damaged} damaged lines of {staged.out}.partial left out, their frames done again",
+            err=True,
+        )
+    return _told(store.tally, work, len(sources), quiet=quiet)
 
 
-def _estimator(work: _Work) -> PoseEstimator:
-    """Of linear frames: the reader hands on such ones."""
-    from dataclasses import replace
+def _run_on_ray(
+    work: Estimation,
+    sources: list[Source],
+    tables: _Tables,
+    address: str | None,
+    *,
+    resume: bool,
+    batch: int | None,
+    threads: int,
+    quiet: bool,
+) -> int:
+    """The same on the workers of a Ray cluster."""
+    from torchpose.cli.terminal import FrameProgress
+    from torchpose.io.reader import default_batch
+    from torchpose.io.rows import DETECTION_SCHEMA
+    from torchpose.io.tally import Tally
+    from torchpose.scale.cluster import cluster
+    from torchpose.scale.estimate import measured, pending
+    from torchpose.scale.parts import Parts
 
-    from torchpose.pipeline import PoseEstimator
+    poses, marks = Parts.at(tables.out, work.schema), None
+    if tables.detections is not None:
+        marks = Parts.at(tables.detections, DETECTION_SCHEMA, "--detections")
+    origin = work.origin((str(source.root) for source in sources), detections=marks is not None)
+    for parts in (poses, marks):
+        if parts is not None:
+            parts.begin(origin, resume=resume)
+    tally = Tally()
+    blocks = pending(sources, batch or default_batch(work.camera.width, work.camera.height), poses, tally)
+    left = sum(len(block.sources) for block in blocks)
+    with FrameProgress(len(sources), len(sources) - left, quiet=quiet) as progress:
+        try:
+            with cluster(address, threads) as workers:
+                for records in measured(work, blocks, poses, marks, workers=workers):
+                    for frame, rows in records:
+                        tally.add(frame, rows)
+                    left -= len(records)
+                    progress.advance(len(records), tally.counts)
+        except KeyboardInterrupt:
+            return interrupted(f"{len(sources) - left} of {len(sources)} frames are kept; add --resume to go on")
+    for parts in (marks, poses):
+        if parts is not None:
+            parts.finish()
+    progress.summary(tally.counts, tables.out)
+    return _told(tally, work, len(sources), quiet=quiet)
 
-    method: Any = work.method  # it checks
-    lens = replace(work.camera, tone=None)
-    return PoseEstimator(lens, work.targets, instances=work.instances, method=method)
+
+def _opened(
+    work: Estimation, sources: Sequence[Source], out: Path, detections: Path | None, resume: bool
+) -> ResultStore:
+    """Where the rows go, with those of an earlier run."""
+    from torchpose.io.store import ResultStore
+
+    files = {source.name: source.stamp() for source in sources}  # before they are read
+    kept: dict[str, Any] = {"schema": work.schema, "targets": len(work.rows_of), "files": files}
+    origin = work.origin((str(source.root) for source in sources), detections=detections is not None)
+    return ResultStore(out, detections, resume=resume, origin=origin, **kept)
 
 
-def _tell_crowded(frames: set[str], most: dict[str, int], work: _Work) -> None:
-    """Tells, in a line on stderr, of copies that were seen and have no row."""
+def _told(tally: Tally, work: Estimation, frames: int, *, quiet: bool) -> int:
+    """Tells, on stderr, what is wrong with the run as a whole and what its rows say together; the exit code."""
+    for line in tally.whole_run.lines(f"{work.camera.width}x{work.camera.height}"):
+        say(f"torchpose: warning: {line}", err=True)
+    if not quiet:
+        _tell_crowded(tally, frames, work)
+        _tell_misfits(tally.misfits, work)
+    return ended(tally.unreadable)
+
+
+def _tell_crowded(tally: Tally, count: int, work: Estimation) -> None:
+    """Tells, in a line on stderr, of copies that were seen in some of the frames and have no row."""
+    frames, most = tally.crowded, tally.most
     if not frames:
         return
-    seen = ", ".join(f"{count} of {target}" for target, count in most.items())
+    seen = ", ".join(f"{number} of {target}" for target, number in most.items())
     more = max(most.values()) > work.instances
     fix = f"--instances {max(most.values())} looks for all" if more else "no pose explains the others"
     say(
-        f"torchpose: {len(frames)} of {len(work.sources)} frames show more copies of a target than they have rows, "
+        f"torchpose: {len(frames)} of {count} frames show more copies of a target than they have rows, "
         f"up to {seen}; {fix}",
         err=True,
     )
 
 
-def _tell_misfits(misfits: dict[str, Misfits], work: _Work) -> None:
+def _tell_misfits(misfits: dict[str, Misfits], work: Estimation) -> None:
     """Tells, on stderr, what the files leave out that the standard deviations then cannot count."""
     silent = [t.name for t in work.rows_of if t.covariance is None and t.name in misfits and misfits[t.name].frames]
     files = [f"target {', '.join(silent)} (center_sigma, edge_gain_sigma)"] if silent else []
@@ -314,66 +380,6 @@ def _stated(target: Target) -> tuple[float, float]:
     return float((variance[:-1].sum() / len(target)).sqrt()), float(variance[-1].sqrt())
 
 
-def _records(batch: reader.Batch, estimator: PoseEstimator, work: _Work, painter: pictures.Overlay | None) -> list[Row]:
-    """Rows and detections of every frame of a batch, see `ResultStore.append`."""
-    from torchpose.io.rows import detection_rows, fault_row, pose_rows
-
-    names = [target.name for target in work.targets]
-    records: dict[str, Row] = {s.name: {"frame": s.name, "rows": [], "detections": []} for s in batch.sources}
-    for position, fault in batch.faults.items():
-        frame = batch.sources[position].name
-        records[frame]["rows"] = [fault_row(frame, t.name, fault.status, fault.reason) for t in work.rows_of]
-    for positions, frames in batch.groups:
-        sources = [batch.sources[position] for position in positions]
-        frame_names = [source.name for source in sources]
-        poses = estimator(frames).cpu()
-        if painter is not None:
-            painter.write(frames, poses, frame_names)
-        given = _of_parts(poses, work.targets)
-        if work.relative_to is not None:
-            given = given.relative_to(names.index(work.relative_to))
-        rows = pose_rows(given, frame_names, names)
-        if work.hand_eye is not None:
-            _add_base_cells(rows, given, sources, work.hand_eye)
-        for row in rows:
-            records[row["frame"]]["rows"].append(row)
-        for row in detection_rows(poses.detections, frame_names, names):
-            records[row["frame"]]["detections"].append(row)
-    return list(records.values())
-
-
-def _of_parts(poses: Poses, targets: list[Target]) -> Poses:
-    """Poses of the parts, for the targets that say where their part is."""
-    import torch
-
-    parts = [target.part_from_target for target in targets]
-    if not any(parts):
-        return poses
-    still = (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
-    rotation, translation = (torch.stack(tensors) for tensors in zip(*(part or still for part in parts), strict=True))
-    return poses.moved(rotation[poses.target], translation[poses.target])
-
-
-def _add_base_cells(rows: list[Row], poses: Poses, sources: Sequence[Source], hand_eye: HandEye) -> None:
-    """Adds the poses in the robot base; cells stay empty where a camera on the tool has no robot pose."""
-    from dataclasses import replace
-
-    import torch
-
-    from torchpose.geometry import rotations
-    from torchpose.io.rows import base_cells
-
-    robot = None
-    if hand_eye.mount == "tool":
-        unknown = (float("nan"),) * 6
-        tool = torch.tensor([source.robot_pose or unknown for source in sources], dtype=torch.float64)[poses.frame]
-        robot = (rotations.exp(tool[:, 3:]), tool[:, :3])
-    based = poses.seen_from(*hand_eye.base_from_camera(robot))
-    based = replace(based, covariance=based.covariance + hand_eye.base_covariance(based.t, robot))
-    for row, cells in zip(rows, base_cells(based), strict=True):
-        row.update(cells)
-
-
 def _load_hand_eye(path: Path | None, sources: Sequence[Source]) -> HandEye | None:
     if path is None:
         return None
@@ -399,13 +405,3 @@ def _check_relative(name: str | None, targets: Sequence[Target], hand_eye: Path 
     if hand_eye is not None or instances > 1:
         other = "--hand-eye" if hand_eye is not None else "--instances"
         raise ConfigError(f"--relative-to: cannot be combined with {other}; leave one of them out")
-
-
-def _digest(model: Any) -> str:
-    """SHA-256 of the values of a dataclass: the same for the same numbers, however the file is laid out."""
-    import hashlib
-    from dataclasses import fields
-
-    values = [(field.name, getattr(model, field.name)) for field in fields(model) if field.name != "source"]
-    plain = [(name, value.tolist() if hasattr(value, "tolist") else value) for name, value in values]
-    return hashlib.sha256(repr(plain).encode()).hexdigest()
