@@ -54,9 +54,10 @@ def _plot_places(panel: Any, found: Measurement) -> None:
     panel.quiver(
         *nominal[:, :2].T, *(enlarged * off[:, :2].T), angles="xy", scale_units="xy", scale=1, width=0.004, color=_BLUE
     )
-    for marker, at, z, known in zip(found.target.ids.tolist(), nominal, off[:, 2], sigma[:, 2], strict=True):
-        text = f"{marker}: z {1e3 * float(z):+.1f} +- {1e3 * float(known):.1f} um"
-        panel.annotate(text, at[:2].tolist(), xytext=(0, -16), textcoords="offset points", fontsize=8, ha="center")
+    for marker, at, move, known in zip(found.target.ids.tolist(), nominal, off, sigma[:, 2], strict=True):
+        text = f"{marker}: z {1e3 * float(move[2]):+.1f} +- {1e3 * float(known):.1f} um"
+        beside = 10 if move[1] > 0 else -16  # points; away from the arrow, y downwards
+        panel.annotate(text, at[:2].tolist(), xytext=(0, beside), textcoords="offset points", fontsize=8, ha="center")
     room = 2 * _LONGEST * extent  # for the longest arrow and the numbers
     (left, top), (right, bottom) = ((nominal[:, :2].amin(0) - room).tolist(), (nominal[:, :2].amax(0) + room).tolist())
     panel.set(xlim=(left, right), ylim=(bottom, top), xlabel="x, mm", ylabel="y, mm")
