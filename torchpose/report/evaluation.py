@@ -12,7 +12,7 @@ from torchpose.report.figures import COLOURS, GREY, band, subplots
 from torchpose.report.files import make_folder, save_figures
 
 _MOST_NEES = 25.0  # shown; larger ones in the last bin
-_MOST_BAND = 20.0  # standard deviations, in their median, that a panel makes room for: one row that claims little is cut
+_MOST_BAND = 20.0  # median deviations that a panel makes room for; what one row claims beyond is cut
 
 
 def plot_errors(evaluation: Evaluation, title: str) -> Figure:

@@ -1,6 +1,6 @@
 """How the plots look: one style, no window, no global state. Slow to import: commands do where they plot."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -34,7 +34,7 @@ def finish(figure: Figure) -> Figure:
 
 
 def legend_below(
-    figure: Figure, panels: Sequence[Any], columns: int, styles: Mapping[str, str] = {}, fontsize: float = 9
+    figure: Figure, panels: Iterable[Any], columns: int, styles: Mapping[str, str] = {}, fontsize: float = 9
 ) -> None:
     """One legend of all panels below them, where it covers no data; each label once.
 
