@@ -21,7 +21,7 @@ from pydantic import Field, FiniteFloat, model_validator
 from torch import Tensor
 
 from torchpose.camera import Camera
-from torchpose.config import beside, read_yaml, validate
+from torchpose.config import beside, example, read_yaml, validate
 from torchpose.config.kinds import Grey, Seed, Word
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
@@ -91,7 +91,7 @@ class Scene:
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Scene:
         """Reads a twin file; files that it names are relative to it. Raises ConfigError."""
-        path = Path(path)
+        path = example(path, "rig")
         file = validate(TwinFile, read_yaml(path), path)
         cameras = {}
         for given in file.cameras:
