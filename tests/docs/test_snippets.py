@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Iterator
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ poses = estimator(torch.stack([torch.from_numpy(cv2.imread(name, cv2.IMREAD_GRAY
 i, j = 0, 2
 """
 }
+SHELL = {"|", ">", ">>", "<", "&&", "&", ";", "2>"}  # what ends the words of a command
 BLOCK = re.compile(r"^( *)```(\w+)[^\n]*\n(.*?)^\1```", re.MULTILINE | re.DOTALL)
 
 
@@ -50,7 +52,8 @@ def blocks(page: Path) -> Iterator[tuple[str, str]]:
 def command_lines(text: str, program: str) -> list[list[str]]:
     """Words of every line that calls a program, in fenced and in indented blocks; continued lines are one."""
     found = re.findall(rf"^ *{program}((?: [^\n]*)?)$", re.sub(r"\\\n\s*", " ", text), re.MULTILINE)
-    return [shlex.split(line, comments=True) for line in found]
+    words = [shlex.split(line, comments=True) for line in found]
+    return [list(takewhile(lambda word: word not in SHELL, line)) for line in words]
 
 
 def of_torchpose(page: Path) -> list[list[str]]:
