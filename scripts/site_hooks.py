@@ -35,7 +35,7 @@ _LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s]+)\)")
 def on_config(config: Any) -> Any:
     """Fills the navigation: what is listed by the program, and of the pages those that are there."""
     made = {"commands.md", *TOP_PAGES.values()}
-    filled = {
+    filled: dict[str, list[Any]] = {
         "API": ["api/index.md", *({f"torchpose.{room}": f"api/{room}.md"} for room in rooms())],
         "Decisions": ["decisions/README.md", *({title(path): f"decisions/{path.name}"} for path in records())],
         "Notebooks": [{title_of_notebook(path): f"notebooks/{path.stem}.md"} for path in notebooks()],

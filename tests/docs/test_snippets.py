@@ -111,8 +111,8 @@ def test_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         (tmp_path / name).symlink_to(ROOT / name)
     monkeypatch.chdir(tmp_path)
     for language, body in blocks(page):
-        if language == "yaml" and (name := re.match(r"# (\S+\.yaml)\n", body)):
-            (tmp_path / name[1]).write_text(body, encoding="utf-8")
+        if language == "yaml" and (file := re.match(r"# (\S+\.yaml)\n", body)):
+            (tmp_path / file[1]).write_text(body, encoding="utf-8")
         elif language == "python":
             exec(compile(GIVEN.get(page.name, "") + body, named(page), "exec"), {"__name__": "__main__"})
         elif language == "sh":

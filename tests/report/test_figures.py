@@ -35,7 +35,8 @@ def texts(figure: Figure) -> list[str]:
     names = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
     for panel in figure.axes:
         names += [panel.get_xlabel(), panel.get_ylabel(), panel.get_title()]
-        names += [text.get_text() for text in panel.get_legend().get_texts()] if panel.get_legend() else []
+        if (legend := panel.get_legend()) is not None:
+            names += [text.get_text() for text in legend.get_texts()]
     return names
 
 

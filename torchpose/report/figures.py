@@ -50,8 +50,8 @@ def legend_below(
     for label, style in styles.items():
         line = style in ("-", "--", ":")
         handles[label] = Line2D([], [], color=GREY, ls=style if line else "none", marker="" if line else style)
-    place = "outside lower center"
-    figure.legend(list(handles.values()), list(handles), loc=place, ncols=columns, fontsize=fontsize, frameon=False)
+    look: dict[str, Any] = {"ncols": columns, "fontsize": fontsize, "frameon": False}
+    figure.legend(list(handles.values()), list(handles), loc="outside lower center", **look)
 
 
 def subplots(rows: int, columns: int, size: tuple[float, float], **options: Any) -> tuple[Figure, Any]:
