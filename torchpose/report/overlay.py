@@ -95,7 +95,7 @@ class Overlay:
         Raises:
             ConfigError: a picture cannot be written.
         """
-        lines = self._project_axes(poses)
+        lines = self.project_axes(poses)
 
         def write_one(index: int) -> None:
             picture = self._draw(frames[index], index, poses, lines, names[index])
@@ -106,9 +106,9 @@ class Overlay:
 
     def draw(self, frame: Tensor, poses: Poses, name: str) -> np.ndarray:
         """Picture (H, W, 3) uint8, blue-green-red, of one frame (H, W) with the poses of a batch of one."""
-        return self._draw(frame, 0, poses, self._project_axes(poses), name)
+        return self._draw(frame, 0, poses, self.project_axes(poses), name)
 
-    def _project_axes(self, poses: Poses) -> np.ndarray:
+    def project_axes(self, poses: Poses) -> np.ndarray:
         """Pixels (N, 3, points, 2) of the axes of each pose, NaN where there is none or it is behind the camera."""
         points = self._axes[poses.target] @ poses.R[:, None].mT + poses.t[:, None, None]
         pixels = self._camera.project(points)
