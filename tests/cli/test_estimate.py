@@ -547,7 +547,7 @@ def test_a_run_killed_again_and_again_and_resumed_gives_the_rows_of_an_undisturb
     assert finish(start("--out", "whole.csv", "--detections", "whole_det.csv"))[0] == 1
     chance = random.Random(3)
     journal = Path("poses.csv.partial")
-    words = ["--out", "poses.csv", "--detections", "det.csv"]
+    words = ["--out", "poses.csv", "--detections", "det.csv", "--threads", "3"]  # on one core the rows are the same
     kills: list[Any] = []
     for _ in range(3):
         process = start(*words, *(["--resume"] if kills else []))
@@ -570,7 +570,7 @@ def test_a_run_killed_again_and_again_and_resumed_gives_the_rows_of_an_undisturb
 
 @pytest.mark.usefixtures("many")
 def test_an_interrupted_run_says_how_to_go_on_and_prints_nothing_else() -> None:
-    process = start("--out", "poses.csv")
+    process = start("--out", "poses.csv", "--threads", "2")
     assert wait_for_rows(process, Path("poses.csv.partial"), 2)
     process.send_signal(signal.SIGINT)
     code, error = finish(process)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,9 +20,10 @@ from torchpose.cli.common import (
     cores,
     ended,
     frames_of,
+    importing,
     interrupted,
+    one_thread_each,
     say,
-    use_threads,
     with_tone,
 )
 
@@ -83,12 +85,14 @@ def estimate(
     One row a frame and target, or with --instances one a copy: status, translation in mm, rotation vector in rad
     (target to camera), their standard deviations, reprojection RMS in px, number of markers.
     """
-    from torchpose.camera import Camera
-    from torchpose.cli.terminal import native_stderr_silenced
-    from torchpose.io.estimates import Estimation
-    from torchpose.io.writers import check_table_path
-    from torchpose.target import Target
+    with importing():
+        from torchpose.camera import Camera
+        from torchpose.cli.terminal import native_stderr_silenced
+        from torchpose.io.estimates import Estimation
+        from torchpose.io.writers import check_table_path
+        from torchpose.target import Target
 
+    one_thread_each()
     for path, option in ((out, "--out"), (detections, "--detections")):
         if path is not None:
             check_table_path(path, option)
@@ -157,30 +161,27 @@ def _run(
     quiet: bool,
 ) -> int:
     """Estimates what is not done yet and writes the tables; returns the exit code."""
-    import cv2
-    import torch
-
-    from torchpose.camera import LINEAR
     from torchpose.cli.terminal import FrameProgress
-    from torchpose.io.reader import FrameReader, default_batch, in_batches
+    from torchpose.io.estimates import estimated
+    from torchpose.io.processes import Crew
+    from torchpose.io.reader import default_batch, in_batches
     from torchpose.report.overlay import Overlay
 
-    cv2.setNumThreads(1)  # frames are decoded side by side; threads inside of one would only compete
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    # decoding is the larger part of the work; torch's threads wait actively and would take its cores away
-    use_threads(threads, share=0.5)
-    camera, targets = work.camera, work.targets
-    tone, estimator = camera.tone or LINEAR, work.estimator()
-    painter = None if overlay is None else Overlay(camera, targets, overlay, threads=threads)
+    estimator = work.estimator()
+    painter = None if overlay is None else Overlay(work.camera, work.targets, overlay, threads=1)
     store = _opened(work, sources, out, detections, resume)
     # a resumed run works on the same batches as one that was not interrupted, so that rows agree to the last bit
-    batches = in_batches(sources, batch or default_batch(camera.width, camera.height))
+    batches = in_batches(sources, batch or default_batch(work.camera.width, work.camera.height))
     pending = [one for one in batches if any(source.name not in store for source in one)]
-    reader = FrameReader(pending, camera.width, camera.height, threads=threads, tone=tone)
+    # a single process decodes ahead with all threads, several do so with one each
+    decoding = threads if len(pending) < 2 else 1
+    job = partial(estimated, work, estimator, None if painter is None else painter.write, decoding)
     try:
-        with FrameProgress(len(sources), len(store), quiet=quiet) as progress, torch.inference_mode():
-            for frames in reader:
-                records = work.records(frames, estimator, None if painter is None else painter.write)
+        with (
+            Crew(job, pending, threads, let_go=store.close) as crew,
+            FrameProgress(len(sources), len(store), quiet=quiet) as progress,
+        ):
+            for records in crew:
                 new = [record for record in records if record["frame"] not in store]
                 store.append(new)
                 progress.advance(len(new), store.counts)
