@@ -16,6 +16,7 @@ from torchpose.errors import ConfigError, printable
 if TYPE_CHECKING:
     from torchpose import camera as cameras
     from torchpose.io.sources import Source
+    from torchpose.io.storage import Place
 
 INTERRUPTED = 130  # as shells have it: 128 + SIGINT
 
@@ -78,7 +79,17 @@ def one_thread_each() -> None:
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 
-def frames_of(inputs: Sequence[Path]) -> list[Source]:
+def check_device(name: str) -> None:
+    """Raises ConfigError unless frames can be worked on there."""
+    import torch
+
+    if name not in ("cpu", "cuda"):
+        raise ConfigError(f"--device: {name} is not known; give cpu or cuda")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("--device: torch finds no CUDA device here; leave --device out, or install torch for CUDA")
+
+
+def frames_of(inputs: Sequence[Path | Place]) -> list[Source]:
     """Frames of the INPUTs; what is passed over is told on stderr."""
     from torchpose.io.sources import find_sources
 
@@ -86,9 +97,10 @@ def frames_of(inputs: Sequence[Path]) -> list[Source]:
 
 
 def check_outputs(
-    inputs: Sequence[Path], sources: Sequence[Source], tables: Sequence[Path], overlay: Path | None
+    given: Sequence[Path | Place], sources: Sequence[Source], tables: Sequence[Path], overlay: Path | None
 ) -> None:
     """Refuses outputs that would overwrite or mingle with inputs."""
+    inputs = [path for path in given if isinstance(path, Path)]
     read = {path.resolve() for path in inputs}
     for table in tables:
         if table.resolve() in read:
@@ -104,7 +116,8 @@ def check_outputs(
         )
     from torchpose.report.overlay import picture_path
 
-    frames = {Path(os.path.realpath(source.path)) for source in sources}  # which takes a loop of links, too
+    # which takes a loop of links, too
+    frames = {Path(os.path.realpath(source.path)) for source in sources if isinstance(source.path, Path)}
     places = [picture_path(place, source.name) for source in sources]  # refuses those that lie outside
     if any(path in frames for path in places):
         raise ConfigError(f"{overlay}: --overlay: its pictures would overwrite the frames; choose another folder")

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypedDict
 
 import typer
 
@@ -15,6 +17,7 @@ from torchpose.cli.common import (
     Silent,
     Threads,
     Tone,
+    check_device,
     check_outputs,
     check_robot_poses,
     cores,
@@ -33,12 +36,17 @@ if TYPE_CHECKING:  # imported where they are used: torch takes more than a secon
     from torchpose.io.estimates import Estimation
     from torchpose.io.misfits import Misfits
     from torchpose.io.sources import Source
+    from torchpose.io.storage import Place
     from torchpose.io.store import ResultStore
+    from torchpose.io.tally import Tally
     from torchpose.target import Target
 
+_OUT = "Table of the poses: .csv, .jsonl or .parquet, on a disk or in a store; with --engine ray a folder of parts."
+_ENGINE = "What runs the work: this process, or the workers of a Ray cluster (extra: ray)."
+_ADDRESS = "With --engine ray: a cluster that is there; without it, one starts here and ends with the command."
 _INPUTS = (
     "Image files (PNG, TIFF, BMP, JPEG, PGM; 8 or 16 bit, grey or colour), folders of them, searched recursively and "
-    "taken in natural order, or capture manifests (.jsonl)."
+    "taken in natural order, or capture manifests (.jsonl); paths, or URLs such as s3://BUCKET/FOLDER."
 )
 _CAMERA = (
     "Camera file: OpenCV YAML, JSON or XML, ROS camera_info, Kalibr camchain, COLMAP cameras.txt and others "
@@ -58,15 +66,21 @@ _UPRIGHT = (
     "Boards that look the same after a turn have their rows to the right. Without, they are ambiguous unless measured."
 )
 _RELATIVE = "Name of a target: give the poses of the others (of their parts) in its frame (that of its part)."
+_DEVICE = "Where the frames are worked on; with cuda, --threads decode for it."
 _DETECTIONS = "Table of the markers found: .csv, .jsonl or .parquet."
 
 
+class Engine(StrEnum):
+    local = "local"
+    ray = "ray"
+
+
 def estimate(
-    inputs: Annotated[list[Path], typer.Argument(metavar="INPUT...", help=_INPUTS)],
+    inputs: Annotated[list[str], typer.Argument(metavar="INPUT...", help=_INPUTS)],
     camera: Annotated[str, typer.Option(help=_CAMERA)],
     target: Annotated[list[str], typer.Option(help=_TARGET)],
-    out: Annotated[Path, typer.Option(help="Table of the poses: .csv, .jsonl or .parquet.")],
-    detections: Annotated[Path | None, typer.Option(help=_DETECTIONS)] = None,
+    out: Annotated[str, typer.Option(help=_OUT)],
+    detections: Annotated[str | None, typer.Option(help=_DETECTIONS)] = None,
     overlay: Overlay = None,
     instances: Annotated[int, typer.Option(min=1, max=1000, metavar="K", help=_INSTANCES)] = 1,
     assume_upright: Annotated[bool, typer.Option("--assume-upright", help=_UPRIGHT)] = False,
@@ -78,6 +92,9 @@ def estimate(
     srgb: Annotated[bool, typer.Option("--srgb", help="The same as --tone srgb.")] = False,
     batch: Batch = None,
     threads: Threads = None,
+    device: Annotated[str, typer.Option(metavar="cpu|cuda", help=_DEVICE)] = "cpu",
+    engine: Annotated[Engine, typer.Option(help=_ENGINE)] = Engine.local,
+    address: Annotated[str | None, typer.Option(help=_ADDRESS)] = None,
     quiet: Silent = False,
 ) -> int:
     """Measure the pose of ring targets in every frame, with its uncertainty.
@@ -89,14 +106,17 @@ def estimate(
         from torchpose.camera import Camera
         from torchpose.cli.terminal import native_stderr_silenced
         from torchpose.io.estimates import Estimation
-        from torchpose.io.writers import check_table_path
+        from torchpose.io.storage import place_of
         from torchpose.target import Target
 
+    places = [place_of(name) for name in inputs]
+    on_ray, tables = engine is Engine.ray, _Tables.of(out, detections)
+    _check_engine(address, overlay, device, on_ray=on_ray)
     one_thread_each()
-    for path, option in ((out, "--out"), (detections, "--detections")):
-        if path is not None:
-            check_table_path(path, option)
-    lens, targets, sources = Camera.load(camera), [Target.load(name) for name in target], frames_of(inputs)
+    check_device(device)
+    if not on_ray:
+        tables.check()
+    lens, targets, sources = Camera.load(camera), [Target.load(name) for name in target], frames_of(places)
     if assume_upright:
         targets = [one.upright() for one in targets]
     lens = with_tone(lens, "srgb" if srgb and tone is None else tone)
@@ -104,18 +124,66 @@ def estimate(
     _check_relative(relative_to, targets, hand_eye, instances)
     base = _load_hand_eye(hand_eye, sources)
     work = Estimation(lens, targets, base, method, instances, relative_to, assume_upright)
-    check_outputs(inputs, sources, [p for p in (out, detections) if p is not None], overlay)
+    check_outputs(places, sources, tables.paths, overlay)
+    how: _How = {"resume": resume, "batch": batch, "threads": threads or cores(), "quiet": quiet}
     with native_stderr_silenced():
-        return _run(
-            work, sources, out, detections, overlay, resume=resume, batch=batch, threads=threads or cores(), quiet=quiet
-        )
+        if on_ray:
+            return _run_on_ray(work, sources, tables, address, **how)
+        return _run(work, sources, tables, overlay, device=device, **how)
+
+
+class _How(TypedDict):
+    """Options that rows do not depend on."""
+
+    resume: bool
+    batch: int | None
+    threads: int
+    quiet: bool
+
+
+@dataclass(frozen=True)
+class _Tables:
+    """Where the tables of a run go: paths, or places in a store."""
+
+    out: Path | Place
+    detections: Path | Place | None
+
+    @classmethod
+    def of(cls, out: str, detections: str | None) -> _Tables:
+        from torchpose.io.storage import place_of
+
+        return cls(place_of(out), None if detections is None else place_of(detections))
+
+    @property
+    def paths(self) -> list[Path]:
+        """Those on a disk."""
+        return [path for path in (self.out, self.detections) if isinstance(path, Path)]
+
+    def check(self) -> None:
+        """Raises ConfigError unless both can be written."""
+        from torchpose.io.writers import check_table_path
+
+        for path, option in ((self.out, "--out"), (self.detections, "--detections")):
+            if isinstance(path, Path):
+                check_table_path(path, option)
+
+
+def _check_engine(address: str | None, overlay: Path | None, device: str, *, on_ray: bool) -> None:
+    from torchpose.errors import ConfigError
+
+    if address is not None and not on_ray:
+        raise ConfigError("--address: is of --engine ray alone; add it or leave --address out")
+    if overlay is not None and on_ray:
+        raise ConfigError("--overlay: is not drawn by --engine ray; run a part of the frames with --engine local")
+    if device != "cpu" and on_ray:
+        raise ConfigError("--device: is cpu with --engine ray; leave one of them out")
 
 
 def _with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -> Camera:
     """The camera with the tone that the frames tell, where their kind of file makes one likely; says what it took."""
-    from torchpose.io.images import UnreadableImageError, WrongSizeError, likely_encoded
+    from torchpose.io.images import UnreadableImageError, WrongSizeError
 
-    if not sources or not likely_encoded(sources[0].path):
+    if not sources or not sources[0].likely_encoded():
         return lens
     from dataclasses import replace
 
@@ -151,13 +219,13 @@ def _with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -
 def _run(
     work: Estimation,
     sources: list[Source],
-    out: Path,
-    detections: Path | None,
+    tables: _Tables,
     overlay: Path | None,
     *,
     resume: bool,
     batch: int | None,
     threads: int,
+    device: str,
     quiet: bool,
 ) -> int:
     """Estimates what is not done yet and writes the tables; returns the exit code."""
@@ -165,62 +233,118 @@ def _run(
     from torchpose.io.estimates import estimated
     from torchpose.io.processes import Crew
     from torchpose.io.reader import default_batch, in_batches
+    from torchpose.io.staged import Staged
     from torchpose.report.overlay import Overlay
 
-    estimator = work.estimator()
+    estimator = work.estimator().to(device)
     painter = None if overlay is None else Overlay(work.camera, work.targets, overlay, threads=1)
-    store = _opened(work, sources, out, detections, resume)
+    staged = Staged(tables.out, tables.detections, resume=resume)
+    store = _opened(work, sources, staged.out, staged.detections, resume)
     # a resumed run works on the same batches as one that was not interrupted, so that rows agree to the last bit
     batches = in_batches(sources, batch or default_batch(work.camera.width, work.camera.height))
     pending = [one for one in batches if any(source.name not in store for source in one)]
-    # a single process decodes ahead with all threads, several do so with one each
-    decoding = threads if len(pending) < 2 else 1
+    # a single process decodes ahead with all threads, several do so with one each; neither a GPU nor a connection to a
+    # store can be shared with processes
+    shared = device == "cpu" and all(isinstance(source.path, Path) for source in sources)
+    processes = threads if shared else 1
+    decoding = threads if min(processes, len(pending)) < 2 else 1
     job = partial(estimated, work, estimator, None if painter is None else painter.write, decoding)
     try:
         with (
-            Crew(job, pending, threads, let_go=store.close) as crew,
+            Crew(job, pending, processes, let_go=store.close) as crew,
             FrameProgress(len(sources), len(store), quiet=quiet) as progress,
         ):
             for records in crew:
                 new = [record for record in records if record["frame"] not in store]
                 store.append(new)
-                progress.advance(len(new), store.counts)
+                progress.advance(len(new), store.tally.counts)
         store.finish([source.name for source in sources])
+        staged.send()
     except KeyboardInterrupt:
         return interrupted(f"{len(store)} of {len(sources)} frames are kept; add --resume to go on")
     finally:
         store.close()
-    progress.summary(store.counts, out)
-    _tell_mistakes(store, out, work)
-    if not quiet:
-        _tell_crowded(store, len(sources), work)
-        _tell_misfits(store.misfits, work)
-    return ended(store.unreadable)
+    progress.summary(store.tally.counts, tables.out)
+    if store.damaged:
+        say(
+            f"torchpose: {store.damaged} damaged lines of {staged.out}.partial left out, their frames done again",
+            err=True,
+        )
+    return _told(store.tally, work, len(sources), quiet=quiet)
+
+
+def _run_on_ray(
+    work: Estimation,
+    sources: list[Source],
+    tables: _Tables,
+    address: str | None,
+    *,
+    resume: bool,
+    batch: int | None,
+    threads: int,
+    quiet: bool,
+) -> int:
+    """The same on the workers of a Ray cluster."""
+    from torchpose.cli.terminal import FrameProgress
+    from torchpose.io.reader import default_batch
+    from torchpose.io.rows import DETECTION_SCHEMA
+    from torchpose.io.tally import Tally
+    from torchpose.scale.cluster import cluster
+    from torchpose.scale.estimate import measured, pending
+    from torchpose.scale.parts import Parts
+
+    poses, marks = Parts.at(tables.out, work.schema), None
+    if tables.detections is not None:
+        marks = Parts.at(tables.detections, DETECTION_SCHEMA, "--detections")
+    origin = work.origin((str(source.root) for source in sources), detections=marks is not None)
+    for parts in (poses, marks):
+        if parts is not None:
+            parts.begin(origin, resume=resume)
+    tally = Tally()
+    blocks = pending(sources, batch or default_batch(work.camera.width, work.camera.height), poses, tally)
+    left = sum(len(block.sources) for block in blocks)
+    with FrameProgress(len(sources), len(sources) - left, quiet=quiet) as progress:
+        try:
+            with cluster(address, threads) as workers:
+                for records in measured(work, blocks, poses, marks, workers=workers):
+                    for frame, rows in records:
+                        tally.add(frame, rows)
+                    left -= len(records)
+                    progress.advance(len(records), tally.counts)
+        except KeyboardInterrupt:
+            return interrupted(f"{len(sources) - left} of {len(sources)} frames are kept; add --resume to go on")
+    for parts in (marks, poses):
+        if parts is not None:
+            parts.finish()
+    progress.summary(tally.counts, tables.out)
+    return _told(tally, work, len(sources), quiet=quiet)
 
 
 def _opened(
     work: Estimation, sources: Sequence[Source], out: Path, detections: Path | None, resume: bool
 ) -> ResultStore:
     """Where the rows go, with those of an earlier run."""
-    from torchpose.io.store import ResultStore, stamp_of
+    from torchpose.io.store import ResultStore
 
-    files = {source.name: stamp_of(source.path) for source in sources}  # before they are read
+    files = {source.name: source.stamp() for source in sources}  # before they are read
     kept: dict[str, Any] = {"schema": work.schema, "targets": len(work.rows_of), "files": files}
     origin = work.origin((str(source.root) for source in sources), detections=detections is not None)
     return ResultStore(out, detections, resume=resume, origin=origin, **kept)
 
 
-def _tell_mistakes(store: ResultStore, out: Path, work: Estimation) -> None:
-    """Tells, on stderr, what is wrong with the run as a whole."""
-    for line in store.whole_run.lines(f"{work.camera.width}x{work.camera.height}"):
+def _told(tally: Tally, work: Estimation, frames: int, *, quiet: bool) -> int:
+    """Tells, on stderr, what is wrong with the run as a whole and what its rows say together; the exit code."""
+    for line in tally.whole_run.lines(f"{work.camera.width}x{work.camera.height}"):
         say(f"torchpose: warning: {line}", err=True)
-    if store.damaged:
-        say(f"torchpose: {store.damaged} damaged lines of {out}.partial left out, their frames done again", err=True)
+    if not quiet:
+        _tell_crowded(tally, frames, work)
+        _tell_misfits(tally.misfits, work)
+    return ended(tally.unreadable)
 
 
-def _tell_crowded(store: ResultStore, count: int, work: Estimation) -> None:
+def _tell_crowded(tally: Tally, count: int, work: Estimation) -> None:
     """Tells, in a line on stderr, of copies that were seen in some of the frames and have no row."""
-    frames, most = store.crowded, store.most
+    frames, most = tally.crowded, tally.most
     if not frames:
         return
     seen = ", ".join(f"{number} of {target}" for target, number in most.items())

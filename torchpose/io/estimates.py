@@ -93,7 +93,7 @@ class Estimation:
         for positions, frames in batch.groups:
             sources = [batch.sources[position] for position in positions]
             frame_names = [source.name for source in sources]
-            poses = estimator(frames).cpu()
+            poses = estimator(frames.to(estimator.table.ids.device, non_blocking=True)).cpu()
             if paint is not None:
                 paint(frames, poses, frame_names)
             for row in self._rows(poses, sources):
@@ -124,7 +124,9 @@ def estimated(
         paint: see `Estimation.records`.
     """
     camera = work.camera
-    for batch in FrameReader(batches, camera.width, camera.height, threads=threads, tone=camera.tone or LINEAR):
+    pinned = estimator.table.ids.is_cuda
+    tone = camera.tone or LINEAR
+    for batch in FrameReader(batches, camera.width, camera.height, threads=threads, tone=tone, pinned=pinned):
         yield work.records(batch, estimator, paint)
 
 
