@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchpose import pipeline
 from torchpose.camera import Camera
+from torchpose.detect.candidates import find_coarse
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.pipeline import PoseEstimator
@@ -44,7 +45,7 @@ def estimator() -> PoseEstimator:
 def searched(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Frames of every search of whole frames."""
     counts: list[int] = []
-    search: Callable[..., Any] = pipeline.find_coarse
+    search: Callable[..., Any] = find_coarse
 
     def counted(frames: Tensor, *args: Any, **kwargs: Any) -> Any:
         counts.append(len(frames))

@@ -39,12 +39,13 @@ def test_results_come_in_the_order_of_the_items_from_every_process(count: int) -
 
 
 def test_no_items_are_no_results() -> None:
-    with Crew(squares, [], 3) as crew:
+    nothing: list[int] = []
+    with Crew(squares, nothing, 3) as crew:
         assert list(crew) == []
 
 
 def test_an_error_is_raised_behind_the_results_before_it() -> None:
-    found = []
+    found: list[int] = []
     with pytest.raises(ConfigError, match="-5: is negative"), Crew(squares, [1, 2, 3, 4, -5, 6, 7], 2) as crew:
         found.extend(square for square, _, _ in crew)
     assert found == [1, 4, 9, 16]
@@ -67,7 +68,7 @@ def dying(numbers: Sequence[int]) -> Iterator[int]:
 
 
 def test_a_process_that_is_ended_from_outside_is_one_line() -> None:
-    found = []
+    found: list[int] = []
     with (
         pytest.raises(ConfigError, match=r"^--threads: one of 2 processes .* \(code -9\)"),
         Crew(dying, range(6), 2) as c,
