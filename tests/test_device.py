@@ -13,6 +13,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.devices import DeviceNamed
 from torchpose.camera import Camera
+from torchpose.cli.main import main
 from torchpose.geometry import rotations
 from torchpose.pipeline import Method, PoseEstimator
 from torchpose.sim import add_noise, render
@@ -85,3 +86,18 @@ def test_without_a_gpu_the_check_says_so_in_a_line() -> None:
     script = Path(__file__).parents[1] / "scripts" / "check_gpu.py"
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=True)
     assert done.stdout == "check_gpu: torch finds no CUDA device here; nothing was checked\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("tpu", "tpu is not known; give cpu or cuda"), ("cuda", "torch finds no CUDA device here")]
+)
+def test_a_device_that_is_not_there_is_one_line(
+    name: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    options = ["--camera", "camera.yaml", "--target", "quad40", "--out", str(tmp_path / "poses.csv")]
+    with pytest.raises(SystemExit) as end:
+        main(["estimate", str(tmp_path), *options, "--device", name])
+    assert end.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"torchpose: error: --device: {words}")
