@@ -38,6 +38,16 @@ def test_results_come_in_the_order_of_the_items_from_every_process(count: int) -
         assert not any(alive(process) for process in processes)
 
 
+def tensors(numbers: Sequence[int]) -> Iterator[torch.Tensor]:
+    yield from (torch.full((2,), number) for number in numbers)
+
+
+def test_tensors_outlive_the_process_that_made_them() -> None:
+    with Crew(tensors, [1, 2, 3, 4], 2) as crew:
+        time.sleep(0.2)  # both have ended
+        assert torch.equal(torch.cat(list(crew)), torch.tensor([1, 1, 2, 2, 3, 3, 4, 4]))
+
+
 def test_no_items_are_no_results() -> None:
     nothing: list[int] = []
     with Crew(squares, nothing, 3) as crew:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
+import pickle
 import signal
 import sys
 import traceback
@@ -107,7 +108,7 @@ class Crew(Generic[Item, Result]):
         for end in wait(list(numbers)):
             number = numbers[end]  # type: ignore[index]
             try:
-                message = self._ends[number].recv()
+                message = pickle.loads(self._ends[number].recv_bytes())
             except EOFError:
                 message = False, self._ended(number)
             left[number] = left[number] - 1 if message[0] else 0
@@ -143,11 +144,16 @@ def _serve(
     with contextlib.suppress(BrokenPipeError):  # nobody waits for the results any more
         try:
             for result in work(share):
-                end.send((True, result))
+                _send(end, (True, result))
         except BrokenPipeError:
             raise
         except Exception as error:
-            end.send((False, _portable(error)))
+            _send(end, (False, _portable(error)))
+
+
+def _send(end: Connection, message: tuple[bool, Any]) -> None:
+    """As bytes: `Connection.send` leaves tensors with this process, which may be gone when they are fetched."""
+    end.send_bytes(pickle.dumps(message))
 
 
 def _portable(error: Exception) -> Exception:
