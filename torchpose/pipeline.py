@@ -123,7 +123,7 @@ class PoseEstimator(nn.Module):
         self.camera = camera
         self.targets = _targets(target)
         _check_targets(self.targets)
-        if instances < 1:
+        if not isinstance(instances, int) or instances < 1:
             raise ConfigError(f"instances: {instances} given; give the most copies of a target in a frame, 1 or more")
         if not float_range > 0:
             raise ConfigError(f"float_range: {float_range} is not positive; use 1.0 or 255.0")

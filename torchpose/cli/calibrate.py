@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -128,15 +129,17 @@ def _check_files(
     if out is None and camera is None:
         found = "--measure-target" if target_out is not None else "--hand-eye-out"
         raise ConfigError(f"--camera: needed to find {found}; give the camera file, or --out to calibrate it now")
+    from torchpose.config import real
+
     files: dict[Path, str] = {}
     for path, option in ((out, "--out"), (hand_eye_out, "--hand-eye-out"), (target_out, "--measure-target")):
         if path is None:
             continue
-        if not path.parent.is_dir():
+        if not os.path.isdir(path.parent):
             raise ConfigError(f"{path}: {option}: folder {path.parent} does not exist; create it or choose another")
-        if path.is_dir():
+        if os.path.isdir(path):
             raise ConfigError(f"{path}: {option}: is a folder; give the name of a file")
-        if (other := files.setdefault(path.resolve(), option)) != option:
+        if (other := files.setdefault(real(path), option)) != option:
             raise ConfigError(f"{path}: {option}: is the file of {other}, too; choose another")
 
 
@@ -155,7 +158,7 @@ def _distance(
         return None, inputs
     if target_out is None or isinstance(shown, Board):
         raise ConfigError("--distance: scales a measured target; give --measure-target too")
-    numbers = [path for path in inputs if not path.exists() and _is_number(str(path))]
+    numbers = [path for path in inputs if not os.path.exists(path) and _is_number(str(path))]
     sigma = float(str(numbers[0])) if numbers else 0.0
     distance = Distance(*given, sigma)
     distance.check(shown)

@@ -100,15 +100,17 @@ def check_outputs(
     given: Sequence[Path | Place], sources: Sequence[Source], tables: Sequence[Path], overlay: Path | None
 ) -> None:
     """Refuses outputs that would overwrite or mingle with inputs."""
+    from torchpose.config import real
+
     inputs = [path for path in given if isinstance(path, Path)]
-    read = {path.resolve() for path in inputs}
+    read = {real(path) for path in inputs}
     for table in tables:
-        if table.resolve() in read:
+        if real(table) in read:
             raise ConfigError(f"{table}: --out: is an INPUT too; choose another file")
     if overlay is None:
         return
-    place = overlay.resolve()
-    folder = next((path for path in inputs if path.is_dir() and place.is_relative_to(path.resolve())), None)
+    place = real(overlay)
+    folder = next((path for path in inputs if os.path.isdir(path) and place.is_relative_to(real(path))), None)
     if folder is not None:
         raise ConfigError(
             f"{overlay}: --overlay: lies inside INPUT {folder}, where its pictures would be taken for frames; "
@@ -116,8 +118,7 @@ def check_outputs(
         )
     from torchpose.report.overlay import picture_path
 
-    # which takes a loop of links, too
-    frames = {Path(os.path.realpath(source.path)) for source in sources if isinstance(source.path, Path)}
+    frames = {real(source.path) for source in sources if isinstance(source.path, Path)}
     places = [picture_path(place, source.name) for source in sources]  # refuses those that lie outside
     if any(path in frames for path in places):
         raise ConfigError(f"{overlay}: --overlay: its pictures would overwrite the frames; choose another folder")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import astuple
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -32,7 +33,7 @@ def evaluate(
     from torchpose.analysis.evaluation import evaluate as evaluate_poses
     from torchpose.io.truth import read_truth
 
-    known = read_truth(truth / "truth.csv" if truth.is_dir() else truth)
+    known = read_truth(truth / "truth.csv" if os.path.isdir(truth) else truth)
     rows, more = _rows_of(poses, known)
     estimates = estimates_of(rows)
     result = evaluate_poses(estimates, known)

@@ -14,6 +14,7 @@ from torchpose.config.files import (
     quoted,
     read_text,
     read_yaml,
+    real,
     write_text,
 )
 from torchpose.config.models import problem_of, shown, suggest, validate, within
@@ -31,6 +32,7 @@ __all__ = [
     "quoted",
     "read_text",
     "read_yaml",
+    "real",
     "shown",
     "suggest",
     "validate",

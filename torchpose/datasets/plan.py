@@ -27,7 +27,7 @@ from torchpose.sim.fields import keys_of
 from torchpose.target import Target
 
 _HALTON_BASES = (2, 3, 5, 7, 11, 13)
-_CHUNK = 2000  # poses whose markers are looked for at once: some 10 MB
+_CHUNK = 500  # poses whose markers are looked for at once: half a MB a plane, which stays in the cache
 _HOPELESS = 20_000  # poses without one in view, after which no more are drawn
 _TRIES = 50  # random poses drawn for one that keeps the target in view
 
@@ -220,7 +220,8 @@ def _some_in_view(camera: Camera, target: Target, R: Float[Tensor, "N 3 3"], t: 
     pixel = camera.project(x)
     last = torch.tensor([camera.width - 1, camera.height - 1], dtype=t.dtype)
     inside = ((pixel >= 0) & (pixel <= last)).all(-1)
-    inside &= (x[..., :2] / x[..., 2:]).norm(dim=-1) < camera.fold_radius
+    if math.isfinite(camera.fold_radius):
+        inside &= (x[..., :2] / x[..., 2:]).norm(dim=-1) < camera.fold_radius
     return inside.view(len(t), 36, -1).all(1).sum(1)
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from torchpose.config import real
 from torchpose.errors import ConfigError
 from torchpose.io import images, remote
 from torchpose.io.manifest import read_manifest
@@ -134,7 +135,7 @@ def _sources_of(given: Path | Place, passed: Counter[str]) -> Iterator[Source]:
         yield from _stored(given, passed)
         return
     if _state(given) == "folder":
-        root = given.resolve()
+        root = real(given)
         pairs = [(_text(path.relative_to(given).as_posix()), path) for path in _walk(given, passed)]
         for name, path in sorted(pairs, key=lambda pair: natural_key(pair[0])):
             yield from _pages(name, path, root)
@@ -151,7 +152,7 @@ def _sources_of(given: Path | Place, passed: Counter[str]) -> Iterator[Source]:
     if path.suffix.lower() == MANIFEST_SUFFIX:
         yield from _recorded(path, camera or None, passed)
     else:
-        yield from _pages(_text(given.name), given, given.parent.resolve())
+        yield from _pages(_text(given.name), given, real(given.parent))
 
 
 def _stored(given: Place, passed: Counter[str]) -> Iterator[Source]:
@@ -187,7 +188,7 @@ def _recorded_in_store(manifest: Place, camera: str | None, passed: Counter[str]
 
 def _recorded(manifest: Path, camera: str | None, passed: Counter[str]) -> Iterator[Source]:
     """The frames of a manifest: one a record, so what a file holds behind its first page is passed over."""
-    root = manifest.parent.resolve()
+    root = real(manifest.parent)
     for frame in read_manifest(manifest, camera):
         path = manifest.parent / frame.image
         pages = list(_pages(frame.image, path, root))

@@ -29,9 +29,9 @@ def check_table_path(path: Path, option: str) -> None:
     """Raises ConfigError unless a table can be written to ``path``, the argument of ``option``."""
     if path.suffix.lower() not in TABLE_SUFFIXES:
         raise ConfigError(f"{path}: {option}: of an unknown type; give a file that ends in {', '.join(TABLE_SUFFIXES)}")
-    if path.is_dir():
+    if os.path.isdir(path):
         raise ConfigError(f"{path}: {option}: is a folder; give a file")
-    if not path.parent.is_dir():
+    if not os.path.isdir(path.parent):
         raise ConfigError(f"{path}: {option}: folder {path.parent} does not exist; create it or choose another")
     longest = path.with_name(f"{path.name}.run.json")  # of what a run writes
     probe = _temporary(longest)

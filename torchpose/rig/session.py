@@ -57,7 +57,7 @@ class Session:
         self._file: int | None = None
         self._lock: Lock | None = None
         if resume:
-            if not self.manifest.exists():
+            if not os.path.exists(self.manifest):
                 problem = "does not exist; leave --resume out to start the session"
                 raise ConfigError(f"{self.manifest}: --resume: {problem}")
             self._hold()  # before a torn line is dropped, which may be one that is being written
@@ -70,7 +70,7 @@ class Session:
             self._check_new()
 
     def _check_new(self) -> None:
-        if self.manifest.exists():
+        if os.path.exists(self.manifest):
             raise ConfigError(f"{self.manifest}: --out: holds a session already; add --resume or choose another folder")
 
     def _hold(self) -> None:
@@ -85,7 +85,7 @@ class Session:
     @property
     def begun(self) -> bool:
         """Whether there is a manifest to go on with."""
-        return self.manifest.exists()
+        return os.path.exists(self.manifest)
 
     def __enter__(self) -> Self:
         try:
