@@ -40,6 +40,7 @@ def test_mistakes_are_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]
     mistakes: list[tuple[list[str | Path], str]] = [
         (["--address", "auto"], "--address: is of --engine ray alone"),
         (["--engine", "ray", "--overlay", tmp_path], "--overlay: is not drawn by --engine ray"),
+        (["--engine", "ray", "--device", "cuda"], "--device: is cpu with --engine ray"),
         (["--engine", "ray", "--address", "here"], "here: --address: is none; give HOST:PORT"),
         (["--engine", "ray", "--address", "127.0.0.1:9"], "127.0.0.1:9: --address: no Ray cluster answers"),
     ]

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from torchpose.cli.common import Batch, Quiet, Resume, Threads, cores, interrupted, say, use_threads
+from torchpose.cli.common import Batch, Quiet, Resume, Threads, cores, importing, interrupted, one_thread_each, say
 
 _BACKEND = "Who renders: the analytic renderer, or Blender Cycles (extra: blender)."
 
@@ -32,14 +32,12 @@ def simulate(
     """
     from collections import Counter
 
-    import cv2
+    with importing():
+        from torchpose.cli.terminal import FrameProgress
+        from torchpose.datasets.dataset import write_bop, write_dataset
+        from torchpose.datasets.plan import load_plan
 
-    from torchpose.cli.terminal import FrameProgress
-    from torchpose.datasets.dataset import write_bop, write_dataset
-    from torchpose.datasets.plan import load_plan
-
-    cv2.setNumThreads(1)
-    use_threads(threads, share=0.5)
+    one_thread_each()
     read = load_plan(plan)
     with FrameProgress(len(read), 0, quiet=quiet) as progress:
         try:
