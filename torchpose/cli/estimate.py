@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypedDict
@@ -32,7 +31,10 @@ from torchpose.cli.common import (
     with_tone,
 )
 from torchpose.cli.options import (
+    ADDRESS,
+    ENGINE,
     CameraFile,
+    Engine,
     FilesFrom,
     HandEyeFile,
     Instances,
@@ -40,6 +42,7 @@ from torchpose.cli.options import (
     RelativeTo,
     Targets,
     Upright,
+    check_address,
 )
 from torchpose.errors import ConfigError
 
@@ -60,8 +63,6 @@ _OUT = (
     "Table of the poses: .csv, .jsonl or .parquet, on a disk or in a store, with --engine ray a folder of parts; or "
     "`-`: JSON lines on standard output."
 )
-_ENGINE = "What runs the work: this process, or the workers of a Ray cluster (extra: ray)."
-_ADDRESS = "With --engine ray: a cluster that is there; without it, one starts here and ends with the command."
 _INPUTS = (
     "Image files (PNG, TIFF, BMP, JPEG, PGM; 8 or 16 bit, grey or colour), films (.mp4, .avi, .mov, .mkv, .webm), "
     "folders of both, searched recursively and taken in natural order, or capture manifests (.jsonl); paths, or URLs "
@@ -71,11 +72,6 @@ _JUDGED = 16  # frames that the tone is judged by
 _RESUME = "Keep the frames that an earlier run finished and do the rest."
 _DEVICE = "Where the frames are worked on; with cuda, --threads decode for it."
 _DETECTIONS = "Table of the markers found: .csv, .jsonl or .parquet."
-
-
-class Engine(StrEnum):
-    local = "local"
-    ray = "ray"
 
 
 def estimate(
@@ -97,8 +93,8 @@ def estimate(
     batch: Batch = None,
     threads: Threads = None,
     device: Annotated[str, typer.Option(metavar="cpu|cuda", help=_DEVICE)] = "cpu",
-    engine: Annotated[Engine, typer.Option(help=_ENGINE)] = Engine.local,
-    address: Annotated[str | None, typer.Option(help=_ADDRESS)] = None,
+    engine: Annotated[Engine, typer.Option(help=ENGINE)] = Engine.local,
+    address: Annotated[str | None, typer.Option(help=ADDRESS)] = None,
     quiet: Silent = False,
 ) -> int:
     """Measure the pose of ring targets in every frame, with its uncertainty.
@@ -114,7 +110,8 @@ def estimate(
 
     places = [place_of(name) for name in inputs or []]
     on_ray, tables = engine is Engine.ray, _Tables.of(out, detections)
-    _check_engine(address, overlay, device, on_ray=on_ray)
+    check_address(engine, address)
+    _check_engine(overlay, device, on_ray=on_ray)
     _check_stream(tables, resume=resume, on_ray=on_ray)
     one_thread_each()
     check_device(device)
@@ -209,9 +206,7 @@ def _check_stream(tables: _Tables, *, resume: bool, on_ray: bool) -> None:
             raise ConfigError(f"--out: - is standard output, which has no {option}; give a file, or leave {option} out")
 
 
-def _check_engine(address: str | None, overlay: Path | None, device: str, *, on_ray: bool) -> None:
-    if address is not None and not on_ray:
-        raise ConfigError("--address: is of --engine ray alone; add it or leave --address out")
+def _check_engine(overlay: Path | None, device: str, *, on_ray: bool) -> None:
     if overlay is not None and on_ray:
         raise ConfigError("--overlay: is not drawn by --engine ray; run a part of the frames with --engine local")
     if device != "cpu" and on_ray:

@@ -164,6 +164,7 @@ def write_dataset(
     batch: int | None = None,
     threads: int = 1,
     progress: Callable[[int], None] = lambda done: None,
+    crew: Callable[..., Any] = Crew,
 ) -> int:
     """Writes a data set; memory does not grow with the number of frames.
 
@@ -175,6 +176,7 @@ def write_dataset(
         batch: frames at a time.
         threads: cores to use, a process each.
         progress: called with the number of frames just finished.
+        crew: who shares the work out: processes, or what else has the interface of `Crew`.
 
     Returns:
         Number of frames rendered now.
@@ -189,12 +191,12 @@ def write_dataset(
     size = max(1, min(16, _BATCH_PIXELS // (plan.camera.width * plan.camera.height))) if backend == "analytic" else 1
     batches = torch.split(pending, batch or size) if len(pending) else ()
     processes = threads if backend == "analytic" else 1  # Blender has threads of its own
-    with Crew(partial(_write_frames, plan, backend, folder), batches, processes) as crew:
-        for finished in crew:
+    with crew(partial(_write_frames, plan, backend, folder), batches, processes) as rendered:
+        for finished in rendered:
             progress(finished)
     truth = plan_truth(plan)
     if plan.file.bounds:
-        with Crew(partial(_bounds_of, plan), torch.split(torch.arange(len(plan)), _BOUNDS_AT_ONCE), threads) as parts:
+        with crew(partial(_bounds_of, plan), torch.split(torch.arange(len(plan)), _BOUNDS_AT_ONCE), threads) as parts:
             std = torch.cat(list(parts))
         truth.extra.update(zip(BOUND, std.unbind(1), strict=True))
     write_truth(out / "truth.csv", truth)
