@@ -346,11 +346,13 @@ def _run_on_ray(
     with FrameProgress(len(sources), len(sources) - left, quiet=quiet) as progress:
         try:
             with cluster(address, threads) as workers:
-                for records in measured(work, blocks, poses, marks, workers=workers):
+                for records in measured(work, blocks, poses, marks, workers=workers.count):
                     for frame, rows in records:
                         tally.add(frame, rows)
                     left -= len(records)
                     progress.advance(len(records), tally.counts)
+                if lost := workers.lost():
+                    say(f"torchpose: {lost} nodes were lost on the way; others have done their blocks again", err=True)
         except KeyboardInterrupt:
             return interrupted(f"{len(sources) - left} of {len(sources)} frames are kept; add --resume to go on")
     for parts in (marks, poses):

@@ -57,7 +57,7 @@ def crew_of(engine: Engine, address: str | None, threads: int) -> Iterator[tuple
     from torchpose.scale.crew import RayCrew
 
     with cluster(address, threads) as workers:
-        yield RayCrew, workers
+        yield RayCrew, workers.count
 
 
 def check_address(engine: Engine, address: str | None) -> None:
