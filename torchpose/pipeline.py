@@ -33,6 +33,9 @@ from torchpose.identify import (
     Identified,
     MarkerTable,
     Scene,
+    Views,
+    find_near,
+    held,
     identify,
     identify_boards,
     in_company,
@@ -187,24 +190,29 @@ class PoseEstimator(nn.Module):
         return f"camera={self.camera.width}x{self.camera.height}, targets=[{names}]"
 
     @torch.no_grad()
-    def forward(self, frames: Tensor | NDArray[Any]) -> Poses:
+    def forward(self, frames: Tensor | NDArray[Any], near: Poses | None = None) -> Poses:
         """Poses of every target in every frame.
 
         Args:
             frames: (H, W), (B, H, W) or (B, 1, H, W) grey, or (B, 3, H, W) RGB, of which the luma counts; tensors or
                 NumPy arrays of uint8, uint16, or floating point with white at ``float_range``.
+            near: poses not long before, row by row of the frame of the batch that they are near to: of a sequence, what
+                the last call gave. The rings are looked for where these put them, up to `identify.near.MOST_MOVE` px
+                away, and all over the frame only where a target is not found whole there; so one that was lost is found
+                again. The result is the same to a fraction of its deviation, but for `Poses.copies`, which then counts
+                what is near. Boards, and several instances, are looked for everywhere.
 
         Returns:
             Rows sorted by frame, target and instance, on the device of the frames: B * T of them with
             ``instances=1``. With more, every frame and target has at least one row, and one for each copy with a pose.
 
         Raises:
-            FrameError: wrong shape, size or dtype.
+            FrameError: wrong shape, size or dtype. ConfigError: ``near`` is of other targets.
         """
         frames = self._checked(frames)
         scene = Scene.of(frames, self.camera.to(frames.device), self.table.to(frames.device))
-        scene, found = self._found(scene)
-        again = self._second_look(scene, found)
+        scene, found, tried = self._found(scene, near)
+        again = self._second_look(scene, found, tried)
         if len(again[0]) > len(found.rings):
             found = self._solved(scene, *again)
         if found.solvable.numel():
@@ -227,27 +235,54 @@ class PoseEstimator(nn.Module):
             frames = frames.float() * (255.0 / self.float_range)
         return frames.contiguous()
 
-    def _found(self, scene: Scene) -> tuple[Scene, Found]:
-        """What is found in all frames: at the coarse scale alone where that shows every target whole."""
+    def _found(self, scene: Scene, near: Poses | None = None) -> tuple[Scene, Found, Rings]:
+        """What is found in all frames: at the coarse scale alone where that shows every target whole.
+
+        Also the rings that were measured for that.
+        """
         frames, wanted = scene.frames, Wanted.of(scene.table.polarity, _LEAST_CANDIDATE)
         if not bool(scene.table.coded.all()):
-            return self._found_with_boards(scene)
+            scene, found = self._found_with_boards(scene)
+            return scene, found, found.rings
         if self.instances > 1:  # a copy may be too small for the coarse scale
             circles = self._useful(scene, find_candidates(frames, wanted=wanted, float_range=255.0))
-            return self._read(scene, self._measured(scene, circles))
-        coarse = find_coarse(frames, wanted=wanted, float_range=255.0)
+            scene, found = self._read(scene, self._measured(scene, circles))
+            return scene, found, found.rings
+        coarse = None if near is None else find_near(scene, *_placed(scene, near), wanted)
+        tracked = coarse is not None
+        if coarse is None:
+            coarse = find_coarse(frames, wanted=wanted, float_range=255.0)
         rings, copies, tried = self._likely(scene, coarse)
         first = self._read(scene, rings, copies)
-        settled = _settled(*first)
+        settled = self._settled(*first, tried.rings)
         if bool(settled.all()):
-            return first
+            return *first, tried.rings
+        if tracked:
+            return self._found_elsewhere(scene, first, settled, tried.rings)
         rest, number = (~settled).nonzero()[:, 0], (~settled).cumsum(0) - 1
         known = coarse[~settled[coarse.frame]]
         known = replace(known, frame=number[known.frame])
         finer = find_candidates(frames[rest], wanted=wanted, coarse=known, float_range=255.0)
         circles = self._useful(scene, replace(finer, frame=rest[finer.frame]))
-        more = self._measured(scene, circles, tried)
-        return self._read(scene, Rings.cat([rings[settled[rings.frame]], more]), copies)
+        every = Rings.cat([rings[settled[rings.frame]], self._measured(scene, circles, tried)])
+        return *self._read(scene, every, copies), Rings.cat([tried.rings, every])
+
+    def _found_elsewhere(
+        self, scene: Scene, near: tuple[Scene, Found], settled: Tensor, tried: Rings
+    ) -> tuple[Scene, Found, Rings]:
+        """The same where some frames are settled by what is near the last poses, and the others searched as ever."""
+        rest, rows = (~settled).nonzero()[:, 0], len(scene.table)
+        whole = near[1].rings
+        other = Scene.of(scene.frames[rest], scene.camera, scene.table)
+        _, found, searched = self._found(other)
+        more = replace(found.rings, frame=rest[found.rings.frame])
+        copies = torch.zeros(scene.groups, dtype=torch.int64, device=rest.device)
+        for identified, frame in ((near[1].identified, None), (found.identified, rest)):
+            group = identified.group
+            group = group if frame is None else frame[group // rows] * rows + group % rows
+            copies.scatter_reduce_(0, group, identified.copies, "amax")
+        tried = Rings.cat([tried[settled[tried.frame]], replace(searched, frame=rest[searched.frame])])
+        return *self._read(scene, Rings.cat([whole[settled[whole.frame]], more]), copies), tried
 
     def _found_with_boards(self, scene: Scene) -> tuple[Scene, Found]:
         """The same where there are boards among the targets: at finer and finer scales where they are not whole."""
@@ -255,12 +290,24 @@ class PoseEstimator(nn.Module):
         candidates = find_candidates(scene.frames, factor)
         while True:
             found = self._read(scene, self._measured(scene, self._circles(scene, candidates)), None, candidates)
-            rest = (~_settled(*found)).nonzero()[:, 0]
+            rest = (~self._settled(*found, found[1].rings)).nonzero()[:, 0]
             factor //= 2
             if factor < 1 or rest.numel() == 0:
                 return found
             more = find_candidates(scene.frames[rest], factor)
             candidates = merge_duplicates(Candidates.cat([candidates, replace(more, frame=rest[more.frame])]))
+
+    def _settled(self, scene: Scene, found: Found, tried: Rings) -> Tensor:
+        """Frames (B,) bool in which every target has a row with all of its markers and a pose that they agree on.
+
+        A marker in whose place a blurred ring was measured counts: no finer scale shows more of it.
+        """
+        agreed = marked(found.solvable[found.solutions.status == Status.OK], len(scene.frame))
+        missing = scene.table.valid[scene.target] & (found.identified.ring < 0)
+        if bool((agreed & missing.any(1)).any()):
+            missing &= ~held(scene, found.identified, _views(found), _much_blurred(tried))
+        good = agreed & ~missing.any(1)
+        return marked(scene.group[good], scene.groups).view(len(scene.frames), len(scene.table)).all(1)
 
     def _circles(self, scene: Scene, candidates: Candidates) -> Circles:
         candidates = candidates[torch.isin(candidates.polarity, scene.table.polarity)]
@@ -272,7 +319,9 @@ class PoseEstimator(nn.Module):
         if len(circles) == 0:
             return circles
         rough, at = rough_rings(circles, scene.camera), (scene.table, scene.camera.matrix)
-        return circles[in_company(rough, *at) | (_legible(circles.inside.blur) & named(rough, *at))]
+        beside = in_company(rough, *at)
+        circles = replace(circles, alone=~beside)
+        return circles[beside | (_legible(circles.inside.blur) & named(rough, *at))]
 
     def _rings(self, scene: Scene, circles: Circles, *, hopeful: bool = False) -> tuple[Rings, Tensor]:
         return measure_circles(scene.frames, circles, scene.camera, correct=self._recipe.correct, hopeful=hopeful)
@@ -361,17 +410,10 @@ class PoseEstimator(nn.Module):
             rings, identified, evidence, solvable, solve_poses(evidence[solvable], rough, compile=self.solves_compiled)
         )
 
-    def _second_look(self, scene: Scene, found: Found) -> tuple[Rings, Identified]:
+    def _second_look(self, scene: Scene, found: Found, tried: Rings) -> tuple[Rings, Identified]:
         """Looks for missing markers where the solutions put them, or the rough pose where there is none."""
-        identified, some = found.identified, found.solutions[found.solutions.solved]
-        index = found.solvable[found.solutions.solved]
-        seen = (identified.ring >= 0).index_copy(0, index, some.mask)
-        nowhere = torch.full_like(identified.R, torch.nan), torch.full_like(identified.t, torch.nan)
-        R, t = (torch.stack(v, 1) for v in zip((identified.R, identified.t), nowhere, strict=True))
-        twofold = (some.status == Status.AMBIGUOUS)[:, None, None]
-        R = R.index_copy(0, index, torch.stack([some.R, torch.where(twofold, some.R_alt, torch.nan)], 1))
-        t = t.index_copy(0, index, torch.stack([some.t, some.t_alt], 1))
-        return look_again(scene, found.rings, identified, seen, R, t, correct=self._recipe.correct)
+        known = found.rings, found.identified, _views(found), _much_blurred(tried)
+        return look_again(scene, *known, correct=self._recipe.correct)
 
     def _refined(self, scene: Scene, found: Found) -> Solutions:
         """The solutions after the steps of the method."""
@@ -380,6 +422,23 @@ class PoseEstimator(nn.Module):
         for step in self._recipe.steps:
             solutions = step(solutions, evidence, sight)
         return solutions
+
+
+def _placed(scene: Scene, near: Poses) -> tuple[Tensor, Tensor]:
+    """The poses as those of the rows (N, 3, 3), (N, 3) of a scene with one for every frame and target; NaN elsewhere.
+
+    Raises:
+        ConfigError: they are of other targets.
+    """
+    if len(near) and int(near.target.max()) >= len(scene.table):
+        raise ConfigError(f"near: poses of {int(near.target.max()) + 1} targets, but there are {len(scene.table)}")
+    some = near[(near.instance == 0) & (near.frame < len(scene.frames))]
+    group = some.frame * len(scene.table) + some.target
+    R, t = (
+        torch.full((scene.groups, *shape), torch.nan, dtype=torch.float64, device=group.device)
+        for shape in ((3, 3), (3,))
+    )
+    return R.index_copy(0, group, some.R.to(R)), t.index_copy(0, group, some.t.to(t))
 
 
 def _legible(blur: Tensor) -> Tensor:
@@ -398,12 +457,22 @@ def _lacking(scene: Scene, identified: Identified) -> Tensor:
     return marked(identified.group[lacks] // len(scene.table), len(scene.frames))
 
 
-def _settled(scene: Scene, found: Found) -> Tensor:
-    """Frames (B,) bool in which every target has a row with all of its markers and a pose that they agree on."""
-    agreed = found.solvable[found.solutions.status == Status.OK]
-    missing = scene.table.valid[scene.target] & (found.identified.ring < 0)
-    good = marked(agreed, len(scene.frame)) & ~missing.any(1)
-    return marked(scene.group[good], scene.groups).view(len(scene.frames), len(scene.table)).all(1)
+def _much_blurred(rings: Rings) -> Rings:
+    """Those whose blur hides no more of them at a coarse scale than at a fine one."""
+    return rings[~_legible(rings.blur)]
+
+
+def _views(found: Found) -> Views:
+    """The poses that rows may have: both where they are ambiguous, the rough one where there is no solution."""
+    identified, some = found.identified, found.solutions[found.solutions.solved]
+    index = found.solvable[found.solutions.solved]
+    seen = (identified.ring >= 0).index_copy(0, index, some.mask)
+    nowhere = torch.full_like(identified.R, torch.nan), torch.full_like(identified.t, torch.nan)
+    R, t = (torch.stack(v, 1) for v in zip((identified.R, identified.t), nowhere, strict=True))
+    twofold = (some.status == Status.AMBIGUOUS)[:, None, None]
+    R = R.index_copy(0, index, torch.stack([some.R, torch.where(twofold, some.R_alt, torch.nan)], 1))
+    t = t.index_copy(0, index, torch.stack([some.t, some.t_alt], 1))
+    return Views(seen, R, t)
 
 
 def _targets(given: Any) -> tuple[Target, ...]:

@@ -22,6 +22,7 @@ from torchpose.cli.detect import detect
 from torchpose.cli.estimate import estimate
 from torchpose.cli.evaluate import evaluate
 from torchpose.cli.examples import examples
+from torchpose.cli.live import live
 from torchpose.cli.reproduce import reproduce
 from torchpose.cli.sensitivity import sensitivity
 from torchpose.cli.simulate import simulate
@@ -59,7 +60,7 @@ def _torchpose(
 
 
 # what stands below the options: help/COMMAND.md
-_MEASURING = (estimate, watch, detect, simulate, evaluate, capture)
+_MEASURING = (estimate, live, watch, detect, simulate, evaluate, capture)
 _COMMANDS = (*_MEASURING, sensitivity, reproduce, design, calibrate, examples)
 for _command in _COMMANDS:
     app.command(epilog=(_HELP / f"{_command.__name__}.md").read_text(encoding="utf-8"))(_command)

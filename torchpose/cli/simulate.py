@@ -2,11 +2,12 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from torchpose.cli.common import Batch, Quiet, Resume, Threads, cores, interrupted, say, use_threads
+from torchpose.cli.common import Batch, Quiet, Resume, Threads, cores, importing, interrupted, one_thread_each, say
+from torchpose.cli.options import ADDRESS, ENGINE, Engine, crew_of
 
 _BACKEND = "Who renders: the analytic renderer, or Blender Cycles (extra: blender)."
 
@@ -24,6 +25,8 @@ def simulate(
     bop: Annotated[bool, typer.Option("--bop", help="Export the layout of the BOP challenge besides.")] = False,
     batch: Batch = None,
     threads: Threads = None,
+    engine: Annotated[Engine, typer.Option(help=ENGINE)] = Engine.local,
+    address: Annotated[str | None, typer.Option(help=ADDRESS)] = None,
     quiet: Quiet = False,
 ) -> int:
     """Render the frames of a plan, with their exact truth and the Cramer-Rao bound of every pose.
@@ -32,26 +35,19 @@ def simulate(
     """
     from collections import Counter
 
-    import cv2
+    with importing():
+        from torchpose.cli.terminal import FrameProgress
+        from torchpose.datasets.dataset import write_bop, write_dataset
+        from torchpose.datasets.plan import load_plan
 
-    from torchpose.cli.terminal import FrameProgress
-    from torchpose.datasets.dataset import write_bop, write_dataset
-    from torchpose.datasets.plan import load_plan
-
-    cv2.setNumThreads(1)
-    use_threads(threads, share=0.5)
+    one_thread_each()
     read = load_plan(plan)
+    how: dict[str, Any] = {"backend": backend.value, "resume": resume, "batch": batch}
     with FrameProgress(len(read), 0, quiet=quiet) as progress:
+        how["progress"] = lambda done: progress.advance(done, Counter())
         try:
-            write_dataset(
-                read,
-                out,
-                backend=backend.value,
-                resume=resume,
-                batch=batch,
-                threads=threads or cores(),
-                progress=lambda done: progress.advance(done, Counter()),
-            )
+            with crew_of(engine, address, threads or cores()) as (crew, count):
+                write_dataset(read, out, **how, threads=count, crew=crew)
             if bop:
                 write_bop(out)
         except KeyboardInterrupt:

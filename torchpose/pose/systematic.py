@@ -108,7 +108,8 @@ class OnPrint(Rows):
         look: the same if the print is behind the misfit, whatever is likeliest: where to look for the markers next.
         misfit: `Misfit`, what the residuals show beyond noise and stated uncertainties; it is in the covariance.
         explained: whether the residuals agree with all that.
-        chi2, freedom: of the residuals, as in `Excess`.
+        chi2: of the residuals, as in `Excess`.
+        freedom: its degrees of freedom.
         known: whether the pose is determined.
     """
 
