@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -29,14 +28,10 @@ from torchpose.cli.common import (
 if TYPE_CHECKING:  # imported where they are used: torch takes more than a second, which --help need not wait for
     from torchpose.camera import Camera
     from torchpose.handeye import HandEye
-    from torchpose.io import reader
+    from torchpose.io.estimates import Estimation
     from torchpose.io.misfits import Misfits
-    from torchpose.io.rows import Row
     from torchpose.io.sources import Source
     from torchpose.io.store import ResultStore
-    from torchpose.pipeline import PoseEstimator
-    from torchpose.report import overlay as pictures
-    from torchpose.results import Poses
     from torchpose.target import Target
 
 _INPUTS = (
@@ -90,6 +85,7 @@ def estimate(
     """
     from torchpose.camera import Camera
     from torchpose.cli.terminal import native_stderr_silenced
+    from torchpose.io.estimates import Estimation
     from torchpose.io.writers import check_table_path
     from torchpose.target import Target
 
@@ -102,12 +98,13 @@ def estimate(
     lens = with_tone(lens, "srgb" if srgb and tone is None else tone)
     lens = lens if lens.tone is not None else _with_judged_tone(lens, targets[0], sources)
     _check_relative(relative_to, targets, hand_eye, instances)
-    work = _Work(
-        lens, targets, sources, _load_hand_eye(hand_eye, sources), method, instances, relative_to, assume_upright
-    )
+    base = _load_hand_eye(hand_eye, sources)
+    work = Estimation(lens, targets, base, method, instances, relative_to, assume_upright)
     check_outputs(inputs, sources, [p for p in (out, detections) if p is not None], overlay)
     with native_stderr_silenced():
-        return _run(work, out, detections, overlay, resume=resume, batch=batch, threads=threads or cores(), quiet=quiet)
+        return _run(
+            work, sources, out, detections, overlay, resume=resume, batch=batch, threads=threads or cores(), quiet=quiet
+        )
 
 
 def _with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -> Camera:
@@ -147,45 +144,9 @@ def _with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -
     return replace(lens, tone=tone or LINEAR)
 
 
-@dataclass(frozen=True)
-class _Work:
-    """What the rows depend on."""
-
-    camera: Camera
-    targets: list[Target]
-    sources: list[Source]
-    hand_eye: HandEye | None
-    method: str
-    instances: int
-    relative_to: str | None
-    upright: bool
-
-    @property
-    def rows_of(self) -> list[Target]:
-        """Targets that have rows."""
-        return [target for target in self.targets if target.name != self.relative_to]
-
-    def origin(self, detections: bool) -> dict[str, Any]:
-        """The same for `ResultStore`. Names are those that its error messages shall say."""
-        from importlib.metadata import version
-
-        return {
-            "torchpose version": version("torchpose"),
-            "--camera": _digest(self.camera),
-            "--target": [[target.name, _digest(target)] for target in self.targets],
-            "--hand-eye": None if self.hand_eye is None else _digest(self.hand_eye),
-            "--method": self.method,
-            "--tone": str(self.camera.tone or "linear"),
-            "--instances": self.instances,
-            "--relative-to": self.relative_to,
-            "--assume-upright": self.upright,
-            "--detections": detections,
-            "INPUT": sorted({str(source.root) for source in self.sources}),
-        }
-
-
 def _run(
-    work: _Work,
+    work: Estimation,
+    sources: list[Source],
     out: Path,
     detections: Path | None,
     overlay: Path | None,
@@ -208,10 +169,10 @@ def _run(
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     # decoding is the larger part of the work; torch's threads wait actively and would take its cores away
     use_threads(threads, share=0.5)
-    camera, targets, sources = work.camera, work.targets, work.sources
-    tone, estimator = camera.tone or LINEAR, _estimator(work)
+    camera, targets = work.camera, work.targets
+    tone, estimator = camera.tone or LINEAR, work.estimator()
     painter = None if overlay is None else Overlay(camera, targets, overlay, threads=threads)
-    store = _opened(work, out, detections, resume)
+    store = _opened(work, sources, out, detections, resume)
     # a resumed run works on the same batches as one that was not interrupted, so that rows agree to the last bit
     batches = in_batches(sources, batch or default_batch(camera.width, camera.height))
     pending = [one for one in batches if any(source.name not in store for source in one)]
@@ -219,7 +180,7 @@ def _run(
     try:
         with FrameProgress(len(sources), len(store), quiet=quiet) as progress, torch.inference_mode():
             for frames in reader:
-                records = _records(frames, estimator, work, painter)
+                records = work.records(frames, estimator, None if painter is None else painter.write)
                 new = [record for record in records if record["frame"] not in store]
                 store.append(new)
                 progress.advance(len(new), store.counts)
@@ -231,23 +192,24 @@ def _run(
     progress.summary(store.counts, out)
     _tell_mistakes(store, out, work)
     if not quiet:
-        _tell_crowded(store.crowded, store.most, work)
+        _tell_crowded(store, len(sources), work)
         _tell_misfits(store.misfits, work)
     return ended(store.unreadable)
 
 
-def _opened(work: _Work, out: Path, detections: Path | None, resume: bool) -> ResultStore:
+def _opened(
+    work: Estimation, sources: Sequence[Source], out: Path, detections: Path | None, resume: bool
+) -> ResultStore:
     """Where the rows go, with those of an earlier run."""
-    from torchpose.io.rows import BASE_SCHEMA, POSE_SCHEMA
     from torchpose.io.store import ResultStore, stamp_of
 
-    files = {source.name: stamp_of(source.path) for source in work.sources}  # before they are read
-    schema = POSE_SCHEMA | (BASE_SCHEMA if work.hand_eye else {})
-    kept: dict[str, Any] = {"schema": schema, "targets": len(work.rows_of), "files": files}
-    return ResultStore(out, detections, resume=resume, origin=work.origin(detections is not None), **kept)
+    files = {source.name: stamp_of(source.path) for source in sources}  # before they are read
+    kept: dict[str, Any] = {"schema": work.schema, "targets": len(work.rows_of), "files": files}
+    origin = work.origin((str(source.root) for source in sources), detections=detections is not None)
+    return ResultStore(out, detections, resume=resume, origin=origin, **kept)
 
 
-def _tell_mistakes(store: ResultStore, out: Path, work: _Work) -> None:
+def _tell_mistakes(store: ResultStore, out: Path, work: Estimation) -> None:
     """Tells, on stderr, what is wrong with the run as a whole."""
     for line in store.whole_run.lines(f"{work.camera.width}x{work.camera.height}"):
         say(f"torchpose: warning: {line}", err=True)
@@ -255,32 +217,22 @@ def _tell_mistakes(store: ResultStore, out: Path, work: _Work) -> None:
         say(f"torchpose: {store.damaged} damaged lines of {out}.partial left out, their frames done again", err=True)
 
 
-def _estimator(work: _Work) -> PoseEstimator:
-    """Of linear frames: the reader hands on such ones."""
-    from dataclasses import replace
-
-    from torchpose.pipeline import PoseEstimator
-
-    method: Any = work.method  # it checks
-    lens = replace(work.camera, tone=None)
-    return PoseEstimator(lens, work.targets, instances=work.instances, method=method)
-
-
-def _tell_crowded(frames: set[str], most: dict[str, int], work: _Work) -> None:
-    """Tells, in a line on stderr, of copies that were seen and have no row."""
+def _tell_crowded(store: ResultStore, count: int, work: Estimation) -> None:
+    """Tells, in a line on stderr, of copies that were seen in some of the frames and have no row."""
+    frames, most = store.crowded, store.most
     if not frames:
         return
-    seen = ", ".join(f"{count} of {target}" for target, count in most.items())
+    seen = ", ".join(f"{number} of {target}" for target, number in most.items())
     more = max(most.values()) > work.instances
     fix = f"--instances {max(most.values())} looks for all" if more else "no pose explains the others"
     say(
-        f"torchpose: {len(frames)} of {len(work.sources)} frames show more copies of a target than they have rows, "
+        f"torchpose: {len(frames)} of {count} frames show more copies of a target than they have rows, "
         f"up to {seen}; {fix}",
         err=True,
     )
 
 
-def _tell_misfits(misfits: dict[str, Misfits], work: _Work) -> None:
+def _tell_misfits(misfits: dict[str, Misfits], work: Estimation) -> None:
     """Tells, on stderr, what the files leave out that the standard deviations then cannot count."""
     silent = [t.name for t in work.rows_of if t.covariance is None and t.name in misfits and misfits[t.name].frames]
     files = [f"target {', '.join(silent)} (center_sigma, edge_gain_sigma)"] if silent else []
@@ -314,66 +266,6 @@ def _stated(target: Target) -> tuple[float, float]:
     return float((variance[:-1].sum() / len(target)).sqrt()), float(variance[-1].sqrt())
 
 
-def _records(batch: reader.Batch, estimator: PoseEstimator, work: _Work, painter: pictures.Overlay | None) -> list[Row]:
-    """Rows and detections of every frame of a batch, see `ResultStore.append`."""
-    from torchpose.io.rows import detection_rows, fault_row, pose_rows
-
-    names = [target.name for target in work.targets]
-    records: dict[str, Row] = {s.name: {"frame": s.name, "rows": [], "detections": []} for s in batch.sources}
-    for position, fault in batch.faults.items():
-        frame = batch.sources[position].name
-        records[frame]["rows"] = [fault_row(frame, t.name, fault.status, fault.reason) for t in work.rows_of]
-    for positions, frames in batch.groups:
-        sources = [batch.sources[position] for position in positions]
-        frame_names = [source.name for source in sources]
-        poses = estimator(frames).cpu()
-        if painter is not None:
-            painter.write(frames, poses, frame_names)
-        given = _of_parts(poses, work.targets)
-        if work.relative_to is not None:
-            given = given.relative_to(names.index(work.relative_to))
-        rows = pose_rows(given, frame_names, names)
-        if work.hand_eye is not None:
-            _add_base_cells(rows, given, sources, work.hand_eye)
-        for row in rows:
-            records[row["frame"]]["rows"].append(row)
-        for row in detection_rows(poses.detections, frame_names, names):
-            records[row["frame"]]["detections"].append(row)
-    return list(records.values())
-
-
-def _of_parts(poses: Poses, targets: list[Target]) -> Poses:
-    """Poses of the parts, for the targets that say where their part is."""
-    import torch
-
-    parts = [target.part_from_target for target in targets]
-    if not any(parts):
-        return poses
-    still = (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
-    rotation, translation = (torch.stack(tensors) for tensors in zip(*(part or still for part in parts), strict=True))
-    return poses.moved(rotation[poses.target], translation[poses.target])
-
-
-def _add_base_cells(rows: list[Row], poses: Poses, sources: Sequence[Source], hand_eye: HandEye) -> None:
-    """Adds the poses in the robot base; cells stay empty where a camera on the tool has no robot pose."""
-    from dataclasses import replace
-
-    import torch
-
-    from torchpose.geometry import rotations
-    from torchpose.io.rows import base_cells
-
-    robot = None
-    if hand_eye.mount == "tool":
-        unknown = (float("nan"),) * 6
-        tool = torch.tensor([source.robot_pose or unknown for source in sources], dtype=torch.float64)[poses.frame]
-        robot = (rotations.exp(tool[:, 3:]), tool[:, :3])
-    based = poses.seen_from(*hand_eye.base_from_camera(robot))
-    based = replace(based, covariance=based.covariance + hand_eye.base_covariance(based.t, robot))
-    for row, cells in zip(rows, base_cells(based), strict=True):
-        row.update(cells)
-
-
 def _load_hand_eye(path: Path | None, sources: Sequence[Source]) -> HandEye | None:
     if path is None:
         return None
@@ -399,13 +291,3 @@ def _check_relative(name: str | None, targets: Sequence[Target], hand_eye: Path 
     if hand_eye is not None or instances > 1:
         other = "--hand-eye" if hand_eye is not None else "--instances"
         raise ConfigError(f"--relative-to: cannot be combined with {other}; leave one of them out")
-
-
-def _digest(model: Any) -> str:
-    """SHA-256 of the values of a dataclass: the same for the same numbers, however the file is laid out."""
-    import hashlib
-    from dataclasses import fields
-
-    values = [(field.name, getattr(model, field.name)) for field in fields(model) if field.name != "source"]
-    plain = [(name, value.tolist() if hasattr(value, "tolist") else value) for name, value in values]
-    return hashlib.sha256(repr(plain).encode()).hexdigest()
