@@ -24,7 +24,14 @@ from torchpose.rings import Rings, mapped, measure_predicted
 
 @checked
 def look_again(
-    scene: Scene, rings: Rings, identified: Identified, seen: Tensor, R: Tensor, t: Tensor, *, correct: bool = True
+    scene: Scene,
+    rings: Rings,
+    identified: Identified,
+    seen: Tensor,
+    poses: tuple[Tensor, Tensor],
+    *,
+    least: int = MIN_MARKERS - 1,
+    correct: bool = True,
 ) -> tuple[Rings, Identified]:
     """The rings and their markers, with those that were found at the predicted places.
 
@@ -33,13 +40,13 @@ def look_again(
         rings: found so far.
         identified: the same, of N rows.
         seen: (N, M) bool, the markers that fit the poses.
-        R: (N, S, 3, 3), S possible poses of each row; NaN where there are fewer.
-        t: (N, S, 3), the same.
+        poses: R (N, S, 3, 3) and t (N, S, 3) of S possible poses of each row; NaN where there are fewer.
+        least: markers of a row that must have been seen; 0 where something else tells the pose.
         correct: as for `rings.measure_rings`.
     """
-    markers, camera = scene.table[scene.target], scene.camera
+    markers, camera, (R, t) = scene.table[scene.target], scene.camera, poses
     rings_of = markers.valid & (markers.radii[..., 1] > 0)  # discs have no codes, and one circle
-    wanted = rings_of & ~seen & (seen.sum(-1) >= MIN_MARKERS - 1)[:, None]
+    wanted = rings_of & ~seen & (seen.sum(-1) >= least)[:, None]
     row, option, marker = (wanted[:, None] & R.isfinite().all(-1).all(-1)[..., None]).nonzero().unbind(-1)
     if row.numel() == 0:
         return rings, identified
