@@ -1,6 +1,6 @@
 """What a measurement can reach, and what it reached."""
 
-from torchpose.analysis.crlb import pose_crlb
+from torchpose.analysis.crlb import pose_crlb, rig_crlb
 from torchpose.analysis.errors import PoseErrors, pose_errors, rms
 from torchpose.analysis.monte_carlo import simulate_frames, simulate_points
 from torchpose.analysis.sensitivity import ErrorBudget, Uncertainty, edge_noise, propagate
@@ -13,6 +13,7 @@ __all__ = [
     "pose_crlb",
     "pose_errors",
     "propagate",
+    "rig_crlb",
     "rms",
     "simulate_frames",
     "simulate_points",

@@ -42,6 +42,10 @@ _CAMERA = (
     "Camera file: OpenCV YAML, JSON or XML, ROS camera_info, Kalibr camchain, COLMAP cameras.txt and others "
     "(docs/cameras.md). FILE#cam1 or FILE#2 picks one of several."
 )
+_CAMERAS = (
+    "Several cameras, instead of --camera: Kalibr camchain, OpenCV's stereo calibration, or a folder of ROS "
+    "camera_info with tf_static.yaml. INPUT has one folder a camera (cam0, cam1, ...), or is a capture manifest (docs/rigs.md)."
+)
 _METHODS = "photometric|edges|centers|paper"  # torchpose.pipeline.Method, which takes a second to import
 _METHOD = "Last stage: grey values, edge points, ring centres, or the paper's own chain."
 _HAND_EYE = "Calibrated camera-to-base or camera-to-tool transform; adds the poses in the robot base."
@@ -61,9 +65,10 @@ _DETECTIONS = "Table of the markers found: .csv, .jsonl or .parquet."
 
 def estimate(
     inputs: Annotated[list[Path], typer.Argument(metavar="INPUT...", help=_INPUTS)],
-    camera: Annotated[str, typer.Option(help=_CAMERA)],
     target: Annotated[list[str], typer.Option(help=_TARGET)],
     out: Annotated[Path, typer.Option(help="Table of the poses: .csv, .jsonl or .parquet.")],
+    camera: Annotated[str | None, typer.Option(help=_CAMERA)] = None,
+    cameras: Annotated[Path | None, typer.Option(metavar="RIG", help=_CAMERAS)] = None,
     detections: Annotated[Path | None, typer.Option(help=_DETECTIONS)] = None,
     overlay: Overlay = None,
     instances: Annotated[int, typer.Option(min=1, max=1000, metavar="K", help=_INSTANCES)] = 1,
@@ -83,7 +88,8 @@ def estimate(
     One row a frame and target, or with --instances one a copy: status, translation in mm, rotation vector in rad
     (target to camera), their standard deviations, reprojection RMS in px, number of markers.
     """
-    from torchpose.camera import Camera
+    from torchpose.camera import Camera, CameraRig
+    from torchpose.cli.moments import estimate_moments
     from torchpose.cli.terminal import native_stderr_silenced
     from torchpose.io.estimates import Estimation
     from torchpose.io.writers import check_table_path
@@ -92,19 +98,45 @@ def estimate(
     for path, option in ((out, "--out"), (detections, "--detections")):
         if path is not None:
             check_table_path(path, option)
-    lens, targets, sources = Camera.load(camera), [Target.load(name) for name in target], frames_of(inputs)
-    if assume_upright:
-        targets = [one.upright() for one in targets]
-    lens = with_tone(lens, "srgb" if srgb and tone is None else tone)
-    lens = lens if lens.tone is not None else _with_judged_tone(lens, targets[0], sources)
+    _check_one_of(camera, cameras, detections, overlay, instances)
+    targets = [Target.load(name).upright() if assume_upright else Target.load(name) for name in target]
     _check_relative(relative_to, targets, hand_eye, instances)
+    tone = "srgb" if srgb and tone is None else tone
+    threads = threads or cores()
+    if cameras is not None:
+        rig = CameraRig.load(cameras)
+        base = _load_hand_eye(hand_eye, [])
+        rest = Estimation(rig.cameras[0], targets, base, method, 1, relative_to, assume_upright)
+        options = {"tone": tone, "resume": resume, "batch": batch, "threads": threads, "quiet": quiet}
+        return estimate_moments(rig, inputs, rest, out, options)
+    assert camera is not None
+    lens, sources = Camera.load(camera), frames_of(inputs)
+    lens = with_tone(lens, tone)
+    lens = lens if lens.tone is not None else _with_judged_tone(lens, targets[0], sources)
     base = _load_hand_eye(hand_eye, sources)
     work = Estimation(lens, targets, base, method, instances, relative_to, assume_upright)
     check_outputs(inputs, sources, [p for p in (out, detections) if p is not None], overlay)
     with native_stderr_silenced():
-        return _run(
-            work, sources, out, detections, overlay, resume=resume, batch=batch, threads=threads or cores(), quiet=quiet
+        return _run(work, sources, out, detections, overlay, resume=resume, batch=batch, threads=threads, quiet=quiet)
+
+
+def _check_one_of(
+    camera: str | None, cameras: Path | None, detections: Path | None, overlay: Path | None, instances: int
+) -> None:
+    from torchpose.errors import ConfigError
+
+    if (camera is None) == (cameras is None):
+        raise ConfigError(
+            f"--camera: {'missing' if camera is None else 'stands beside --cameras'}; give --camera of one camera, or "
+            "--cameras of several"
         )
+    if cameras is None:
+        return
+    for name, given in (("--detections", detections is not None), ("--overlay", overlay is not None)):
+        if given:
+            raise ConfigError(f"{name}: is of one camera; leave it out with --cameras, or run each camera by itself")
+    if instances > 1:
+        raise ConfigError("--instances: several cameras look for one copy; leave it out with --cameras")
 
 
 def _with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -> Camera:

@@ -76,6 +76,7 @@ class ResultStore:
         unreadable: frames that could not be read, with their reason.
         crowded: frames that show more copies of a target than they have rows.
         most: by target, the most copies of it that one of these frames shows.
+        disagree: number of rows whose cameras contradict each other.
         misfits: by target, what its rows say together of target and camera file.
         whole_run: what only all rows together show.
         damaged: lines of the journal that were not as they had been written.
@@ -124,6 +125,7 @@ class ResultStore:
         self.unreadable: dict[str, str] = {}
         self.crowded: set[str] = set()
         self.most: dict[str, int] = {}
+        self.disagree = 0
         self.misfits: dict[str, Misfits] = {}
         self.whole_run = WholeRun()
         self._places: dict[str, Place] = {}
@@ -201,6 +203,7 @@ class ResultStore:
         rows = Counter(row["target"] for row in record["rows"])
         for row in record["rows"]:
             self.misfits.setdefault(row["target"], Misfits()).add(row)
+            self.disagree += row["reason"] == "cameras_disagree"
             self.whole_run.add(row)
             if (row.get("copies") or 0) > rows[row["target"]]:
                 self.crowded.add(record["frame"])

@@ -4,7 +4,7 @@ Every camera that has a pose proposes it; one that sees two rings proposes the r
 camera proposes anything, rays alone do (`torchpose.pnp.several`). Each proposal is fitted to the markers near it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -16,7 +16,8 @@ from torchpose.identify import MIN_MARKERS
 from torchpose.identify.hypotheses import PLACE_TOLERANCE
 from torchpose.moments.views import Moments, View
 from torchpose.pnp import PnPCode
-from torchpose.pnp.several import Rays, solve_rays, starts
+from torchpose.pnp.several import Rays, solve_rays
+from torchpose.pnp.several.starts import starts
 from torchpose.pose import AMBIGUOUS_CHI2, Evidence, shape_chi2
 from torchpose.pose.evidence import visible
 from torchpose.results import Status
@@ -120,7 +121,7 @@ def _rays(moments: Moments, evidence: list[Evidence]) -> Rays:
         xy = torch.where(seen, (some.center - principal) / focal, 0.0)
         none = some.points.new_zeros(*some.mask.shape, 2, 0)
         parts.append(Rays(some.points, xy, root * focal * seen[..., None], *place, none, some.mask))
-    return Rays(**{name: torch.cat([getattr(part, name) for part in parts], 1) for name in vars(parts[0])})
+    return replace(parts[0], **{name: torch.cat([getattr(part, name) for part in parts], 1) for name in vars(parts[0])})
 
 
 def _near(moments: Moments, evidence: list[Evidence], R: Tensor, t: Tensor, share: float) -> Tensor:
@@ -147,7 +148,7 @@ def _fitted(rays: Rays, R: Tensor, t: Tensor, near: Tensor) -> tuple[Tensor, Ten
     rows, several = t.shape[:2]
     every = rays[torch.arange(rows, device=t.device).repeat_interleave(several)]
     seen = torch.where(_enough(near)[..., None], near.flatten(2), rays.seen[:, None]).flatten(0, 1)
-    some = Rays(**(vars(every) | {"seen": seen, "root": every.root * seen[..., None, None]}))
+    some = replace(every, seen=seen, root=every.root * seen[..., None, None])
     there = R.isfinite().flatten(2).all(2).flatten()
     R, t = (torch.where(there.view(-1, *[1] * (x.ndim - 1)), x, torch.nan) for x in (R.flatten(0, 1), t.flatten(0, 1)))
     found = solve_rays(some, (R[:, None], t[:, None]), _STEPS)
