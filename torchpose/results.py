@@ -141,9 +141,9 @@ class Poses(Rows):
         chi2: of all evidence (centres and ring shapes) at the pose.
         R_alt, t_alt, rms_alt, chi2_alt: the other minimum of the same evidence (the second planar solution); NaN
             where both coincide or there is none.
-        share: of the information about the pose, by camera of a rig; 0 where one contributes nothing, None without a rig.
-        consistency: chi-squared of what the C cameras of a rig say against each other, and its degrees of freedom; 0 with
-            one camera.
+        share: of the information about the pose, by camera of a rig, 0 where it contributes nothing; None without rig.
+        consistency: chi-squared of what the C cameras of a rig say against each other, and its degrees of freedom; 0
+            with one camera.
         odd: the camera of a rig that contradicts the others, where three or more tell; -1 else.
         detections: the markers of the whole batch; selecting rows leaves them alone, their `frame`, `target` and
             `instance` say whose they are.

@@ -44,7 +44,8 @@ _CAMERA = (
 )
 _CAMERAS = (
     "Several cameras, instead of --camera: Kalibr camchain, OpenCV's stereo calibration, or a folder of ROS "
-    "camera_info with tf_static.yaml. INPUT has one folder a camera (cam0, cam1, ...), or is a capture manifest (docs/rigs.md)."
+    "camera_info with tf_static.yaml. INPUT has one folder a camera (cam0, cam1, ...), or is a capture manifest "
+    "(docs/rigs.md)."
 )
 _METHODS = "photometric|edges|centers|paper"  # torchpose.pipeline.Method, which takes a second to import
 _METHOD = "Last stage: grey values, edge points, ring centres, or the paper's own chain."

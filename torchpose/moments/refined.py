@@ -181,7 +181,7 @@ def _on_frames(moments: Moments, views: list[_Rows], begun: _Begun, place: Tenso
         place = place.index_copy(0, active, now.look)
         doubt = torch.stack([one.doubt for one in fitted]).any(0)
         amiss = (doubt | (good & (now.misfit != Misfit.NONE))) & (number == 0)
-        active = active[((good & (beside > BESIDE)) | amiss) & ~now.disagree]
+        active = active[((good & (beside > BESIDE)) | amiss) & ~now.torn]
         if active.numel() == 0:
             break
     return found
@@ -323,7 +323,7 @@ def _decided(moments: Moments, views: list[_Rows], start: Start, refine: Refine)
 def _judged(moments: Moments, views: list[_Rows], start: Start, pose: JointPose, rms: Tensor) -> Fused:
     """The rows with their status; of several reasons the last one counts."""
     behind = torch.stack([_from_behind(moments, view, pose) for view in views]).any(0)
-    disagree = pose.disagree | start.against.any(1)
+    disagree = pose.torn | start.against.any(1)
     against = torch.where(start.against.sum(1) == 1, start.against.int().argmax(1), -1)
     several = (start.mask.any(-1) | start.against).sum(1) > 2
     odd = torch.where(start.against.any(1), against, pose.odd)

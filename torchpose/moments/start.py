@@ -117,11 +117,12 @@ def _rays(moments: Moments, evidence: list[Evidence]) -> Rays:
         root = torch.linalg.cholesky(torch.linalg.inv(visible(some.covariance + some.placed, some.mask))).mT
         seen = some.mask[..., None]
         each = (rig.R[view.camera], rig.t[view.camera], factor[view.camera])
-        place = [x.to(some.points).expand(*some.mask.shape, *x.shape) for x in each]
+        turn, shift, place = (x.to(some.points).expand(*some.mask.shape, *x.shape) for x in each)
         xy = torch.where(seen, (some.center - principal) / focal, 0.0)
         none = some.points.new_zeros(*some.mask.shape, 2, 0)
-        parts.append(Rays(some.points, xy, root * focal * seen[..., None], *place, none, some.mask))
-    return replace(parts[0], **{name: torch.cat([getattr(part, name) for part in parts], 1) for name in vars(parts[0])})
+        parts.append(Rays(some.points, xy, root * focal * seen[..., None], turn, shift, place, none, some.mask))
+    joined = {name: torch.cat([getattr(part, name) for part in parts], 1) for name in vars(parts[0])}
+    return replace(parts[0], **joined)
 
 
 def _near(moments: Moments, evidence: list[Evidence], R: Tensor, t: Tensor, share: float) -> Tensor:
