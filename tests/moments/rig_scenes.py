@@ -57,9 +57,12 @@ def hidden(frames: Tensor, camera: tp.Camera, pose: tuple[Tensor, Tensor], marke
     return out
 
 
+RIG = rig(0, 35, -35)
+
+
 @cache
 def estimator() -> tp.PoseEstimator:
-    return tp.PoseEstimator(rig(0, 35, -35), TARGET)
+    return tp.PoseEstimator(RIG, TARGET)
 
 
 def errors(found: tp.Poses, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import torchpose as tp
-from tests.moments.rig_scenes import BLUR, NOISE, TARGET, errors, estimator, hidden, pictures, poses, rig
+from tests.moments.rig_scenes import BLUR, NOISE, RIG, TARGET, errors, estimator, hidden, pictures, poses, rig
 from torchpose.analysis import rig_crlb
 
 F64 = torch.float64
@@ -15,16 +15,15 @@ NEES = (1.8, 13.0)
 
 def test_poses_are_as_good_as_the_joint_bound_and_say_so() -> None:
     R, t = poses(COUNT)
-    cameras = estimator().rig
-    found = estimator()(pictures(cameras, R, t))
+    found = estimator()(pictures(RIG, R, t))
     assert found.ok.tolist() == [True] * COUNT
     error, nees = errors(found, R, t)
-    bound = rig_crlb(cameras, TARGET, R, t, psf_sigma=BLUR, noise_sigma=NOISE)
+    bound = rig_crlb(RIG, TARGET, R, t, psf_sigma=BLUR, noise_sigma=NOISE)
     least = bound.diagonal(dim1=1, dim2=2)
     torch.testing.assert_close(found.std.square().mean(0), least.mean(0), rtol=0.2, atol=0)
     assert bool((error.square().mean(0) < 3.5 * least.mean(0)).all())  # chi-squared of 6, 99.9 %
     assert NEES[0] < float(nees.mean()) < NEES[1]
-    alone = tp.PoseEstimator(cameras.cameras[0], TARGET)(pictures(cameras, R, t)[0])
+    alone = tp.PoseEstimator(RIG.cameras[0], TARGET)(pictures(RIG, R, t)[0])
     assert float(alone.std[:, 2].mean()) > 3 * float(found.std[:, 2].mean())  # depth is what the others tell
     # what every row says of its cameras
     assert found.cameras.tolist() == [3] * COUNT
@@ -33,12 +32,12 @@ def test_poses_are_as_good_as_the_joint_bound_and_say_so() -> None:
     torch.testing.assert_close(found.share.sum(1), torch.ones(COUNT, dtype=F64), rtol=0, atol=1e-6)
     assert found.consistency[:, 1].tolist() == [12.0] * COUNT
     assert float(found.consistency[:, 0].sum()) < 12 * COUNT + 4 * (24 * COUNT) ** 0.5
-    assert sorted(set(found.detections.camera.tolist())) == [0, 1, 2]  # type: ignore[union-attr]
+    assert sorted(set(found.detections.camera.tolist())) == [0, 1, 2]
 
 
 def test_pictures_that_are_missing_contribute_nothing() -> None:
     R, t = poses(4, 1)
-    frames = pictures(estimator().rig, R, t)
+    frames = pictures(RIG, R, t)
     whole = estimator()(frames)
     seen = torch.ones(3, 4, dtype=torch.bool)
     seen[0, 0] = seen[1, 1] = seen[1:, 2] = seen[:, 3] = False
@@ -52,20 +51,19 @@ def test_pictures_that_are_missing_contribute_nothing() -> None:
     assert found.share is not None
     assert found.share[0, 0] == 0
     # the one that the first camera has alone is that camera's own
-    single = tp.PoseEstimator(estimator().rig.cameras[0], TARGET)(frames[0][2:3])
+    single = tp.PoseEstimator(RIG.cameras[0], TARGET)(frames[0][2:3])
     torch.testing.assert_close(found.t[2], single.t[0], rtol=0, atol=1e-9)
     torch.testing.assert_close(found.covariance[2], single.covariance[0], rtol=1e-6, atol=0)
     # batches do not change what is found
-    assert float((whole.t[0] - estimator()([f[:1] for f in pictures(estimator().rig, R, t)]).t[0]).abs().max()) < 1e-6
+    assert float((whole.t[0] - estimator()([f[:1] for f in pictures(RIG, R, t)]).t[0]).abs().max()) < 1e-6
 
 
 def test_two_markers_in_every_camera_are_enough() -> None:
     R, t = poses(3, 2)
-    cameras = estimator().rig
-    frames = pictures(cameras, R, t)
+    frames = pictures(RIG, R, t)
     for number, markers in enumerate(([0, 1], [2, 3], [0, 2])):
-        frames[number] = hidden(frames[number], cameras.cameras[number], cameras.seen_by(number, R, t), markers)
-    alone = tp.PoseEstimator(cameras.cameras[0], TARGET)(frames[0])
+        frames[number] = hidden(frames[number], RIG.cameras[number], RIG.seen_by(number, R, t), markers)
+    alone = tp.PoseEstimator(RIG.cameras[0], TARGET)(frames[0])
     assert not bool(alone.ok.any())
     found = estimator()(frames)
     assert bool(found.ok.all())
@@ -78,9 +76,8 @@ def test_two_markers_in_every_camera_are_enough() -> None:
 def test_a_camera_is_told_where_to_look() -> None:
     """A camera that sees one marker, of which the others tell which one it is."""
     R, t = poses(2, 3)
-    cameras = estimator().rig
-    frames = pictures(cameras, R, t)
-    frames[2] = hidden(frames[2], cameras.cameras[2], cameras.seen_by(2, R, t), [0, 1, 2])
+    frames = pictures(RIG, R, t)
+    frames[2] = hidden(frames[2], RIG.cameras[2], RIG.seen_by(2, R, t), [0, 1, 2])
     found = estimator()(frames)
     assert bool(found.ok.all())
     assert found.cameras.tolist() == [3, 3]
@@ -94,16 +91,15 @@ def test_a_camera_is_told_where_to_look() -> None:
 
 def test_cameras_that_contradict_each_other_are_rejected_and_the_odd_one_is_named() -> None:
     R, t = poses(3, 4)
-    cameras = estimator().rig
     knocked = torch.zeros(3, 6, dtype=F64)
     knocked[1, 4] = 1e-3  # 0.6 px
-    found = estimator()(pictures(cameras, R, t, knocked))
+    found = estimator()(pictures(RIG, R, t, knocked))
     assert [tp.Reason(r).name for r in found.reason.tolist()] == ["CAMERAS_DISAGREE"] * 3
     assert found.odd is not None
     assert found.odd.tolist() == [1, 1, 1]
     assert not bool(found.t.isfinite().any())  # no average of right and wrong
     knocked[1, 4] = 0.1  # 60 px: its own pose is another one
-    far = estimator()(pictures(cameras, R, t, knocked))
+    far = estimator()(pictures(RIG, R, t, knocked))
     assert [tp.Reason(r).name for r in far.reason.tolist()] == ["CAMERAS_DISAGREE"] * 3
     assert far.odd is not None
     assert far.odd.tolist() == [1, 1, 1]
@@ -118,13 +114,13 @@ def test_small_knocks_widen_and_places_that_are_stated_are_weighed() -> None:
     R, t = poses(COUNT, 5)
     knocked = torch.zeros(3, 6, dtype=F64)
     knocked[1, 4] = 3e-5  # 0.02 px, several deviations of a ring's centre
-    found = estimator()(pictures(estimator().rig, R, t, knocked))
+    found = estimator()(pictures(RIG, R, t, knocked))
     good = found.ok.nonzero()[:, 0]
     _, nees = errors(found[good], R[good], t[good])
     assert len(good) < COUNT or float(nees.max()) < 30
     covariance = torch.diag(torch.tensor([0.01, 0.01, 0.01, 1e-4, 1e-4, 1e-4] * 2, dtype=F64).square())
-    stated = tp.PoseEstimator(rig(0, 35, -35, covariance=covariance), TARGET)
-    found = stated(pictures(stated.rig, R, t, knocked))
+    stated = rig(0, 35, -35, covariance=covariance)
+    found = tp.PoseEstimator(stated, TARGET)(pictures(stated, R, t, knocked))
     assert bool(found.ok.all())
     error, nees = errors(found, R, t)
     assert float(nees.max()) < 30
@@ -137,8 +133,7 @@ def test_small_knocks_widen_and_places_that_are_stated_are_weighed() -> None:
 @pytest.mark.parametrize("method", ["edges", "centers"])
 def test_other_methods(method: str) -> None:
     R, t = poses(3, 6)
-    one = tp.PoseEstimator(rig(0, 35, -35), TARGET, method=method)  # type: ignore[arg-type]
-    found = one(pictures(one.rig, R, t))
+    found = tp.PoseEstimator(RIG, TARGET, method=method)(pictures(RIG, R, t))  # type: ignore[arg-type]
     assert bool(found.ok.all())
     error, nees = errors(found, R, t)
     assert float(error[:, :3].abs().max()) < 0.01

@@ -52,6 +52,7 @@ def _run(work: RigEstimation, moments: list[Moment], out: Path, options: dict[st
     from torchpose.io.moments import MomentReader, batches_of
     from torchpose.io.reader import default_batch
     from torchpose.io.store import ResultStore
+    from torchpose.results import Status
 
     cv2.setNumThreads(1)
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -71,12 +72,14 @@ def _run(work: RigEstimation, moments: list[Moment], out: Path, options: dict[st
     batches = batches_of(moments, work.rig, options["batch"] or default_batch(largest.width, largest.height))
     pending = [one for one in batches if any(moment.name not in store for moment in one)]
     unreadable: dict[str, str] = {}
+    other: dict[str, str] = {}
     try:
         with FrameProgress(len(moments), len(store), quiet=options["quiet"]) as progress, torch.inference_mode():
             for pictures in MomentReader(pending, work.rig, threads=options["threads"]):
                 new = [record for record in work.records(pictures, estimator) if record["frame"] not in store]
-                for number, camera, _, reason in pictures.faults:
-                    unreadable[f"{work.rig.names[camera]}/{pictures.moments[number].name}"] = reason
+                for number, camera, status, reason in pictures.faults:
+                    kind = unreadable if status == Status.UNREADABLE else other
+                    kind[f"{work.rig.names[camera]}/{pictures.moments[number].name}"] = reason
                 store.append(new)
                 progress.advance(len(new), store.counts)
         store.finish([moment.name for moment in moments])
@@ -87,6 +90,9 @@ def _run(work: RigEstimation, moments: list[Moment], out: Path, options: dict[st
     progress.summary(store.counts, out)
     for line in store.whole_run.lines(f"{largest.width}x{largest.height}"):
         say(f"torchpose: warning: {line}", err=True)
+    if other:
+        first, reason = next(iter(other.items()))
+        say(f"torchpose: warning: {first} ({reason}): {len(other)} have not the size of their camera", err=True)
     if not options["quiet"]:
         _tell_disagreement(store.disagree, work)
     return ended(unreadable)

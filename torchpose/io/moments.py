@@ -19,7 +19,7 @@ from torchpose.camera import LINEAR, CameraRig
 from torchpose.errors import ConfigError
 from torchpose.io.estimates import Estimation, digest
 from torchpose.io.manifest import read_manifest
-from torchpose.io.reader import Batch, FrameReader, in_batches
+from torchpose.io.reader import Batch, FrameReader
 from torchpose.io.rows import POSE_SCHEMA, Row, Schema, fault_row, finite
 from torchpose.io.sources import MANIFEST_SUFFIX, Source, find_sources, natural_key
 from torchpose.io.store import Stamp, stamp_of
@@ -288,4 +288,5 @@ def batches_of(moments: Sequence[Moment], rig: CameraRig, size: int) -> list[Seq
     """Moments in runs that need about as much memory as ``size`` frames of the largest camera."""
     largest = max(camera.width * camera.height for camera in rig.cameras)
     several = sum(camera.width * camera.height for camera in rig.cameras) / largest
-    return in_batches(moments, max(1, int(size / several)))  # type: ignore[arg-type, return-value]
+    step = max(1, int(size / several))
+    return [moments[k : k + step] for k in range(0, len(moments), step)]

@@ -158,14 +158,6 @@ def joint_pose(rig: CameraRig, views: list[Seen], R: Tensor, t: Tensor, moved: T
     )
 
 
-def quick_pose(rig: CameraRig, views: list[Seen], R: Tensor, t: Tensor, moved: Tensor) -> tuple[Tensor, Tensor]:
-    """The pose of noise alone, to linearise about."""
-    parts = _parts(rig, views, R, t, moved)
-    matrix, right = _assembled(parts.normals, parts.own)
-    step = solve_scaled(matrix, right)[:, :POSE].nan_to_num(nan=0.0)
-    return rotations.exp(step[:, 3:]) @ R, t + step[:, :3]
-
-
 def _parts(rig: CameraRig, views: list[Seen], R: Tensor, t: Tensor, moved: Tensor) -> _Parts:
     """Of all cameras, about a pose in the first one."""
     count = len(views)

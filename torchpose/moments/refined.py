@@ -22,7 +22,7 @@ from torch import Tensor
 from torchpose.geometry.robust import LEAST_KEPT
 from torchpose.geometry.rows import Rows
 from torchpose.identify import MIN_MARKERS
-from torchpose.moments.joint import JointPose, Seen, joint_pose, quick_pose
+from torchpose.moments.joint import JointPose, Seen, joint_pose
 from torchpose.moments.start import Start, ambiguous
 from torchpose.moments.views import Moments, motion_in_view
 from torchpose.pose import (
@@ -135,7 +135,6 @@ def _on_centers(moments: Moments, views: list[_Rows], R: Tensor, t: Tensor) -> J
     """The joint pose of the centres of the ellipses."""
     seen = [_by_centers(moments, view, *moments.rig.seen_by(view.camera, R, t)) for view in views]
     nowhere = t.new_zeros(len(t), views[0].evidence.mask.shape[1], PLACE)
-    R, t = quick_pose(moments.rig, seen, R, t, nowhere)
     return joint_pose(moments.rig, seen, R, t, nowhere)
 
 
@@ -150,8 +149,8 @@ def _by_centers(moments: Moments, view: _Rows, R: Tensor, t: Tensor) -> Seen:
 def _on_frames(moments: Moments, views: list[_Rows], begun: _Begun, place: Tensor, refine: Refine) -> JointPose:
     """The joint pose of the pictures, as `refine.methods.on_frames` has that of one camera's."""
     R, t = begun
-    found = _on_centers(moments, views, R, t)
     active = torch.arange(len(t), device=t.device)
+    good = torch.zeros_like(active, dtype=torch.bool)
     for number in range(ROUNDS):
         some = [view.of(active) for view in views]
         held = _held(moments, some, R[active], t[active])
@@ -159,32 +158,31 @@ def _on_frames(moments: Moments, views: list[_Rows], begun: _Begun, place: Tenso
             _fitted(moments, view, known, (R[active], t[active]), place[active], refine, number > 0)
             for view, known in zip(some, held, strict=True)
         ]
-        seen = [one.seen for one in fitted]
-        now = joint_pose(
-            moments.rig, seen, *quick_pose(moments.rig, seen, R[active], t[active], place[active]), place[active]
-        )
-        good = now.known & torch.stack([one.on_frames for one in fitted]).any(0)
+        now = joint_pose(moments.rig, [one.seen for one in fitted], R[active], t[active], place[active])
+        holds = now.known & torch.stack([one.on_frames for one in fitted]).any(0)
         if number == 0:
+            found = now
             views = [
-                view._replace(sight=replace(view.sight, look=one.look)) for view, one in zip(views, fitted, strict=True)
+                _Rows(v.camera, v.evidence, replace(v.sight, look=f.look)) for v, f in zip(views, fitted, strict=True)
             ]
         else:
             # markers looked for where they are leave less to noise: if not, they are elsewhere
-            good &= torch.logdet(now.noise) < torch.logdet(found.noise[active])
-        better = good.nonzero()[:, 0]
-        found = found.replaced(active[better], now[better])
-        scale = torch.stack(
-            [view.evidence.matrix[0, 0] / one.seen.setting.t[:, 2] for view, one in zip(views, fitted, strict=True)]
-        )
-        beside = (now.look - place[active]).abs().amax((-1, -2)) * scale.amax(0)
+            holds &= torch.logdet(now.noise) < torch.logdet(found.noise[active])
+        better = holds.nonzero()[:, 0]
+        found, good = found.replaced(active[better], now[better]), good.index_fill(0, active[better], True)
+        mm = [view.evidence.matrix[0, 0] / one.seen.setting.t[:, 2] for view, one in zip(views, fitted, strict=True)]
+        beside = (now.look - place[active]).abs().amax((-1, -2)) * torch.stack(mm).amax(0)
         R, t = R.index_copy(0, active, now.R), t.index_copy(0, active, now.t)
         place = place.index_copy(0, active, now.look)
         doubt = torch.stack([one.doubt for one in fitted]).any(0)
-        amiss = (doubt | (good & (now.misfit != Misfit.NONE))) & (number == 0)
-        active = active[((good & (beside > BESIDE)) | amiss) & ~now.torn]
+        amiss = (doubt | (holds & (now.misfit != Misfit.NONE))) & (number == 0)
+        active = active[((holds & (beside > BESIDE)) | amiss) & ~now.torn]
         if active.numel() == 0:
             break
-    return found
+    bad = (~good).nonzero()[:, 0]
+    if bad.numel() == 0:
+        return found
+    return found.replaced(bad, _on_centers(moments, [view.of(bad) for view in views], begun.R[bad], begun.t[bad]))
 
 
 class _Fitted(NamedTuple):
@@ -198,6 +196,8 @@ class _Fitted(NamedTuple):
 
 def _held(moments: Moments, views: list[_Rows], R: Tensor, t: Tensor) -> list[Tensor]:
     """Information (J, 6, 6) about the poses, in the axes of each camera, that holds those that see too few markers."""
+    if all(bool((view.evidence.mask.sum(-1) >= MIN_MARKERS).all()) for view in views):
+        return [t.new_zeros(len(t), POSE, POSE)] * len(views)
     whole = torch.zeros(len(t), POSE, POSE, dtype=t.dtype, device=t.device)
     turns = [motion_in_view(moments.rig, view.camera).to(t) for view in views]
     for view, turn in zip(views, turns, strict=True):
@@ -229,9 +229,7 @@ def _fitted(
         start_rms, torch.full_like(start_rms, CENTER_RMS)
     )
     good = refined.good & ((kept > LEAST_KEPT) | (near & (kept > LEAST_KEPT_NEAR)))
-    n = refined.normals.right.shape[-1]
-    centers = _by_centers(moments, view, R, t)
-    normals, own_R, own_t = _padded(centers.normals, n), centers.R, centers.t
+    normals, own_R, own_t = _elsewhere(moments, view, (R, t), refined.normals, bool(good.all()))
     better = some[good]
     normals = normals.replaced(better, refined.normals[good])
     own_R, own_t = own_R.index_copy(0, better, refined.R[good]), own_t.index_copy(0, better, refined.t[good])
@@ -239,6 +237,18 @@ def _fitted(
     on_frames, doubt = empty.index_fill(0, better, True), empty.index_copy(0, some, refined.doubt)
     look = None if refined.look is None else _laid_out(refined.look, some, rows)
     return _Fitted(Seen(view.camera, setting, normals, own_R, own_t), on_frames, doubt, look)
+
+
+def _elsewhere(
+    moments: Moments, view: _Rows, poses: tuple[Tensor, Tensor], like: MarkerNormals, nowhere: bool
+) -> tuple[MarkerNormals, Tensor, Tensor]:
+    """What a camera tells of rows where its grey values do not: what its centres do; nothing if there are no such."""
+    n = like.right.shape[-1]
+    if nowhere:
+        right = like.right.new_zeros(*view.evidence.mask.shape, n)
+        return MarkerNormals(right[..., None].expand(*right.shape, n), right), *poses
+    centers = _by_centers(moments, view, *poses)
+    return _padded(centers.normals, n), centers.R, centers.t
 
 
 def _padded(normals: MarkerNormals, n: int) -> MarkerNormals:

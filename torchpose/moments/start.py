@@ -23,6 +23,7 @@ from torchpose.pose.evidence import visible
 from torchpose.results import Status
 
 _STEPS = 30  # of the fit to the centres, at most
+_SAME = 1e-3  # rad, between ends of two searches of one minimum, at most (convention)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +70,8 @@ def begin(moments: Moments, rows: Tensor, more: tuple[Tensor, Tensor] | None = N
     alone = (~R.isfinite().flatten(2).all(2).any(1)).nonzero()[:, 0]
     if alone.numel():
         R, t = (_with_more(x, alone, y) for x, y in zip((R, t), starts(rays[alone]), strict=True))
+    some = R.isfinite().flatten(2).all(2).any(0)
+    R, t = R[:, some], t[:, some]
     near = _near(moments, evidence, R, t, 1.0)
     R, t, centers = _fitted(rays, R, t, near)
     near = _near(moments, evidence, R, t, 0.5)  # half of it: a pose is known, not guessed
@@ -168,21 +171,15 @@ def _best(
 ) -> Start:
     """Of S poses (J, S, ...) that which explains most markers, by centres and shapes best."""
     R, t = poses
-    for k, (view, some) in enumerate(zip(moments.views, evidence, strict=True)):
-        turn, shift = moments.in_view(view, R, t)
-        at_all = torch.where(turn.isfinite(), turn, 0.0), torch.where(shift.isfinite(), shift, 1.0)
-        shapes = shape_chi2(some, *at_all)
-        chi2 = chi2 + torch.where(near[:, :, k].any(-1), shapes, 0.0)
     support = near.flatten(2).sum(-1)
     good = R.isfinite().flatten(2).all(2) & _enough(near) & chi2.isfinite()
-    # of as many markers the one with less chi-squared
-    score = torch.where(good, support + 1 / (2 + chi2.nan_to_num(nan=torch.inf)), -1.0)
-    best = score.argmax(1)
-    row = torch.arange(len(best), device=best.device)
+    row = torch.arange(len(good), device=good.device)
+    best, other = _ranked(R, chi2, support, good)
+    if bool(other.any()):
+        chi2 = chi2 + _of_shapes(moments, evidence, R, t, near)
+        good &= chi2.isfinite()
+        best, other = _ranked(R, chi2, support, good)
     known = good.any(1)
-    off = torch.cat([t - t[row, best][:, None], rotations.log(R @ R[row, best][:, None].mT)], -1)
-    # two searches that end in one minimum agree to far more digits than two minima
-    other = good & (support == support[row, best][:, None]) & (off[..., 3:].norm(dim=-1) > 1e-3)
     second = torch.where(other, chi2, torch.inf).argmin(1)
     has = other.any(1)
 
@@ -201,6 +198,26 @@ def _best(
         mask,
         against,
     )
+
+
+def _ranked(R: Tensor, chi2: Tensor, support: Tensor, good: Tensor) -> tuple[Tensor, Tensor]:
+    """The best of S poses (J,), and which others (J, S) bool are of as many markers."""
+    # of as many markers the one with less chi-squared
+    score = torch.where(good, support + 1 / (2 + chi2.nan_to_num(nan=torch.inf)), -1.0)
+    best = score.argmax(1, keepdim=True)
+    turn = rotations.angle_between(R, R.gather(1, best[..., None, None].expand(-1, -1, 3, 3)))
+    # two searches that end in one minimum agree to far more digits than two minima
+    return best[:, 0], good & (support == support.gather(1, best)) & (turn > _SAME)
+
+
+def _of_shapes(moments: Moments, evidence: list[Evidence], R: Tensor, t: Tensor, near: Tensor) -> Tensor:
+    """Chi-squared (J, S) of the shapes of the rings in the cameras that poses explain anything of."""
+    chi2 = torch.zeros_like(t[..., 0])
+    for k, (view, some) in enumerate(zip(moments.views, evidence, strict=True)):
+        turn, shift = moments.in_view(view, R, t)
+        there = torch.where(turn.isfinite(), turn, 0.0), torch.where(shift.isfinite(), shift, 1.0)
+        chi2 = chi2 + torch.where(near[:, :, k].any(-1), shape_chi2(some, *there), 0.0)
+    return chi2
 
 
 def ambiguous(start: Start) -> Tensor:

@@ -71,10 +71,9 @@ def solve(
     Args:
         object_points: (N, 3) shared by all poses, or (B, N, 3).
         image_points: (B, N, 2) px.
-        camera: `Camera`, or the pinhole matrix (3, 3) or (B, 3, 3), or a `CameraRig` of which each point has been seen
-            by one camera (generalised pose; method "iterative", three points or more, from wherever they tell a start).
-            Poses are then in the first camera; what is uncertain of places and lenses is weighed with the noise.
-        camera_index: (N,) or (B, N), number of the camera of each point, with a rig.
+        camera: `Camera`, pinhole matrix (3, 3) or (B, 3, 3), or `CameraRig` (method "iterative"): poses are
+            then in its first camera, and what is uncertain of places and lenses is weighed with the noise.
+        camera_index: (N,) or (B, N), the camera of a rig that saw each point.
         method: "iterative" is the maximum-likelihood estimate (Levenberg-Marquardt through the full camera model from
             every start that a closed form finds); the others return their closed form, with its covariance there.
         sigma_px: standard deviation of the image points, per axis.
@@ -106,13 +105,17 @@ def solve(
     compile = compile and inputs.pixels.device.type == "cpu" and inputs.pixels.shape[1] <= _COMPILED_POINTS
     with torch.no_grad():
         if rig is not None:
-            result = solve_rig(inputs, *rig, starts, max_iterations)
-        else:
-            result = _solve(inputs, method, starts, max_iterations, compile)
-    if rig is None and torch.is_grad_enabled() and method == "iterative" and inputs.requires_grad:
+            return _raised(solve_rig(inputs, *rig, starts, max_iterations), raise_on_failure)
+        result = _solve(inputs, method, starts, max_iterations, compile)
+    if torch.is_grad_enabled() and method == "iterative" and inputs.requires_grad:
         result = attach_gradient(result, inputs)
+    return _raised(result, raise_on_failure)
+
+
+def _raised(result: PnPResult, wanted: bool) -> PnPResult:
+    """The result; raises PnPError where that is wanted and a pose failed."""
     failed = result.code > PnPCode.AMBIGUOUS
-    if raise_on_failure and bool(failed.any()):
+    if wanted and bool(failed.any()):
         first = int(failed.nonzero()[0])
         code = PnPCode(int(result.code[first])).name
         raise PnPError(f"pose {first}: {code}; {int(failed.sum())} of {len(failed)} poses failed")
