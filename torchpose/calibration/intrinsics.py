@@ -141,7 +141,7 @@ def calibrate_intrinsics(
     names, seen = ("fx", "fy", "cx", "cy", *coefficients), views
     views = views.of_views(views.counts >= MIN_POINTS)
     _check_count(views, len(names))
-    fits = [_first_fit(views, with_lens(start, lens).to(views.pixels)) for start in starts]
+    fits = [first_fit(views, with_lens(start, lens).to(views.pixels)) for start in starts]
     best = min(filter(None, fits), key=lambda one: _robust_cost(one[1], len(views.view)), default=None)
     if best is None:
         raise ConfigError("INPUT: no pose explains the views; give --camera to start from and check the target")
@@ -223,7 +223,7 @@ def carried(information: Float[Tensor, "u u"], held: Float[Tensor, "n n"], names
 
 def _located(views: Views, camera: Camera, plate: Plate | None) -> tuple[Views, Bundle, Common]:
     views = views.of_views(views.counts >= MIN_POINTS)
-    first = _first_fit(views, camera.to(views.pixels), free=False) if len(views) else None
+    first = first_fit(views, camera.to(views.pixels), free=False) if len(views) else None
     if first is None:
         raise ConfigError("INPUT: no view has a pose; check --camera, the target and the frames")
     return weigh(*first, 0, plate)
@@ -240,7 +240,7 @@ class Common(NamedTuple):
 def weigh(views: Views, bundle: Bundle, unknowns: int, plate: Plate | None = None) -> tuple[Views, Bundle, Common]:
     """Views without contradicting points, their fit, weighted, of n unknown intrinsics, and the common error.
 
-    ``bundle`` is a `_first_fit`: with equal weights.
+    ``bundle`` is a `first_fit`: with equal weights.
     """
     # with wrong places residuals tell nothing of the noise: the first fit that moves them goes by the covariances alone
     told = plate is not None and bool(views.covariance.any())
@@ -357,7 +357,7 @@ def _with_common(views: Views, common: Common) -> Views:
     return replace(views, covariance=widened(views.covariance, common.px), rims=rims)
 
 
-def _first_fit(views: Views, camera: Camera, *, free: bool = True) -> tuple[Views, Bundle] | None:
+def first_fit(views: Views, camera: Camera, *, free: bool = True) -> tuple[Views, Bundle] | None:
     """Fit with equal weights from one start: poses, everything, poses anew (the other planar solution), everything."""
     found = None
     for _ in range(2):

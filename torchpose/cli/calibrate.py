@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from torchpose.calibration.session import Measurement, Shown
     from torchpose.camera import Camera
     from torchpose.io.sources import Source
+    from torchpose.target import Target
 
 _BOARD = (
     "Instead of a target: circles:7x6:20mm (columns, rows, pitch), acircles:4x11:20mm (OpenCV's asymmetric grid), "
@@ -52,7 +53,17 @@ _DISTANCE = (
     "deviation in mm if it is not 0. By default the scale is that of the nominal places."
 )
 _LENSES = "pinhole|brown4|brown5|rational8|kannala_brandt"
-_INPUTS = "Image files, folders or capture manifests (.jsonl) of one camera."
+_INPUTS = (
+    "Image files, folders or capture manifests (.jsonl) of one camera; with --cameras-out one folder with a folder a "
+    "camera, or one manifest: pictures of one name are of one moment."
+)
+_CAMERAS_OUT = (
+    "File to write of several cameras (Kalibr camchain): intrinsics, places and their covariances, in one adjustment."
+)
+_CAMERAS = (
+    "With --cameras-out: a file of all cameras, or once a camera its file, in the order of their names. Intrinsics are "
+    "held, and their covariances carried through."
+)
 _OUT = "Camera file to write; without it --camera is taken as it is."
 
 
@@ -66,6 +77,8 @@ def calibrate(
     target_out: Annotated[Path | None, typer.Option("--measure-target", metavar="FILE", help=_MEASURE_TARGET)] = None,
     distance: Annotated[tuple[int, int, float] | None, typer.Option(metavar="ID ID MM [SIGMA]", help=_DISTANCE)] = None,
     hand_eye_out: Annotated[Path | None, typer.Option(help=_HAND_EYE_OUT)] = None,
+    cameras_out: Annotated[Path | None, typer.Option(metavar="RIG", help=_CAMERAS_OUT)] = None,
+    cameras: Annotated[list[Path] | None, typer.Option(metavar="RIG", help=_CAMERAS)] = None,
     tone: Tone = None,
     plots: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for residual plots and tables.")] = None,
     threads: Threads = None,
@@ -79,6 +92,13 @@ def calibrate(
 
     if (target is None) == (board is None):
         raise ConfigError("--target: give either --target or --board, what the frames show")
+    if cameras_out is not None or cameras:
+        from torchpose.cli.calibrate_rig import Request, calibrate_rig
+
+        single = {"--out": out, "--camera": camera, "--hand-eye-out": hand_eye_out, "--distance": distance}
+        outs = (cameras_out, target_out, plots)
+        shown = Target.load(target) if target is not None else parse_board(board or "")
+        return calibrate_rig(Request(inputs, shown, model, cameras or [], *outs, tone, threads, quiet), single)
     _check_files(out, hand_eye_out, camera, target_out)
     shown = Target.load(target) if target is not None else parse_board(board or "")
     between, inputs = _distance(distance, inputs, shown, target_out)
@@ -87,7 +107,7 @@ def calibrate(
         check_robot_poses(sources)
     start = None if camera is None else with_tone(Camera.load(camera), tone)
     said = start.tone if start is not None else read_tone(tone)
-    frames = _Frames(sources, start, threads=threads or cores(), quiet=quiet)
+    frames = BatchedFrames(sources, start, threads=threads or cores(), quiet=quiet)
     calibration = fit = measured = None
     try:
         with native_stderr_silenced():
@@ -95,7 +115,7 @@ def calibrate(
                 measured = _measured(frames, shown, start, model, between, said, held=out is None)
                 calibration = measured.calibration
                 _show(calibration, len(sources), held=out is None)
-                _show_target(measured)
+                show_places(measured.target, measured.nominal)
                 measured.target.save(target_out)
                 if out is not None:
                     measured.camera.save(out)
@@ -128,8 +148,13 @@ def _check_files(
     if out is None and camera is None:
         found = "--measure-target" if target_out is not None else "--hand-eye-out"
         raise ConfigError(f"--camera: needed to find {found}; give the camera file, or --out to calibrate it now")
+    check_places({"--out": out, "--hand-eye-out": hand_eye_out, "--measure-target": target_out})
+
+
+def check_places(given: Mapping[str, Path | None]) -> None:
+    """Refuses files, by option, that cannot be written or that two options name."""
     files: dict[Path, str] = {}
-    for path, option in ((out, "--out"), (hand_eye_out, "--hand-eye-out"), (target_out, "--measure-target")):
+    for option, path in given.items():
         if path is None:
             continue
         if not path.parent.is_dir():
@@ -170,12 +195,12 @@ def _is_number(text: str) -> bool:
     return True
 
 
-class _Frames:
+class BatchedFrames:
     """The frames of all sources in batches, anew at every call; what could not be read is remembered."""
 
     def __init__(self, sources: Sequence[Source], start: Camera | None, *, threads: int, quiet: bool) -> None:
         self.sources, self._threads, self._quiet = sources, threads, quiet
-        self.width, self.height = (start.width, start.height) if start is not None else _first_size(sources)
+        self.width, self.height = (start.width, start.height) if start is not None else first_size(sources)
         self.unreadable: dict[str, str] = {}
 
     def __call__(self) -> Iterator[tuple[list[str], Tensor]]:
@@ -201,7 +226,7 @@ class _Frames:
                 progress.advance(len(batch.sources), Counter())
 
 
-def _first_size(sources: Sequence[Source]) -> tuple[int, int]:
+def first_size(sources: Sequence[Source]) -> tuple[int, int]:
     from torchpose.io.images import UnreadableImageError
 
     for source in sources:
@@ -214,7 +239,7 @@ def _first_size(sources: Sequence[Source]) -> tuple[int, int]:
 
 
 def _calibrate(
-    frames: _Frames, shown: Shown, start: Camera | None, model: str, tone: cameras.Tone | None
+    frames: BatchedFrames, shown: Shown, start: Camera | None, model: str, tone: cameras.Tone | None
 ) -> Calibration:
     from torchpose.calibration.intrinsics import start_cameras
     from torchpose.calibration.session import calibrate_camera
@@ -224,7 +249,7 @@ def _calibrate(
 
 
 def _measured(
-    frames: _Frames,
+    frames: BatchedFrames,
     shown: Shown,
     start: Camera | None,
     model: str,
@@ -243,7 +268,7 @@ def _measured(
     return measure_target(frames, shown, first, given=given, lens=model, distance=distance, tone=tone)
 
 
-def _hand_eye(frames: _Frames, shown: Shown, calibration: Calibration | None, camera: Camera | None) -> HandEyeFit:
+def _hand_eye(frames: BatchedFrames, shown: Shown, calibration: Calibration | None, camera: Camera | None) -> HandEyeFit:
     from torchpose.calibration.session import calibrate_robot, locate_camera
 
     robot = {source.name: source.robot_pose for source in frames.sources if source.robot_pose is not None}
@@ -268,9 +293,8 @@ def _show(found: Calibration, frames: int, *, held: bool = False) -> None:
         say(f"warning: {warning}", err=True)
 
 
-def _show_target(found: Measurement) -> None:
-    """How far the markers are from their nominal places, and how well that is known."""
-    target, nominal = found.target, found.nominal
+def show_places(target: Target, nominal: Target) -> None:
+    """How far the markers of a measured target are from their nominal places, and how well that is known."""
     assert target.covariance is not None  # always there after a measurement
     off = target.centers - nominal.centers
     sigma = target.covariance.diagonal()[:-1].view(-1, 3).sqrt()

@@ -67,6 +67,19 @@ _WRONG = {
 }
 
 
+def read_manifest_cameras(path: Path) -> list[str]:
+    """Names of the cameras that have frames with an image.
+
+    Raises:
+        ConfigError: the file cannot be read, or a line is not a JSON object.
+    """
+    found = {}
+    for number, record in read_records(path):
+        if record.get("record") == "frame" and record.get("image", "") is not None:
+            found[_checked(ManifestFrame, record, f"{path}: line {number}").camera] = None
+    return sorted(found)
+
+
 def read_manifest(path: Path, camera: str | None = None) -> list[ManifestFrame]:
     """Frames of a capture manifest in the order of capture, robot poses in mm and rad.
 
