@@ -46,7 +46,8 @@ def plot_rig(found: RigCalibration) -> Figure:
             _line(panel, torch.stack([origin, corner]), color=colour, lw=1.0)
         sigma = 0.0 if number == 0 or rig.covariance is None else _known_to(rig.covariance, number)
         label = name if not number else f"{name} +- {1e3 * sigma:.2g} um"
-        panel.text(*_turned(origin), label, color=colour, fontsize=10)
+        above = origin - 0.3 * depth * back[0][:, 1]
+        panel.text(*_turned(above), label, color=colour, fontsize=10, ha="center")
     panel.set(xlabel="x, mm", ylabel="z, mm", zlabel="-y, mm")
     panel.set_aspect("equal")
     figure.suptitle(f"{len(rig)} cameras, {len(found.views)} moments, axes of {rig.names[0]}", fontsize=11)
@@ -82,7 +83,7 @@ def plot_cameras(found: RigCalibration) -> Figure:
     for number, row in enumerate((sums / points).sqrt()):
         panel.plot(row.tolist(), "o", ms=4, color=COLOURS[number % len(COLOURS)], label=found.rig.names[number])
     panel.set(xlabel="moment", ylabel="RMS residual, px", ylim=(0, None))
-    panel.legend(ncols=count, fontsize=8)
+    panel.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=count, fontsize=8, frameon=False)
     panel.grid(alpha=0.25, lw=0.5)
     return figure
 
