@@ -3,6 +3,7 @@
 from torchpose.analysis.crlb import pose_crlb, rig_crlb
 from torchpose.analysis.errors import PoseErrors, pose_errors, rms
 from torchpose.analysis.monte_carlo import simulate_frames, simulate_points
+from torchpose.analysis.placing import second_camera_crlb
 from torchpose.analysis.sensitivity import ErrorBudget, Uncertainty, edge_noise, propagate
 
 __all__ = [
@@ -15,6 +16,7 @@ __all__ = [
     "propagate",
     "rig_crlb",
     "rms",
+    "second_camera_crlb",
     "simulate_frames",
     "simulate_points",
 ]
