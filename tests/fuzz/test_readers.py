@@ -125,8 +125,8 @@ def read_journal(path: Path) -> None:
     store = ResultStore(at, path.with_name("d.csv"), resume=True, **several)
     try:
         store.finish(FRAMES)
-        store.whole_run.lines("640x480")
-        for name, misfits in store.misfits.items():
+        store.tally.whole_run.lines("640x480")
+        for name, misfits in store.tally.misfits.items():
             misfits.lines(name, [0, 1, 2, 3])
     finally:
         store.close()
