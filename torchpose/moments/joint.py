@@ -326,16 +326,17 @@ def _taken(information: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
     scale = torch.where(scale > 0, scale.rsqrt(), 0.0).nan_to_num(posinf=0.0)
     scaled = (information * scale[..., :, None] * scale[..., None, :]).nan_to_num(nan=0.0)
     values, vectors = torch.linalg.eigh(0.5 * (scaled + scaled.mT))
-    there = values > _LEAST * values[..., -1:].clamp_min(_LEAST)
+    # what is left of sums that were taken off each other has half of their digits
+    least = LEAST_DIRECTION**0.5
+    there = values > least * values[..., -1:].clamp_min(least)
     along = (vectors.mT @ (right * scale)[..., None])[..., 0]
-    return torch.where(there, along.square() / values.clamp_min(_LEAST**2), 0.0).sum(-1), there.sum(-1)
+    return torch.where(there, along.square() / values.clamp_min(LEAST_DIRECTION), 0.0).sum(-1), there.sum(-1)
 
 
 # rad, of what a camera may be turned: from below any noise to what nobody would call a calibration (convention)
 _OFF, _GRID = (-8.0, -2.0), 25
 # times: rigs that are as they say are loosened once in a hundred, like prints (measured: `scripts/rig_statistics.py`)
 _LIKELIER = 3.0
-_LEAST = 1e3 * LEAST_DIRECTION  # of correlations that are taken off each other: rounding leaves more
 
 
 def _share(normals: MarkerNormals, own: Tensor, views: int) -> Tensor:
