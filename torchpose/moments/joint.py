@@ -300,24 +300,36 @@ def _turns(rig: CameraRig, views: list[Seen], R: Tensor, t: Tensor, n: int) -> T
 def _loosened(normals: MarkerNormals, parts: _Parts, numbers: Tensor, turns: Tensor) -> Tensor | None:
     """The columns ``turns`` by as much as cameras seem to be beside their places; None where none does.
 
-    How much that is, nobody knows: it is averaged over by its likelihood, as `pose.excess` does for prints.
+    One camera may be turned, or beside its place in all six numbers, or all are. Which it is and how much, nobody
+    knows: it is averaged over by its likelihood, as `pose.excess` does for prints.
     """
     known = torch.cat([parts.own, numbers], -1)
     information, right = _remaining(normals, known, turns, numbers.shape[-1])
     finite = (information.isfinite().all(-1) & right.isfinite()).all(-1)
     information = torch.where(finite[:, None, None], information, 0.0)
+    right = torch.where(finite[:, None], right, 0.0)
+    cameras = torch.eye(right.shape[-1] // POSE, dtype=right.dtype, device=right.device)
+    turned = torch.nn.functional.pad(right.new_ones(2), (0, POSE - 2))
+    which = torch.cat(
+        [torch.kron(cameras, turned[None]), cameras.repeat_interleave(POSE, 1), right.new_ones(1, len(right[0]))]
+    )
+    variance = torch.logspace(*_OFF, _GRID, dtype=right.dtype, device=right.device).square()
+    likelihood = torch.stack([_likelihood(information, right, some > 0, variance) for some in which], 1)
+    weight = torch.softmax(likelihood.flatten(1), -1).view_as(likelihood)
+    evidence = torch.logsumexp(likelihood.flatten(1), -1) - math.log(likelihood[0].numel())
+    off = torch.where((evidence > math.log(_LIKELIER))[:, None], (weight @ variance) @ which, 0.0)
+    return turns * off.sqrt()[:, None, None] if bool((off > 0).any()) else None
+
+
+def _likelihood(information: Tensor, right: Tensor, some: Tensor, variance: Tensor) -> Tensor:
+    """Logarithm (J, G) of how much likelier some of the unknowns are off with G variances than not at all."""
+    information, right = information[:, some][:, :, some], right[:, some]
     values, vectors = torch.linalg.eigh(0.5 * (information + information.mT))
-    values = values.clamp_min(0.0)[:, None]
-    along = (vectors.mT @ torch.where(finite[:, None], right, 0.0)[..., None])[..., 0].square()[:, None]
-    variance = torch.logspace(*_OFF, _GRID, dtype=right.dtype, device=right.device)[:, None].square()
+    values, variance = values.clamp_min(0.0)[:, None], variance[:, None]
+    along = (vectors.mT @ right[..., None])[..., 0].square()[:, None]
     # the right side along a direction has the variance l + v l^2
     spread = 1 + variance * values
-    gained = torch.where(values > 0, along * variance / spread, 0.0)
-    likelihood = 0.5 * (gained - spread.log()).sum(-1)
-    weight = torch.softmax(likelihood, -1)
-    evidence = torch.logsumexp(likelihood, -1) - math.log(_GRID)
-    off = torch.where(evidence > math.log(_LIKELIER), weight @ variance[:, 0], 0.0)
-    return turns * off.sqrt()[:, None, None, None] if bool((off > 0).any()) else None
+    return 0.5 * (torch.where(values > 0, along * variance / spread, 0.0) - spread.log()).sum(-1)
 
 
 def _taken(information: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
