@@ -313,23 +313,26 @@ def _loosened(normals: MarkerNormals, parts: _Parts, numbers: Tensor, turns: Ten
     which = torch.cat(
         [torch.kron(cameras, turned[None]), cameras.repeat_interleave(POSE, 1), right.new_ones(1, len(right[0]))]
     )
-    variance = torch.logspace(*_OFF, _GRID, dtype=right.dtype, device=right.device).square()
-    likelihood = torch.stack([_likelihood(information, right, some > 0, variance) for some in which], 1)
+    found = [_likelihood(information, right, some > 0) for some in which]
+    likelihood, variance = (torch.stack(part, 1) for part in zip(*found, strict=True))
     weight = torch.softmax(likelihood.flatten(1), -1).view_as(likelihood)
     evidence = torch.logsumexp(likelihood.flatten(1), -1) - math.log(likelihood[0].numel())
-    off = torch.where((evidence > math.log(_LIKELIER))[:, None], (weight @ variance) @ which, 0.0)
+    off = torch.where((evidence > math.log(_LIKELIER))[:, None], (weight * variance).sum(-1) @ which, 0.0)
     return turns * off.sqrt()[:, None, None] if bool((off > 0).any()) else None
 
 
-def _likelihood(information: Tensor, right: Tensor, some: Tensor, variance: Tensor) -> Tensor:
-    """Logarithm (J, G) of how much likelier some of the unknowns are off with G variances than not at all."""
+def _likelihood(information: Tensor, right: Tensor, some: Tensor) -> tuple[Tensor, Tensor]:
+    """Logarithm (J, G) of how much likelier some of the unknowns are off with G variances (J, G) than not at all."""
     information, right = information[:, some][:, :, some], right[:, some]
     values, vectors = torch.linalg.eigh(0.5 * (information + information.mT))
-    values, variance = values.clamp_min(0.0)[:, None], variance[:, None]
+    values = values.clamp_min(0.0)[:, None]
+    known = values[..., -1:].clamp_min(torch.finfo(values.dtype).tiny)
+    variance = torch.logspace(*_OFF, _GRID, dtype=right.dtype, device=right.device)[:, None].square() / known
     along = (vectors.mT @ right[..., None])[..., 0].square()[:, None]
     # the right side along a direction has the variance l + v l^2
     spread = 1 + variance * values
-    return 0.5 * (torch.where(values > 0, along * variance / spread, 0.0) - spread.log()).sum(-1)
+    likelihood = 0.5 * (torch.where(values > 0, along * variance / spread, 0.0) - spread.log()).sum(-1)
+    return likelihood, variance[..., 0]
 
 
 def _taken(information: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
@@ -345,10 +348,11 @@ def _taken(information: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(there, along.square() / values.clamp_min(LEAST_DIRECTION), 0.0).sum(-1), there.sum(-1)
 
 
-# rad, of what a camera may be turned: from below any noise to what nobody would call a calibration (convention)
-_OFF, _GRID = (-8.0, -2.0), 25
-# times: rigs that are as they say are loosened once in a hundred, like prints (measured: `scripts/rig_statistics.py`)
-_LIKELIER = 3.0
+# deviations of what the pictures tell best, by which a camera may be off: from none that would show to what nobody
+# would call a calibration (convention)
+_OFF, _GRID = (-1.0, 3.0), 24
+# times, of rigs that are as they say one in a hundred is loosened (measured: `scripts/rig_statistics.py`)
+_LIKELIER = 0.5
 
 
 def _share(normals: MarkerNormals, own: Tensor, views: int) -> Tensor:
