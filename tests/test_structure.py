@@ -28,7 +28,7 @@ FLOW = [
     ["io", "sim"],
     ["analysis"],
     ["datasets"],
-    ["design", "calibration", "rig"],
+    ["design", "calibration", "rig", "scale"],
     ["report"],
     ["studies"],
     ["cli"],

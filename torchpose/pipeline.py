@@ -106,7 +106,7 @@ class PoseEstimator(nn.Module):
 
     made_for: Tensor
 
-    def __new__(cls, camera: Camera | CameraRig | None = None, *args: Any, **kwargs: Any) -> PoseEstimator:
+    def __new__(cls, camera: Any = None, target: Any = None, *args: Any, **options: Any) -> PoseEstimator:
         several = cls is PoseEstimator and isinstance(camera, CameraRig)
         return super().__new__(RigEstimator if several else cls)
 

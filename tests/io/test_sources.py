@@ -60,6 +60,7 @@ def test_names_that_are_not_utf8_become_valid_text(tmp_path: Path) -> None:
     touch(Path(os.fsdecode(os.fsencode(tmp_path) + b"/f\xff.png")))
     (source,) = find_sources([tmp_path])
     assert source.name == "f\\xff.png"
+    assert isinstance(source.path, Path)
     assert source.path.exists()
 
 

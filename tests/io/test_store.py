@@ -306,8 +306,8 @@ def test_counts_and_unreadable_frames_include_those_of_the_earlier_run(tmp_path:
     first.close()
     second = store(tmp_path, resume=True)
     second.append([record(NAMES[1])])
-    assert second.counts == {"ok": 2, "unreadable": 1}
-    assert second.unreadable == {"x.png": "empty"}
+    assert second.tally.counts == {"ok": 2, "unreadable": 1}
+    assert second.tally.unreadable == {"x.png": "empty"}
     second.close()
 
 
@@ -455,10 +455,10 @@ def test_copies_without_a_row_are_counted(tmp_path: Path) -> None:
     of.close()
     again = store(tmp_path, resume=True)
     for one in (of, again):
-        assert one.crowded == {"b", "c"}
-        assert one.most == {"quad": 6}
+        assert one.tally.crowded == {"b", "c"}
+        assert one.tally.most == {"quad": 6}
     again.finish(["a", "b", "c"])
     done = store(tmp_path, resume=True)
     assert len(done) == 3
-    assert done.crowded == {"b", "c"}
+    assert done.tally.crowded == {"b", "c"}
     done.close()

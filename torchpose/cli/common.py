@@ -14,6 +14,7 @@ from torchpose.errors import ConfigError, printable
 if TYPE_CHECKING:
     from torchpose import camera as cameras
     from torchpose.io.sources import Source
+    from torchpose.io.storage import Place
 
 INTERRUPTED = 130  # as shells have it: 128 + SIGINT
 
@@ -52,7 +53,7 @@ def use_threads(threads: int | None, *, share: float = 1.0) -> int:
     return wanted
 
 
-def frames_of(inputs: Sequence[Path]) -> list[Source]:
+def frames_of(inputs: Sequence[Path | Place]) -> list[Source]:
     """Frames of the INPUTs; what is passed over is told on stderr."""
     from torchpose.io.sources import find_sources
 
@@ -60,9 +61,10 @@ def frames_of(inputs: Sequence[Path]) -> list[Source]:
 
 
 def check_outputs(
-    inputs: Sequence[Path], sources: Sequence[Source], tables: Sequence[Path], overlay: Path | None
+    given: Sequence[Path | Place], sources: Sequence[Source], tables: Sequence[Path], overlay: Path | None
 ) -> None:
     """Refuses outputs that would overwrite or mingle with inputs."""
+    inputs = [path for path in given if isinstance(path, Path)]
     read = {path.resolve() for path in inputs}
     for table in tables:
         if table.resolve() in read:
@@ -78,7 +80,8 @@ def check_outputs(
         )
     from torchpose.report.overlay import picture_path
 
-    frames = {Path(os.path.realpath(source.path)) for source in sources}  # which takes a loop of links, too
+    # which takes a loop of links, too
+    frames = {Path(os.path.realpath(source.path)) for source in sources if isinstance(source.path, Path)}
     places = [picture_path(place, source.name) for source in sources]  # refuses those that lie outside
     if any(path in frames for path in places):
         raise ConfigError(f"{overlay}: --overlay: its pictures would overwrite the frames; choose another folder")

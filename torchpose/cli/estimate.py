@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypedDict
 
 import typer
 
@@ -31,12 +33,17 @@ if TYPE_CHECKING:  # imported where they are used: torch takes more than a secon
     from torchpose.io.estimates import Estimation
     from torchpose.io.misfits import Misfits
     from torchpose.io.sources import Source
+    from torchpose.io.storage import Place
     from torchpose.io.store import ResultStore
+    from torchpose.io.tally import Tally
     from torchpose.target import Target
 
+_OUT = "Table of the poses: .csv, .jsonl or .parquet, on a disk or in a store; with --engine ray a folder of parts."
+_ENGINE = "What runs the work: this process, or the workers of a Ray cluster (extra: ray)."
+_ADDRESS = "With --engine ray: a cluster that is there; without it, one starts here and ends with the command."
 _INPUTS = (
     "Image files (PNG, TIFF, BMP, JPEG, PGM; 8 or 16 bit, grey or colour), folders of them, searched recursively and "
-    "taken in natural order, or capture manifests (.jsonl)."
+    "taken in natural order, or capture manifests (.jsonl); paths, or URLs such as s3://BUCKET/FOLDER."
 )
 _CAMERA = (
     "Camera file: OpenCV YAML, JSON or XML, ROS camera_info, Kalibr camchain, COLMAP cameras.txt and others "
@@ -64,13 +71,18 @@ _RELATIVE = "Name of a target: give the poses of the others (of their parts) in 
 _DETECTIONS = "Table of the markers found: .csv, .jsonl or .parquet."
 
 
+class Engine(StrEnum):
+    local = "local"
+    ray = "ray"
+
+
 def estimate(
-    inputs: Annotated[list[Path], typer.Argument(metavar="INPUT...", help=_INPUTS)],
+    inputs: Annotated[list[str], typer.Argument(metavar="INPUT...", help=_INPUTS)],
     target: Annotated[list[str], typer.Option(help=_TARGET)],
-    out: Annotated[Path, typer.Option(help="Table of the poses: .csv, .jsonl or .parquet.")],
+    out: Annotated[str, typer.Option(help=_OUT)],
     camera: Annotated[str | None, typer.Option(help=_CAMERA)] = None,
     cameras: Annotated[Path | None, typer.Option(metavar="RIG", help=_CAMERAS)] = None,
-    detections: Annotated[Path | None, typer.Option(help=_DETECTIONS)] = None,
+    detections: Annotated[str | None, typer.Option(help=_DETECTIONS)] = None,
     overlay: Overlay = None,
     instances: Annotated[int, typer.Option(min=1, max=1000, metavar="K", help=_INSTANCES)] = 1,
     assume_upright: Annotated[bool, typer.Option("--assume-upright", help=_UPRIGHT)] = False,
@@ -82,6 +94,8 @@ def estimate(
     srgb: Annotated[bool, typer.Option("--srgb", help="The same as --tone srgb.")] = False,
     batch: Batch = None,
     threads: Threads = None,
+    engine: Annotated[Engine, typer.Option(help=_ENGINE)] = Engine.local,
+    address: Annotated[str | None, typer.Option(help=_ADDRESS)] = None,
     quiet: Silent = False,
 ) -> int:
     """Measure the pose of ring targets in every frame, with its uncertainty.
@@ -89,62 +103,89 @@ def estimate(
     One row a frame and target, or with --instances one a copy: status, translation in mm, rotation vector in rad
     (target to camera), their standard deviations, reprojection RMS in px, number of markers.
     """
-    from torchpose.camera import Camera, CameraRig
-    from torchpose.cli.moments import estimate_moments
+    from torchpose.camera import Camera
+    from torchpose.cli.moments import estimate_moments, rig_of
     from torchpose.cli.terminal import native_stderr_silenced
     from torchpose.io.estimates import Estimation
-    from torchpose.io.writers import check_table_path
+    from torchpose.io.storage import place_of
     from torchpose.target import Target
 
-    for path, option in ((out, "--out"), (detections, "--detections")):
-        if path is not None:
-            check_table_path(path, option)
-    _check_one_of(camera, cameras, detections, overlay, instances)
+    places = [place_of(name) for name in inputs]
+    on_ray, tables = engine is Engine.ray, _Tables.of(out, detections)
+    _check_engine(address, overlay, on_ray=on_ray)
+    if not on_ray:
+        tables.check()
     targets = [Target.load(name).upright() if assume_upright else Target.load(name) for name in target]
     _check_relative(relative_to, targets, hand_eye, instances)
+    how: _How = {"resume": resume, "batch": batch, "threads": threads or cores(), "quiet": quiet}
     tone = "srgb" if srgb and tone is None else tone
-    threads = threads or cores()
-    if cameras is not None:
-        rig = CameraRig.load(cameras)
-        base = _load_hand_eye(hand_eye, [])
-        rest = Estimation(rig.cameras[0], targets, base, method, 1, relative_to, assume_upright)
-        options = {"tone": tone, "resume": resume, "batch": batch, "threads": threads, "quiet": quiet}
-        return estimate_moments(rig, inputs, rest, out, options)
-    assert camera is not None
-    lens, sources = Camera.load(camera), frames_of(inputs)
+    if several := rig_of(camera, cameras, {"--overlay": overlay, "--detections": detections, "--engine": on_ray}):
+        work = Estimation(
+            several.cameras[0], targets, _load_hand_eye(hand_eye, []), method, instances, relative_to, assume_upright
+        )
+        return estimate_moments(several, places, work, tables.out, {"tone": tone, **how})
+    lens, sources = Camera.load(str(camera)), frames_of(places)
     lens = with_tone(lens, tone)
     lens = lens if lens.tone is not None else _with_judged_tone(lens, targets[0], sources)
     base = _load_hand_eye(hand_eye, sources)
     work = Estimation(lens, targets, base, method, instances, relative_to, assume_upright)
-    check_outputs(inputs, sources, [p for p in (out, detections) if p is not None], overlay)
+    check_outputs(places, sources, tables.paths, overlay)
     with native_stderr_silenced():
-        return _run(work, sources, out, detections, overlay, resume=resume, batch=batch, threads=threads, quiet=quiet)
+        if on_ray:
+            return _run_on_ray(work, sources, tables, address, **how)
+        return _run(work, sources, tables, overlay, **how)
 
 
-def _check_one_of(
-    camera: str | None, cameras: Path | None, detections: Path | None, overlay: Path | None, instances: int
-) -> None:
+class _How(TypedDict):
+    """Options that rows do not depend on."""
+
+    resume: bool
+    batch: int | None
+    threads: int
+    quiet: bool
+
+
+@dataclass(frozen=True)
+class _Tables:
+    """Where the tables of a run go: paths, or places in a store."""
+
+    out: Path | Place
+    detections: Path | Place | None
+
+    @classmethod
+    def of(cls, out: str, detections: str | None) -> _Tables:
+        from torchpose.io.storage import place_of
+
+        return cls(place_of(out), None if detections is None else place_of(detections))
+
+    @property
+    def paths(self) -> list[Path]:
+        """Those on a disk."""
+        return [path for path in (self.out, self.detections) if isinstance(path, Path)]
+
+    def check(self) -> None:
+        """Raises ConfigError unless both can be written."""
+        from torchpose.io.writers import check_table_path
+
+        for path, option in ((self.out, "--out"), (self.detections, "--detections")):
+            if isinstance(path, Path):
+                check_table_path(path, option)
+
+
+def _check_engine(address: str | None, overlay: Path | None, *, on_ray: bool) -> None:
     from torchpose.errors import ConfigError
 
-    if (camera is None) == (cameras is None):
-        raise ConfigError(
-            f"--camera: {'missing' if camera is None else 'stands beside --cameras'}; give --camera of one camera, or "
-            "--cameras of several"
-        )
-    if cameras is None:
-        return
-    for name, given in (("--detections", detections is not None), ("--overlay", overlay is not None)):
-        if given:
-            raise ConfigError(f"{name}: is of one camera; leave it out with --cameras, or run each camera by itself")
-    if instances > 1:
-        raise ConfigError("--instances: several cameras look for one copy; leave it out with --cameras")
+    if address is not None and not on_ray:
+        raise ConfigError("--address: is of --engine ray alone; add it or leave --address out")
+    if overlay is not None and on_ray:
+        raise ConfigError("--overlay: is not drawn by --engine ray; run a part of the frames with --engine local")
 
 
 def _with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -> Camera:
     """The camera with the tone that the frames tell, where their kind of file makes one likely; says what it took."""
-    from torchpose.io.images import UnreadableImageError, WrongSizeError, likely_encoded
+    from torchpose.io.images import UnreadableImageError, WrongSizeError
 
-    if not sources or not likely_encoded(sources[0].path):
+    if not sources or not sources[0].likely_encoded():
         return lens
     from dataclasses import replace
 
@@ -180,8 +221,7 @@ def _with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -
 def _run(
     work: Estimation,
     sources: list[Source],
-    out: Path,
-    detections: Path | None,
+    tables: _Tables,
     overlay: Path | None,
     *,
     resume: bool,
@@ -196,6 +236,7 @@ def _run(
     from torchpose.camera import LINEAR
     from torchpose.cli.terminal import FrameProgress
     from torchpose.io.reader import FrameReader, default_batch, in_batches
+    from torchpose.io.staged import Staged
     from torchpose.report.overlay import Overlay
 
     cv2.setNumThreads(1)  # frames are decoded side by side; threads inside of one would only compete
@@ -205,7 +246,8 @@ def _run(
     camera, targets = work.camera, work.targets
     tone, estimator = camera.tone or LINEAR, work.estimator()
     painter = None if overlay is None else Overlay(camera, targets, overlay, threads=threads)
-    store = _opened(work, sources, out, detections, resume)
+    staged = Staged(tables.out, tables.detections, resume=resume)
+    store = _opened(work, sources, staged.out, staged.detections, resume)
     # a resumed run works on the same batches as one that was not interrupted, so that rows agree to the last bit
     batches = in_batches(sources, batch or default_batch(camera.width, camera.height))
     pending = [one for one in batches if any(source.name not in store for source in one)]
@@ -216,43 +258,94 @@ def _run(
                 records = work.records(frames, estimator, None if painter is None else painter.write)
                 new = [record for record in records if record["frame"] not in store]
                 store.append(new)
-                progress.advance(len(new), store.counts)
+                progress.advance(len(new), store.tally.counts)
         store.finish([source.name for source in sources])
+        staged.send()
     except KeyboardInterrupt:
         return interrupted(f"{len(store)} of {len(sources)} frames are kept; add --resume to go on")
     finally:
         store.close()
-    progress.summary(store.counts, out)
-    _tell_mistakes(store, out, work)
-    if not quiet:
-        _tell_crowded(store, len(sources), work)
-        _tell_misfits(store.misfits, work)
-    return ended(store.unreadable)
+    progress.summary(store.tally.counts, tables.out)
+    if store.damaged:
+        say(
+            f"torchpose: {store.damaged} damaged lines of {staged.out}.partial left out, their frames done again",
+            err=True,
+        )
+    return _told(store.tally, work, len(sources), quiet=quiet)
+
+
+def _run_on_ray(
+    work: Estimation,
+    sources: list[Source],
+    tables: _Tables,
+    address: str | None,
+    *,
+    resume: bool,
+    batch: int | None,
+    threads: int,
+    quiet: bool,
+) -> int:
+    """The same on the workers of a Ray cluster."""
+    from torchpose.cli.terminal import FrameProgress
+    from torchpose.io.reader import default_batch
+    from torchpose.io.rows import DETECTION_SCHEMA
+    from torchpose.io.tally import Tally
+    from torchpose.scale.cluster import cluster
+    from torchpose.scale.estimate import measured, pending
+    from torchpose.scale.parts import Parts
+
+    poses, marks = Parts.at(tables.out, work.schema), None
+    if tables.detections is not None:
+        marks = Parts.at(tables.detections, DETECTION_SCHEMA, "--detections")
+    origin = work.origin((str(source.root) for source in sources), detections=marks is not None)
+    for parts in (poses, marks):
+        if parts is not None:
+            parts.begin(origin, resume=resume)
+    tally = Tally()
+    blocks = pending(sources, batch or default_batch(work.camera.width, work.camera.height), poses, tally)
+    left = sum(len(block.sources) for block in blocks)
+    with FrameProgress(len(sources), len(sources) - left, quiet=quiet) as progress:
+        try:
+            with cluster(address, threads) as workers:
+                for records in measured(work, blocks, poses, marks, workers=workers):
+                    for frame, rows in records:
+                        tally.add(frame, rows)
+                    left -= len(records)
+                    progress.advance(len(records), tally.counts)
+        except KeyboardInterrupt:
+            return interrupted(f"{len(sources) - left} of {len(sources)} frames are kept; add --resume to go on")
+    for parts in (marks, poses):
+        if parts is not None:
+            parts.finish()
+    progress.summary(tally.counts, tables.out)
+    return _told(tally, work, len(sources), quiet=quiet)
 
 
 def _opened(
     work: Estimation, sources: Sequence[Source], out: Path, detections: Path | None, resume: bool
 ) -> ResultStore:
     """Where the rows go, with those of an earlier run."""
-    from torchpose.io.store import ResultStore, stamp_of
+    from torchpose.io.store import ResultStore
 
-    files = {source.name: stamp_of(source.path) for source in sources}  # before they are read
+    files = {source.name: source.stamp() for source in sources}  # before they are read
     kept: dict[str, Any] = {"schema": work.schema, "targets": len(work.rows_of), "files": files}
     origin = work.origin((str(source.root) for source in sources), detections=detections is not None)
     return ResultStore(out, detections, resume=resume, origin=origin, **kept)
 
 
-def _tell_mistakes(store: ResultStore, out: Path, work: Estimation) -> None:
-    """Tells, on stderr, what is wrong with the run as a whole."""
-    for line in store.whole_run.lines(f"{work.camera.width}x{work.camera.height}"):
+def _told(tally: Tally, work: Estimation, frames: int, *, quiet: bool) -> int:
+    """Tells, on stderr, what is wrong with the run as a whole and what its rows say together; the exit code."""
+    for line in tally.whole_run.lines(f"{work.camera.width}x{work.camera.height}"):
         say(f"torchpose: warning: {line}", err=True)
-    if store.damaged:
-        say(f"torchpose: {store.damaged} damaged lines of {out}.partial left out, their frames done again", err=True)
+    if not quiet:
+        _tell_crowded(tally, frames, work)
+        _tell_misfits(tally.misfits, work)
+    return ended(tally.unreadable)
 
 
-def _tell_crowded(store: ResultStore, count: int, work: Estimation) -> None:
+def _tell_crowded(tally: Tally, count: int, work: Estimation) -> None:
     """Tells, in a line on stderr, of copies that were seen in some of the frames and have no row."""
-    frames, most = store.crowded, store.most
+    frames, most = tally.crowded, tally.most
     if not frames:
         return
     seen = ", ".join(f"{number} of {target}" for target, number in most.items())

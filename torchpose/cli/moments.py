@@ -13,9 +13,29 @@ if TYPE_CHECKING:
     from torchpose.camera import CameraRig
     from torchpose.io.estimates import Estimation
     from torchpose.io.moments import Moment, RigEstimation
+    from torchpose.io.storage import Place
 
 
-def estimate_moments(rig: CameraRig, inputs: list[Path], rest: Estimation, out: Path, options: dict[str, Any]) -> int:
+def rig_of(camera: str | None, cameras: Path | None, options: dict[str, Any]) -> CameraRig | None:
+    """The rig of --cameras; None where there is one camera. ``options`` do not go with several."""
+    from torchpose.camera import CameraRig
+
+    if (camera is None) == (cameras is None):
+        raise ConfigError(
+            f"--camera: {'missing' if camera is None else 'stands beside --cameras'}; give --camera of one camera, or "
+            "--cameras of several"
+        )
+    if cameras is None:
+        return None
+    for name, given in options.items():
+        if given:
+            raise ConfigError(f"{name}: is of one camera; leave it out with --cameras, or run each camera by itself")
+    return CameraRig.load(cameras)
+
+
+def estimate_moments(
+    rig: CameraRig, inputs: list[Path | Place], rest: Estimation, out: Path | Place, options: dict[str, Any]
+) -> int:
     """Estimates what is not done yet and writes the table; returns the exit code.
 
     Args:
@@ -31,6 +51,10 @@ def estimate_moments(rig: CameraRig, inputs: list[Path], rest: Estimation, out: 
 
     if len(inputs) != 1:
         raise ConfigError(f"{inputs[1]}: INPUT: with --cameras there is one INPUT; give the folder of all cameras")
+    if not isinstance(inputs[0], Path) or not isinstance(out, Path):
+        raise ConfigError("--cameras: reads and writes folders of this machine; copy the pictures here")
+    if rest.instances > 1:
+        raise ConfigError("--instances: several cameras look for one copy; leave it out with --cameras")
     if (tone := read_tone(options["tone"])) is not None:
         lenses = [replace(camera, tone=tone) for camera in rig.cameras]
         rig = CameraRig(lenses, rig.R, rig.t, rig.covariance, rig.names)
@@ -81,20 +105,20 @@ def _run(work: RigEstimation, moments: list[Moment], out: Path, options: dict[st
                     kind = unreadable if status == Status.UNREADABLE else other
                     kind[f"{work.rig.names[camera]}/{pictures.moments[number].name}"] = reason
                 store.append(new)
-                progress.advance(len(new), store.counts)
+                progress.advance(len(new), store.tally.counts)
         store.finish([moment.name for moment in moments])
     except KeyboardInterrupt:
         return interrupted(f"{len(store)} of {len(moments)} moments are kept; add --resume to go on")
     finally:
         store.close()
-    progress.summary(store.counts, out)
-    for line in store.whole_run.lines(f"{largest.width}x{largest.height}"):
+    progress.summary(store.tally.counts, out)
+    for line in store.tally.whole_run.lines(f"{largest.width}x{largest.height}"):
         say(f"torchpose: warning: {line}", err=True)
     if other:
         first, reason = next(iter(other.items()))
         say(f"torchpose: warning: {first} ({reason}): {len(other)} have not the size of their camera", err=True)
     if not options["quiet"]:
-        _tell_disagreement(store.disagree, work)
+        _tell_disagreement(store.tally.disagree, work)
     return ended(unreadable)
 
 

@@ -331,4 +331,4 @@ def _floats(values: Any) -> Tensor:
 
 
 def _backgrounds(path: Path, name: str | None) -> list[Path]:
-    return [] if name is None else [source.path for source in find_sources([Path(beside(path, name))])]
+    return [] if name is None else [Path(str(source.path)) for source in find_sources([Path(beside(path, name))])]

@@ -22,7 +22,7 @@ from torchpose.io.manifest import read_manifest
 from torchpose.io.reader import Batch, FrameReader
 from torchpose.io.rows import POSE_SCHEMA, Row, Schema, fault_row, finite
 from torchpose.io.sources import MANIFEST_SUFFIX, Source, find_sources, natural_key
-from torchpose.io.store import Stamp, stamp_of
+from torchpose.io.store import Stamp
 from torchpose.pipeline import PoseEstimator
 from torchpose.results import Poses, Status
 
@@ -59,7 +59,7 @@ class Moment:
     @property
     def stamp(self) -> Stamp | None:
         """Changes when any of the pictures does, or one comes or goes."""
-        stamps = [None if source is None else stamp_of(source.path) for source in self.sources]
+        stamps = [None if source is None else source.stamp() for source in self.sources]
         known = [(k, stamp) for k, stamp in enumerate(stamps, 1) if stamp is not None]
         if not known:
             return None
@@ -112,7 +112,7 @@ def _in_manifest(given: Path, rig: CameraRig, tell: Callable[[str], None]) -> li
             moment = _without(frame.image, name)
             if moment in own:
                 raise ConfigError(
-                    f"{given}: INPUT: {own[moment].path.name} and {frame.image} of camera {name} are both of moment "
+                    f"{given}: INPUT: {own[moment].path} and {frame.image} of camera {name} are both of moment "
                     f"{moment}; give them names that differ beside the camera's"
                 )
             own[moment] = Source(moment, given.parent / frame.image, root, frame.robot_pose)

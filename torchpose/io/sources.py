@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from torchpose.errors import ConfigError
-from torchpose.io import images
+from torchpose.io import images, remote
 from torchpose.io.manifest import read_manifest
+from torchpose.io.storage import Listed, Place, StorageError, refused
 
 IMAGE_SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg", ".pgm")
 MANIFEST_SUFFIX = ".jsonl"
@@ -35,21 +36,39 @@ class Source:
 
     Attributes:
         name: what the rows call it: path relative to its INPUT, forward slashes.
-        path: where the image lies.
+        path: where the image lies, on a disk or in a store.
         root: the folder that ``name`` is relative to, resolved.
         robot_pose: tool in the robot base, mm and rad, if a manifest recorded it.
         directory: of a TIFF file with several pages, see `images.pages`.
+        listed: size in bytes and time of change in ns, where a store has told them.
     """
 
     name: str
-    path: Path
-    root: Path
+    path: Path | Place
+    root: Path | Place
     robot_pose: tuple[float, ...] | None = None
     directory: int = 0
+    listed: tuple[int, int] | None = None
 
     def decode(self, *, threads: int = 1, size: tuple[int, int] | None = None) -> np.ndarray:
         """Grey values, see `images.decode`."""
-        return images.decode(self.path, threads=threads, directory=self.directory, size=size)
+        decode = images.decode if isinstance(self.path, Path) else remote.decode
+        return decode(self.path, threads=threads, directory=self.directory, size=size)  # type: ignore[arg-type]
+
+    def likely_encoded(self) -> bool:
+        """See `images.likely_encoded`."""
+        of = self.path
+        return images.likely_encoded(of) if isinstance(of, Path) else remote.likely_encoded(of)
+
+    def stamp(self) -> list[int] | None:
+        """Size of the file in bytes and its time of change in ns; None where there is none."""
+        if self.listed is not None or not isinstance(self.path, Path):
+            return None if self.listed is None else [*self.listed]
+        try:
+            found = self.path.stat()
+        except (OSError, ValueError):
+            return None
+        return [found.st_size, found.st_mtime_ns]
 
 
 def _silent(line: str) -> None:
@@ -65,7 +84,7 @@ def natural_key(name: str) -> tuple[tuple[tuple[str | int, ...], ...], str]:
     return parts, name
 
 
-def find_sources(inputs: Sequence[Path], tell: Callable[[str], None] = _silent) -> list[Source]:
+def find_sources(inputs: Sequence[Path | Place], tell: Callable[[str], None] = _silent) -> list[Source]:
     """Frames of image files, folders (searched recursively, in natural order) and capture manifests, input by input.
 
     In folders, hidden files and folders and everything without an image's suffix are passed over. A file with an
@@ -109,8 +128,11 @@ def _summary(passed: Counter[str]) -> str:
     return ", ".join(f"{count} {kind}" for kind, count in kinds if count)
 
 
-def _sources_of(given: Path, passed: Counter[str]) -> Iterator[Source]:
+def _sources_of(given: Path | Place, passed: Counter[str]) -> Iterator[Source]:
     """Frames of an input; pictures that are not read are counted in ``passed``."""
+    if isinstance(given, Place):
+        yield from _stored(given, passed)
+        return
     if _state(given) == "folder":
         root = given.resolve()
         pairs = [(_text(path.relative_to(given).as_posix()), path) for path in _walk(given, passed)]
@@ -132,6 +154,37 @@ def _sources_of(given: Path, passed: Counter[str]) -> Iterator[Source]:
         yield from _pages(_text(given.name), given, given.parent.resolve())
 
 
+def _stored(given: Place, passed: Counter[str]) -> Iterator[Source]:
+    """The same of a file, a folder or a manifest in a store."""
+    try:
+        if given.suffix.lower() == MANIFEST_SUFFIX:
+            yield from _recorded_in_store(given.parent / given.name, given.fragment or None, passed)
+        elif given.suffix.lower() in IMAGE_SUFFIXES and given.kind() == "file":
+            yield from _pages(given.name, given, given.parent, _stamp(given.stat()))
+        else:
+            for one in sorted(given.listed(), key=lambda one: natural_key(one.name)):
+                suffix = Path(one.name).suffix.lower()
+                if suffix not in _OTHERS.union(IMAGE_SUFFIXES) or any(p.startswith(".") for p in one.name.split("/")):
+                    continue
+                if suffix in _OTHERS:
+                    passed[suffix] += 1
+                else:
+                    yield from _pages(one.name, given / one.name, given, _stamp(one))
+    except StorageError as error:
+        raise refused(error, given, "INPUT") from None
+
+
+def _stamp(one: Listed) -> tuple[int, int]:
+    return one.size, one.time
+
+
+def _recorded_in_store(manifest: Place, camera: str | None, passed: Counter[str]) -> Iterator[Source]:
+    for frame in remote.manifest_frames(manifest, camera):
+        pages = list(_pages(frame.image, manifest.parent / frame.image, manifest.parent))
+        passed["pages behind the first"] += len(pages) - 1
+        yield replace(pages[0], robot_pose=frame.robot_pose)
+
+
 def _recorded(manifest: Path, camera: str | None, passed: Counter[str]) -> Iterator[Source]:
     """The frames of a manifest: one a record, so what a file holds behind its first page is passed over."""
     root = manifest.parent.resolve()
@@ -142,11 +195,15 @@ def _recorded(manifest: Path, camera: str | None, passed: Counter[str]) -> Itera
         yield replace(pages[0], robot_pose=frame.robot_pose)
 
 
-def _pages(name: str, path: Path, root: Path) -> Iterator[Source]:
+def _pages(
+    name: str, path: Path | Place, root: Path | Place, listed: tuple[int, int] | None = None
+) -> Iterator[Source]:
     """The frames of a file."""
-    places = images.pages(path) if path.suffix.lower() in _STACKS else [0]
+    places = [0]
+    if path.suffix.lower() in _STACKS:
+        places = images.pages(path) if isinstance(path, Path) else remote.pages(path)
     for number, place in enumerate(places, start=1):
-        yield Source(name if number == 1 else f"{name}#{number}", path, root, directory=place)
+        yield Source(name if number == 1 else f"{name}#{number}", path, root, directory=place, listed=listed)
 
 
 def _state(path: Path) -> str:

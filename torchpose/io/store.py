@@ -12,7 +12,6 @@ size, what was changed since, and what a damaged line of the journal held.
 """
 
 import json
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,9 +22,8 @@ from torchpose.config import parse_json, read_text
 from torchpose.errors import ConfigError
 from torchpose.io.cells import row_check
 from torchpose.io.journal import Journal, Place
-from torchpose.io.misfits import Misfits
 from torchpose.io.rows import DETECTION_SCHEMA, NEWER, Row, Schema
-from torchpose.io.whole_run import WholeRun
+from torchpose.io.tally import Tally
 from torchpose.io.writers import atomic_path, check_table_path, read_rows, write_rows
 from torchpose.results import Status
 
@@ -38,15 +36,6 @@ Stamp = Annotated[list[int], Field(min_length=2, max_length=2)]
 """Size of a frame's file in bytes and its time of change in ns: another picture under the same name has another one."""
 _STAMPS = TypeAdapter(dict[str, Stamp | None])
 _AGAIN = {status.name.lower() for status in (Status.UNREADABLE, Status.WRONG_SIZE)}
-
-
-def stamp_of(path: Path) -> Stamp | None:
-    """The stamp of a file; None where there is none."""
-    try:
-        found = path.stat()
-    except (OSError, ValueError):
-        return None
-    return [found.st_size, found.st_mtime_ns]
 
 
 class _Record(BaseModel):
@@ -72,13 +61,7 @@ class ResultStore:
             rows are kept, of the others those that were made from the same file.
 
     Attributes:
-        counts: number of rows by status, those of an earlier run included.
-        unreadable: frames that could not be read, with their reason.
-        crowded: frames that show more copies of a target than they have rows.
-        most: by target, the most copies of it that one of these frames shows.
-        disagree: number of rows whose cameras contradict each other.
-        misfits: by target, what its rows say together of target and camera file.
-        whole_run: what only all rows together show.
+        tally: of all rows, those of an earlier run included.
         damaged: lines of the journal that were not as they had been written.
 
     Raises:
@@ -121,13 +104,7 @@ class ResultStore:
 
     def _forget(self) -> None:
         """No frame is done."""
-        self.counts: Counter[str] = Counter()
-        self.unreadable: dict[str, str] = {}
-        self.crowded: set[str] = set()
-        self.most: dict[str, int] = {}
-        self.disagree = 0
-        self.misfits: dict[str, Misfits] = {}
-        self.whole_run = WholeRun()
+        self.tally = Tally()
         self._places: dict[str, Place] = {}
         self._made_from: dict[str, Stamp | None] = {}
 
@@ -197,17 +174,7 @@ class ResultStore:
     def _note(self, record: Row) -> None:
         """Counts what a record says."""
         self._made_from[record["frame"]] = record["file"]
-        self.counts.update(row["status"] for row in record["rows"])
-        if record["rows"][0]["status"] == "unreadable":
-            self.unreadable[record["frame"]] = record["rows"][0]["reason"]
-        rows = Counter(row["target"] for row in record["rows"])
-        for row in record["rows"]:
-            self.misfits.setdefault(row["target"], Misfits()).add(row)
-            self.disagree += row["reason"] == "cameras_disagree"
-            self.whole_run.add(row)
-            if (row.get("copies") or 0) > rows[row["target"]]:
-                self.crowded.add(record["frame"])
-                self.most[row["target"]] = max(self.most.get(row["target"], 0), row["copies"])
+        self.tally.add(record["frame"], record["rows"])
 
     def _load(self) -> bool:
         """Reads the journal of a killed run; False if not even its first line is whole."""

@@ -3,11 +3,13 @@
 import contextlib
 import csv
 import hashlib
+import io
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
+from typing import BinaryIO
 
 from torchpose.config import check_regular, parse_json
 from torchpose.errors import ConfigError
@@ -90,7 +92,8 @@ def read_table(path: Path, schema: Schema, needed: Sequence[str]) -> list[Row]:
     check, number = row_check(schema, text=path.suffix == ".csv"), 0
     rows: list[Row] = []
     try:
-        check_regular(path)
+        if not (path.is_dir() and path.suffix == ".parquet"):
+            check_regular(path)
         for number, row in enumerate(_READERS[path.suffix](path), 1):  # noqa: B007  # counts on behind the loop
             if missing := [name for name in needed if name not in row]:
                 raise ConfigError(f"{path}: {missing[0]}: column is missing; give what torchpose estimate wrote")
@@ -181,6 +184,19 @@ def _read_jsonl(path: Path) -> Iterator[Row]:
 
 
 def _write_parquet(path: Path, rows: Iterable[Row], schema: Schema) -> None:
+    # opened here: pyarrow takes no path whose bytes are not UTF-8
+    with path.open("wb") as file:
+        _write_groups(file, rows, schema, {})
+
+
+def parquet_bytes(rows: Iterable[Row], schema: Schema, metadata: Mapping[bytes, bytes]) -> bytes:
+    """A Parquet file of rows, with entries of its own in the metadata."""
+    file = io.BytesIO()
+    _write_groups(file, rows, schema, metadata)
+    return file.getvalue()
+
+
+def _write_groups(file: BinaryIO, rows: Iterable[Row], schema: Schema, metadata: Mapping[bytes, bytes]) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -193,20 +209,22 @@ def _write_parquet(path: Path, rows: Iterable[Row], schema: Schema) -> None:
         "solutions": pa.list_(pa.struct(parts | {"rms_px": number, "chi2": number})),
     }
     plain = {str: pa.string(), int: pa.int64(), float: number}
-    arrow = pa.schema({c: nested[c] if kind is list else plain[kind] for c, kind in schema.items()})
+    columns = {c: nested[c] if kind is list else plain[kind] for c, kind in schema.items()}
+    arrow = pa.schema(columns, metadata=dict(metadata) or None)
     remaining = iter(rows)
-    # opened here: pyarrow takes no path whose bytes are not UTF-8
-    with path.open("wb") as file, pq.ParquetWriter(file, arrow) as writer:
+    with pq.ParquetWriter(file, arrow) as writer:
         while group := list(islice(remaining, _ROW_GROUP)):
             writer.write_table(pa.Table.from_pylist(group, arrow))
 
 
 def _read_parquet(path: Path) -> Iterator[Row]:
+    """Rows of a file, or of all the parts of a folder in the order of their names."""
     import pyarrow.parquet as pq
 
-    with path.open("rb") as opened, pq.ParquetFile(opened) as file:
-        for group in file.iter_batches(_ROW_GROUP):
-            yield from group.to_pylist()
+    for one in sorted(path.glob("*.parquet")) if path.is_dir() else [path]:
+        with one.open("rb") as opened, pq.ParquetFile(opened) as file:
+            for group in file.iter_batches(_ROW_GROUP):
+                yield from group.to_pylist()
 
 
 _WRITERS: dict[str, Callable[[Path, Iterable[Row], Schema], None]] = {

@@ -300,24 +300,39 @@ def _turns(rig: CameraRig, views: list[Seen], R: Tensor, t: Tensor, n: int) -> T
 def _loosened(normals: MarkerNormals, parts: _Parts, numbers: Tensor, turns: Tensor) -> Tensor | None:
     """The columns ``turns`` by as much as cameras seem to be beside their places; None where none does.
 
-    How much that is, nobody knows: it is averaged over by its likelihood, as `pose.excess` does for prints.
+    One camera may be turned, or beside its place in all six numbers, or all are. Which it is and how much, nobody
+    knows: it is averaged over by its likelihood, as `pose.excess` does for prints.
     """
     known = torch.cat([parts.own, numbers], -1)
     information, right = _remaining(normals, known, turns, numbers.shape[-1])
     finite = (information.isfinite().all(-1) & right.isfinite()).all(-1)
     information = torch.where(finite[:, None, None], information, 0.0)
+    right = torch.where(finite[:, None], right, 0.0)
+    cameras = torch.eye(right.shape[-1] // POSE, dtype=right.dtype, device=right.device)
+    turned = torch.nn.functional.pad(right.new_ones(2), (0, POSE - 2))
+    which = torch.cat(
+        [torch.kron(cameras, turned[None]), cameras.repeat_interleave(POSE, 1), right.new_ones(1, len(right[0]))]
+    )
+    found = [_likelihood(information, right, some > 0) for some in which]
+    likelihood, variance = (torch.stack(part, 1) for part in zip(*found, strict=True))
+    weight = torch.softmax(likelihood.flatten(1), -1).view_as(likelihood)
+    evidence = torch.logsumexp(likelihood.flatten(1), -1) - math.log(likelihood[0].numel())
+    off = torch.where((evidence > math.log(_LIKELIER))[:, None], (weight * variance).sum(-1) @ which, 0.0)
+    return turns * off.sqrt()[:, None, None] if bool((off > 0).any()) else None
+
+
+def _likelihood(information: Tensor, right: Tensor, some: Tensor) -> tuple[Tensor, Tensor]:
+    """Logarithm (J, G) of how much likelier some of the unknowns are off with G variances (J, G) than not at all."""
+    information, right = information[:, some][:, :, some], right[:, some]
     values, vectors = torch.linalg.eigh(0.5 * (information + information.mT))
     values = values.clamp_min(0.0)[:, None]
-    along = (vectors.mT @ torch.where(finite[:, None], right, 0.0)[..., None])[..., 0].square()[:, None]
-    variance = torch.logspace(*_OFF, _GRID, dtype=right.dtype, device=right.device)[:, None].square()
+    known = values[..., -1:].clamp_min(torch.finfo(values.dtype).tiny)
+    variance = torch.logspace(*_OFF, _GRID, dtype=right.dtype, device=right.device)[:, None].square() / known
+    along = (vectors.mT @ right[..., None])[..., 0].square()[:, None]
     # the right side along a direction has the variance l + v l^2
     spread = 1 + variance * values
-    gained = torch.where(values > 0, along * variance / spread, 0.0)
-    likelihood = 0.5 * (gained - spread.log()).sum(-1)
-    weight = torch.softmax(likelihood, -1)
-    evidence = torch.logsumexp(likelihood, -1) - math.log(_GRID)
-    off = torch.where(evidence > math.log(_LIKELIER), weight @ variance[:, 0], 0.0)
-    return turns * off.sqrt()[:, None, None, None] if bool((off > 0).any()) else None
+    likelihood = 0.5 * (torch.where(values > 0, along * variance / spread, 0.0) - spread.log()).sum(-1)
+    return likelihood, variance[..., 0]
 
 
 def _taken(information: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
@@ -326,16 +341,18 @@ def _taken(information: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
     scale = torch.where(scale > 0, scale.rsqrt(), 0.0).nan_to_num(posinf=0.0)
     scaled = (information * scale[..., :, None] * scale[..., None, :]).nan_to_num(nan=0.0)
     values, vectors = torch.linalg.eigh(0.5 * (scaled + scaled.mT))
-    there = values > _LEAST * values[..., -1:].clamp_min(_LEAST)
+    # what is left of sums that were taken off each other has half of their digits
+    least = LEAST_DIRECTION**0.5
+    there = values > least * values[..., -1:].clamp_min(least)
     along = (vectors.mT @ (right * scale)[..., None])[..., 0]
-    return torch.where(there, along.square() / values.clamp_min(_LEAST**2), 0.0).sum(-1), there.sum(-1)
+    return torch.where(there, along.square() / values.clamp_min(LEAST_DIRECTION), 0.0).sum(-1), there.sum(-1)
 
 
-# rad, of what a camera may be turned: from below any noise to what nobody would call a calibration (convention)
-_OFF, _GRID = (-8.0, -2.0), 25
-# times: rigs that are as they say are loosened once in a hundred, like prints (measured: `scripts/rig_statistics.py`)
-_LIKELIER = 3.0
-_LEAST = 1e3 * LEAST_DIRECTION  # of correlations that are taken off each other: rounding leaves more
+# deviations of what the pictures tell best, by which a camera may be off: from none that would show to what nobody
+# would call a calibration (convention)
+_OFF, _GRID = (-1.0, 3.0), 24
+# times, of rigs that are as they say one in a hundred is loosened (measured: `scripts/rig_statistics.py`)
+_LIKELIER = 0.5
 
 
 def _share(normals: MarkerNormals, own: Tensor, views: int) -> Tensor:

@@ -4,6 +4,7 @@ Every camera that has a pose proposes it; one that sees two rings proposes the r
 camera proposes anything, rays alone do (`torchpose.pnp.several`). Each proposal is fitted to the markers near it.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -17,13 +18,12 @@ from torchpose.identify.hypotheses import PLACE_TOLERANCE
 from torchpose.moments.views import Moments, View
 from torchpose.pnp import PnPCode
 from torchpose.pnp.several import Rays, solve_rays
-from torchpose.pnp.several.starts import starts
+from torchpose.pnp.several.starts import APART_DEG, starts
 from torchpose.pose import AMBIGUOUS_CHI2, Evidence, shape_chi2
 from torchpose.pose.evidence import visible
 from torchpose.results import Status
 
 _STEPS = 30  # of the fit to the centres, at most
-_SAME = 1e-3  # rad, between ends of two searches of one minimum, at most (convention)
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,8 +206,7 @@ def _ranked(R: Tensor, chi2: Tensor, support: Tensor, good: Tensor) -> tuple[Ten
     score = torch.where(good, support + 1 / (2 + chi2.nan_to_num(nan=torch.inf)), -1.0)
     best = score.argmax(1, keepdim=True)
     turn = rotations.angle_between(R, R.gather(1, best[..., None, None].expand(-1, -1, 3, 3)))
-    # two searches that end in one minimum agree to far more digits than two minima
-    return best[:, 0], good & (support == support.gather(1, best)) & (turn > _SAME)
+    return best[:, 0], good & (support == support.gather(1, best)) & (turn > math.radians(APART_DEG))
 
 
 def _of_shapes(moments: Moments, evidence: list[Evidence], R: Tensor, t: Tensor, near: Tensor) -> Tensor:

@@ -66,14 +66,14 @@ def solve(
     compile: bool = False,
     raise_on_failure: bool = False,
 ) -> PnPResult:
-    """Poses of B sets of N points. Line features have a solver of their own, `torchpose.pnp.lines`.
+    """Poses of B sets of N points; of lines, see `torchpose.pnp.lines`.
 
     Args:
         object_points: (N, 3) shared by all poses, or (B, N, 3).
         image_points: (B, N, 2) px.
         camera: `Camera`, pinhole matrix (3, 3) or (B, 3, 3), or `CameraRig` (method "iterative"): poses are
             then in its first camera, and what is uncertain of places and lenses is weighed with the noise.
-        camera_index: (N,) or (B, N), the camera of a rig that saw each point.
+        camera_index: (N,) or (B, N), of each point, with a rig.
         method: "iterative" is the maximum-likelihood estimate (Levenberg-Marquardt through the full camera model from
             every start that a closed form finds); the others return their closed form, with its covariance there.
         sigma_px: standard deviation of the image points, per axis.
@@ -104,10 +104,9 @@ def solve(
         raise ArgumentError(f"max_iterations: is {max_iterations}; give 1 or more")
     compile = compile and inputs.pixels.device.type == "cpu" and inputs.pixels.shape[1] <= _COMPILED_POINTS
     with torch.no_grad():
-        if rig is not None:
-            return _raised(solve_rig(inputs, *rig, starts, max_iterations), raise_on_failure)
-        result = _solve(inputs, method, starts, max_iterations, compile)
-    if torch.is_grad_enabled() and method == "iterative" and inputs.requires_grad:
+        several = None if rig is None else solve_rig(inputs, *rig, starts, max_iterations)
+        result = _solve(inputs, method, starts, max_iterations, compile) if several is None else several
+    if rig is None and torch.is_grad_enabled() and method == "iterative" and inputs.requires_grad:
         result = attach_gradient(result, inputs)
     return _raised(result, raise_on_failure)
 

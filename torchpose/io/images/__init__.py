@@ -4,7 +4,7 @@ import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
-from io import FileIO
+from io import SEEK_END, BufferedReader, BytesIO, FileIO
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,19 @@ from torchpose.io.images import jpeg, plain, png, tiff
 from torchpose.io.images.header import Header, UnreadableImageError, WrongSizeError, check_size, memory_told
 from torchpose.io.images.native import by_opencv
 
-__all__ = ["UnreadableImageError", "WrongSizeError", "decode", "likely_encoded", "pages"]
+__all__ = [
+    "UnreadableImageError",
+    "WrongSizeError",
+    "decode",
+    "decode_open",
+    "likely_encoded",
+    "likely_encoded_open",
+    "pages",
+    "pages_open",
+]
+
+Open = FileIO | BufferedReader | BytesIO
+"""What is read from: a file, or what a store gives."""
 
 _HEAD = 64  # bytes that tell of what kind a file is
 _MOST_BYTES = 1 << 31  # of a file other than TIFF, which is read by pages: 16-bit colour of the largest picture
@@ -32,13 +44,19 @@ def decode(path: Path, *, threads: int = 1, directory: int = 0, size: tuple[int,
         UnreadableImageError: with the reason. A file that ends early or is damaged is refused, never filled up.
         WrongSizeError: its header states another size. No memory is taken for its pixels.
     """
-    with _opened(path) as file, memory_told():
+    with _opened(path) as file:
+        return decode_open(file, threads=threads, directory=directory, size=size)
+
+
+def decode_open(file: Open, *, threads: int = 1, directory: int = 0, size: tuple[int, int] | None = None) -> np.ndarray:
+    """The same of a file that is open, at its beginning."""
+    with memory_told():
         head = file.read(_HEAD)
         if head.startswith(tiff.MAGIC):
             return tiff.TiffFile(file).decode(directory, size)
         if not head.startswith((png.MAGIC, jpeg.MAGIC, plain.BMP, *plain.PGM)):
             raise UnreadableImageError("not_an_image" if head else "empty")
-        if os.fstat(file.fileno()).st_size > _MOST_BYTES:
+        if file.seek(0, SEEK_END) > _MOST_BYTES:
             raise UnreadableImageError("too_large")
         file.seek(0)
         return _decode(file.read(), threads, size)
@@ -69,18 +87,28 @@ def pages(path: Path) -> list[int]:
     """
     try:
         with _opened(path) as file:
-            return tiff.TiffFile(file).pages() if file.read(4) in tiff.MAGIC else [0]
+            return pages_open(file)
     except UnreadableImageError:
         return [0]
+
+
+def pages_open(file: Open) -> list[int]:
+    """The same of a file that is open, at its beginning. UnreadableImageError: it ends early."""
+    return tiff.TiffFile(file).pages() if file.read(4) in tiff.MAGIC else [0]
 
 
 def likely_encoded(path: Path) -> bool:
     """Whether a file is of a kind that mostly holds values bent by a tone curve: JPEG, or colour (PNG, BMP)."""
     try:
         with _opened(path) as file:
-            head = file.read(_HEAD)
+            return likely_encoded_open(file)
     except UnreadableImageError:
         return False
+
+
+def likely_encoded_open(file: Open) -> bool:
+    """The same of a file that is open, at its beginning."""
+    head = file.read(_HEAD)
     if head.startswith(png.MAGIC):
         return png.is_colour(head)
     if head.startswith(plain.BMP):

@@ -8,7 +8,7 @@ Orientation, resolution and all other tags are of no matter.
 
 import io
 import struct
-from io import FileIO
+from io import BufferedReader, BytesIO, FileIO
 
 import numpy as np
 
@@ -48,7 +48,7 @@ Tags = dict[int, np.ndarray]
 class TiffFile:
     """Directories and pixels of an open file. Whatever it says is held against its size before it is read."""
 
-    def __init__(self, file: FileIO) -> None:
+    def __init__(self, file: FileIO | BufferedReader | BytesIO) -> None:
         self._file = file
         self._size = file.seek(0, io.SEEK_END)
         head = self._at(0, 4)

@@ -20,7 +20,7 @@ from torchpose.pnp.several.rays import Rays
 _FIRST, _MORE = 3, 7
 _KEPT = 8
 MINIMA = 4  # that are followed: two of a plane, and as many where the cameras are far apart (convention)
-_APART_DEG = 5.0  # between two minima (convention): nearer ones are one, not ended yet
+APART_DEG = 5.0  # between two minima (convention): nearer ones are one, not ended yet
 _DAMPING = 1e-3  # to begin with
 
 
@@ -109,7 +109,7 @@ def _spread() -> Tensor:
 def _different(R: Tensor, t: Tensor, cost: Tensor) -> tuple[Tensor, Tensor]:
     """The best `MINIMA` of S poses (B, S, ...) that are not the same."""
     row = torch.arange(len(R), device=R.device)
-    least = 1 + 2 * torch.cos(torch.deg2rad(torch.tensor(_APART_DEG)))
+    least = 1 + 2 * torch.cos(torch.deg2rad(torch.tensor(APART_DEG)))
     chosen = []
     for _ in range(MINIMA):
         best = cost.argmin(1)

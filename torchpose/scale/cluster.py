@@ -1,0 +1,132 @@
+"""A Ray cluster for the time of a command: its own on this machine, or one that is there."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import socket
+from collections.abc import Iterator
+from importlib.metadata import version
+from typing import Any, cast
+
+from torchpose.errors import ConfigError
+
+# shares of a core of the two stages, one in all: with whole ones the workers would leave no core to decode
+MEASURING, DECODING = 0.75, 0.25
+_CONNECT = 5.0  # seconds (convention)
+
+
+@contextlib.contextmanager
+def cluster(address: str | None, workers: int) -> Iterator[int]:
+    """Connects, or starts a cluster of so many cores that ends with the block; gives the number of its cores.
+
+    Raises:
+        ConfigError: Ray is not installed, the address does not answer, or its nodes lack this version of torchpose.
+    """
+    try:
+        import ray
+        import ray.data
+    except ImportError:
+        raise ConfigError("--engine ray: Ray is not installed; install it with pip install 'torchpose[ray]'") from None
+    if address is not None:
+        _check_answers(address)
+    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR, "include_dashboard": False}
+    own = {"num_cpus": workers} if address is None else {"address": address}
+    if address is not None:
+        del quiet["include_dashboard"]
+    try:
+        ray.init(**own, **quiet)
+    except (ConnectionError, ValueError, RuntimeError, TimeoutError, OSError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        where = "" if address is None else f"{address}: "
+        raise ConfigError(f"{where}--address: no Ray cluster answers ({reason}); start one with ray start") from None
+    try:
+        _silence()
+        _check_nodes()
+        resources: Any = ray.cluster_resources  # without types
+        yield int(resources().get("CPU", 1))
+    finally:
+        ray.shutdown()
+
+
+def _check_answers(address: str) -> None:
+    """Raises ConfigError unless something listens there; Ray itself would try for minutes."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not (host and port.isdigit()):
+        if address in ("auto", "local"):
+            return
+        raise ConfigError(f"{address}: --address: is none; give HOST:PORT, ray://HOST:PORT or auto")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=_CONNECT).close()
+    except (OSError, OverflowError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise ConfigError(
+            f"{address}: --address: no Ray cluster answers ({reason}); start one with ray start --head"
+        ) from None
+
+
+def _silence() -> None:
+    """Progress is shown by the command itself."""
+    import ray.data
+
+    context = ray.data.DataContext.get_current()
+    context.enable_progress_bars = False
+    context.enable_operator_progress_bars = False
+    for name in ("ray", "ray.data"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+
+
+def _check_nodes() -> None:
+    """Raises ConfigError unless every node has this version of torchpose."""
+    import ray
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    own = version("torchpose")
+
+    def installed() -> str:
+        from importlib.metadata import PackageNotFoundError, version
+
+        try:
+            return version("torchpose")
+        except PackageNotFoundError:
+            return ""
+
+    asked, nodes = {}, cast(Any, ray.nodes)  # without types
+    for node in nodes():
+        if node["Alive"] and node["Resources"].get("CPU"):
+            strategy = NodeAffinitySchedulingStrategy(node_id=node["NodeID"], soft=True)
+            task = ray.remote(installed).options(num_cpus=0, scheduling_strategy=strategy)
+            asked[node["NodeManagerHostname"]] = task.remote()
+    for name, answer in asked.items():
+        found = ray.get(answer)
+        if found != own:
+            has = f"has torchpose {found}" if found else "lacks torchpose"
+            raise ConfigError(f"{name}: --address: this node of the cluster {has}; install torchpose {own} there")
+
+
+def blocks_done(data: Any) -> Iterator[dict[str, Any]]:
+    """The rows of a data set as they are done. ConfigError: what a worker raised, in one line."""
+    import ray.exceptions
+
+    try:
+        yield from data.iter_rows()
+    except ray.exceptions.RayError as error:
+        raise _of_worker(error) from None
+
+
+def _of_worker(error: BaseException) -> ConfigError:
+    """What a worker raised, as an error of the command."""
+    from torchpose.io.storage import StorageError
+
+    cause: BaseException | None = error
+    while cause is not None:
+        inner = getattr(cause, "cause", None) or cause.__cause__
+        if isinstance(cause, ConfigError):
+            return ConfigError(str(cause))
+        if isinstance(cause, StorageError):
+            return ConfigError(f"--out: {cause.problem}; {cause.fix}; add --resume to go on")
+        if inner is None or inner is cause:
+            break
+        cause = inner
+    lines = [line for line in str(cause).splitlines() if line.strip()] or [type(cause).__name__]
+    return ConfigError(f"--engine ray: a worker ended ({lines[-1].strip()[:200]}); add --resume to go on")
