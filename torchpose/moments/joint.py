@@ -121,16 +121,15 @@ def joint_pose(rig: CameraRig, views: list[Seen], R: Tensor, t: Tensor, moved: T
     """
     parts = _parts(rig, views, R, t, moved)
     excess, further = _excess(parts, views)
-    n, lens = parts.normals.right.shape[-1], parts.numbers[..., :0]
+    n = parts.normals.right.shape[-1]
     beside = parts.numbers
     if further is not None:
         beside = torch.cat([beside, _among(further * excess.deviation[:, None, None], n)], -1)
     normals = parts.normals.over(excess.factor)
-    joint = _Joint.of(normals, parts.own, beside, lens, True)
     between, freedom, odd, torn = _between(normals, parts, beside, len(views))
+    # counted, not estimated: the pose is the one of a rig that is as its file says
     loose = _loosened(normals, parts, beside, _turns(rig, views, R, t, n))
-    if loose is not None:
-        joint = _Joint.of(normals, parts.own, torch.cat([beside, loose], -1), lens, True)
+    joint = _Joint.of(normals, parts.own, beside, beside[..., :0] if loose is None else loose, True)
     place = look = _print_places(parts, views, joint, excess.deviation, further)
     other = ((excess.misfit == Misfit.CAMERA) | (excess.misfit == Misfit.SCATTER)).nonzero()[:, 0]
     if other.numel() and further is not None:
