@@ -3,8 +3,8 @@
     python scripts/rig_calibration_statistics.py --sets 100 --markdown
 
 Every set: cameras on an arc around the target, 170 mm away, each with a lens of its own (k1 k2 p1 p2), all of them
-unknown; a plate of 5 x 4 points 12 mm apart, 0.05 px of noise on every point. A camera sees the plate where it is turned
-away from it by less than 50 degrees and all of it is in the frame; so of three and six cameras those at the ends never
+unknown; a plate of 5 x 4 points 12 mm apart, 0.05 px of noise on every point. A camera sees the plate where it is
+turned away from it by less than 50 degrees and all of it is in the frame; so of three and six cameras those at the ends never
 see it at one moment. Columns: RMS error of all places over what is claimed (translation, rotation), mean NEES of the
 places over its freedom with the deviation of that mean, and the same errors of a chain of cv2.stereoCalibrate over the
 same pixels, pair by pair along the arc, with the intrinsics that cv2.calibrateCamera gives from all views of each.
@@ -119,7 +119,9 @@ def by_opencv(scene: Drawn, views: list[Views]) -> tp.CameraRig | None:
     points = scene.points.numpy().astype(np.float32)
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_USE_INTRINSIC_GUESS
     size = (scene.rig.cameras[0].width, scene.rig.cameras[0].height)
-    seen = [dict(zip(v.names, v.pixels.unflatten(0, (len(v), -1)).numpy().astype(np.float32), strict=True)) for v in views]
+    seen = [
+        dict(zip(v.names, v.pixels.unflatten(0, (len(v), -1)).numpy().astype(np.float32), strict=True)) for v in views
+    ]
     lenses = []
     for camera, own in zip(scene.rig.cameras, seen, strict=True):
         start = camera.matrix.numpy().copy(), np.zeros(5)
@@ -132,7 +134,14 @@ def by_opencv(scene: Drawn, views: list[Views]) -> tp.CameraRig | None:
         one, two = ([seen[j][name] for name in both] for j in (k, k + 1))
         stop = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-12)
         _, *_, turn, shift, _, _ = cv2.stereoCalibrate(
-            [points] * len(both), one, two, *lenses[k], *lenses[k + 1], size, flags=cv2.CALIB_FIX_INTRINSIC, criteria=stop
+            [points] * len(both),
+            one,
+            two,
+            *lenses[k],
+            *lenses[k + 1],
+            size,
+            flags=cv2.CALIB_FIX_INTRINSIC,
+            criteria=stop,
         )
         step = rotations.compose(torch.from_numpy(turn), torch.from_numpy(shift)[:, 0], R[-1], t[-1])
         R.append(step[0])

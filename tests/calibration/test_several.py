@@ -32,7 +32,9 @@ def held(scene: statistics.Drawn, views: list[Views]) -> list[Located]:
     return found
 
 
-def of_seed(cameras: int, moments: int, seed: int, sigma: float = statistics.SIGMA) -> tuple[statistics.Drawn, list[Views]]:
+def of_seed(
+    cameras: int, moments: int, seed: int, sigma: float = statistics.SIGMA
+) -> tuple[statistics.Drawn, list[Views]]:
     scene = statistics.drawn(cameras, moments, seed)
     return scene, [statistics.views_of(scene, number, seed, sigma) for number in range(cameras)]
 

@@ -202,7 +202,7 @@ def check_connected(names: Sequence[str], common: Int[Tensor, "C C"]) -> None:
     groups = dict.fromkeys(" and ".join(compress(names, row)) for row in reached.tolist())
     if len(groups) > 1:
         raise ConfigError(
-            f"INPUT: cameras {' | '.join(groups)} are apart: never is the target seen by one of each at one moment; add "
+            f"INPUT: cameras {' | '.join(groups)} are apart: the target is seen by one of each at no moment; add "
             "moments in which it is, or calibrate each by itself"
         )
 

@@ -107,7 +107,7 @@ def calibrate(
         check_robot_poses(sources)
     start = None if camera is None else with_tone(Camera.load(camera), tone)
     said = start.tone if start is not None else read_tone(tone)
-    frames = BatchedFrames(sources, start, threads=threads or cores(), quiet=quiet)
+    frames = CameraFrames(sources, start, threads=threads or cores(), quiet=quiet)
     calibration = fit = measured = None
     try:
         with native_stderr_silenced():
@@ -195,7 +195,7 @@ def _is_number(text: str) -> bool:
     return True
 
 
-class BatchedFrames:
+class CameraFrames:
     """The frames of all sources in batches, anew at every call; what could not be read is remembered."""
 
     def __init__(self, sources: Sequence[Source], start: Camera | None, *, threads: int, quiet: bool) -> None:
@@ -239,7 +239,7 @@ def first_size(sources: Sequence[Source]) -> tuple[int, int]:
 
 
 def _calibrate(
-    frames: BatchedFrames, shown: Shown, start: Camera | None, model: str, tone: cameras.Tone | None
+    frames: CameraFrames, shown: Shown, start: Camera | None, model: str, tone: cameras.Tone | None
 ) -> Calibration:
     from torchpose.calibration.intrinsics import start_cameras
     from torchpose.calibration.session import calibrate_camera
@@ -249,7 +249,7 @@ def _calibrate(
 
 
 def _measured(
-    frames: BatchedFrames,
+    frames: CameraFrames,
     shown: Shown,
     start: Camera | None,
     model: str,
@@ -268,7 +268,7 @@ def _measured(
     return measure_target(frames, shown, first, given=given, lens=model, distance=distance, tone=tone)
 
 
-def _hand_eye(frames: BatchedFrames, shown: Shown, calibration: Calibration | None, camera: Camera | None) -> HandEyeFit:
+def _hand_eye(frames: CameraFrames, shown: Shown, calibration: Calibration | None, camera: Camera | None) -> HandEyeFit:
     from torchpose.calibration.session import calibrate_robot, locate_camera
 
     robot = {source.name: source.robot_pose for source in frames.sources if source.robot_pose is not None}

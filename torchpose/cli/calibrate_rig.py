@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from torchpose.calibration.session import Shown
     from torchpose.calibration.several import RigCalibration
     from torchpose.camera import Camera, CameraRig
-    from torchpose.cli.calibrate import BatchedFrames
+    from torchpose.cli.calibrate import CameraFrames
     from torchpose.io.moments import Moment
 
 
@@ -43,7 +43,7 @@ def calibrate_rig(asked: Request, single: Mapping[str, Any]) -> int:
         single: options of one camera, which are refused.
     """
     from torchpose.calibration.rig_session import OneCamera, calibrate_cameras, measure_with_cameras
-    from torchpose.cli.calibrate import BatchedFrames, first_size
+    from torchpose.cli.calibrate import CameraFrames, first_size
     from torchpose.cli.terminal import native_stderr_silenced
     from torchpose.target import Target
 
@@ -61,7 +61,7 @@ def calibrate_rig(asked: Request, single: Mapping[str, Any]) -> int:
         if not sources:
             raise ConfigError(f"{asked.inputs[0]}: INPUT: has no picture of camera {name}; add some, or leave it out")
         given = None if known is None else _with_tone(known.cameras[number], tone)
-        batches = BatchedFrames(sources, given, threads=asked.threads or cores(), quiet=asked.quiet)
+        batches = CameraFrames(sources, given, threads=asked.threads or cores(), quiet=asked.quiet)
         frames.append(batches)
         several.append(OneCamera(name, batches, given or _of_size(*first_size(sources)), guess=given is None))
     lens = asked.model if known is None else None
@@ -198,7 +198,7 @@ def _write(asked: Request, found: RigCalibration, measured: RigMeasurement | Non
             say(str(path))
 
 
-def _unreadable(names: Sequence[str], frames: Sequence[BatchedFrames]) -> dict[str, str]:
+def _unreadable(names: Sequence[str], frames: Sequence[CameraFrames]) -> dict[str, str]:
     return {
         f"{name}/{picture}": reason
         for name, batches in zip(names, frames, strict=True)

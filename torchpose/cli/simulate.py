@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from torchpose.cli.common import Batch, Quiet, Resume, Threads, cores, interrupted, say, use_threads
+from torchpose.errors import ConfigError
 
 _BACKEND = "Who renders: the analytic renderer, or Blender Cycles (extra: blender)."
 
@@ -41,7 +42,10 @@ def simulate(
     cv2.setNumThreads(1)
     use_threads(threads, share=0.5)
     read = load_plan(plan)
-    with FrameProgress(len(read), 0, quiet=quiet) as progress:
+    cameras = 1 if read.rig is None else len(read.rig)
+    if bop and cameras > 1:
+        raise ConfigError("--bop: its layout is of one camera; leave it out of plans with several")
+    with FrameProgress(cameras * len(read), 0, quiet=quiet) as progress:
         try:
             write_dataset(
                 read,
@@ -58,7 +62,8 @@ def simulate(
             return interrupted(f"{out} keeps its frames; add --resume to go on")
     if not quiet:
         marked = int((read.seen < len(read.target)).sum())
-        say(f"{len(read)} frames in {out / 'frames'}, truth in {out / 'truth.csv'}", err=True)
+        what = "frames" if cameras == 1 else f"moments of {cameras} cameras"
+        say(f"{len(read)} {what} in {out / 'frames'}, truth in {out / 'truth.csv'}", err=True)
         if marked:
             say(f"{marked} of them without the whole target in view, marked in the truth", err=True)
     return 0

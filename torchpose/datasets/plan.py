@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchpose.camera import Camera
+from torchpose.camera import Camera, CameraRig
 from torchpose.config import beside, read_yaml, validate, within
 from torchpose.datasets.plan_file import MOST_FRAMES, PlanFile, Random
 from torchpose.errors import ConfigError
@@ -28,6 +28,7 @@ from torchpose.target import Target
 
 _HALTON_BASES = (2, 3, 5, 7, 11, 13)
 _CHUNK = 2000  # poses whose markers are looked for at once: some 10 MB
+_APART = 1_000_003  # between the seeds of cameras (convention): farther than anyone's seeds of sets are
 _HOPELESS = 20_000  # poses without one in view, after which no more are drawn
 _TRIES = 50  # random poses drawn for one that keeps the target in view
 
@@ -82,6 +83,7 @@ class Plan(Rows):
         texture: of the paper, where it has one.
         file: what the plan file ``path`` says, with the ``camera`` and the ``target`` that it names.
         backgrounds: pictures, in natural order; frame i takes the one of the number i modulo their count.
+        rig: the cameras, where there are several; ``camera`` is then the first of them, in which poses are.
     """
 
     R: Float[Tensor, "N 3 3"]
@@ -97,6 +99,26 @@ class Plan(Rows):
     camera: Camera = shared()
     target: Target = shared()
     backgrounds: list[Path] = shared()
+    rig: CameraRig | None = shared(None)
+
+    def by_camera(self) -> dict[str, Plan]:
+        """The plan as each camera sees it, by the names of the cameras; noise and what is drawn by chance differ."""
+        if self.rig is None:
+            return {"": self}
+        return {name: self._seen_by(number) for number, name in enumerate(self.rig.names)}
+
+    def _seen_by(self, number: int) -> Plan:
+        assert self.rig is not None
+        R, t = self.rig.seen_by(number, self.R, self.t)
+        turn, camera = self.rig.R[number].to(t), self.rig.cameras[number]
+        # the target moves alike for all: its motion is about the axes of the camera
+        motion = (self.motion.unflatten(1, (2, 3)) @ turn.mT).flatten(1)
+        seen = markers_in_view(camera, self.target, R, t)
+        own, sensor = _APART * number, self.file.sensor
+        if sensor.seed is not None:
+            sensor = sensor.model_copy(update={"seed": sensor.seed + own})
+        file = self.file.model_copy(update={"seed": self.file.seed + own, "sensor": sensor})
+        return replace(self, R=R, t=t, motion=motion, seen=seen, camera=camera, file=file, rig=None)
 
     @property
     def names(self) -> list[str]:
@@ -120,7 +142,8 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
     """
     path = Path(path)
     file = validate(PlanFile, read_yaml(path), path)
-    camera = Camera.load(beside(path, file.camera))
+    rig = None if file.cameras is None else CameraRig.load(beside(path, file.cameras))
+    camera = Camera.load(beside(path, file.camera or "")) if rig is None else rig.cameras[0]
     target = Target.load(beside(path, file.target))
     if file.faults:
         with within(f"{path}: "):
@@ -165,6 +188,7 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
         camera,
         target,
         _backgrounds(path, image.background),
+        rig,
     )
     if file.out_of_view == "error":
         _check_view(plan)

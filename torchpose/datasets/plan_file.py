@@ -268,7 +268,8 @@ def _small(value: Any) -> bool:
 class PlanFile(_Section):
     """A plan file, see docs/simulation.md."""
 
-    camera: Word
+    camera: Word | None = None
+    cameras: Word | None = None
     target: Word
     seed: Seed = 0
     poses: Poses
@@ -280,6 +281,12 @@ class PlanFile(_Section):
     depth_range: Pair | None = None
     out_of_view: Literal["error", "mark"] = "error"
     bounds: bool = True
+
+    @model_validator(mode="after")
+    def _one_or_several(self) -> PlanFile:
+        if (self.camera is None) == (self.cameras is None):
+            raise ValueError("names neither camera nor cameras, or both; give the file of one camera, or of several")
+        return self
 
     @field_validator("faults")
     @classmethod

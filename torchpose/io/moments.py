@@ -7,7 +7,7 @@ capture manifest the name of a picture without its camera's is that of the momen
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,7 @@ How many of them contribute; chi-squared of what they say against each other ove
 one as large is by chance; the camera that contradicts all others, where that is clear; and of every camera its name and
 share of the information about the pose.
 """
+_APART = 1e-3  # s (convention): pictures of one moment that lie farther apart are told
 _TELL = 1e15  # of times in ns: so many digits of each are told apart
 
 
@@ -104,6 +105,7 @@ def _in_folders(given: Path, rig: CameraRig, tell: Callable[[str], None]) -> lis
 def _in_manifest(given: Path, rig: CameraRig, tell: Callable[[str], None]) -> list[dict[str, Source]]:
     root, pictures = given.parent.resolve(), []
     known = {name for name in rig.names if _has_camera(given, name)}
+    times: dict[str, list[float]] = {}
     if not known:
         raise ConfigError(f"{given}: INPUT: has no frame of the cameras {', '.join(rig.names)}; name them alike")
     for name in rig.names:
@@ -116,10 +118,27 @@ def _in_manifest(given: Path, rig: CameraRig, tell: Callable[[str], None]) -> li
                     f"{moment}; give them names that differ beside the camera's"
                 )
             own[moment] = Source(moment, given.parent / frame.image, root, frame.robot_pose)
+            if frame.trigger_time_s is not None:
+                times.setdefault(moment, []).append(frame.trigger_time_s)
         pictures.append(own)
     if len(known) < len(rig):
         tell(f"{given}: has no frame of {', '.join(n for n in rig.names if n not in known)}, which contribute nothing")
+    if line := _apart(times):
+        tell(f"{given}: {line}")
     return pictures
+
+
+def _apart(times: Mapping[str, list[float]]) -> str:
+    """Tells of moments whose pictures were not taken at one time; empty where all were."""
+    spans = {moment: max(of) - min(of) for moment, of in times.items()}
+    late = [moment for moment, span in spans.items() if span > _APART]
+    if not late:
+        return ""
+    worst = max(late, key=spans.__getitem__)
+    return (
+        f"pictures of {len(late)} of {len(spans)} moments were triggered up to {1e3 * spans[worst]:.3g} ms apart "
+        f"({worst}): one pose is right only where the target was at rest"
+    )
 
 
 def _has_camera(given: Path, name: str) -> bool:

@@ -106,7 +106,7 @@ def _arrows(panel: Any, found: RigCalibration, number: int) -> None:
 def plot_ties(found: RigCalibration) -> Figure:
     """In how many moments each two cameras see the target."""
     figure, ((panel,),) = subplots(1, 1, (6, 5))
-    panel.imshow(found.common, cmap="Blues", vmin=0)
+    panel.imshow(found.common.numpy(), cmap="Blues", vmin=0)
     panel.grid(False)
     for (row, column), value in _entries(found.common):
         dark = value > 0.6 * float(found.common.max())
