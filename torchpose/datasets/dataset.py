@@ -26,7 +26,7 @@ import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-from torchpose.analysis.crlb import pose_crlb
+from torchpose.analysis.crlb import pose_crlb, rig_crlb
 from torchpose.camera import Camera
 from torchpose.config import parse_json, read_text, write_text
 from torchpose.datasets.plan import Plan
@@ -83,24 +83,24 @@ def plan_truth(plan: Plan) -> Truth:
 def bounds(plan: Plan, which: Int[Tensor, " B"]) -> Float[Tensor, "B 6"]:
     """Cramer-Rao standard deviations of the frames numbered ``which``; NaN where no pose is determined.
 
-    Of the evenly lit frame at rest, blurred by all but ``defocus``, with the noise of its dark parts, see
-    `torchpose.analysis.pose_crlb`: a bound still, but one that defocus, motion, shot noise, clutter and covers keep any
-    estimator away from.
+    With several cameras those of the pose from all of them. Of the evenly lit frame at rest, blurred by all but
+    ``defocus``, with the noise of its dark parts, see `torchpose.analysis.pose_crlb`: a bound still, but one that
+    defocus, motion, shot noise, clutter and covers keep any estimator away from.
     """
     sensor, part = plan.file.sensor, plan[which]
     taken = part.conditions
     variance = taken.noise.square() + (0.0 if sensor.full_well is None else 255.0 / sensor.full_well * taken.dark)
-    covariance = pose_crlb(
-        plan.camera,
-        plan.target,
-        part.R,
-        part.t,
+    given = {
+        "dark": taken.dark,
+        "light": taken.light,
+        "noise_sigma": variance.sqrt(),
+        "bits": sensor.bits,
         **taken.blur,
-        dark=taken.dark,
-        light=taken.light,
-        noise_sigma=variance.sqrt(),
-        bits=sensor.bits,
-    )
+    }
+    if plan.rig is None:
+        covariance = pose_crlb(plan.camera, plan.target, part.R, part.t, **given)
+    else:
+        covariance = rig_crlb(plan.rig, plan.target, part.R, part.t, **given)
     return covariance.diagonal(dim1=1, dim2=2).sqrt()
 
 
@@ -210,6 +210,24 @@ def write_dataset(
     return len(pending)
 
 
+def write_rig_dataset(plan: Plan, out: Path, **options: Any) -> int:
+    """Writes a data set of several cameras: one of each in a folder of its name, the rig, and the truth of all.
+
+    ``truth.csv`` has the poses in the first camera, and the joint bounds. Arguments and result as of `write_dataset`.
+    """
+    rig = plan.rig
+    assert rig is not None
+    count = sum(write_dataset(plan.of_camera(k), out / name, **options) for k, name in enumerate(rig.names))
+    rig.save(out / "rig.yaml")
+    replace(plan.target, part_rotation=None, part_translation=None).save(out / "target.yaml")
+    truth = plan_truth(plan)
+    if plan.file.bounds:
+        std = torch.cat([bounds(plan, which) for which in torch.split(torch.arange(len(plan)), 64)])
+        truth.extra.update(zip(BOUND, std.unbind(1), strict=True))
+    write_truth(out / "truth.csv", replace(truth, frame=[f"frames/{name}" for name in plan.names]))
+    return count
+
+
 def _write_prints(plan: Plan, out: Path) -> None:
     """What was printed, where that differs from the target."""
     if (prints := plan.prints) is None:
@@ -310,7 +328,7 @@ def _origin(plan: Plan, backend: Backend) -> dict[str, object]:
     return {
         "torchpose version": version("torchpose"),
         "backend": backend,
-        "plan": plan.file.model_dump(exclude={"camera", "target", "bounds"}),
+        "plan": plan.file.model_dump(exclude={"camera", "cameras", "target", "bounds"}),
         "camera": [camera.width, camera.height, camera.model, digest(camera.matrix, camera.distortion)],
         "target": [target.name, target.background, digest(target.centers, target.normals, target.radii)],
         "poses": digest(plan.R, plan.t),
