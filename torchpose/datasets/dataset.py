@@ -55,12 +55,10 @@ def plan_truth(plan: Plan) -> Truth:
 
     Columns besides the pose: tilt_deg, psf_sigma, psf_ratio, psf_deg, smear_px, smear_deg, disc_px, see
     `torchpose.datasets.plan.Conditions`; noise_sigma (read noise), dark, light, motion_mm, motion_deg;
-    markers_in_view, markers that lie in the frame as a whole, and markers_in_view_NAME of each camera where there are
-    several; in_depth_range, 0 where the plan's range is left;
+    markers_in_view, markers that lie in the frame as a whole; in_depth_range, 0 where the plan's range is left;
     those of `torchpose.sim.Disturbances`; edge_gain, the dot gain of the print.
     """
     taken, prints = plan.conditions, plan.prints
-    others = {} if plan.rig is None else {f"markers_in_view_{n}": p.seen.double() for n, p in plan.by_camera().items()}
     return Truth(
         frame=plan.names,
         target=[plan.target.name] * len(plan),
@@ -75,7 +73,6 @@ def plan_truth(plan: Plan) -> Truth:
             "motion_mm": plan.motion[:, :3].norm(dim=1),
             "motion_deg": plan.motion[:, 3:].norm(dim=1).rad2deg(),
             "markers_in_view": plan.seen.double(),
-            **others,
             "in_depth_range": plan.in_depth_range.double(),
             **{name: getattr(plan.disturbances, name) for name in DISTURBANCES},
             "edge_gain": torch.zeros(len(plan), dtype=torch.float64) if prints is None else prints.gain,
@@ -86,19 +83,24 @@ def plan_truth(plan: Plan) -> Truth:
 def bounds(plan: Plan, which: Int[Tensor, " B"]) -> Float[Tensor, "B 6"]:
     """Cramer-Rao standard deviations of the frames numbered ``which``; NaN where no pose is determined.
 
-    Of the evenly lit frame at rest, blurred by all but ``defocus``, with the noise of its dark parts, see
-    `torchpose.analysis.pose_crlb`: a bound still, but one that defocus, motion, shot noise, clutter and covers keep any
-    estimator away from.
+    With several cameras those of the pose from all of them. Of the evenly lit frame at rest, blurred by all but
+    ``defocus``, with the noise of its dark parts, see `torchpose.analysis.pose_crlb`: a bound still, but one that
+    defocus, motion, shot noise, clutter and covers keep any estimator away from.
     """
     sensor, part = plan.file.sensor, plan[which]
     taken = part.conditions
     variance = taken.noise.square() + (0.0 if sensor.full_well is None else 255.0 / sensor.full_well * taken.dark)
-    light = {"dark": taken.dark, "light": taken.light, "noise_sigma": variance.sqrt(), "bits": sensor.bits}
-    conditions: dict[str, Any] = {**taken.blur, **light}
+    given = {
+        "dark": taken.dark,
+        "light": taken.light,
+        "noise_sigma": variance.sqrt(),
+        "bits": sensor.bits,
+        **taken.blur,
+    }
     if plan.rig is None:
-        covariance = pose_crlb(plan.camera, plan.target, part.R, part.t, **conditions)
+        covariance = pose_crlb(plan.camera, plan.target, part.R, part.t, **given)
     else:
-        covariance = rig_crlb(plan.rig, plan.target, part.R, part.t, **conditions)
+        covariance = rig_crlb(plan.rig, plan.target, part.R, part.t, **given)
     return covariance.diagonal(dim1=1, dim2=2).sqrt()
 
 
@@ -179,24 +181,6 @@ def write_dataset(
         ConfigError: the folder holds another data set, or holds one and ``resume`` is false, or cannot be written.
     """
     folder = _prepare(plan, out, backend, resume)
-    written = 0
-    for name, seen in plan.by_camera().items():
-        place = folder / name
-        place.mkdir(exist_ok=True)
-        written += _write_frames(seen, place, backend, batch, threads, progress)
-    truth = plan_truth(plan)
-    if plan.file.bounds:
-        std = torch.cat([bounds(plan, which) for which in torch.split(torch.arange(len(plan)), 64)])
-        truth.extra.update(zip(BOUND, std.unbind(1), strict=True))
-    write_truth(out / "truth.csv", truth)
-    _write_prints(plan, out)
-    return written
-
-
-def _write_frames(
-    plan: Plan, folder: Path, backend: Backend, batch: int | None, threads: int, progress: Callable[[int], None]
-) -> int:
-    """Writes the frames of one camera that are not there yet; how many."""
     done = {path.name for path in folder.iterdir()}
     pending = torch.tensor([i for i, name in enumerate(plan.names) if name not in done], dtype=torch.int64)
     progress(len(plan) - len(pending))
@@ -217,7 +201,31 @@ def _write_frames(
                 for i, frame in zip(which.tolist(), frames, strict=True)
             ]
         progress(_finished(ahead))
+    truth = plan_truth(plan)
+    if plan.file.bounds:
+        std = torch.cat([bounds(plan, which) for which in torch.split(torch.arange(len(plan)), 64)])
+        truth.extra.update(zip(BOUND, std.unbind(1), strict=True))
+    write_truth(out / "truth.csv", truth)
+    _write_prints(plan, out)
     return len(pending)
+
+
+def write_rig_dataset(plan: Plan, out: Path, **options: Any) -> int:
+    """Writes a data set of several cameras: one of each in a folder of its name, the rig, and the truth of all.
+
+    ``truth.csv`` has the poses in the first camera, and the joint bounds. Arguments and result as of `write_dataset`.
+    """
+    rig = plan.rig
+    assert rig is not None
+    count = sum(write_dataset(plan.of_camera(k), out / name, **options) for k, name in enumerate(rig.names))
+    rig.save(out / "rig.yaml")
+    replace(plan.target, part_rotation=None, part_translation=None).save(out / "target.yaml")
+    truth = plan_truth(plan)
+    if plan.file.bounds:
+        std = torch.cat([bounds(plan, which) for which in torch.split(torch.arange(len(plan)), 64)])
+        truth.extra.update(zip(BOUND, std.unbind(1), strict=True))
+    write_truth(out / "truth.csv", replace(truth, frame=[f"frames/{name}" for name in plan.names]))
+    return count
 
 
 def _write_prints(plan: Plan, out: Path) -> None:
@@ -289,10 +297,7 @@ def _prepare(plan: Plan, out: Path, backend: Backend, resume: bool) -> Path:
     except OSError as error:
         raise ConfigError(f"{out}: --out: cannot be made ({error.strerror}); choose another folder") from None
     write_text(out / "plan.json", json.dumps(origin, indent=2) + "\n")
-    if plan.rig is None:
-        plan.camera.save(out / "camera.yaml")
-    else:
-        plan.rig.save(out / "cameras.yaml")
+    plan.camera.save(out / "camera.yaml")
     # without a part: the truth is the pose of the target itself
     replace(plan.target, part_rotation=None, part_translation=None).save(out / "target.yaml")
     return frames
@@ -313,24 +318,20 @@ def _check_origin(out: Path, origin: dict[str, object], resume: bool) -> None:
         )
 
 
-def _digest(*values: Tensor) -> str:
-    return hashlib.sha256(b"".join(v.contiguous().numpy().tobytes() for v in values)).hexdigest()
-
-
-def _about(camera: Camera) -> list[object]:
-    return [camera.width, camera.height, camera.model, _digest(camera.matrix, camera.distortion)]
-
-
 def _origin(plan: Plan, backend: Backend) -> dict[str, object]:
     """What the frames depend on, by the names that error messages say."""
+
+    def digest(*values: Tensor) -> str:
+        return hashlib.sha256(b"".join(v.contiguous().numpy().tobytes() for v in values)).hexdigest()
+
     camera, target = plan.camera, plan.target
     return {
         "torchpose version": version("torchpose"),
         "backend": backend,
         "plan": plan.file.model_dump(exclude={"camera", "cameras", "target", "bounds"}),
-        "camera": _about(camera) if plan.rig is None else [_about(one) for one in plan.rig.cameras],
-        "target": [target.name, target.background, _digest(target.centers, target.normals, target.radii)],
-        "poses": _digest(plan.R, plan.t) if plan.rig is None else _digest(plan.R, plan.t, plan.rig.R, plan.rig.t),
+        "camera": [camera.width, camera.height, camera.model, digest(camera.matrix, camera.distortion)],
+        "target": [target.name, target.background, digest(target.centers, target.normals, target.radii)],
+        "poses": digest(plan.R, plan.t),
         "backgrounds": [path.name for path in plan.backgrounds],
     }
 

@@ -26,9 +26,9 @@ from torchpose.sim import Disturbances, PrintErrors, Prints, Texture, faults_of,
 from torchpose.sim.fields import keys_of
 from torchpose.target import Target
 
+_APART = 1_000_003  # between the seeds of a rig's cameras (convention: a prime)
 _HALTON_BASES = (2, 3, 5, 7, 11, 13)
 _CHUNK = 2000  # poses whose markers are looked for at once: some 10 MB
-_APART = 1_000_003  # between the seeds of cameras (convention): farther than anyone's seeds of sets are
 _HOPELESS = 20_000  # poses without one in view, after which no more are drawn
 _TRIES = 50  # random poses drawn for one that keeps the target in view
 
@@ -82,8 +82,8 @@ class Plan(Rows):
         prints: what was printed, where the plan says that it differs from the target.
         texture: of the paper, where it has one.
         file: what the plan file ``path`` says, with the ``camera`` and the ``target`` that it names.
+        rig: of several cameras, of which ``camera`` is the first; see `Plan.of_camera`.
         backgrounds: pictures, in natural order; frame i takes the one of the number i modulo their count.
-        rig: the cameras, where there are several; ``camera`` is then the first of them, in which poses are.
     """
 
     R: Float[Tensor, "N 3 3"]
@@ -101,23 +101,14 @@ class Plan(Rows):
     backgrounds: list[Path] = shared()
     rig: CameraRig | None = shared(None)
 
-    def by_camera(self) -> dict[str, Plan]:
-        """The plan as each camera sees it, by the names of the cameras; noise and what is drawn by chance differ."""
-        if self.rig is None:
-            return {"": self}
-        return {name: self._seen_by(number) for number, name in enumerate(self.rig.names)}
-
-    def _seen_by(self, number: int) -> Plan:
+    def of_camera(self, number: int) -> Plan:
+        """What one camera of the rig sees, with noise of its own; markers may be out of its view."""
         assert self.rig is not None
+        camera, turn = self.rig.cameras[number], self.rig.R[number]
         R, t = self.rig.seen_by(number, self.R, self.t)
-        turn, camera = self.rig.R[number].to(t), self.rig.cameras[number]
-        # the target moves alike for all: its motion is about the axes of the camera
-        motion = (self.motion.unflatten(1, (2, 3)) @ turn.mT).flatten(1)
+        motion = torch.cat([self.motion[:, :3] @ turn.T, self.motion[:, 3:] @ turn.T], 1)
+        file = self.file.model_copy(update={"seed": self.file.seed + number * _APART})
         seen = markers_in_view(camera, self.target, R, t)
-        own, sensor = _APART * number, self.file.sensor
-        if sensor.seed is not None:
-            sensor = sensor.model_copy(update={"seed": sensor.seed + own})
-        file = self.file.model_copy(update={"seed": self.file.seed + own, "sensor": sensor})
         return replace(self, R=R, t=t, motion=motion, seen=seen, camera=camera, file=file, rig=None)
 
     @property
@@ -142,8 +133,8 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
     """
     path = Path(path)
     file = validate(PlanFile, read_yaml(path), path)
-    rig = None if file.cameras is None else CameraRig.load(beside(path, file.cameras))
-    camera = Camera.load(beside(path, file.camera or "")) if rig is None else rig.cameras[0]
+    rig = CameraRig.load(beside(path, file.cameras)) if file.cameras else None
+    camera = Camera.load(beside(path, file.camera)) if rig is None else rig.cameras[0]
     target = Target.load(beside(path, file.target))
     if file.faults:
         with within(f"{path}: "):

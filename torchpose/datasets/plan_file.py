@@ -266,10 +266,10 @@ def _small(value: Any) -> bool:
 
 
 class PlanFile(_Section):
-    """A plan file, see docs/simulation.md."""
+    """A plan file, see docs/simulation.md; ``camera`` or, with poses in the first of them, ``cameras``."""
 
-    camera: Word | None = None
-    cameras: Word | None = None
+    camera: Word = ""
+    cameras: Word = ""
     target: Word
     seed: Seed = 0
     poses: Poses
@@ -283,9 +283,9 @@ class PlanFile(_Section):
     bounds: bool = True
 
     @model_validator(mode="after")
-    def _one_or_several(self) -> PlanFile:
-        if (self.camera is None) == (self.cameras is None):
-            raise ValueError("names neither camera nor cameras, or both; give the file of one camera, or of several")
+    def _one_of(self) -> PlanFile:
+        if bool(self.camera) == bool(self.cameras):
+            raise ValueError("names no camera, or both kinds; give camera, or cameras (a rig)")
         return self
 
     @field_validator("faults")
