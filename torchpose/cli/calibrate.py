@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import typer
 
@@ -87,7 +87,6 @@ def calibrate(
     """Calibrate a camera from views of a target, and where it sits on the robot, each with its covariance."""
     from torchpose.calibration.session import parse_board
     from torchpose.camera import Camera
-    from torchpose.cli.terminal import native_stderr_silenced
     from torchpose.target import Target
 
     if (target is None) == (board is None):
@@ -108,29 +107,53 @@ def calibrate(
     start = None if camera is None else with_tone(Camera.load(camera), tone)
     said = start.tone if start is not None else read_tone(tone)
     frames = CameraFrames(sources, start, threads=threads or cores(), quiet=quiet)
+    return _run(frames, shown, start, model, between, said, _Outputs(out, target_out, hand_eye_out, plots))
+
+
+class _Outputs(NamedTuple):
+    """Files to write, and the folder of plots."""
+
+    camera: Path | None
+    target: Path | None
+    hand_eye: Path | None
+    plots: Path | None
+
+
+def _run(
+    frames: CameraFrames,
+    shown: Shown,
+    start: Camera | None,
+    model: str,
+    between: Distance | None,
+    said: cameras.Tone | None,
+    out: _Outputs,
+) -> int:
+    """Calibrates and writes one after the other; returns the exit code."""
+    from torchpose.cli.terminal import native_stderr_silenced
+
     calibration = fit = measured = None
     try:
         with native_stderr_silenced():
-            if target_out is not None:
-                measured = _measured(frames, shown, start, model, between, said, held=out is None)
+            if out.target is not None:
+                measured = _measured(frames, shown, start, model, between, said, held=out.camera is None)
                 calibration = measured.calibration
-                _show(calibration, len(sources), held=out is None)
+                _show(calibration, len(frames.sources), held=out.camera is None)
                 show_places(measured.target, measured.nominal)
-                measured.target.save(target_out)
-                if out is not None:
-                    measured.camera.save(out)
-            elif out is not None:
+                measured.target.save(out.target)
+                if out.camera is not None:
+                    measured.camera.save(out.camera)
+            elif out.camera is not None:
                 calibration = _calibrate(frames, shown, start, model, said)
-                _show(calibration, len(sources))
-                calibration.camera.save(out)
-            if hand_eye_out is not None:
+                _show(calibration, len(frames.sources))
+                calibration.camera.save(out.camera)
+            if out.hand_eye is not None:
                 fit = _hand_eye(frames, shown, calibration, start)
                 _show_hand_eye(fit)
-                fit.hand_eye.save(hand_eye_out)
-            if plots is not None:
+                fit.hand_eye.save(out.hand_eye)
+            if out.plots is not None:
                 from torchpose.report.calibration import save_calibration
 
-                for path in save_calibration(calibration, fit, plots, measured):
+                for path in save_calibration(calibration, fit, out.plots, measured):
                     say(str(path))
     except KeyboardInterrupt:
         return interrupted("nothing more was written; run again")

@@ -78,7 +78,7 @@ def sensitivity(
 
     from torchpose.analysis.sensitivity import Uncertainty
     from torchpose.analysis.sweep import sweep, sweep_rings
-    from torchpose.studies.fig04_sensitivity import cases_of, tabulate
+    from torchpose.studies.fig04_sensitivity import cases_of
     from torchpose.target import Target
 
     printed = Target.load(target)
@@ -95,6 +95,20 @@ def sensitivity(
     if noise is not None:
         edges = replace(size, image=_of_edges(noise, levels, blur))
         rings[f"edges of the rings, noise {noise:g}"] = sweep_rings(lens, printed, at, edges, tilt=tilt)
+    return _written(cases, rings, size, lens, printed, out)
+
+
+def _written(
+    cases: dict[str, Sweep],
+    rings: dict[str, Swept],
+    size: Uncertainty,
+    lens: Camera,
+    printed: Target,
+    out: Path,
+) -> int:
+    """Writes and shows what was predicted; returns the exit code."""
+    from torchpose.studies.fig04_sensitivity import tabulate
+
     files = tabulate(cases, rings).save(out)
     _show(cases | rings, size)
     for line in (*_unstated(lens, printed), *files):
