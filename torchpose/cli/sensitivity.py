@@ -32,6 +32,14 @@ _LEVELS = "Grey levels of print and paper, with --noise."
 _FOCAL = "Error of the focal length; by default 0.25, or 0 where the camera file states a covariance."
 _CAMERAS = "File of several cameras: what each tells alone, and all together, over the distance; and --second-camera."
 _SECOND = "What a second camera like the first tells besides, by the angle between the two; ends the prediction there."
+_SIZES = (
+    "--focal-error-percent",
+    "--principal-point-px",
+    "--print-um",
+    "--flatness-um",
+    "--radius-um",
+    "--scale-percent",
+)
 _DISTORTION = "Standard deviations of the camera's coefficients: 1e-3,1e-3,1e-5,1e-5."
 
 
@@ -69,9 +77,8 @@ def sensitivity(
     lens = _lens(camera)
     if focal_error_percent is None:
         focal_error_percent = 0.25 if lens.covariance is None else 0.0
-    options = ("focal-error-percent", "principal-point-px", "print-um", "flatness-um", "radius-um", "scale-percent")
     values = (focal_error_percent, principal_point_px, print_um, flatness_um, radius_um, scale_percent)
-    sizes = {f"--{option}": value for option, value in zip(options, values, strict=True)}
+    sizes = dict(zip(_SIZES, values, strict=True))
     sigmas = list(dict.fromkeys(sigma_px or [0.2, 1.0]))
     _check(sizes, sigmas, distance, tilt_deg)
     import torch
