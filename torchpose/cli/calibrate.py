@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -22,6 +23,7 @@ from torchpose.cli.common import (
     say,
     with_tone,
 )
+from torchpose.cli.options import camera_option, target_option
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -58,10 +60,10 @@ _OUT = "Camera file to write; without it --camera is taken as it is."
 
 def calibrate(
     inputs: Annotated[list[Path], typer.Argument(metavar="INPUT...", help=_INPUTS)],
-    target: Annotated[str | None, typer.Option(help="Target file or name of a built-in target.")] = None,
+    target: Annotated[str | None, target_option("Target file or name of a built-in target.")] = None,
     board: Annotated[str | None, typer.Option(help=_BOARD)] = None,
-    out: Annotated[Path | None, typer.Option(help=_OUT)] = None,
-    camera: Annotated[str | None, typer.Option(help="Camera file to start from, or to use.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help=_OUT)] = None,
+    camera: Annotated[str | None, camera_option("Camera file to start from, or to use.")] = None,
     model: Annotated[str, typer.Option(metavar=_LENSES, help="Distortion of the lens.")] = "brown5",
     target_out: Annotated[Path | None, typer.Option("--measure-target", metavar="FILE", help=_MEASURE_TARGET)] = None,
     distance: Annotated[tuple[int, int, float] | None, typer.Option(metavar="ID ID MM [SIGMA]", help=_DISTANCE)] = None,
@@ -96,17 +98,17 @@ def calibrate(
                 calibration = measured.calibration
                 _show(calibration, len(sources), held=out is None)
                 _show_target(measured)
-                measured.target.save(target_out)
+                _save(measured.target, target_out, "--measure-target")
                 if out is not None:
-                    measured.camera.save(out)
+                    _save(measured.camera, out, "--out")
             elif out is not None:
                 calibration = _calibrate(frames, shown, start, model, said)
                 _show(calibration, len(sources))
-                calibration.camera.save(out)
+                _save(calibration.camera, out, "--out")
             if hand_eye_out is not None:
                 fit = _hand_eye(frames, shown, calibration, start)
                 _show_hand_eye(fit)
-                fit.hand_eye.save(hand_eye_out)
+                _save(fit.hand_eye, hand_eye_out, "--hand-eye-out")
             if plots is not None:
                 from torchpose.report.calibration import save_calibration
 
@@ -128,16 +130,26 @@ def _check_files(
     if out is None and camera is None:
         found = "--measure-target" if target_out is not None else "--hand-eye-out"
         raise ConfigError(f"--camera: needed to find {found}; give the camera file, or --out to calibrate it now")
+    from torchpose.config import real
+    from torchpose.io.writers import check_folder_of
+
     files: dict[Path, str] = {}
     for path, option in ((out, "--out"), (hand_eye_out, "--hand-eye-out"), (target_out, "--measure-target")):
         if path is None:
             continue
-        if not path.parent.is_dir():
-            raise ConfigError(f"{path}: {option}: folder {path.parent} does not exist; create it or choose another")
-        if path.is_dir():
+        check_folder_of(path, option)
+        if os.path.isdir(path):
             raise ConfigError(f"{path}: {option}: is a folder; give the name of a file")
-        if (other := files.setdefault(path.resolve(), option)) != option:
+        if (other := files.setdefault(real(path), option)) != option:
             raise ConfigError(f"{path}: {option}: is the file of {other}, too; choose another")
+
+
+def _save(found: Any, path: Path, option: str) -> None:
+    """Writes the file of a camera, target or hand-eye transform, its folder made where it is missing."""
+    from torchpose.io.writers import make_folder_of
+
+    make_folder_of(path, option)
+    found.save(path)
 
 
 def _distance(
@@ -155,7 +167,7 @@ def _distance(
         return None, inputs
     if target_out is None or isinstance(shown, Board):
         raise ConfigError("--distance: scales a measured target; give --measure-target too")
-    numbers = [path for path in inputs if not path.exists() and _is_number(str(path))]
+    numbers = [path for path in inputs if not os.path.exists(path) and _is_number(str(path))]
     sigma = float(str(numbers[0])) if numbers else 0.0
     distance = Distance(*given, sigma)
     distance.check(shown)
