@@ -23,7 +23,8 @@ from torch import Tensor
 
 import torchpose as tp
 from torchpose.geometry import rotations
-from torchpose.sim import add_noise, render, shapes
+from torchpose.sim import add_noise, disturbances, render, shapes
+from torchpose.sim.disturbances import COMA, lines_moved
 from torchpose.sim.shapes import Shapes
 
 F64 = torch.float64
@@ -333,18 +334,14 @@ def defocus(shot: Shot, radius: float) -> Shot:
 def coma(shot: Shot, length: float) -> Shot:
     """A head and a fainter, wider tail in a random direction, of that length in px; its centroid stays in place."""
     turn = shot.rng.uniform(0, 2 * math.pi)
-    share, along = np.array([0.6, 0.28, 0.12]), length * np.array([0.0, 0.5, 1.0])
-    along, width = along - share @ along, length * np.array([0.0, 0.2, 0.35])
-
-    def way(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        s, f2 = u * math.cos(turn) + v * math.sin(turn), u * u + v * v
-        parts = zip(share, along, width, strict=True)
-        return sum(p * np.exp(-2j * math.pi * a * s - 2 * math.pi**2 * w * w * f2) for p, a, w in parts)
-
-    spread, tail = float(share @ width**2), float(share @ along**2)
+    share, along, width = np.array(COMA).T * np.array([[1.0], [length], [length]])
+    frame = torch.from_numpy(shot.picture)[None]
+    through = disturbances.coma(frame, torch.tensor([length], dtype=F64), torch.tensor([turn], dtype=F64))[0].numpy()
+    spread, tail = float(share @ width**2), float(share @ along**2 - (share @ along) ** 2)
     cos, sin = math.cos(turn), math.sin(turn)
     own = BASE_PSF**2 + spread
-    return blurred(shot, way, Blur((own + tail * cos * cos, tail * cos * sin, own + tail * sin * sin)))
+    blur = Blur((own + tail * cos * cos, tail * cos * sin, own + tail * sin * sin))
+    return replace(shot.seen(through), blur=blur)
 
 
 _BASE = (BASE_PSF**2, 0.0, BASE_PSF**2)
@@ -426,11 +423,9 @@ def interlacing(shot: Shot, shift: float) -> Shot:
 
 
 def _rows_moved(shot: Shot, offset: np.ndarray) -> Shot:
-    """Every row displaced along u by its offset (H,) in px, by the shift theorem."""
-    wide = np.pad(shot.picture, ((0, 0), (32, 32)), mode="reflect")
-    phase = np.exp(-2j * math.pi * offset[:, None] * np.fft.rfftfreq(wide.shape[1])[None])
-    moved = np.fft.irfft(np.fft.rfft(wide) * phase, wide.shape[1])
-    return shot.seen(moved[:, 32:-32].astype(np.float32))
+    """Every row displaced along u by its offset (H,) in px."""
+    moved = lines_moved(torch.from_numpy(shot.picture)[None].double(), torch.from_numpy(offset)[None])
+    return shot.seen(moved[0].numpy().astype(np.float32))
 
 
 # sensor

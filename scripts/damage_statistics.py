@@ -42,7 +42,9 @@ def coded(frame: np.ndarray) -> Iterator[tuple[str, bytes]]:
     colour = np.dstack([frame, (0.9 * frame).astype(np.uint8), (0.8 * frame).astype(np.uint8)])
     yield "baseline", cv2.imencode(".jpg", frame)[1].tobytes()
     yield "own tables", by_pillow(frame, optimize=True)
+    yield "own tables, restart markers", by_pillow(frame, optimize=True, restart_marker_blocks=64)
     yield "progressive", by_pillow(frame, progressive=True)
+    yield "progressive, restart markers", by_pillow(frame, progressive=True, restart_marker_rows=1)
     yield "restart markers", cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_RST_INTERVAL, 16])[1].tobytes()
     yield "colour 4:2:0", cv2.imencode(".jpg", colour)[1].tobytes()
     yield "colour 4:4:4", by_pillow(colour, subsampling=0)
@@ -97,12 +99,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--flips", type=int, default=60, help="damaged files of each kind")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--kind", nargs="+", help="of files; all by default")
     args = parser.parse_args()
     frame = np.asarray(cv2.imread(str(SAMPLE / "frames" / "005.png"), cv2.IMREAD_GRAYSCALE))
     estimator = tp.PoseEstimator(tp.Camera.load(SAMPLE / "camera.yaml"), tp.Target.load("quad40"))
     print("| file | reader | refused | same | < 1 | < 3 | > 3 | other | worst |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     for kind, data in coded(frame):
+        if args.kind and kind not in args.kind:
+            continue
         clean = by_opencv(data)
         for name, read in (("torchpose", ours), ("OpenCV", opencv)):
             images = [read(damaged) for damaged in flipped(data, args.flips, args.seed)]

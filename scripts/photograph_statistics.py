@@ -41,6 +41,8 @@ def with_left_out(found: Measurement) -> str:
     """The same of all rings that were fitted, and those that the adjustment left out, with their residuals."""
     fit, target, seen = found.calibration, found.target, found.calibration.seen
     assert seen is not None  # what was measured
+    lost = [name for name in seen.names if name not in fit.views.names]
+    seen = seen.of_views(torch.tensor([name not in lost for name in seen.names]))
     view = torch.tensor([fit.views.names.index(name) for name in seen.names])[seen.view]
     place = target.centers[(seen.point[:, None] == target.ids).int().argmax(1)]
     at = (fit.bundle.R[view] @ place[..., None]).squeeze(-1) + fit.bundle.t[view]
@@ -54,7 +56,9 @@ def with_left_out(found: Measurement) -> str:
         for k in out
     ]
     share = float(chi2.sum()) / (fit.degrees + 2 * len(out))
-    return f"with all {len(chi2)}: chi-squared over freedom {share:.2f}; left out were {', '.join(named) or 'none'}"
+    return (
+        f"with all {len(chi2)}: chi-squared over freedom {share:.2f}; left out were {', '.join(named + lost) or 'none'}"
+    )
 
 
 def main() -> None:

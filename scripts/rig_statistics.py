@@ -5,8 +5,9 @@
 
 Simulated frames of quad40, as much of 2 megapixels as the target is in, 8 bit, noise 2, blur 0.7 px; cameras of one rig
 look at one place, 160 mm away, from angles that a case names, the first of which is 0. One row a case: moments with a
-pose, RMS error over RMS bound across and along the axis of the first camera and of the rotation, RMS errors, share of rows
-that claim 1.3 times the bound in depth or more, mean NEES (ideal 6), consistency (mean chi-squared between the cameras over its freedom, ideal 1).
+pose, RMS error over RMS bound across and along the axis of the first camera and of the rotation, RMS errors, share of
+rows that claim 1.3 times the bound in depth or more, mean NEES (ideal 6), consistency (mean chi-squared between the
+cameras over its freedom, ideal 1).
 
 Cases end in `-places` where the rig states a covariance of its places (20 um, 0.2 mrad a camera) and every moment has
 places of its own from it. `two-markers`: each camera sees two markers of the four, at opposite corners in turns.

@@ -34,6 +34,7 @@ from torchpose.geometry.least_squares import Pose
 from torchpose.io.misfits import Misfits
 from torchpose.io.rows import pose_rows
 from torchpose.sim import PrintErrors, Processing, SensorPattern
+from torchpose.sim.disturbances import lines_moved
 
 _MANY = 5.0  # claimed standard deviations: what no row may be off where the frame shows why
 Cameras = Callable[[tp.Camera], tp.Camera]
@@ -132,17 +133,11 @@ def swapped(a: int, b: int) -> Targets:
 
 
 def rows_moved(offset: Callable[[int], np.ndarray]) -> Pictures:
-    """Every row displaced along u by its offset in px, by the shift theorem.
-
-    As `torchpose.sim.disturbances.lines_moved`, with a margin for shifts of a px and more.
-    """
+    """Every row displaced along u by its offset in px."""
 
     def read(light: Tensor) -> Tensor:
-        wide = torch.nn.functional.pad(light[:, None], (32, 32, 0, 0), mode="reflect")[:, 0]
-        frequency = torch.fft.rfftfreq(wide.shape[-1])
-        by = torch.from_numpy(offset(light.shape[1])).float()
-        phase = torch.exp(-2j * math.pi * by[:, None] * frequency)
-        return torch.fft.irfft(torch.fft.rfft(wide) * phase, n=wide.shape[-1])[..., 32:-32]
+        by = torch.from_numpy(offset(light.shape[1])).to(light)
+        return lines_moved(light, by.expand(light.shape[:2]))
 
     return read
 

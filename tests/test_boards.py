@@ -13,6 +13,7 @@ from tests.calibration import board_scenes as boards
 from tests.calibration import calibration_scenes as scenes
 from torchpose.geometry import rotations
 from torchpose.grids import Grid
+from torchpose.pose.sizes import sizes_beyond
 from torchpose.sim.shapes import Shapes, ring
 
 F64 = torch.float64
@@ -73,6 +74,30 @@ def test_poses_of_boards(text: str, status: tp.Status) -> None:
     upright = tp.PoseEstimator(CAMERA, target.upright())(taken(target, R, t))
     assert upright.status.tolist() == [tp.Status.OK] * 3
     torch.testing.assert_close(upright.R, poses.R)
+
+
+@pytest.mark.parametrize("larger", [0.94, 1.06])
+def test_discs_of_another_size_than_the_file_s(larger: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fit begins on the right side, near the truth, and ends there: grey values and not centres alone tell."""
+    target = tp.Target.load("acircles:3x7:5mm:2mm")
+    assert target.grid is not None
+    starts: list[Tensor] = []
+
+    def recorded(*args: Tensor) -> tuple[Tensor, Tensor]:
+        starts.append(sizes_beyond(*args)[1])  # type: ignore[arg-type]
+        return sizes_beyond(*args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("torchpose.pose.solve.sizes_beyond", recorded)
+    R, t = views(2)
+    poses = tp.PoseEstimator(CAMERA, target)(taken(replace(target, radii=larger * target.radii), R, t))
+    off = 2.0 * (larger - 1)
+    torch.testing.assert_close(starts[0], torch.full((2,), off, dtype=F64), rtol=0.2, atol=0)
+    # of a disc the gain is a size
+    edges = poses.place[..., 3:].sum(-1)
+    torch.testing.assert_close(edges, torch.full_like(edges, off), rtol=0.02, atol=0)
+    error = errors(poses, target.grid, R, t)
+    assert float((error * torch.linalg.solve(poses.covariance, error)).sum()) < 12 + 4 * 24**0.5
+    assert float(poses.std[:, 2].max()) < 5e-3
 
 
 @pytest.mark.parametrize("turned", [0.0, 180.0])

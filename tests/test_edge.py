@@ -40,13 +40,16 @@ def test_frames_are_taken_as_they_come(camera: tp.Camera) -> None:
     tensor = torch.from_numpy(IMAGE)
     expected = estimator(tensor[None])
     assert bool(expected.ok.all())
-    for frames in (IMAGE, IMAGE[None], tensor, np.broadcast_to(IMAGE, (1, 3, *IMAGE.shape))):
+    read_only = np.frombuffer(IMAGE.tobytes(), np.uint8).reshape(IMAGE.shape)  # of which torch warns
+    for frames in (IMAGE, IMAGE[None], tensor, np.broadcast_to(IMAGE, (1, 3, *IMAGE.shape)), read_only):
         assert torch.equal(by_name(frames).t, expected.t)
     assert len(tp.PoseEstimator(camera, ["quad40"]).targets) == 1
     with pytest.raises(tp.ConfigError, match="target: is neither a file nor built in"):
         tp.PoseEstimator(camera, "quad41")
     with pytest.raises(tp.ConfigError, match="target: is of type int"):
         tp.PoseEstimator(camera, 40)  # type: ignore[arg-type]
+    with pytest.raises(tp.ConfigError, match=r"instances: 2.5 given"):
+        tp.PoseEstimator(camera, "quad40", instances=2.5)  # type: ignore[arg-type]
     with pytest.raises(tp.ConfigError, match="camera: is of type str"):
         tp.PoseEstimator("camera.yaml", "quad40")  # type: ignore[arg-type]
 

@@ -30,6 +30,7 @@ FLOW = [
     ["datasets"],
     ["design", "calibration", "rig", "scale"],
     ["report"],
+    ["live"],
     ["studies"],
     ["cli"],
     ["__main__"],

@@ -6,7 +6,7 @@ are fitted by one sequence of tensor operations. Ellipses are (cx, cy, a >= b, t
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple, Self
 
 import torch
 from jaxtyping import Bool, Float, Int, Real
@@ -204,16 +204,60 @@ def _fused_sums(xy: Tensor, center: Tensor, weights: Tensor | None) -> Tensor:
 
 def _from_moments(center: Tensor, moments: Tensor, enough: Tensor, *, method: Method) -> Tensor:
     """Ellipses (M, 5) from the results of `_moments`."""
-    rows = moments.mT.contiguous()
-    square = (rows[0] + rows[2]).reciprocal()
-    scale = square.rsqrt()
-    scaled = torch.cat([rows[:3] * square, rows[3:7] * (square / scale), rows[7:] * square.square()])
-    conic = _taubin(scaled.unbind(0)) if method == "taubin" else _halir_flusser(scaled)
-    ellipse = conics.ellipse_from_conic(conic)
-    scale = scale[:, None]
-    ellipse = torch.cat([ellipse[:, :2] * scale + center, ellipse[:, 2:4] * scale, ellipse[:, 4:]], -1)
-    m20, m11, m02 = scaled[:3]  # m20 + m02 = 1, so their determinant is the squared ratio of the extents
-    return torch.where((enough & (m20 * m02 - m11 * m11 > _FLAT))[:, None], ellipse, torch.nan)
+    return _Conics.of(center, moments, enough, method).ellipses()
+
+
+class _Conics(NamedTuple):
+    """Fitted conics (M, 6) of points about ``center`` (M, 2), in units of ``scale`` (M,); not all sound (M,)."""
+
+    conic: Tensor
+    center: Tensor
+    scale: Tensor
+    sound: Tensor
+
+    @classmethod
+    def of(cls, center: Tensor, moments: Tensor, enough: Tensor, method: Method = "halir-flusser") -> Self:
+        """From the results of `_moments`."""
+        rows = moments.mT.contiguous()
+        square = (rows[0] + rows[2]).reciprocal()
+        scale = square.rsqrt()
+        scaled = torch.cat([rows[:3] * square, rows[3:7] * (square / scale), rows[7:] * square.square()])
+        conic = _taubin(scaled.unbind(0)) if method == "taubin" else _halir_flusser(scaled)
+        m20, m11, m02 = scaled[:3].unbind()  # m20 + m02 = 1, so their determinant is the squared ratio of the extents
+        return cls(conic, center, scale, enough & (m20 * m02 - m11 * m11 > _FLAT))
+
+    def ellipses(self) -> Tensor:
+        """(M, 5)."""
+        ellipse, scale = conics.ellipse_from_conic(self.conic), self.scale[:, None]
+        ellipse = torch.cat([ellipse[:, :2] * scale + self.center, ellipse[:, 2:4] * scale, ellipse[:, 4:]], -1)
+        return torch.where(self.sound[:, None], ellipse, torch.nan)
+
+    def form(self) -> Tensor:
+        """(M, 5) as `_form_of` has it, which distances need; axes and angle would cost as much as the fit."""
+        squares, b, linear, f = self.conic[:, :3:2], self.conic[:, 1], self.conic[:, 3:5], self.conic[:, 5]
+        mixed = squares.flip(-1)
+        disc = 4 * squares.prod(-1) - b.square()
+        center = (b[:, None] * linear.flip(-1) - 2 * mixed * linear) / disc[:, None]
+        level = -(f + 0.5 * (linear * center).sum(-1)) * self.scale.square()
+        form = torch.cat([center * self.scale[:, None] + self.center, self.conic[:, :3] / level[:, None]], -1)
+        sound = self.sound & (disc > 0) & (form[:, 2] > 0)
+        return torch.where(sound[:, None], form, torch.nan)
+
+
+def _form_of(ellipses: Tensor) -> Tensor:
+    """(M, 5) of ellipses (M, 5): centre and p, r, q of p x^2 + r x y + q y^2 = 1 about it."""
+    conic = conics.conic_from_ellipse(ellipses)
+    return torch.cat([ellipses[:, :2], conic[:, :3]], -1)
+
+
+def _from_form(xy: Tensor, form: Tensor) -> Tensor:
+    """Signed first-order distances (K, T) of points (K, 2, T) from ellipses given by forms (K, 5), as `distance`."""
+    cx, cy, p, r, q = form[:, :, None].unbind(1)
+    dx, dy = xy[:, 0] - cx, xy[:, 1] - cy
+    half = 0.5 * r
+    u, v = p * dx + half * dy, half * dx + q * dy
+    rho = (u * dx + v * dy).sqrt()  # whose gradient is (u, v) / rho
+    return (rho - 1) * rho / (u * u + v * v).sqrt()
 
 
 def _halir_flusser(moments: Tensor) -> Tensor:
@@ -350,30 +394,34 @@ def fit_robust(
     if len(start) != count:
         raise ArgumentError(f"start: has {len(start)} ellipses; give one for each of the {count} of count")
     tiles, xy, there = _tiled(points, index, count)
+    there = there[:, 0]
 
-    def distances(ellipses: Tensor) -> Tensor:
-        value, gx, gy = _radius(*xy.unbind(1), *_inverse_shape(ellipses)[tiles.group, :, None].unbind(1))
-        return value / torch.sqrt(gx * gx + gy * gy)
+    def refit(weights: Tensor) -> _Conics:
+        return _Conics.of(*_tile_moments(tiles, xy, weights[:, None]))
 
-    def refit(weights: Tensor) -> Tensor:
-        return _from_moments(*_tile_moments(tiles, xy, weights[:, None]), method="halir-flusser")
+    def distances(form: Tensor) -> Tensor:
+        return _from_form(xy, form[tiles.group])
 
     def trust(off: Tensor, scale: float) -> Tensor:
-        return there[:, 0] * geman_mcclure(off / scale).nan_to_num(nan=0.0)
+        return there * geman_mcclure(off / scale).nan_to_num(nan=0.0)
 
-    ellipses = start.double()
+    form = _form_of(start.double())
     for scale in scales:
-        again = refit(trust(distances(ellipses), scale))
-        ellipses = torch.where(again.isfinite().all(-1, keepdim=True), again, ellipses)
-    keep = there[:, 0]
+        again = refit(trust(distances(form), scale)).form()
+        form = torch.where(again.isfinite().all(-1, keepdim=True), again, form)
+    keep, fitted = there, None
     for _ in range(3):
-        r = distances(ellipses)
+        r = distances(form)
         # the weighted RMS under Geman-McClure weights is a scale that outliers hardly move
         w = trust(r, scales[-1])
         sums = tiles.sums(torch.stack([(w * r.square().nan_to_num(nan=0.0)).sum(-1), w.sum(-1)], -1))
         sigma = (sums[:, 0] / sums[:, 1]).sqrt()
-        keep = there[:, 0] * (r.abs() <= (cut * sigma + 0.02)[tiles.group, None])
-        ellipses = refit(keep)
+        before, keep = keep, there * (r.abs() <= (cut * sigma + 0.02)[tiles.group, None])
+        if fitted is not None and torch.equal(before, keep):  # the same points again
+            break
+        fitted = refit(keep)
+        form = fitted.form()
+    ellipses = start if fitted is None else fitted.ellipses()
     return ellipses, tiles.flat(keep) > 0
 
 

@@ -33,6 +33,8 @@ from torchpose.identify import (
     Identified,
     MarkerTable,
     Scene,
+    Views,
+    held,
     identify,
     identify_boards,
     in_company,
@@ -128,7 +130,7 @@ class PoseEstimator(nn.Module):
         self.camera = camera
         self.targets = _targets(target)
         _check_targets(self.targets)
-        if instances < 1:
+        if not isinstance(instances, int) or instances < 1:
             raise ConfigError(f"instances: {instances} given; give the most copies of a target in a frame, 1 or more")
         if not float_range > 0:
             raise ConfigError(f"float_range: {float_range} is not positive; use 1.0 or 255.0")
@@ -209,8 +211,8 @@ class PoseEstimator(nn.Module):
         """
         frames = self._checked(frames)
         scene = Scene.of(frames, self.camera.to(frames.device), self.table.to(frames.device))
-        scene, found = self._found(scene)
-        again = self._second_look(scene, found)
+        scene, found, tried = self._found(scene)
+        again = self._second_look(scene, found, tried)
         if len(again[0]) > len(found.rings):
             found = self._solved(scene, *again)
         return self._finished(scene, found)
@@ -237,27 +239,32 @@ class PoseEstimator(nn.Module):
             frames = frames.float() * (255.0 / self.float_range)
         return frames.contiguous()
 
-    def _found(self, scene: Scene) -> tuple[Scene, Found]:
-        """What is found in all frames: at the coarse scale alone where that shows every target whole."""
+    def _found(self, scene: Scene) -> tuple[Scene, Found, Rings]:
+        """What is found in all frames: at the coarse scale alone where that shows every target whole.
+
+        Also the rings that were measured for that.
+        """
         frames, wanted = scene.frames, Wanted.of(scene.table.polarity, _LEAST_CANDIDATE)
         if not bool(scene.table.coded.all()):
-            return self._found_with_boards(scene)
+            scene, found = self._found_with_boards(scene)
+            return scene, found, found.rings
         if self.instances > 1:  # a copy may be too small for the coarse scale
             circles = self._useful(scene, find_candidates(frames, wanted=wanted, float_range=255.0))
-            return self._read(scene, self._measured(scene, circles))
+            scene, found = self._read(scene, self._measured(scene, circles))
+            return scene, found, found.rings
         coarse = find_coarse(frames, wanted=wanted, float_range=255.0)
         rings, copies, tried = self._likely(scene, coarse)
         first = self._read(scene, rings, copies)
-        settled = _settled(*first)
+        settled = self._settled(*first, tried.rings)
         if bool(settled.all()):
-            return first
+            return *first, tried.rings
         rest, number = (~settled).nonzero()[:, 0], (~settled).cumsum(0) - 1
         known = coarse[~settled[coarse.frame]]
         known = replace(known, frame=number[known.frame])
         finer = find_candidates(frames[rest], wanted=wanted, coarse=known, float_range=255.0)
         circles = self._useful(scene, replace(finer, frame=rest[finer.frame]))
-        more = self._measured(scene, circles, tried)
-        return self._read(scene, Rings.cat([rings[settled[rings.frame]], more]), copies)
+        every = Rings.cat([rings[settled[rings.frame]], self._measured(scene, circles, tried)])
+        return *self._read(scene, every, copies), Rings.cat([tried.rings, every])
 
     def _found_with_boards(self, scene: Scene) -> tuple[Scene, Found]:
         """The same where there are boards among the targets: at finer and finer scales where they are not whole."""
@@ -265,12 +272,24 @@ class PoseEstimator(nn.Module):
         candidates = find_candidates(scene.frames, factor)
         while True:
             found = self._read(scene, self._measured(scene, self._circles(scene, candidates)), None, candidates)
-            rest = (~_settled(*found)).nonzero()[:, 0]
+            rest = (~self._settled(*found, found[1].rings)).nonzero()[:, 0]
             factor //= 2
             if factor < 1 or rest.numel() == 0:
                 return found
             more = find_candidates(scene.frames[rest], factor)
             candidates = merge_duplicates(Candidates.cat([candidates, replace(more, frame=rest[more.frame])]))
+
+    def _settled(self, scene: Scene, found: Found, tried: Rings) -> Tensor:
+        """Frames (B,) bool in which every target has a row with all of its markers and a pose that they agree on.
+
+        A marker in whose place a blurred ring was measured counts: no finer scale shows more of it.
+        """
+        agreed = marked(found.solvable[found.solutions.status == Status.OK], len(scene.frame))
+        missing = scene.table.valid[scene.target] & (found.identified.ring < 0)
+        if bool((agreed & missing.any(1)).any()):
+            missing &= ~held(scene, found.identified, _views(found), _much_blurred(tried))
+        good = agreed & ~missing.any(1)
+        return marked(scene.group[good], scene.groups).view(len(scene.frames), len(scene.table)).all(1)
 
     def _circles(self, scene: Scene, candidates: Candidates) -> Circles:
         candidates = candidates[torch.isin(candidates.polarity, scene.table.polarity)]
@@ -282,7 +301,9 @@ class PoseEstimator(nn.Module):
         if len(circles) == 0:
             return circles
         rough, at = rough_rings(circles, scene.camera), (scene.table, scene.camera.matrix)
-        return circles[in_company(rough, *at) | (_legible(circles.inside.blur) & named(rough, *at))]
+        beside = in_company(rough, *at)
+        circles = replace(circles, alone=~beside)
+        return circles[beside | (_legible(circles.inside.blur) & named(rough, *at))]
 
     def _rings(self, scene: Scene, circles: Circles, *, hopeful: bool = False) -> tuple[Rings, Tensor]:
         return measure_circles(scene.frames, circles, scene.camera, correct=self._recipe.correct, hopeful=hopeful)
@@ -371,17 +392,10 @@ class PoseEstimator(nn.Module):
             rings, identified, evidence, solvable, solve_poses(evidence[solvable], rough, compile=self.solves_compiled)
         )
 
-    def _second_look(self, scene: Scene, found: Found) -> tuple[Rings, Identified]:
+    def _second_look(self, scene: Scene, found: Found, tried: Rings) -> tuple[Rings, Identified]:
         """Looks for missing markers where the solutions put them, or the rough pose where there is none."""
-        identified, some = found.identified, found.solutions[found.solutions.solved]
-        index = found.solvable[found.solutions.solved]
-        seen = (identified.ring >= 0).index_copy(0, index, some.mask)
-        nowhere = torch.full_like(identified.R, torch.nan), torch.full_like(identified.t, torch.nan)
-        R, t = (torch.stack(v, 1) for v in zip((identified.R, identified.t), nowhere, strict=True))
-        twofold = (some.status == Status.AMBIGUOUS)[:, None, None]
-        R = R.index_copy(0, index, torch.stack([some.R, torch.where(twofold, some.R_alt, torch.nan)], 1))
-        t = t.index_copy(0, index, torch.stack([some.t, some.t_alt], 1))
-        return look_again(scene, found.rings, identified, seen, (R, t), correct=self._recipe.correct)
+        known = found.rings, found.identified, _views(found), _much_blurred(tried)
+        return look_again(scene, *known, correct=self._recipe.correct)
 
     def _refined(self, scene: Scene, found: Found) -> Solutions:
         """The solutions after the steps of the method."""
@@ -472,8 +486,8 @@ class RigEstimator(PoseEstimator):
         """What one camera's pictures show, as far as it goes alone."""
         one, targets = self._of(camera), len(self.targets)
         scene = Scene.of(frames, one.camera.to(frames.device), one.table.to(frames.device))
-        scene, found = one._found(scene)
-        again = one._second_look(scene, found)
+        scene, found, tried = one._found(scene)
+        again = one._second_look(scene, found, tried)
         if len(again[0]) > len(found.rings):
             found = one._solved(scene, *again)
         moment = seen.nonzero()[:, 0]
@@ -529,15 +543,8 @@ class RigEstimator(PoseEstimator):
         kept = start.mask[:, number]
         ring = identified.ring.index_copy(0, own, torch.where(kept, identified.ring[own], -1))
         identified = replace(identified, ring=ring)
-        again = look_again(
-            view.scene,
-            view.found.rings,
-            identified,
-            ring >= 0,
-            (R[:, None], t[:, None]),
-            least=0,
-            correct=one._recipe.correct,
-        )
+        rings, there = view.found.rings, Views(ring >= 0, R[:, None], t[:, None], 0)
+        again = look_again(view.scene, rings, identified, there, rings[:0], correct=one._recipe.correct)
         return view._replace(found=one._solved(view.scene, *again))
 
     def _alone(self, moments: Moments, rows: Tensor) -> list[Alone]:
@@ -575,12 +582,22 @@ def _lacking(scene: Scene, identified: Identified) -> Tensor:
     return marked(identified.group[lacks] // len(scene.table), len(scene.frames))
 
 
-def _settled(scene: Scene, found: Found) -> Tensor:
-    """Frames (B,) bool in which every target has a row with all of its markers and a pose that they agree on."""
-    agreed = found.solvable[found.solutions.status == Status.OK]
-    missing = scene.table.valid[scene.target] & (found.identified.ring < 0)
-    good = marked(agreed, len(scene.frame)) & ~missing.any(1)
-    return marked(scene.group[good], scene.groups).view(len(scene.frames), len(scene.table)).all(1)
+def _much_blurred(rings: Rings) -> Rings:
+    """Those whose blur hides no more of them at a coarse scale than at a fine one."""
+    return rings[~_legible(rings.blur)]
+
+
+def _views(found: Found) -> Views:
+    """The poses that rows may have: both where they are ambiguous, the rough one where there is no solution."""
+    identified, some = found.identified, found.solutions[found.solutions.solved]
+    index = found.solvable[found.solutions.solved]
+    seen = (identified.ring >= 0).index_copy(0, index, some.mask)
+    nowhere = torch.full_like(identified.R, torch.nan), torch.full_like(identified.t, torch.nan)
+    R, t = (torch.stack(v, 1) for v in zip((identified.R, identified.t), nowhere, strict=True))
+    twofold = (some.status == Status.AMBIGUOUS)[:, None, None]
+    R = R.index_copy(0, index, torch.stack([some.R, torch.where(twofold, some.R_alt, torch.nan)], 1))
+    t = t.index_copy(0, index, torch.stack([some.t, some.t_alt], 1))
+    return Views(seen, R, t)
 
 
 def _targets(given: Any) -> tuple[Target, ...]:

@@ -65,7 +65,8 @@ class Detections(Rows):
         marker: marker id as in the target file.
         center: image of the marker's centre, compensated for perspective, px.
         center_cov: its covariance, px^2.
-        outer, inner: fitted ellipses cx, cy, a >= b (semi-axes, px), theta (rad, [0, pi)).
+        outer: fitted ellipse cx, cy, a >= b (semi-axes, px), theta (rad, [0, pi)).
+        inner: that of the inner circle.
         camera: number in the rig, where several cameras look.
     """
 
@@ -85,7 +86,8 @@ class Motions(Rows):
     """Poses of one row's target in the frame of another's: X_i = R X_j + t.
 
     Attributes:
-        R, t: t in mm.
+        R: rotation.
+        t: translation, mm.
         covariance: translation (mm) first, then rotation (rad, about the axes of frame i), of everything.
         noise: the part of it that is the noise of the two frames.
     """
@@ -123,7 +125,8 @@ class Poses(Rows):
         copies: of the target that the frame shows, each by a pose or by four markers in their places; the same in all
             rows of a frame and target. More than there are rows: the others were left out, or no pose explains them.
             Where one copy is looked for, those at the coarse scale are counted, and there may be more.
-        R, t: target to camera: X_cam = R X_target + t, mm.
+        R: target to camera: X_cam = R X_target + t.
+        t: mm.
         covariance: translation (mm) first, then rotation (rad, left-multiplied: R = exp(w) R_est, that is about the
             camera axes). Of everything: noise, target and camera.
         noise: the part of it that is the frame's own: how far the pose would scatter if the frame were taken again.
@@ -133,14 +136,19 @@ class Poses(Rows):
             edges of a ring further from its centre, all in mm, as far as the file or the residuals leave it open; NaN
             for markers that were not used.
         misfit: `Misfit`.
-        residual_chi2, freedom: chi-squared of what the markers say against each other, under noise and the stated
-            uncertainties alone, and its degrees of freedom; what stands above chance is counted in the covariance.
+        residual_chi2: chi-squared of what the markers say against each other, under noise and the stated
+            uncertainties alone; what stands above chance is counted in the covariance.
+        freedom: its degrees of freedom.
         rms: reprojection RMS of the compensated marker centres, px.
-        status, reason: `Status` and `Reason`.
+        status: `Status`.
+        reason: `Reason`, why it is not OK.
         markers: number of markers used.
         chi2: of all evidence (centres and ring shapes) at the pose.
-        R_alt, t_alt, rms_alt, chi2_alt: the other minimum of the same evidence (the second planar solution); NaN
-            where both coincide or there is none.
+        R_alt: rotation of the other minimum of the same evidence (the second planar solution); NaN where both coincide
+            or there is none.
+        t_alt: its translation.
+        rms_alt: its `rms`.
+        chi2_alt: its `chi2`.
         share: of the information about the pose, by camera of a rig, 0 where it contributes nothing; None without rig.
         consistency: chi-squared of what the C cameras of a rig say against each other, and its degrees of freedom; 0
             with one camera.

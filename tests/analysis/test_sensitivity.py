@@ -165,10 +165,13 @@ def test_what_a_target_shares_with_its_camera_counts_once() -> None:
     assert opposite.sources["calibration"][0, 2, 2].sqrt() < 0.002
 
 
-@pytest.mark.parametrize(("place", "gain"), [(0.001, 0.001), (0.01, 0.015), (0.05, 0.05)])
+@pytest.mark.parametrize(("place", "gain"), [(0.001, 0.001), (0.01, 0.015), (0.05, 0.05), ((0.02, 0.02, 0.06), 0.02)])
 @pytest.mark.parametrize("name", ["quad40", "hexa50"])
-def test_the_budget_of_rings_is_what_estimate_states(name: str, place: float, gain: float) -> None:
-    """Of rendered frames: all three sources, each where it counts, and the noise of the frame alone."""
+def test_the_budget_of_rings_is_what_estimate_states(name: str, place: float | tuple[float, ...], gain: float) -> None:
+    """Of rendered frames: all three sources, each where it counts, and the noise of the frame alone.
+
+    Places that are off in height turn their rings besides.
+    """
     square = torch.diag(torch.tensor([0.05, 0.05, 0.03, 0.03], dtype=F64).square())
     square = torch.block_diag(square, torch.diag(torch.tensor([1e-3, 1e-2, 1e-5, 1e-5], dtype=F64).square()))
     camera = replace(pinhole(800.0, 600, 500), distortion=distorted().distortion, covariance=square)
@@ -183,7 +186,8 @@ def test_the_budget_of_rings_is_what_estimate_states(name: str, place: float, ga
     stated = found.covariance.diagonal(dim1=1, dim2=2).sqrt()
     assert (stated / budget.std() - 1).abs().max() < 0.08
     noise = found.noise.diagonal(dim1=1, dim2=2).sqrt()
-    assert (noise / budget.std("image") - 1).abs().max() < 0.12
+    # where the print decides all but everything, its weights do
+    assert ((noise - budget.std("image")).abs() < 0.12 * budget.std("image") + 0.01 * stated).all()
 
 
 def test_rings_reach_the_cramer_rao_bound() -> None:

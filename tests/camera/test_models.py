@@ -259,6 +259,30 @@ def test_near_a_pole_no_ray_is_returned_that_another_could_replace(excess: float
     ].abs().max() < 1e-8
 
 
+def beside_the_axis(excess: float, apart: float, spot: float = 0.45) -> list[float]:
+    """A lens and a pair of complex poles at u = spot (1 +- i apart), which nearly cancel: a spike, no pole."""
+    pair = [1 / spot**2, -2 / spot, 1 + apart**2]
+    n = np.polymul([0.1, 1], np.add(pair, [0, 0, excess]) / (1 + apart**2 + excess))
+    q = np.asarray(pair) / (1 + apart**2)
+    return [n[2], n[1], 0.0, 0.0, n[0], q[1], q[0], 0.0]
+
+
+@pytest.mark.parametrize("apart", [0.0, 1e-3, 0.03, 0.1])
+@pytest.mark.parametrize("excess", [-1e-3, 1e-3, 0.02, 1.0])
+def test_a_spike_without_a_pole_ends_the_inverse_too(excess: float, apart: float) -> None:
+    camera = Camera(1824, 1216, K, beside_the_axis(excess, apart))
+    radius = torch.linspace(0, 1.0, 100, dtype=torch.float64)
+    found = camera.undistort_points(torch.stack([radius * 1111.1 + 911.5, torch.full_like(radius, 607.5)], -1))[:, 0]
+    r, bent = rays(camera)
+    slope = bent.diff() / r.diff()
+    real = (bent[:-1] > 0) & (slope > 0) & (slope * r[:-1] <= 3.0 * bent[:-1])
+    crossings = ((bent[None, :-1] <= radius[1:, None]) & (bent[None, 1:] > radius[1:, None]) & real).sum(1)
+    valid = found[1:].isfinite()
+    assert (crossings[valid] == 1).all()
+    # nothing is lost where the spike is none
+    assert bool(valid.all()) or not bool(real[1:].all())
+
+
 def test_markers_without_a_ray_make_no_pose_that_is_wrong() -> None:
     """A lens, and a fit of it that has a pole at r = 0.67; the target moves out of the part with rays."""
     matrix: list[list[float]] = [[550.0, 0, 455.5], [0, 550.0, 303.5], [0, 0, 1]]
@@ -286,6 +310,7 @@ def test_a_pole_outside_the_frame_costs_nothing() -> None:
     assert share_without_ray(camera) == 0
     # division model: a pincushion with a true pole, beyond which nothing is imaged
     assert share_without_ray(Camera(1824, 1216, K, [0, 0, 0, 0, 0, -0.3, 0, 0])) == 0
+    assert Camera(1824, 1216, K, [-2.2e-313, 0, 0, 0]).fold_radius == math.inf
 
 
 @pytest.mark.parametrize(

@@ -112,7 +112,7 @@ def test_camera_and_hand_eye_of_a_manifest(capture: Path, tmp_path: Path, capsys
         (("--target", "hexa50", "--board", "chessboard:9x6:5mm", "--out", "c.yaml"), "either --target or --board"),
         (("--target", "hexa50"), "--out: nothing to write"),
         (("--target", "hexa50", "--hand-eye-out", "h.yaml"), "--camera: needed"),
-        (("--target", "hexa50", "--out", "missing/c.yaml"), "folder missing does not exist"),
+        (("--target", "hexa50", "--out", "/proc/missing/c.yaml"), "--out: /proc cannot be written"),
         (("--target", "hexa50", "--out", "c.yaml", "--model", "brown6"), "brown6"),
         (("--board", "chessboard:9x6", "--out", "c.yaml"), "is no board"),
         (

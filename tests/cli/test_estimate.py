@@ -329,7 +329,6 @@ MISTAKES = {
     "broken manifest": (["m.jsonl"], {}, {"m.jsonl": "{broken\n{}\n"}, "m.jsonl: line 1"),
     "unknown output type": (["f"], {"out": "poses.txt"}, {}, "poses.txt: --out"),
     "output is a folder": (["f"], {"out": "d.csv"}, {"d.csv/x": ""}, "d.csv: --out"),
-    "output folder missing": (["f"], {"out": "gone/p.csv"}, {}, "gone/p.csv: --out"),
     "output below a file": (["f"], {"out": "file/p.csv"}, {"file": ""}, "file/p.csv: --out"),
     "output unwritable": (["f"], {"out": "/proc/p.csv"}, {}, "/proc/p.csv: --out"),
     "output is the manifest": (

@@ -144,7 +144,7 @@ def test_plans_with_several_cameras(shots: Path, tmp_path: Path) -> None:
     ("more", "message"),
     [
         (["--camera", "cam.yaml"], "--camera: stands beside --cameras"),
-        (["--detections", "d.csv"], "--detections: is of one camera"),
+        (["--detections", "d.csv"], "-d: is of one camera"),
         (["--instances", "2"], "--instances: several cameras look for one copy"),
         (["--method", "paper"], "method: 'paper' is of one camera"),
     ],

@@ -189,6 +189,44 @@ def test_more_threads_than_a_process_has_are_refused(run: Callable[..., Any], wo
     one_line(run(*ESTIMATE, "f", *words), 2, told)
 
 
+LONG = "a" * 300
+NO_PLACE = {
+    "loop": "loop",
+    "long": LONG,
+    "below a long name": f"{LONG}/x",
+    "below a loop": "loop/x",
+    "far": "p/" * 2500,
+}
+WHERE = {
+    "out": [*ESTIMATE, "f", "--out", "PLACE.csv"],
+    "detections": [*ESTIMATE, "f", "--detections", "PLACE.csv"],
+    "overlay": [*ESTIMATE, "f", "--overlay", "PLACE"],
+    "image": [*ESTIMATE, "PLACE.png"],
+    "manifest": [*ESTIMATE, "PLACE.jsonl"],
+    "camera": [*ESTIMATE, "f", "--camera", "PLACE#1"],
+    "target": [*ESTIMATE, "f", "--target", "PLACE"],
+    "hand-eye": [*ESTIMATE, "f", "--hand-eye", "PLACE"],
+    "calibration": ["calibrate", "f", "--target", "quad40", "--out", "PLACE.yaml"],
+    "poses": ["evaluate", "PLACE.csv", "t"],
+    "truth": ["evaluate", "p.csv", "PLACE"],
+    "plan": ["simulate", "PLACE", "--out", "s"],
+}
+
+
+@pytest.mark.parametrize("kind", NO_PLACE)
+def test_names_that_no_file_can_have_are_told_in_one_line(run: Callable[..., Any], kind: str) -> None:
+    png("f/a.png")
+    for suffix in ("", ".csv", ".png", ".jsonl", ".yaml"):
+        Path(f"loop{suffix}").symlink_to(f"loop{suffix}")
+    for where, words in WHERE.items():
+        code, told = run(*(word.replace("PLACE", NO_PLACE[kind]) for word in words))
+        # a table takes the place of a link that leads nowhere
+        replaced = kind == "loop" and where in ("out", "detections", "calibration")
+        assert code in ((0, 2) if replaced else (2,)), where
+        assert "Traceback" not in told, where
+        assert told.count("\n") <= 1, where
+
+
 def test_a_negative_deviation_is_called_so(run: Callable[..., Any]) -> None:
     words = ["calibrate", "f", "--target", "quad40", "--measure-target", "t.yaml", "--distance", "0", "1", "40", "-0.1"]
     one_line(run(*words), 2, "-0.1: a negative number stands where an option should")

@@ -59,25 +59,28 @@ def test_classes_by_name_and_by_numbers(tmp_path: Path) -> None:
 
 
 def by_brute_force(target: tp.Target, views: tuple[torch.Tensor, torch.Tensor]) -> torch.Tensor:
-    """Covariance of the places from one least-squares problem of all poses, places and the gain, dense, by differences.
+    """Covariance of the places from one least-squares problem of all poses, places, turns of rings and the gain, dense.
 
-    Points along both rims, measured across the edge; the frame held by seven weightless conditions.
+    Points along both rims, measured across the edge. Heights of 40 um at 28.3 mm bend the plate by 2.8 mrad.
     """
     assert target.covariance is not None
     count, cam, m = 90, camera(), len(target)
     angle = torch.arange(count, dtype=F64) * (2 * math.pi / count)
     circle = torch.stack([angle.cos(), angle.sin(), 0 * angle], -1)
     poses = len(views[0])
+    ends = 6 * poses + 3 * m
 
     def pixels(unknowns: torch.Tensor) -> torch.Tensor:
-        pose, places, gain = unknowns[: 6 * poses].view(-1, 6), unknowns[6 * poses : -1].view(m, 3), unknowns[-1]
+        pose, places = unknowns[: 6 * poses].view(-1, 6), unknowns[6 * poses : ends].view(m, 3)
+        gain, turns = unknowns[ends], torch.nn.functional.pad(unknowns[ends + 1 :].view(m, 2), (0, 1))
         radii = target.radii + gain * torch.tensor([1.0, -1.0], dtype=F64)
-        points = (target.centers + places)[:, None, None] + radii[..., None, None] * circle
+        rims = torch.einsum("mij,sj->msi", rotations.exp(turns), circle)
+        points = (target.centers + places)[:, None, None] + radii[..., None, None] * rims[:, None]
         turned = rotations.exp(pose[:, 3:]) @ views[0]
         at = torch.einsum("vij,mcsj->vmcsi", turned, points) + (views[1] + pose[:, :3])[:, None, None, None]
         return cam.project(at)
 
-    start = torch.zeros(6 * poses + 3 * m + 1, dtype=F64)
+    start = torch.zeros(ends + 1 + 2 * m, dtype=F64)
     jacobian = torch.func.jacfwd(pixels)(start)  # (V, M, 2, S, 2, U)
     seen = pixels(start)
     step = (seen.roll(-1, 3) - seen.roll(1, 3)) / 2
@@ -86,8 +89,9 @@ def by_brute_force(target: tp.Target, views: tuple[torch.Tensor, torch.Tensor]) 
     weight = contrast**2 / (2 * math.sqrt(math.pi * blur2) * (IMAGING.noise**2 + 1 / 12)) / step.norm(dim=-1)
     rows = (normal[..., None, :] @ jacobian)[..., 0, :].flatten(0, 3) * weight.flatten()[:, None].sqrt()
     matrix = rows.mT @ rows
-    matrix[6 * poses :, 6 * poses :] += torch.linalg.inv(target.covariance)
-    return torch.linalg.inv(matrix)[6 * poses :, 6 * poses :]
+    matrix[6 * poses : ends + 1, 6 * poses : ends + 1] += torch.linalg.inv(target.covariance)
+    matrix.diagonal()[ends + 1 :] += (2 * 0.04 / math.sqrt(800)) ** -2
+    return torch.linalg.inv(matrix)[6 * poses : ends + 1, 6 * poses : ends + 1]
 
 
 def test_what_a_measured_print_leaves_is_that_of_one_dense_adjustment() -> None:

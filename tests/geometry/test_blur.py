@@ -12,7 +12,7 @@ from torch import Tensor
 
 from tests.exact import F64
 from torchpose.geometry import blur as blurs
-from torchpose.geometry.blurred_edge import Kind, Spread
+from torchpose.geometry.blurred_edge import Edge, Kind, Spread
 
 SIGMAS = st.floats(0.2, 8.0)
 
@@ -117,6 +117,22 @@ def test_derivatives_of_edges(kind: Kind, values: tuple[float, float, float]) ->
         move[k] = step
         by_number = (edge(numbers + move, distance) - edge(numbers - move, distance)) / (2 * step)
         torch.testing.assert_close(found.by_blur[k], by_number, rtol=0, atol=5e-3)  # skewness is taken as given
+
+
+@pytest.mark.parametrize(("kind", "values"), [("line", (4.0, 5.0, 2.0)), ("disc", (4.0, 5.0, 0.0))])
+def test_a_wider_core_moves_a_curved_edge(kind: Kind, values: tuple[float, float, float]) -> None:
+    """Derivatives by the core where it is wide and the edge is bent, by finite differences."""
+    g = torch.Generator().manual_seed(1)
+    angle, distance = 6.3 * torch.rand(1, 60, generator=g), 6 * torch.rand(1, 60, generator=g) - 3
+    nu, nv, bend = angle.cos(), angle.sin(), torch.full((1, 60), 0.1)
+
+    def edge(core: float) -> Edge:
+        numbers = torch.tensor([[core, *values[1:]]], dtype=F64)
+        return Spread(numbers, kind).at(torch.zeros(1, dtype=torch.int64), nu, nv)(distance, bend)
+
+    step = 0.05
+    by_core = (edge(values[0] + step).fraction - edge(values[0] - step).fraction) / (2 * step)
+    torch.testing.assert_close(edge(values[0]).by_blur[0], by_core, rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize("kind", ["gauss", "line", "disc"])

@@ -14,6 +14,7 @@ import torchpose as tp
 from tests.exact import pinhole, random_poses
 from torchpose import pipeline
 from torchpose.detect import Candidates, find_candidates
+from torchpose.identify import second_look
 from torchpose.sim import add_noise, render
 from torchpose.target import Target
 
@@ -73,6 +74,21 @@ def test_another_code_is_no_marker(monkeypatch: pytest.MonkeyPatch, scene: Scene
     frames = add_noise(render(camera, replace(target, radii=radii), r, t, psf_sigma=0.8), 1.0, seed=2)
     found = estimate(monkeypatch, scene, 1, frames)
     assert (found.markers == 3).all()
+
+
+def test_what_is_blurred_is_not_looked_at_again(monkeypatch: pytest.MonkeyPatch, scene: Scene) -> None:
+    """A ring of another code where a marker is missing: under such a blur no other look shows more."""
+    camera, target, r, t, _ = scene
+    radii = target.radii.clone()
+    radii[3, 1] = 4.0
+    frames = add_noise(render(camera, replace(target, radii=radii), r, t, psf_sigma=3.0), 1.0, seed=2)
+    calls = []
+    for module, name in ((pipeline, "find_candidates"), (second_look, "measure_predicted")):
+        monkeypatch.setattr(module, name, lambda *_, **__: calls.append("again"))
+    poses = tp.PoseEstimator(camera, target)(frames)
+    assert poses.ok.all()
+    assert (poses.markers == 3).all()
+    assert not calls
 
 
 def test_a_covered_small_ring_completes_the_target() -> None:

@@ -416,7 +416,7 @@ def test_cells_of_another_kind_in_a_journal_are_one_clear_line(tmp_path: Path, c
         store(tmp_path, resume=True)
 
 
-@pytest.mark.parametrize("place", ["p.txt", "p", "gone/p.csv", "folder.csv", "file/p.csv", "/proc/p.csv"])
+@pytest.mark.parametrize("place", ["p.txt", "p", "folder.csv", "file/p.csv", "/proc/p.csv"])
 def test_places_that_cannot_be_written_are_refused_at_once(tmp_path: Path, place: str) -> None:
     (tmp_path / "folder.csv").mkdir()
     (tmp_path / "file").touch()

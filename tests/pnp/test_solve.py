@@ -374,6 +374,7 @@ def test_wrong_arguments_are_named() -> None:
         ({"huber": 0.0}, "huber: is 0.0"),
         ({"mask": torch.ones(3, 4, dtype=torch.bool, device="meta")}, "mask: is on meta, but image_points on cpu"),
         ({"max_iterations": 0}, "max_iterations: is 0"),
+        ({"covariances": torch.tensor([[1.0, 0.5], [0.0, 1.0]]).expand(4, 2, 2)}, "covariances: are not symmetric"),
     ):
         with pytest.raises(ArgumentError, match=message):
             pnp.solve(SQUARE, image, MATRIX, **arguments)
@@ -381,6 +382,8 @@ def test_wrong_arguments_are_named() -> None:
         pnp.solve(GRID, image, MATRIX)
     with pytest.raises(ArgumentError, match="camera: has shape"):
         pnp.solve(SQUARE, image, MATRIX[:2])
+    with pytest.raises(ArgumentError, match="image_points: has no points"):
+        pnp.solve(SQUARE[:0], image[:, :0], MATRIX)
 
 
 def test_compile_without_a_compiler_says_so(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -167,6 +167,34 @@ def test_what_is_off_is_told_and_measured(kind: str) -> None:
     assert found.explained.double().mean() > 0.97
 
 
+@pytest.mark.parametrize("size", [0.0131, 0.0177, 0.0236])
+def test_many_residuals_tell_the_size_of_print_errors(size: float) -> None:
+    """To some per cent, wherever it lies between the sizes that are tried, and the residuals are explained."""
+    markers, rows = 40, 3
+    g = torch.Generator().manual_seed(4)
+    by = 3000 * torch.randn(rows, 300, OF_MARKER * markers + OF_EDGES + OF_CAMERA, dtype=F64, generator=g)
+    true = torch.zeros(by.shape[-1], dtype=F64)
+    true[: OF_MARKER * markers] = torch.tensor([size] * 3 + [0.0] * 2, dtype=F64).repeat(markers)
+    numbers = true * torch.randn(rows, len(true), dtype=F64, generator=g)
+    measured = (by @ numbers[..., None])[..., 0] + torch.randn(rows, 300, dtype=F64, generator=g)
+    found = excess_of(by.mT @ by, (by.mT @ measured[..., None])[..., 0])
+    assert found.explained.all()
+    assert (found.misfit == Misfit.PRINT).all()
+    assert ((found.deviation[:, 0] / size).log().abs() < 0.4).all()
+
+
+def test_what_the_rims_do_not_show_is_no_scatter() -> None:
+    """Residuals 2.4 times too large look like larger noise; edges that scatter along the rims as noise does deny it."""
+    information, right = problem(40, 5, of_places(0.0), 6.0)
+    silent, told = (excess_of(information, right, e) for e in (None, torch.full((40,), 56.0, dtype=F64)))
+    assert (silent.misfit == Misfit.SCATTER).double().mean() > 0.8
+    assert (told.misfit == Misfit.SCATTER).double().mean() < 0.4
+    assert (told.misfit != Misfit.NONE).all()
+    assert told.explained.double().mean() > 0.9
+    assert (silent.maybe[silent.misfit == Misfit.SCATTER] > 0).all()
+    assert (silent.maybe[silent.misfit != Misfit.SCATTER] == 0).all()
+
+
 def test_what_no_print_may_have_is_not_explained() -> None:
     assert not excess_of(*problem(20, 2, of_places(30.0))).explained.any()
 

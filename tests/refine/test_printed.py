@@ -99,6 +99,52 @@ def test_rings_turned_by_a_bent_plate_are_where_they_are() -> None:
     assert poses.place[..., 2].abs().max() < 0.01
 
 
+def test_a_stated_height_states_how_rings_are_turned() -> None:
+    """A plate bent by 40 um with a file that says so is no misfit; with one that does not it is."""
+    target = tp.Target.load("quad40")
+    r, t = random_poses(3, 30, (140, 180), seed=12)
+    bent = printed(target, PrintErrors(warp=0.02, shape="cylinder", direction=0.6)).as_target()
+    frames = frames_of([bent] * 3, r, t)
+    poses, silent = (tp.PoseEstimator(CAMERA, one)(frames) for one in (known(target, 0.02, 0.0), target))
+    assert poses.ok.all()
+    assert (poses.misfit == Misfit.NONE).all()
+    assert (silent.misfit == Misfit.PRINT).all()
+    assert nees(poses, r, t).sum() < 43  # chi-squared of 18, once in 1000
+
+
+@pytest.mark.slow
+def test_bent_prints_are_covered() -> None:
+    """24 plates, each bent in its own way: a mean NEES of 6 is known to 0.7; saddles are fewer than heights."""
+    target, count = tp.Target.load("quad40"), 24
+    r, t = random_poses(count, 30, (140, 180), seed=21)
+    g = torch.Generator().manual_seed(22)
+    bent = []
+    for k in range(count):
+        size = 0.06 * float(torch.randn((), generator=g))
+        errors = PrintErrors(warp=abs(size), shape=("cylinder", "twist")[k % 2], direction=float(k))
+        bent.append(printed(target, errors).as_target())
+    height = torch.stack([one.centers[:, 2] for one in bent]).square().mean().sqrt()
+    deviation = torch.cat([torch.tensor([0.0, 0.0, float(height)], dtype=F64).repeat(4), torch.zeros(1, dtype=F64)])
+    stated = dataclasses.replace(target, covariance=torch.diag(deviation.square()))
+    poses = tp.PoseEstimator(CAMERA, stated)(frames_of(bent, r, t))
+    assert poses.ok.all()
+    assert (poses.misfit == Misfit.NONE).double().mean() > 0.8
+    assert 2 < nees(poses, r, t).mean() < 9
+
+
+def test_residuals_that_are_small_by_chance_are_no_scatter() -> None:
+    """All rings off by 10 um as a pose is, and by 0.6 um as none is: the rims say that the noise is no larger."""
+    target = tp.Target.load("quad40")
+    r, t = random_poses(1, 30, (140, 180), seed=12)
+    twist = torch.tensor([1.0, -1.0, 1.0, -1.0], dtype=F64)[:, None]
+    shift = torch.tensor([0.008, 0.006, 0.0], dtype=F64) + 6e-4 * twist * torch.tensor([1.0, 0.0, 0.0], dtype=F64)
+    off_ = dataclasses.replace(target, centers=target.centers + shift)
+    poses = tp.PoseEstimator(CAMERA, target)(frames_of([off_], r, t))
+    assert poses.ok.all()
+    assert int(poses.misfit) not in (Misfit.NONE, Misfit.SCATTER)
+    assert (poses.std[0, :2] > 2.5 * poses.noise_std[0, :2]).all()
+
+
 @pytest.mark.parametrize(("name", "gain"), [("quad40", 0.06), ("quad40", -0.06), ("quad40_dark", 0.06)])
 def test_dot_gain_is_an_unknown(name: str, gain: float) -> None:
     """Found to micrometres where the file says that there may be some; the same precision as without."""

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.geometry.least_squares import scaled_inverse
 from torchpose.identify import MarkerTable
+from torchpose.pose import displaced
 from torchpose.target import Target
 
 POSE = 6
@@ -18,8 +19,8 @@ POSE = 6
 _LEAST_NOISE = 1e-4
 
 
-def print_numbers(target: Target, camera: Camera) -> tuple[Float[Tensor, "M 4 L"], Float[Tensor, "M 4 C"]]:
-    """How places (mm, target frame) and edge gain (mm) vary with numbers of unit variance, as the files state.
+def print_numbers(target: Target, camera: Camera) -> tuple[Float[Tensor, "M 7 L"], Float[Tensor, "M 7 C"]]:
+    """How places (mm), turns (rad, target frame) and edge gain (mm) vary with numbers of unit variance, by the files.
 
     With L numbers of the print's own, and with the C of a camera that was calibrated together with the target.
     """
@@ -34,12 +35,8 @@ def grown(target: Target) -> Float[Tensor, " 2"]:
 
 def marker_columns(target: Target, camera: Camera, R: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B M 7 k"]:
     """How pose (6) and the numbers of the print move each marker, as a pose of its own, and its edges."""
-    numbers = print_numbers(target, camera)[0]
     own = torch.eye(POSE + 1, dtype=R.dtype, device=R.device)[:, :POSE].expand(len(R), len(target), -1, -1)
-    aside = R[:, None] @ numbers[:, :3]
-    return torch.cat(
-        [own, torch.cat([aside, torch.zeros_like(aside), numbers[:, 3:].expand_as(aside[:, :, :1])], 2)], -1
-    )
+    return torch.cat([own, displaced(R, target.centers @ R.mT, print_numbers(target, camera)[0])], -1)
 
 
 def joint_inverse(

@@ -12,7 +12,7 @@ from torchpose.analysis.errors import Pose, pose_difference
 from torchpose.analysis.joint import grown, print_numbers
 from torchpose.analysis.sensitivity import Uncertainty, marker_axes, markers_seen, radius_shift
 from torchpose.camera import Camera
-from torchpose.geometry import least_squares
+from torchpose.geometry import least_squares, rotations
 from torchpose.geometry.arguments import checked
 from torchpose.geometry.least_squares import covariance_factor
 from torchpose.pipeline import PoseEstimator
@@ -53,7 +53,7 @@ def simulate_points(
     generator, draws, true = torch.Generator().manual_seed(wanted.seed), wanted.draws, wanted.true_camera or camera
     drawn = _draw(true, target, uncertainty, draws, generator)
     points = torch.einsum("bij,dmj->dbmi", R, drawn.centers) + t[:, None]
-    normals = (target.normals @ R.mT).expand_as(points)
+    normals = torch.einsum("bij,dmj->dbmi", R, drawn.normals)
     xy = points[..., :2] / points[..., 2:]
     radii = drawn.radii[:, None].expand(*points.shape[:-1], 2)
     xy = xy + radius_shift(points, normals, radii, target.printed_radii)
@@ -114,6 +114,7 @@ class _Draws(NamedTuple):
     center: Float[Tensor, "D 2"]
     distortion: Float[Tensor, "D n"]
     centers: Float[Tensor, "D M 3"]
+    normals: Float[Tensor, "D M 3"]
     radii: Float[Tensor, "D M 2"]
 
     def scene(self, draw: int) -> tuple[Camera, Target]:
@@ -121,7 +122,7 @@ class _Draws(NamedTuple):
         matrix[[0, 1], [0, 1]], matrix[:2, 2] = self.focal[draw].to(matrix), self.center[draw].to(matrix)
         camera = replace(self.camera, matrix=matrix, distortion=self.distortion[draw], covariance=None)
         exact = replace(self.target, edge_gain=0.0, covariance=None, cross_covariance=None)
-        return camera, replace(exact, centers=self.centers[draw], radii=self.radii[draw])
+        return camera, replace(exact, centers=self.centers[draw], normals=self.normals[draw], radii=self.radii[draw])
 
 
 def _draw(camera: Camera, target: Target, uncertainty: Uncertainty, draws: int, generator: torch.Generator) -> _Draws:
@@ -138,7 +139,7 @@ def _draw(camera: Camera, target: Target, uncertainty: Uncertainty, draws: int, 
     center = center + uncertainty.principal_point * shift[:, 5:7]
     distortion = camera.distortion + centers.new_tensor(uncertainty.distortion or 0.0) * shift[:, 7:]
     by_print, by_camera = print_numbers(target, camera)
-    stated = (by_print @ normal(by_print.shape[-1])[:, None, :, None]).squeeze(-1)  # (D, M, 4)
+    stated = (by_print @ normal(by_print.shape[-1])[:, None, :, None]).squeeze(-1)  # (D, M, 7)
     if camera.covariance is not None:
         factor = covariance_factor(camera.covariance)
         count = factor.shape[1]
@@ -151,8 +152,9 @@ def _draw(camera: Camera, target: Target, uncertainty: Uncertainty, draws: int, 
     off = normal(len(target), 5) * centers.new_tensor([in_plane, in_plane, along, radius, radius])
     scale = 1 + uncertainty.print_scale * normal(1, 1)
     moved = (off[..., None, :3] @ marker_axes(target)).squeeze(-2)
-    radii = target.printed_radii * scale + off[..., 3:] + stated[..., 3:] * grown(target)
-    printed = target.centers * scale + moved + stated[..., :3], radii
+    radii = target.printed_radii * scale + off[..., 3:] + stated[..., 6:] * grown(target)
+    normals = (rotations.exp(stated[..., 3:6]) @ target.normals[..., None]).squeeze(-1)
+    printed = target.centers * scale + moved + stated[..., :3], normals, radii
     return _Draws(camera, target, focal, center, distortion, *printed)
 
 

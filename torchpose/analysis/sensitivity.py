@@ -23,6 +23,7 @@ from torchpose.geometry.arguments import checked
 from torchpose.geometry.least_squares import covariance_factor
 from torchpose.geometry.projection import by_pose, image_by_point
 from torchpose.geometry.rotations import plane_axes
+from torchpose.pose import displaced
 from torchpose.target import Target
 
 Features = Literal["centers", "rings"]
@@ -138,15 +139,18 @@ def propagate(
     jacobian = torch.where(seen[:, :, None, None, None], _jacobian(camera, target, R, point), 0.0)
     own = torch.cat([jacobian[..., :POSE], jacobian[..., _RADII] @ grown(target)[:, None]], -1)
     weighted = own.mT @ information  # (B, M, N, 7, 2): N points of each marker
+    each = (weighted @ own).sum(2)
     columns = marker_columns(target, camera, R)
-    columns = columns if features == "rings" else columns[..., :POSE]
-    inverted, known = joint_inverse((weighted @ own).sum(2), columns, variance)
-    inverted = torch.where(known[:, None, None], inverted, torch.nan)[:, :POSE]
-    by_marker = inverted[:, None] @ columns.mT
-    # (B, M, 6, columns): how an error common to the points of a marker moves the pose
-    gain = by_marker @ (weighted @ jacobian[..., POSE:]).sum(2)
-    noise = variance * (by_marker @ (weighted @ own).sum(2) @ by_marker.mT).sum(1)
-    sources = ({"image": noise} if variance else {}) | _shares(camera, target, gain, uncertainty)
+    unknown = columns if features == "rings" else columns[..., :POSE]
+    inverted, known = joint_inverse(each, unknown, variance)
+    by_marker = torch.where(known[:, None, None], inverted, torch.nan)[:, None, :POSE] @ unknown.mT
+    # (B, M, 6, columns): how an error common to the points of a marker moves the pose, and (B, M, 6, 7) its own motion
+    gain, moved = by_marker @ (weighted @ jacobian[..., POSE:]).sum(2), by_marker @ each
+    noise = variance * (moved @ by_marker.mT).sum(1)
+    shared = displaced(R, target.centers @ R.mT, print_numbers(target, camera)[1])
+    by_print, by_camera = ((moved @ numbers).sum(1) for numbers in (columns[..., POSE:], shared))
+    sources = {"image": noise} if variance else {}
+    sources |= _shares(camera, gain, uncertainty) | _stated(camera, target, gain.sum(1), by_print, by_camera)
     return ErrorBudget(sources, torch.stack([0 * noise, *sources.values()]).sum(0), seen)
 
 
@@ -172,7 +176,7 @@ def _jacobian(camera: Camera, target: Target, R: Tensor, point: Points) -> Tenso
     return torch.cat([by_pose(point.by_point, point.arm), both[0], *by_print, both[1]], -1)
 
 
-def _shares(camera: Camera, target: Target, gain: Tensor, uncertainty: Uncertainty) -> dict[str, Tensor]:
+def _shares(camera: Camera, gain: Tensor, uncertainty: Uncertainty) -> dict[str, Tensor]:
     """Covariance (B, 6, 6) by every source but the image that is not exact, from `propagate`'s gains of markers."""
     whole = gain.sum(1)
     bent = any(uncertainty.distortion)
@@ -187,15 +191,24 @@ def _shares(camera: Camera, target: Target, gain: Tensor, uncertainty: Uncertain
         "print_scale": whole[:, None, :, 9:10],
     }
     sizes = {name: float(bent if name == "distortion" else getattr(uncertainty, name)) for name in columns}
-    shares = {name: size**2 * (columns[name] @ columns[name].mT).sum(1) for name, size in sizes.items() if size}
-    on_print = torch.cat([gain[..., 4:7] @ marker_axes(target), gain[..., 7:9] @ grown(target)[:, None]], -1)
-    own, together = ((on_print @ numbers).sum(1) for numbers in print_numbers(target, camera))
+    return {name: size**2 * (columns[name] @ columns[name].mT).sum(1) for name, size in sizes.items() if size}
+
+
+def _stated(camera: Camera, target: Target, whole: Tensor, by_print: Tensor, by_camera: Tensor) -> dict[str, Tensor]:
+    """Covariance (B, 6, 6) by what the files of camera and target state.
+
+    Args:
+        whole: gains of all markers together, of `propagate`.
+        by_print: how the numbers of the print move poses, (B, 6, L).
+        by_camera: the same of those of the camera that the target shares, (B, 6, C).
+    """
+    shares = {}
     if camera.covariance is not None:
         factor = covariance_factor(camera.covariance)
-        by_camera = torch.cat([whole[:, :, :4], whole[:, :, 10:]], -1)[:, :, : len(factor)] @ factor + together
+        by_camera = torch.cat([whole[:, :, :4], whole[:, :, 10:]], -1)[:, :, : len(factor)] @ factor + by_camera
         shares["calibration"] = by_camera @ by_camera.mT
     if target.covariance is not None:
-        shares["target"] = own @ own.mT
+        shares["target"] = by_print @ by_print.mT
     return shares
 
 

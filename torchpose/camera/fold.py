@@ -6,9 +6,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.polynomial import Polynomial
 
-# d log(distorted radius) / d log(radius) of a model that has a pole. A pincushion by k1 alone stays below 3 however
+# d log(distorted radius) / d log(radius) of a rational model. A pincushion by k1 alone stays below 3 however
 # strong it is, near a pole there is no bound (derived)
 _STEEPEST = 3.0
+_BESIDE = 1e-9  # of u, to see which way a function goes on behind a root (convention: far above rounding)
 _HALVINGS = 80  # of an interval: more than the digits of a float64
 
 
@@ -23,9 +24,10 @@ def rational_fold(above: np.ndarray, below: np.ndarray) -> float:
     """The radius up to which f = r n(r^2) / q(r^2) has one inverse, and a plausible one; inf where it has everywhere.
 
     It ends where f stops to grow. A pole ends it too, but before: close to one, f runs through all values within a
-    fraction of a pixel of r. Fits of too many coefficients have a pole that nearly cancels against a root of n; the
-    lens goes on behind it (f is small again, and grows), so that a pixel has two rays, of which the near one is an
-    artefact of the pole. There is no telling which of them is meant: the inverse ends where the second begins.
+    fraction of a pixel of r. So does a spike without a pole, where q is only small. Fits of too many coefficients have
+    one that nearly cancels against a root of n; the lens goes on behind it (f is small again, and grows), so that a
+    pixel has two rays, of which the near one is an artefact of the spike. There is no telling which of them is meant:
+    the inverse ends where the second begins.
 
     Args:
         above: the coefficients of n behind its constant 1.
@@ -35,16 +37,23 @@ def rational_fold(above: np.ndarray, below: np.ndarray) -> float:
     # numerator of d f / dr over r
     growth = n * q + 2 * u * (n.deriv() * q - n * q.deriv())
     fold, pole = first_root(growth), first_root(q)
-    if fold <= pole or math.isinf(pole):
-        return math.sqrt(min(fold, pole))
     steep = growth - _STEEPEST * n * q
-    before = min(first_root(steep), pole)
+    spike = first_root(steep) if np.any(below) else math.inf
+    if fold <= min(spike, pole) or math.isinf(min(spike, pole)):
+        return math.sqrt(fold)
+    before = min(spike, pole)
 
     def bent(u: float) -> float:
         return math.sqrt(u) * float(n(u) / q(u))
 
-    behind = next((v for v in _roots(steep) if v > pole and n(v) / q(v) > 0), math.inf)
-    # a lens that goes on behind the pole continues what was before it; half of that is another sheet of the function
+    def resumes(u: float) -> bool:
+        """Whether the lens grows again from there on, no steeper than any."""
+        after = u * (1 + _BESIDE)
+        size = float(n(after) * q(after))
+        return size > 0 and 0 < float(growth(after)) <= _STEEPEST * size
+
+    behind = next((v for v in sorted([*_roots(growth), *_roots(steep)]) if v > before and resumes(v)), math.inf)
+    # a lens that goes on behind the spike continues what was before it; half of that is another sheet of the function
     if math.isfinite(behind) and 0.5 * bent(before) < bent(behind) < bent(before):
         before = _where(bent, bent(behind), before)
     return math.sqrt(before)
@@ -59,7 +68,9 @@ def _roots(polynomial: Polynomial) -> list[float]:
     """Positive real roots, ascending."""
     # the reciprocals of the roots are those of the polynomial from its constant term on, however small the others
     roots = np.roots(polynomial.coef)
-    positive = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0)]
+    # a double root comes out as a pair beside the axis, by the root of the rounding; what is tiny is a root at infinity
+    real = np.abs(roots.imag) <= 1e-6 * np.abs(roots)
+    positive = roots.real[real & (roots.real > np.finfo(float).tiny)]
     return sorted(1 / positive)
 
 

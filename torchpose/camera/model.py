@@ -16,6 +16,7 @@ from torch.nn.functional import pad
 
 from torchpose.camera.fold import polynomial_fold, rational_fold
 from torchpose.camera.tone import Tone
+from torchpose.config import example
 from torchpose.errors import ConfigError
 from torchpose.geometry.covariance import covariance_fault
 
@@ -46,7 +47,8 @@ class Camera:
       (x, y) theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) / r.
 
     Attributes:
-        width, height: size of the frame, px.
+        width: of the frame, px.
+        height: of the frame, px.
         matrix: (3, 3) float64, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] px. Skew is rejected: none of the file formats but
             the bare matrix could hold it, and OpenCV ignores it.
         distortion: (0|4|5|8,) float64 for brown_conrady, (4,) for kannala_brandt. The 12 or 14 coefficients of OpenCV's
@@ -147,7 +149,7 @@ class Camera:
         """Reads a camera file, see `torchpose.camera.formats.load`; ``FILE#cam1`` picks one of several."""
         from torchpose.camera import formats
 
-        return formats.load(path)
+        return formats.load(example(path, "cameras"))
 
     def save(
         self, path: str | os.PathLike[str], format: Literal["opencv", "json", "ros", "kalibr", "colmap"] | None = None
@@ -242,8 +244,7 @@ class Camera:
     def distort(self, xy: Tensor) -> Tensor:
         """Pixels (..., 2) of undistorted normalised coordinates (..., 2), x = X/Z, y = Y/Z."""
         focal, center = self._intrinsics(xy)
-        x_distorted, y_distorted, *_ = self._warp(*xy.unbind(-1))
-        return torch.stack([x_distorted, y_distorted], -1) * focal + center
+        return torch.stack(self._warp(*xy.unbind(-1), slopes=False), -1) * focal + center
 
     def J_distort(self, xy: Tensor) -> Tensor:
         """Jacobian (..., 2, 2) of `distort`: d(u, v)/d(x, y), px per unit of normalised coordinates."""
@@ -306,8 +307,8 @@ class Camera:
         m = self.matrix.to(like)
         return m.diagonal()[:2], m[:2, 2]
 
-    def _warp(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Distorted normalised x, y and the entries xx, xy, yy of their Jacobian, which is symmetric in both models."""
+    def _warp(self, x: Tensor, y: Tensor, *, slopes: bool = True) -> tuple[Tensor, ...]:
+        """Distorted normalised x, y; with ``slopes`` the xx, xy, yy of the Jacobian, symmetric in both models."""
         r2 = x * x + y * y
         if self.model == "kannala_brandt":
             k1, k2, k3, k4 = self.distortion.to(x).unbind()
@@ -317,6 +318,8 @@ class Camera:
             theta_over_r = torch.where(small, 1 - r2 / 3 + r2 * r2 / 5, torch.atan(r) / r)
             t2 = theta_over_r * theta_over_r * r2
             s = theta_over_r * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+            if not slopes:
+                return s * x, s * y
             growth = (1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))) / (1 + r2)
             # 2 ds/d(r^2), and its series at the axis
             slope = torch.where(small, 2 * (k1 - 1 / 3) + r2 * (4 * k2 - 4 * k1 + 0.8), (growth - s) / r2_safe)
@@ -324,17 +327,20 @@ class Camera:
         d = self.distortion.to(x)
         k1, k2, p1, p2, k3, k4, k5, k6 = pad(d, (0, 8 - len(d))).unbind()
         s = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
-        if len(d) == 8:
+        if rational := len(d) == 8:
             denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
             s = s / denominator
-            slope = (slope - 2 * s * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / denominator
         # 2 (p1 y + p2 x) x + p2 r^2 is OpenCV's 2 p1 x y + p2 (r^2 + 2 x^2)
         shear = 2 * (p2 * x + p1 * y)
         s_tangential = s + shear
+        bent = s_tangential * x + p2 * r2, s_tangential * y + p1 * r2
+        if not slopes:
+            return bent
+        slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
+        if rational:
+            slope = (slope - 2 * s * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / denominator
         return (
-            s_tangential * x + p2 * r2,
-            s_tangential * y + p1 * r2,
+            *bent,
             s_tangential + slope * x * x + 4 * p2 * x,
             slope * x * y + 2 * (p1 * x + p2 * y),
             s_tangential + slope * y * y + 4 * p1 * y,

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
 
@@ -22,6 +23,7 @@ from torchpose.cli.common import (
     say,
     with_tone,
 )
+from torchpose.cli.options import camera_option, target_option
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -69,10 +71,10 @@ _OUT = "Camera file to write; without it --camera is taken as it is."
 
 def calibrate(
     inputs: Annotated[list[Path], typer.Argument(metavar="INPUT...", help=_INPUTS)],
-    target: Annotated[str | None, typer.Option(help="Target file or name of a built-in target.")] = None,
+    target: Annotated[str | None, target_option("Target file or name of a built-in target.")] = None,
     board: Annotated[str | None, typer.Option(help=_BOARD)] = None,
-    out: Annotated[Path | None, typer.Option(help=_OUT)] = None,
-    camera: Annotated[str | None, typer.Option(help="Camera file to start from, or to use.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help=_OUT)] = None,
+    camera: Annotated[str | None, camera_option("Camera file to start from, or to use.")] = None,
     model: Annotated[str, typer.Option(metavar=_LENSES, help="Distortion of the lens.")] = "brown5",
     target_out: Annotated[Path | None, typer.Option("--measure-target", metavar="FILE", help=_MEASURE_TARGET)] = None,
     distance: Annotated[tuple[int, int, float] | None, typer.Option(metavar="ID ID MM [SIGMA]", help=_DISTANCE)] = None,
@@ -139,17 +141,17 @@ def _run(
                 calibration = measured.calibration
                 _show(calibration, len(frames.sources), held=out.camera is None)
                 show_places(measured.target, measured.nominal)
-                measured.target.save(out.target)
+                save(measured.target, out.target, "--measure-target")
                 if out.camera is not None:
-                    measured.camera.save(out.camera)
+                    save(measured.camera, out.camera, "--out")
             elif out.camera is not None:
                 calibration = _calibrate(frames, shown, start, model, said)
                 _show(calibration, len(frames.sources))
-                calibration.camera.save(out.camera)
+                save(calibration.camera, out.camera, "--out")
             if out.hand_eye is not None:
                 fit = _hand_eye(frames, shown, calibration, start)
                 _show_hand_eye(fit)
-                fit.hand_eye.save(out.hand_eye)
+                save(fit.hand_eye, out.hand_eye, "--hand-eye-out")
             if out.plots is not None:
                 from torchpose.report.calibration import save_calibration
 
@@ -176,16 +178,26 @@ def _check_files(
 
 def check_places(given: Mapping[str, Path | None]) -> None:
     """Refuses files, by option, that cannot be written or that two options name."""
+    from torchpose.config import real
+    from torchpose.io.writers import check_folder_of
+
     files: dict[Path, str] = {}
     for option, path in given.items():
         if path is None:
             continue
-        if not path.parent.is_dir():
-            raise ConfigError(f"{path}: {option}: folder {path.parent} does not exist; create it or choose another")
-        if path.is_dir():
+        check_folder_of(path, option)
+        if os.path.isdir(path):
             raise ConfigError(f"{path}: {option}: is a folder; give the name of a file")
-        if (other := files.setdefault(path.resolve(), option)) != option:
+        if (other := files.setdefault(real(path), option)) != option:
             raise ConfigError(f"{path}: {option}: is the file of {other}, too; choose another")
+
+
+def save(found: Any, path: Path, option: str) -> None:
+    """Writes the file of a camera, target or hand-eye transform, its folder made where it is missing."""
+    from torchpose.io.writers import make_folder_of
+
+    make_folder_of(path, option)
+    found.save(path)
 
 
 def _distance(
@@ -203,7 +215,7 @@ def _distance(
         return None, inputs
     if target_out is None or isinstance(shown, Board):
         raise ConfigError("--distance: scales a measured target; give --measure-target too")
-    numbers = [path for path in inputs if not path.exists() and _is_number(str(path))]
+    numbers = [path for path in inputs if not os.path.exists(path) and _is_number(str(path))]
     sigma = float(str(numbers[0])) if numbers else 0.0
     distance = Distance(*given, sigma)
     distance.check(shown)

@@ -184,13 +184,13 @@ def _show(found: RigCalibration, moments: int) -> None:
 
 
 def _write(asked: Request, found: RigCalibration, measured: RigMeasurement | None) -> None:
-    assert asked.cameras_out is not None  # checked with the options
-    found.rig.save(asked.cameras_out)
-    if measured is not None and asked.target_out is not None:
-        from torchpose.cli.calibrate import show_places
+    from torchpose.cli.calibrate import save, show_places
 
+    assert asked.cameras_out is not None  # checked with the options
+    save(found.rig, asked.cameras_out, "--cameras-out")
+    if measured is not None and asked.target_out is not None:
         show_places(measured.target, measured.nominal)
-        measured.target.save(asked.target_out)
+        save(measured.target, asked.target_out, "--measure-target")
     if asked.plots is not None:
         from torchpose.report.rig_calibration import save_rig_calibration
 

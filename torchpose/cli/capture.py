@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from torchpose.cli.common import INTERRUPTED, say
+from torchpose.cli.options import folder_option
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 def capture(
     plan: Annotated[Path, typer.Argument(metavar="PLAN", help="Capture plan (YAML): the poses of the tool.")],
     rig: Annotated[Path, typer.Option(help="Rig file (YAML): robot, workspace, cameras.")],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the session: manifest.jsonl and images/.")],
+    out: Annotated[Path, folder_option("Folder of the session: manifest.jsonl and images/.")],
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only print and draw the path; nothing moves.")] = False,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask before the robot moves.")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a session that was cut short.")] = False,

@@ -17,11 +17,13 @@ if TYPE_CHECKING:
     from torchpose.io.storage import Place
 
 INTERRUPTED = 130  # as shells have it: 128 + SIGINT
+CLOSED = 141  # 128 + SIGPIPE: nobody reads on, as behind `| head`
 
 MOST_SEED = 2**63 - 1  # of torch's generators
 _MOST_THREADS = 256  # (convention) more than any machine of today gains from; thousands of stacks end the process
 _MOST_BATCH = 4096  # frames (convention): of 20 megapixels they fill 80 GB
-Threads = Annotated[int | None, typer.Option(min=1, max=_MOST_THREADS, help="Threads to use; by default one a core.")]
+_THREADS = "Threads to use; by default one a core."
+Threads = Annotated[int | None, typer.Option("--threads", "-j", min=1, max=_MOST_THREADS, help=_THREADS)]
 Tone = Annotated[
     str | None,
     typer.Option(
@@ -53,26 +55,45 @@ def use_threads(threads: int | None, *, share: float = 1.0) -> int:
     return wanted
 
 
-def frames_of(inputs: Sequence[Path | Place]) -> list[Source]:
-    """Frames of the INPUTs; what is passed over is told on stderr."""
+def frames_of(inputs: Sequence[Path | Place], listed: Sequence[Path] = ()) -> list[Source]:
+    """Frames of the INPUTs, and of a list of further ones; what is passed over is told on stderr."""
     from torchpose.io.sources import find_sources
 
-    return find_sources(inputs, lambda line: say(f"torchpose: {line}", err=True))
+    return find_sources(inputs, lambda line: say(f"torchpose: {line}", err=True), more=listed)
+
+
+def listed_files(inputs: Sequence[object], files_from: Path | None) -> list[Path]:
+    """What --files-from names. ConfigError: there is no INPUT either."""
+    from torchpose.io.lists import read_list
+
+    if files_from is not None:
+        return read_list(files_from)
+    if not inputs:
+        raise ConfigError("INPUT: is missing; give image files, folders or a capture manifest, or --files-from")
+    return []
+
+
+def built_in_targets(incomplete: str) -> list[str]:
+    """Names of built-in targets that begin so, for the shell to complete."""
+    places = (Path(__file__).parents[1] / "targets").glob("*.yaml")
+    return sorted(path.stem for path in places if path.stem.startswith(incomplete))
 
 
 def check_outputs(
     given: Sequence[Path | Place], sources: Sequence[Source], tables: Sequence[Path], overlay: Path | None
 ) -> None:
     """Refuses outputs that would overwrite or mingle with inputs."""
+    from torchpose.config import real
+
     inputs = [path for path in given if isinstance(path, Path)]
-    read = {path.resolve() for path in inputs}
+    read = {real(path) for path in inputs}
     for table in tables:
-        if table.resolve() in read:
+        if real(table) in read:
             raise ConfigError(f"{table}: --out: is an INPUT too; choose another file")
     if overlay is None:
         return
-    place = overlay.resolve()
-    folder = next((path for path in inputs if path.is_dir() and place.is_relative_to(path.resolve())), None)
+    place = real(overlay)
+    folder = next((path for path in inputs if os.path.isdir(path) and place.is_relative_to(real(path))), None)
     if folder is not None:
         raise ConfigError(
             f"{overlay}: --overlay: lies inside INPUT {folder}, where its pictures would be taken for frames; "
@@ -80,8 +101,7 @@ def check_outputs(
         )
     from torchpose.report.overlay import picture_path
 
-    # which takes a loop of links, too
-    frames = {Path(os.path.realpath(source.path)) for source in sources if isinstance(source.path, Path)}
+    frames = {real(source.path) for source in sources if isinstance(source.path, Path)}
     places = [picture_path(place, source.name) for source in sources]  # refuses those that lie outside
     if any(path in frames for path in places):
         raise ConfigError(f"{overlay}: --overlay: its pictures would overwrite the frames; choose another folder")

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchpose.cli.common import say
+from torchpose.cli.options import camera_option, folder_option, target_option
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:  # imported where they are used: torch takes more than a second, which --help need not wait for
@@ -35,13 +36,16 @@ _PRINT = (
 _GAIN = "Most dot gain of the print, either way, um: room for it is left between codes; by default that of --print."
 _LEVELS = "Grey levels of print and paper."
 _APERTURE = "Aperture: counts the blur out of focus and notes the depth of field."
+_PAPER = (
+    "Also the sheet on office paper: one page, or tiles with marks to join them, each with bars to verify its scale."
+)
 _TONE = "Tone around the rings: dark rings on light, or the reverse."
 
 
 def design(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for target file, print sheet, table and map.")],
-    camera: Annotated[str | None, typer.Option(help="Camera file, as for estimate.")] = None,
-    target: Annotated[str | None, typer.Option(help=_TARGET)] = None,
+    out: Annotated[Path, folder_option("Folder for target file, print sheet, table and map.")],
+    camera: Annotated[str | None, camera_option("Camera file, as for estimate.")] = None,
+    target: Annotated[str | None, target_option(_TARGET)] = None,
     distance: Annotated[float | None, typer.Option(help="Distance of the target, mm.")] = None,
     distance_range: Annotated[tuple[float, float] | None, typer.Option(metavar="NEAR FAR", help=_RANGE)] = None,
     tilt: Annotated[float, typer.Option(help=_TILT)] = 0.0,
@@ -60,20 +64,20 @@ def design(
     focal_length: Annotated[float | None, typer.Option(help="Of the lens, mm; with --f-number.")] = None,
     background: Annotated[str, typer.Option(metavar="light|dark", help=_TONE)] = "light",
     name: Annotated[str | None, typer.Option(help="Name of the target and of the files.")] = None,
+    paper: Annotated[str | None, typer.Option(metavar="a4|letter", help=_PAPER)] = None,
 ) -> int:
     """Choose a target for a camera, a working volume and an accuracy, and draw it at true scale (SVG, PDF).
 
     Standard deviations are those of the image noise, of the print (--print) and of what the camera file states of
     itself. The target is the one with the fewest rings that does, at the worst point of the volume.
     """
-    from torchpose.design import Need, make_sheet, plate_around, print_of
+    from torchpose.design import Need, print_of
     from torchpose.report.files import make_folder
     from torchpose.target import Target
 
     sides = None if plate is None else _sides(plate)
     _check({"--plate": plate, "--accuracy-um": accuracy_um}, target, (name, markers, print_gain))
-    existing = None if target is None else Target.load(target)
-    scene = None
+    existing, scene = None if target is None else Target.load(target), None
     if existing is None or camera is not None or distance is not None or distance_range is not None:
         volume = _volume(distance, distance_range, tilt, roll, offset)
         scene = _Scene(_camera(camera), volume, _imaging(volume, blur, noise, levels, f_number, focal_length))
@@ -92,12 +96,21 @@ def design(
     else:
         chosen = existing if made is None else made.stated_by(existing)
         promise = None if scene is None else _Promise.of(scene, chosen)
-    written += make_sheet(chosen, sides or plate_around(chosen)).save(out, chosen.name)
+    written += _sheets(chosen, sides, paper, out)
     if scene is not None and promise is not None:
         written += _tell_precision(chosen, scene, promise, need, out)
     for path in written:
         say(str(path))
     return 0
+
+
+def _sheets(target: Target, sides: tuple[float, float] | None, paper: str | None, out: Path) -> list[Path]:
+    """Writes the print sheet, and that on office paper where it is wanted."""
+    from torchpose.design import make_sheet, plate_around, save_tiles
+
+    sheet = make_sheet(target, sides or plate_around(target))
+    written = sheet.save(out, target.name)
+    return written if paper is None else [*written, save_tiles(sheet, paper, out, target.name)]
 
 
 def _check(needed: dict[str, object], target: str | None, chosen: tuple[object, ...]) -> None:
@@ -213,7 +226,7 @@ def _tell_precision(target: Target, scene: _Scene, promise: _Promise, need: Need
     say(_focus(scene))
     table, picture = out / f"{target.name}_precision.csv", out / f"{target.name}_map.png"
     write_rows(table, rows, {column: str if column in ("axis", "unit") else float for column in rows[0]})
-    save_plot(precision_map(scene.camera, target, scene.volume, scene.imaging), target.name, picture)
+    save_plot(precision_map(scene.camera, target, scene.volume, scene.imaging), target.name, picture, scene.volume)
     return [table, picture]
 
 

@@ -39,7 +39,7 @@ _EXPLAIN = "Also list the ellipses that were rejected, with the reason."
 
 def detect(
     inputs: Annotated[list[Path], typer.Argument(metavar="INPUT...", help=_INPUTS)],
-    out: Annotated[Path, typer.Option(help="Table of the shapes: .csv, .jsonl or .parquet.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Table of the shapes: .csv, .jsonl or .parquet.")],
     overlay: Overlay = None,
     explain: Annotated[bool, typer.Option("--explain", help=_EXPLAIN)] = False,
     tone: Tone = None,
@@ -95,7 +95,7 @@ def _batches(
     images: list[np.ndarray] = []
     for source, image in decoded:
         if isinstance(image, str):
-            unreadable[source.name] = image
+            unreadable |= {source.name: image} if image else {}
             continue
         fits = not images or (image.shape == images[0].shape and image.dtype == images[0].dtype)
         if images and not (fits and (len(images) + 1) * image.size <= _BATCH_PIXELS):
@@ -110,16 +110,22 @@ def _batches(
 def _decoded(
     sources: Sequence[Source], threads: int, tone: cameras.Tone | None
 ) -> Iterator[tuple[Source, np.ndarray | str]]:
-    """Every source in order with its frame (H, W), or the reason why there is none; threads decode ahead."""
+    """Every source in order with its frame (H, W), or the reason why there is none; threads decode ahead.
+
+    The reason is empty where a film has ended before.
+    """
     from concurrent.futures import ThreadPoolExecutor
 
     from torchpose.camera import LINEAR
+    from torchpose.io.films import NoFrameError
     from torchpose.io.images import UnreadableImageError
     from torchpose.io.reader import linear_image
 
     def load(source: Source) -> np.ndarray | str:
         try:
             return linear_image(source.decode(threads=threads), tone or LINEAR)
+        except NoFrameError:
+            return ""
         except UnreadableImageError as error:
             return error.reason
 

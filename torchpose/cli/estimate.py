@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypedDict
 
 import typer
 
 from torchpose.cli.common import (
+    CLOSED,
     Batch,
     Overlay,
     Silent,
@@ -22,52 +24,50 @@ from torchpose.cli.common import (
     ended,
     frames_of,
     interrupted,
+    listed_files,
     say,
     use_threads,
     with_tone,
 )
+from torchpose.cli.options import (
+    CameraFile,
+    Cameras,
+    FilesFrom,
+    HandEyeFile,
+    Instances,
+    LastStage,
+    RelativeTo,
+    Targets,
+    Upright,
+)
+from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:  # imported where they are used: torch takes more than a second, which --help need not wait for
     from torchpose.camera import Camera
     from torchpose.handeye import HandEye
     from torchpose.io.estimates import Estimation
     from torchpose.io.misfits import Misfits
+    from torchpose.io.project import Settings
     from torchpose.io.sources import Source
     from torchpose.io.storage import Place
     from torchpose.io.store import ResultStore
+    from torchpose.io.stream import StreamedRows
     from torchpose.io.tally import Tally
     from torchpose.target import Target
 
-_OUT = "Table of the poses: .csv, .jsonl or .parquet, on a disk or in a store; with --engine ray a folder of parts."
+_OUT = (
+    "Table of the poses: .csv, .jsonl or .parquet, on a disk or in a store, with --engine ray a folder of parts; or "
+    "`-`: JSON lines on standard output."
+)
 _ENGINE = "What runs the work: this process, or the workers of a Ray cluster (extra: ray)."
 _ADDRESS = "With --engine ray: a cluster that is there; without it, one starts here and ends with the command."
 _INPUTS = (
-    "Image files (PNG, TIFF, BMP, JPEG, PGM; 8 or 16 bit, grey or colour), folders of them, searched recursively and "
-    "taken in natural order, or capture manifests (.jsonl); paths, or URLs such as s3://BUCKET/FOLDER."
+    "Image files (PNG, TIFF, BMP, JPEG, PGM; 8 or 16 bit, grey or colour), films (.mp4, .avi, .mov, .mkv, .webm), "
+    "folders of both, searched recursively and taken in natural order, or capture manifests (.jsonl); paths, or URLs "
+    "such as s3://BUCKET/FOLDER."
 )
-_CAMERA = (
-    "Camera file: OpenCV YAML, JSON or XML, ROS camera_info, Kalibr camchain, COLMAP cameras.txt and others "
-    "(docs/cameras.md). FILE#cam1 or FILE#2 picks one of several."
-)
-_CAMERAS = (
-    "Several cameras, instead of --camera: Kalibr camchain, OpenCV's stereo calibration, or a folder of ROS "
-    "camera_info with tf_static.yaml. INPUT has one folder a camera (cam0, cam1, ...), or is a capture manifest "
-    "(docs/rigs.md)."
-)
-_METHODS = "photometric|edges|centers|paper"  # torchpose.pipeline.Method, which takes a second to import
-_METHOD = "Last stage: grey values, edge points, ring centres, or the paper's own chain."
-_HAND_EYE = "Calibrated camera-to-base or camera-to-tool transform; adds the poses in the robot base."
 _JUDGED = 16  # frames that the tone is judged by
 _RESUME = "Keep the frames that an earlier run finished and do the rest."
-_INSTANCES = "Most copies of a target in a frame (a tray of equal parts): up to as many rows, column instance."
-_TARGET = (
-    "Target file or name of a built-in target, or a board of equal marks: rings:10x7:20mm:6mm:3mm (columns, rows, "
-    "pitch, radii), circles:7x6:20mm:4mm, acircles:4x11:20mm:4mm (pitch, radius); repeat for several."
-)
-_UPRIGHT = (
-    "Boards that look the same after a turn have their rows to the right. Without, they are ambiguous unless measured."
-)
-_RELATIVE = "Name of a target: give the poses of the others (of their parts) in its frame (that of its part)."
 _DETECTIONS = "Table of the markers found: .csv, .jsonl or .parquet."
 
 
@@ -77,19 +77,20 @@ class Engine(StrEnum):
 
 
 def estimate(
-    inputs: Annotated[list[str], typer.Argument(metavar="INPUT...", help=_INPUTS)],
-    target: Annotated[list[str], typer.Option(help=_TARGET)],
-    out: Annotated[str, typer.Option(help=_OUT)],
-    camera: Annotated[str | None, typer.Option(help=_CAMERA)] = None,
-    cameras: Annotated[Path | None, typer.Option(metavar="RIG", help=_CAMERAS)] = None,
-    detections: Annotated[str | None, typer.Option(help=_DETECTIONS)] = None,
+    out: Annotated[str, typer.Option("--out", "-o", help=_OUT)],
+    inputs: Annotated[list[str] | None, typer.Argument(metavar="INPUT...", help=_INPUTS)] = None,
+    camera: CameraFile = None,
+    cameras: Cameras = None,
+    target: Targets = None,
+    files_from: FilesFrom = None,
+    detections: Annotated[str | None, typer.Option("--detections", "-d", help=_DETECTIONS)] = None,
     overlay: Overlay = None,
-    instances: Annotated[int, typer.Option(min=1, max=1000, metavar="K", help=_INSTANCES)] = 1,
-    assume_upright: Annotated[bool, typer.Option("--assume-upright", help=_UPRIGHT)] = False,
+    instances: Instances = None,
+    assume_upright: Upright = None,
     resume: Annotated[bool, typer.Option("--resume", help=_RESUME)] = False,
-    hand_eye: Annotated[Path | None, typer.Option(help=_HAND_EYE)] = None,
-    relative_to: Annotated[str | None, typer.Option(metavar="NAME", help=_RELATIVE)] = None,
-    method: Annotated[str, typer.Option(metavar=_METHODS, help=_METHOD)] = "photometric",
+    hand_eye: HandEyeFile = None,
+    relative_to: RelativeTo = None,
+    method: LastStage = None,
     tone: Tone = None,
     srgb: Annotated[bool, typer.Option("--srgb", help="The same as --tone srgb.")] = False,
     batch: Batch = None,
@@ -103,37 +104,62 @@ def estimate(
     One row a frame and target, or with --instances one a copy: status, translation in mm, rotation vector in rad
     (target to camera), their standard deviations, reprojection RMS in px, number of markers.
     """
-    from torchpose.camera import Camera
-    from torchpose.cli.moments import estimate_moments, rig_of
+    from torchpose.cli.moments import check_several, estimate_moments
     from torchpose.cli.terminal import native_stderr_silenced
-    from torchpose.io.estimates import Estimation
+    from torchpose.io.project import settings
     from torchpose.io.storage import place_of
-    from torchpose.target import Target
 
-    places = [place_of(name) for name in inputs]
+    places = [place_of(name) for name in inputs or []]
     on_ray, tables = engine is Engine.ray, _Tables.of(out, detections)
     _check_engine(address, overlay, on_ray=on_ray)
+    _check_stream(tables, resume=resume, on_ray=on_ray)
     if not on_ray:
         tables.check()
-    targets = [Target.load(name).upright() if assume_upright else Target.load(name) for name in target]
-    _check_relative(relative_to, targets, hand_eye, instances)
-    how: _How = {"resume": resume, "batch": batch, "threads": threads or cores(), "quiet": quiet}
-    tone = "srgb" if srgb and tone is None else tone
-    if several := rig_of(camera, cameras, {"--overlay": overlay, "--detections": detections, "--engine": on_ray}):
-        work = Estimation(
-            several.cameras[0], targets, _load_hand_eye(hand_eye, []), method, instances, relative_to, assume_upright
+    listed = listed_files(places, files_from)
+    options: dict[str, Any] = {"camera": camera, "target": target, "method": method, "instances": instances}
+    options |= {"hand_eye": hand_eye, "relative_to": relative_to, "assume_upright": assume_upright}
+    stated = settings([*places, *listed], **options, tone="srgb" if srgb and tone is None else tone)
+    how: _How = {"resume": resume, "batch": batch, "threads": threads or cores(), "quiet": quiet, "told": stated.told}
+    if cameras is not None:
+        check_several(camera, {"-d": detections, "--overlay": overlay, "--engine ray": on_ray, "-f": files_from})
+        return estimate_moments(
+            cameras, places, partial(estimation, stated), tables.out, {**how, "tone": stated["tone"]}
         )
-        return estimate_moments(several, places, work, tables.out, {"tone": tone, **how})
-    lens, sources = Camera.load(str(camera)), frames_of(places)
-    lens = with_tone(lens, tone)
-    lens = lens if lens.tone is not None else _with_judged_tone(lens, targets[0], sources)
-    base = _load_hand_eye(hand_eye, sources)
-    work = Estimation(lens, targets, base, method, instances, relative_to, assume_upright)
-    check_outputs(places, sources, tables.paths, overlay)
+    sources = frames_of(places, listed)
+    work = estimation(stated, sources)
+    check_outputs([*places, *listed], sources, tables.paths, overlay)
     with native_stderr_silenced():
         if on_ray:
             return _run_on_ray(work, sources, tables, address, **how)
         return _run(work, sources, tables, overlay, **how)
+
+
+def estimation(stated: Settings, sources: Sequence[Source], lens: Camera | None = None) -> Estimation:
+    """What the rows depend on, by the options, or with a camera that is given.
+
+    ConfigError: one is missing, or they do not go together.
+    """
+    from torchpose.camera import Camera
+    from torchpose.io.estimates import Estimation
+    from torchpose.target import Target
+
+    given, lens = lens, lens or Camera.load(stated.needed("camera"))
+    targets = [Target.load(name) for name in stated.needed("target")]
+    if stated["assume_upright"]:
+        targets = [one.upright() for one in targets]
+    lens = with_tone(lens, stated["tone"])
+    lens = lens if lens.tone is not None or given else with_judged_tone(lens, targets[0], sources)
+    instances = stated["instances"] or 1
+    _check_relative(stated["relative_to"], targets, stated["hand_eye"], instances)
+    return Estimation(
+        lens,
+        targets,
+        _load_hand_eye(stated["hand_eye"], sources),
+        stated["method"] or "photometric",
+        instances,
+        stated["relative_to"],
+        bool(stated["assume_upright"]),
+    )
 
 
 class _How(TypedDict):
@@ -143,6 +169,7 @@ class _How(TypedDict):
     batch: int | None
     threads: int
     quiet: bool
+    told: str
 
 
 @dataclass(frozen=True)
@@ -161,27 +188,38 @@ class _Tables:
     @property
     def paths(self) -> list[Path]:
         """Those on a disk."""
-        return [path for path in (self.out, self.detections) if isinstance(path, Path)]
+        from torchpose.io.stream import is_standard
+
+        return [path for path in (self.out, self.detections) if isinstance(path, Path) and not is_standard(path)]
 
     def check(self) -> None:
         """Raises ConfigError unless both can be written."""
+        from torchpose.io.stream import is_standard
         from torchpose.io.writers import check_table_path
 
         for path, option in ((self.out, "--out"), (self.detections, "--detections")):
-            if isinstance(path, Path):
+            if isinstance(path, Path) and not is_standard(path):
                 check_table_path(path, option)
 
 
-def _check_engine(address: str | None, overlay: Path | None, *, on_ray: bool) -> None:
-    from torchpose.errors import ConfigError
+def _check_stream(tables: _Tables, *, resume: bool, on_ray: bool) -> None:
+    """Refuses what standard output cannot have."""
+    from torchpose.io.stream import is_standard
 
+    options = {"--resume": resume, "--detections": tables.detections is not None, "--engine ray": on_ray}
+    for option, given in options.items():
+        if given and isinstance(tables.out, Path) and is_standard(tables.out):
+            raise ConfigError(f"--out: - is standard output, which has no {option}; give a file, or leave {option} out")
+
+
+def _check_engine(address: str | None, overlay: Path | None, *, on_ray: bool) -> None:
     if address is not None and not on_ray:
         raise ConfigError("--address: is of --engine ray alone; add it or leave --address out")
     if overlay is not None and on_ray:
         raise ConfigError("--overlay: is not drawn by --engine ray; run a part of the frames with --engine local")
 
 
-def _with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -> Camera:
+def with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -> Camera:
     """The camera with the tone that the frames tell, where their kind of file makes one likely; says what it took."""
     from torchpose.io.images import UnreadableImageError, WrongSizeError
 
@@ -196,7 +234,8 @@ def _with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -
     from torchpose.camera import LINEAR
 
     images = []
-    for source in sources[:: (len(sources) - 1) // _JUDGED + 1]:
+    step = 1 if sources[0].film else (len(sources) - 1) // _JUDGED + 1  # a film is read from its beginning
+    for source in sources[: step * _JUDGED : step]:
         try:
             image = source.decode(size=(lens.width, lens.height))
         except (UnreadableImageError, WrongSizeError):
@@ -211,8 +250,8 @@ def _with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -
         "too few rings to tell" if shift is None else f"as linear ones their edges would be {abs(shift.px):.2g} px off"
     )
     say(
-        f"torchpose: {sources[0].name}: JPEG or colour, and neither the camera file nor --tone says its tone: taken as "
-        f"{tone or LINEAR} ({told})",
+        f"torchpose: {sources[0].name}: JPEG, film or colour, and neither the camera file nor --tone says its tone: "
+        f"taken as {tone or LINEAR} ({told})",
         err=True,
     )
     return replace(lens, tone=tone or LINEAR)
@@ -228,6 +267,7 @@ def _run(
     batch: int | None,
     threads: int,
     quiet: bool,
+    told: str,
 ) -> int:
     """Estimates what is not done yet and writes the tables; returns the exit code."""
     import cv2
@@ -237,6 +277,7 @@ def _run(
     from torchpose.cli.terminal import FrameProgress
     from torchpose.io.reader import FrameReader, default_batch, in_batches
     from torchpose.io.staged import Staged
+    from torchpose.io.stream import StreamedRows
     from torchpose.report.overlay import Overlay
 
     cv2.setNumThreads(1)  # frames are decoded side by side; threads inside of one would only compete
@@ -262,7 +303,11 @@ def _run(
         store.finish([source.name for source in sources])
         staged.send()
     except KeyboardInterrupt:
-        return interrupted(f"{len(store)} of {len(sources)} frames are kept; add --resume to go on")
+        stream = isinstance(store, StreamedRows)
+        kept = "are out; standard output has no --resume" if stream else "are kept; add --resume to go on"
+        return interrupted(f"{len(store)} of {len(sources)} frames {kept}")
+    except BrokenPipeError:
+        return CLOSED
     finally:
         store.close()
     progress.summary(store.tally.counts, tables.out)
@@ -271,7 +316,7 @@ def _run(
             f"torchpose: {store.damaged} damaged lines of {staged.out}.partial left out, their frames done again",
             err=True,
         )
-    return _told(store.tally, work, len(sources), quiet=quiet)
+    return _told(store.tally, work, len(sources), quiet=quiet, told=told)
 
 
 def _run_on_ray(
@@ -284,6 +329,7 @@ def _run_on_ray(
     batch: int | None,
     threads: int,
     quiet: bool,
+    told: str,
 ) -> int:
     """The same on the workers of a Ray cluster."""
     from torchpose.cli.terminal import FrameProgress
@@ -318,14 +364,18 @@ def _run_on_ray(
         if parts is not None:
             parts.finish()
     progress.summary(tally.counts, tables.out)
-    return _told(tally, work, len(sources), quiet=quiet)
+    return _told(tally, work, len(sources), quiet=quiet, told=told)
 
 
 def _opened(
     work: Estimation, sources: Sequence[Source], out: Path, detections: Path | None, resume: bool
-) -> ResultStore:
+) -> ResultStore | StreamedRows:
     """Where the rows go, with those of an earlier run."""
     from torchpose.io.store import ResultStore
+    from torchpose.io.stream import StreamedRows, is_standard
+
+    if is_standard(out):
+        return StreamedRows(work.schema)
 
     files = {source.name: source.stamp() for source in sources}  # before they are read
     kept: dict[str, Any] = {"schema": work.schema, "targets": len(work.rows_of), "files": files}
@@ -333,11 +383,13 @@ def _opened(
     return ResultStore(out, detections, resume=resume, origin=origin, **kept)
 
 
-def _told(tally: Tally, work: Estimation, frames: int, *, quiet: bool) -> int:
+def _told(tally: Tally, work: Estimation, frames: int, *, quiet: bool, told: str) -> int:
     """Tells, on stderr, what is wrong with the run as a whole and what its rows say together; the exit code."""
     for line in tally.whole_run.lines(f"{work.camera.width}x{work.camera.height}"):
         say(f"torchpose: warning: {line}", err=True)
     if not quiet:
+        if told:
+            say(f"torchpose: {told}", err=True)
         _tell_crowded(tally, frames, work)
         _tell_misfits(tally.misfits, work)
     return ended(tally.unreadable)
@@ -404,8 +456,6 @@ def _load_hand_eye(path: Path | None, sources: Sequence[Source]) -> HandEye | No
 
 
 def _check_relative(name: str | None, targets: Sequence[Target], hand_eye: Path | None, instances: int) -> None:
-    from torchpose.errors import ConfigError
-
     if name is None:
         return
     names = [target.name for target in targets]

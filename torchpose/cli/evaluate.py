@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import astuple
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -24,7 +25,9 @@ _PLOTS = "Folder for plots of errors, consistency and conditions."
 def evaluate(
     poses: Annotated[Path, typer.Argument(metavar="POSES", help=_POSES)],
     truth: Annotated[Path, typer.Argument(metavar="DIR_OR_TRUTH", help=_TRUTH)],
-    out: Annotated[Path | None, typer.Option(help="Table of the errors, one row a frame (.csv).")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Table of the errors, one row a frame (.csv).")
+    ] = None,
     plots: Annotated[Path | None, typer.Option(metavar="DIR", help=_PLOTS)] = None,
 ) -> int:
     """Compare poses with the truth: bias and spread of each axis beside its bound, success by status, NEES."""
@@ -32,7 +35,7 @@ def evaluate(
     from torchpose.analysis.evaluation import evaluate as evaluate_poses
     from torchpose.io.truth import read_truth
 
-    known = read_truth(truth / "truth.csv" if truth.is_dir() else truth)
+    known = read_truth(truth / "truth.csv" if os.path.isdir(truth) else truth)
     rows, more = _rows_of(poses, known)
     estimates = estimates_of(rows)
     result = evaluate_poses(estimates, known)

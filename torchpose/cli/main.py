@@ -21,9 +21,12 @@ from torchpose.cli.design import design
 from torchpose.cli.detect import detect
 from torchpose.cli.estimate import estimate
 from torchpose.cli.evaluate import evaluate
+from torchpose.cli.examples import examples
+from torchpose.cli.live import live
 from torchpose.cli.reproduce import reproduce
 from torchpose.cli.sensitivity import sensitivity
 from torchpose.cli.simulate import simulate
+from torchpose.cli.watch import watch
 from torchpose.errors import TorchposeError, plain, printable
 
 _HELP = Path(__file__).with_name("help")
@@ -36,7 +39,6 @@ INTERNAL_ERROR = 70  # EX_SOFTWARE of sysexits.h: none of the codes that say som
 app = typer.Typer(
     name="torchpose",
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode="markdown",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
@@ -58,7 +60,9 @@ def _torchpose(
 
 
 # what stands below the options: help/COMMAND.md
-for _command in (estimate, detect, simulate, evaluate, capture, sensitivity, reproduce, design, calibrate):
+_MEASURING = (estimate, live, watch, detect, simulate, evaluate, capture)
+_COMMANDS = (*_MEASURING, sensitivity, reproduce, design, calibrate, examples)
+for _command in _COMMANDS:
     app.command(epilog=(_HELP / f"{_command.__name__}.md").read_text(encoding="utf-8"))(_command)
 
 

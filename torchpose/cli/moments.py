@@ -2,68 +2,66 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchpose.cli.common import check_outputs, check_robot_poses, ended, interrupted, read_tone, say, use_threads
+from torchpose.cli.common import check_outputs, ended, interrupted, read_tone, say, use_threads
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:
-    from torchpose.camera import CameraRig
+    from torchpose.camera import Camera
     from torchpose.io.estimates import Estimation
     from torchpose.io.moments import Moment, RigEstimation
+    from torchpose.io.sources import Source
     from torchpose.io.storage import Place
 
 
-def rig_of(camera: str | None, cameras: Path | None, options: dict[str, Any]) -> CameraRig | None:
-    """The rig of --cameras; None where there is one camera. ``options`` do not go with several."""
-    from torchpose.camera import CameraRig
-
-    if (camera is None) == (cameras is None):
-        raise ConfigError(
-            f"--camera: {'missing' if camera is None else 'stands beside --cameras'}; give --camera of one camera, or "
-            "--cameras of several"
-        )
-    if cameras is None:
-        return None
+def check_several(camera: str | None, options: dict[str, Any]) -> None:
+    """Refuses what does not go with --cameras, of options by their names."""
+    if camera is not None:
+        raise ConfigError("--camera: stands beside --cameras; give --camera of one camera, or --cameras of several")
     for name, given in options.items():
         if given:
             raise ConfigError(f"{name}: is of one camera; leave it out with --cameras, or run each camera by itself")
-    return CameraRig.load(cameras)
 
 
 def estimate_moments(
-    rig: CameraRig, inputs: list[Path | Place], rest: Estimation, out: Path | Place, options: dict[str, Any]
+    cameras: Path,
+    inputs: list[Path | Place],
+    rest: Callable[[list[Source], Camera], Estimation],
+    out: Path | Place,
+    options: dict[str, Any],
 ) -> int:
     """Estimates what is not done yet and writes the table; returns the exit code.
 
     Args:
-        rig: the cameras.
+        cameras: file of the rig.
         inputs: of the command: one folder, or one manifest.
-        rest: what the rows depend on besides; its camera counts for nothing.
+        rest: what the rows depend on besides, by a picture of every moment and the first camera.
         out: table of the poses.
-        options: ``tone``, ``resume``, ``batch``, ``threads`` and ``quiet`` of the command.
+        options: ``tone``, ``resume``, ``batch``, ``threads``, ``quiet`` and ``told`` of the command.
     """
     from torchpose.camera import CameraRig
     from torchpose.cli.terminal import native_stderr_silenced
     from torchpose.io.moments import RigEstimation, find_moments
+    from torchpose.io.stream import is_standard
 
     if len(inputs) != 1:
-        raise ConfigError(f"{inputs[1]}: INPUT: with --cameras there is one INPUT; give the folder of all cameras")
-    if not isinstance(inputs[0], Path) or not isinstance(out, Path):
-        raise ConfigError("--cameras: reads and writes folders of this machine; copy the pictures here")
-    if rest.instances > 1:
-        raise ConfigError("--instances: several cameras look for one copy; leave it out with --cameras")
+        raise ConfigError("INPUT: with --cameras there is one; give the folder of all cameras")
+    if not isinstance(inputs[0], Path) or not isinstance(out, Path) or is_standard(out):
+        raise ConfigError("--cameras: reads and writes files of this machine; copy the pictures here, and name a file")
+    rig = CameraRig.load(cameras)
     if (tone := read_tone(options["tone"])) is not None:
         lenses = [replace(camera, tone=tone) for camera in rig.cameras]
         rig = CameraRig(lenses, rig.R, rig.t, rig.covariance, rig.names)
     moments = find_moments(inputs[0], rig, lambda line: say(f"torchpose: {line}", err=True))
+    work = RigEstimation(rig, rest([moment.first for moment in moments], rig.cameras[0]))
+    if work.rest.instances > 1:
+        raise ConfigError("--instances: several cameras look for one copy; leave it out with --cameras")
     sources = [source for moment in moments for source in moment.sources if source is not None]
     check_outputs(inputs, sources, [out], None)
-    if rest.hand_eye is not None and rest.hand_eye.mount == "tool":
-        check_robot_poses([moment.first for moment in moments], ", but the camera of the hand-eye file is on the tool")
-    work = RigEstimation(rig, replace(rest, camera=rig.cameras[0]))
     with native_stderr_silenced():
         return _run(work, moments, out, options)
 
@@ -118,6 +116,8 @@ def _run(work: RigEstimation, moments: list[Moment], out: Path, options: dict[st
         first, reason = next(iter(other.items()))
         say(f"torchpose: warning: {first} ({reason}): {len(other)} have not the size of their camera", err=True)
     if not options["quiet"]:
+        if options["told"]:
+            say(f"torchpose: {options['told']}", err=True)
         _tell_disagreement(store.tally.disagree, work)
     return ended(unreadable)
 

@@ -6,12 +6,13 @@ from typing import Annotated
 import typer
 
 from torchpose.cli.common import MOST_SEED, Quiet, interrupted, say
+from torchpose.cli.options import folder_option
 
 _Full = Annotated[bool, typer.Option("--full", help="As many seeds and frames as the documented figures have: hours.")]
 
 
 def reproduce(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the report, report.html, and its tables.")],
+    out: Annotated[Path, folder_option("Folder of the report, report.html, and its tables.")],
     full: _Full = False,
     only: Annotated[list[str] | None, typer.Option(metavar="STUDY", help="This study alone; may be repeated.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Keep the studies that an earlier run finished.")] = False,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import typer
 
 from torchpose.cli.common import MOST_SEED, say
+from torchpose.cli.options import camera_option, folder_option, target_option
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -44,9 +45,9 @@ _DISTORTION = "Standard deviations of the camera's coefficients: 1e-3,1e-3,1e-5,
 
 
 def sensitivity(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for tables (.csv) and plots (.png).")],
-    camera: Annotated[Path | None, typer.Option(help="Camera file; by default the paper's camera.")] = None,
-    target: Annotated[str, typer.Option(help="Target file, or the name of a built-in target.")] = "quad8",
+    out: Annotated[Path, folder_option("Folder for tables (.csv) and plots (.png).")],
+    camera: Annotated[Path | None, camera_option("Camera file; by default the paper's camera.")] = None,
+    target: Annotated[str, target_option("Target file, or the name of a built-in target.")] = "quad8",
     distance: _Distances = (12.0, 32.0),
     steps: Annotated[int, typer.Option(min=3, max=1000, help="Number of distances.")] = 11,
     tilt_deg: Annotated[float, typer.Option(help="Tilt of the target about the x axis.")] = 0.0,

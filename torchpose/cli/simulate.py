@@ -19,7 +19,7 @@ class Backend(StrEnum):
 
 def simulate(
     plan: Annotated[Path, typer.Argument(metavar="PLAN", help="Plan file (YAML): poses, imaging, sensor.")],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the data set.")],
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder of the data set.")],
     backend: Annotated[Backend, typer.Option(help=_BACKEND)] = Backend.analytic,
     resume: Resume = False,
     bop: Annotated[bool, typer.Option("--bop", help="Export the layout of the BOP challenge besides.")] = False,

@@ -4,6 +4,7 @@ Every error is a `ConfigError` of the form ``FILE: FIELD: what is wrong; the fix
 """
 
 from torchpose.config.documents import parse_json, parse_mapping
+from torchpose.config.examples import example
 from torchpose.config.files import (
     MOST_TABLE_BYTES,
     beside,
@@ -14,6 +15,7 @@ from torchpose.config.files import (
     quoted,
     read_text,
     read_yaml,
+    real,
     write_text,
 )
 from torchpose.config.models import problem_of, shown, suggest, validate, within
@@ -22,6 +24,7 @@ __all__ = [
     "MOST_TABLE_BYTES",
     "beside",
     "check_regular",
+    "example",
     "format_list",
     "format_number",
     "is_inside",
@@ -31,6 +34,7 @@ __all__ = [
     "quoted",
     "read_text",
     "read_yaml",
+    "real",
     "shown",
     "suggest",
     "validate",

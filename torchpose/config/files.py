@@ -32,12 +32,21 @@ def check_regular(path: Path, *, most: int | None = None) -> None:
         raise ConfigError(f"{path}: file: has {found.st_size / 1e6:.0f} MB; at most {most / 1e6:.0f} MB are read")
 
 
-def is_inside(path: Path, folder: Path) -> bool:
-    """Whether a path lies in a folder once all links and ``..`` are followed; what is not there counts as named."""
+def real(path: Path) -> Path:
+    """The path with all links and ``..`` followed as far as they can be; what is not there counts as named.
+
+    pathlib's own `resolve` fails at links in a loop, its `is_dir` and `exists` at names that are too long: paths that a
+    user gives are asked by `os.path`.
+    """
     try:
-        return path.resolve().is_relative_to(folder.resolve())
-    except (OSError, ValueError, RuntimeError):  # names of no file, and links in a loop
-        return False
+        return Path(os.path.realpath(path))
+    except (OSError, ValueError):  # a name that no file can have
+        return path.absolute()
+
+
+def is_inside(path: Path, folder: Path) -> bool:
+    """Whether a path lies in a folder once all links and ``..`` are followed."""
+    return real(path).is_relative_to(real(folder))
 
 
 def read_text(path: str | os.PathLike[str], *, most: int = MOST_BYTES) -> str:

@@ -288,9 +288,9 @@ def _write_png(path: Path, frame: np.ndarray) -> None:
 def _prepare(plan: Plan, out: Path, backend: Backend, resume: bool) -> Path:
     """Writes all but frames and truth into the data set's folder; returns the folder of the frames."""
     origin, frames = _origin(plan, backend), out / "frames"
-    if out.exists() and not out.is_dir():
+    if os.path.exists(out) and not os.path.isdir(out):
         raise ConfigError(f"{out}: --out: is a file; give a folder")
-    if frames.exists() and any(frames.iterdir()):
+    if os.path.exists(frames) and any(frames.iterdir()):
         _check_origin(out, origin, resume)
     try:
         frames.mkdir(parents=True, exist_ok=True)

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.camera import Camera, CameraRig
-from torchpose.config import beside, read_yaml, validate, within
+from torchpose.config import beside, example, read_yaml, validate, within
 from torchpose.datasets.plan_file import MOST_FRAMES, PlanFile, Random
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
@@ -28,7 +28,7 @@ from torchpose.target import Target
 
 _APART = 1_000_003  # between the seeds of a rig's cameras (convention: a prime)
 _HALTON_BASES = (2, 3, 5, 7, 11, 13)
-_CHUNK = 2000  # poses whose markers are looked for at once: some 10 MB
+_CHUNK = 500  # poses whose markers are looked for at once: half a MB a plane, which stays in the cache
 _HOPELESS = 20_000  # poses without one in view, after which no more are drawn
 _TRIES = 50  # random poses drawn for one that keeps the target in view
 
@@ -131,7 +131,7 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
         ConfigError: one line ``FILE: FIELD: what is wrong; the fix``. A frame with a marker out of view or a target out
             of the depth range is an error unless the plan says ``out_of_view: mark``.
     """
-    path = Path(path)
+    path = example(path, "plans")
     file = validate(PlanFile, read_yaml(path), path)
     rig = CameraRig.load(beside(path, file.cameras)) if file.cameras else None
     camera = Camera.load(beside(path, file.camera)) if rig is None else rig.cameras[0]
@@ -235,7 +235,8 @@ def _some_in_view(camera: Camera, target: Target, R: Float[Tensor, "N 3 3"], t: 
     pixel = camera.project(x)
     last = torch.tensor([camera.width - 1, camera.height - 1], dtype=t.dtype)
     inside = ((pixel >= 0) & (pixel <= last)).all(-1)
-    inside &= (x[..., :2] / x[..., 2:]).norm(dim=-1) < camera.fold_radius
+    if math.isfinite(camera.fold_radius):
+        inside &= (x[..., :2] / x[..., 2:]).norm(dim=-1) < camera.fold_radius
     return inside.view(len(t), 36, -1).all(1).sum(1)
 
 
@@ -346,4 +347,5 @@ def _floats(values: Any) -> Tensor:
 
 
 def _backgrounds(path: Path, name: str | None) -> list[Path]:
-    return [] if name is None else [Path(str(source.path)) for source in find_sources([Path(beside(path, name))])]
+    sources = [] if name is None else find_sources([Path(beside(path, name))])
+    return [Path(str(source.path)) for source in sources if source.film is None]

@@ -1,6 +1,6 @@
 """Target design: from camera, working volume and accuracy to a target, its predicted precision and a print sheet."""
 
-from torchpose.design.precision import Need, Precision, PrecisionMap, precision_map, predict_volume
+from torchpose.design.precision import Need, Precision, PrecisionMap, precision_map, predict_volume, surroundings
 from torchpose.design.predict import (
     Imaging,
     best_focus,
@@ -12,10 +12,12 @@ from torchpose.design.predict import (
 from torchpose.design.printing import MEASURING_VIEWS, PRINTS, PrintClass, measured, print_of, scale_deviation
 from torchpose.design.search import Design, design_target
 from torchpose.design.sheet import Sheet, make_sheet, plate_around
+from torchpose.design.tiles import PAPERS, save_tiles, tile_sheet
 from torchpose.design.volume import WorkingVolume
 
 __all__ = [
     "MEASURING_VIEWS",
+    "PAPERS",
     "PRINTS",
     "Design",
     "Imaging",
@@ -36,6 +38,9 @@ __all__ = [
     "predict_volume",
     "predicted_covariance",
     "print_of",
+    "save_tiles",
     "scale_deviation",
     "sharp_range",
+    "surroundings",
+    "tile_sheet",
 ]

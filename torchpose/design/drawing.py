@@ -5,6 +5,7 @@ which knows no circle), and a length on the page is the number in the file.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from xml.sax.saxutils import escape
 
@@ -58,7 +59,20 @@ class Text:
     number: bool = False
 
 
-Shape = Circle | Rectangle | Line | Text
+@dataclass(frozen=True)
+class Window:
+    """What lies in a rectangle with its upper left corner at x, y of shapes that are moved by ``dx``, ``dy``, mm."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+    dx: float
+    dy: float
+    shapes: "list[Shape]"
+
+
+Shape = Circle | Rectangle | Line | Text | Window
 
 
 @dataclass(frozen=True)
@@ -89,6 +103,10 @@ class Page:
 
     def pdf(self) -> bytes:
         """The page as PDF 1.6, with the trim box of the printer's trade and the wish not to be scaled."""
+        return pdf_of([self])
+
+    def _pdf_parts(self) -> tuple[str, bytes]:
+        """Boxes and content of the page."""
         # from here on y down and mm
         flip = f"{_number(_POINTS)} 0 0 {_number(-_POINTS)} 0 {_number(self.height * _POINTS)} cm"
         content = "\n".join([flip, *map(_pdf, self.shapes)]).encode("cp1252", "replace")
@@ -96,28 +114,42 @@ class Page:
         media = [0.0, 0.0, self.width - _HAIR, self.height - _HAIR]
         trim = [x, self.height - y - height, x + width, self.height - y]
         boxes = [" ".join(_number(v * _POINTS) for v in box) for box in (media, trim)]
-        objects = [
-            b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
-            b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
-            f"<< /Type /Page /Parent 2 0 R /MediaBox [{boxes[0]}] /TrimBox [{boxes[1]}] /Contents 4 0 R "
-            "/Resources << /Font << /F 5 0 R >> >> >>".encode(),
+        return f"/MediaBox [{boxes[0]}] /TrimBox [{boxes[1]}]", content
+
+
+def pdf_of(pages: Sequence[Page]) -> bytes:
+    """A document of pages under the title of the first, see `Page.pdf`."""
+    font = 3 + 2 * len(pages)
+    kids = " ".join(f"{3 + 2 * k} 0 R" for k in range(len(pages)))
+    objects = [
+        b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
+        f"<< /Type /Pages /Kids [{kids}] /Count {len(pages)} >>".encode(),
+    ]
+    for page in pages:
+        boxes, content = page._pdf_parts()
+        objects += [
+            f"<< /Type /Page /Parent 2 0 R {boxes} /Contents {len(objects) + 2} 0 R "
+            f"/Resources << /Font << /F {font} 0 R >> >> >>".encode(),
             b"<< /Length %d >>\nstream\n%s\nendstream" % (len(content), content),
-            b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica /Encoding /WinAnsiEncoding >>",
-            b"<< /Title (%s) /Creator (torchpose) >>" % _pdf_string(self.title).encode("cp1252", "replace"),
         ]
-        file = b"%PDF-1.6\n%\xe2\xe3\xcf\xd3\n"
-        offsets = []
-        for number, body in enumerate(objects, 1):
-            offsets.append(len(file))
-            file += b"%d 0 obj\n%s\nendobj\n" % (number, body)
-        table = b"".join(b"%010d 00000 n \n" % offset for offset in offsets)
-        size, start = len(objects) + 1, len(file)
-        file += b"xref\n0 %d\n0000000000 65535 f \n%s" % (size, table)
-        return file + b"trailer\n<< /Size %d /Root 1 0 R /Info %d 0 R >>\nstartxref\n%d\n%%%%EOF\n" % (
-            size,
-            size - 1,
-            start,
-        )
+    title = _pdf_string(pages[0].title).encode("cp1252", "replace")
+    objects += [
+        b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica /Encoding /WinAnsiEncoding >>",
+        b"<< /Title (%s) /Creator (torchpose) >>" % title,
+    ]
+    file = b"%PDF-1.6\n%\xe2\xe3\xcf\xd3\n"
+    offsets = []
+    for number, body in enumerate(objects, 1):
+        offsets.append(len(file))
+        file += b"%d 0 obj\n%s\nendobj\n" % (number, body)
+    table = b"".join(b"%010d 00000 n \n" % offset for offset in offsets)
+    size, start = len(objects) + 1, len(file)
+    file += b"xref\n0 %d\n0000000000 65535 f \n%s" % (size, table)
+    return file + b"trailer\n<< /Size %d /Root 1 0 R /Info %d 0 R >>\nstartxref\n%d\n%%%%EOF\n" % (
+        size,
+        size - 1,
+        start,
+    )
 
 
 def _number(value: float) -> str:
@@ -135,6 +167,10 @@ def _element(name: str, text: str | None = None, /, **attributes: float | str) -
 
 
 def _svg(shape: Shape) -> str:
+    if isinstance(shape, Window):
+        box = _numbers(shape.x - shape.dx, shape.y - shape.dy, shape.width, shape.height)
+        place = " ".join(f'{key}="{_number(getattr(shape, key))}"' for key in ("x", "y", "width", "height"))
+        return "\n".join([f'<svg {place} viewBox="{box}">', *map(_svg, shape.shapes), "</svg>"])
     if isinstance(shape, Text):
         family, anchor = "Helvetica, Arial, sans-serif", {"text_anchor": "middle"} if shape.number else {}
         return _element("text", shape.text, x=shape.x, y=shape.y, font_size=shape.size, font_family=family, **anchor)
@@ -147,6 +183,10 @@ def _svg(shape: Shape) -> str:
 
 
 def _pdf(shape: Shape) -> str:
+    if isinstance(shape, Window):
+        clip = f"{_numbers(shape.x, shape.y, shape.width, shape.height)} re W n"
+        move = f"1 0 0 1 {_numbers(shape.dx, shape.dy)} cm"
+        return "\n".join([f"q {clip} {move}", *map(_pdf, shape.shapes), "Q"])
     if isinstance(shape, Text):
         x = shape.x - (_DIGIT * shape.size * len(shape.text) / 2 if shape.number else 0)
         return (

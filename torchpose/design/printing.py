@@ -7,19 +7,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.analysis.joint import POSE, marker_columns
+from torchpose.analysis.joint import POSE, marker_columns, print_numbers
 from torchpose.camera import Camera
 from torchpose.design.predict import Imaging, marker_information
 from torchpose.design.volume import WorkingVolume
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.geometry.arguments import checked
-from torchpose.geometry.least_squares import covariance_factor, scaled_inverse
+from torchpose.geometry.least_squares import scaled_inverse
 from torchpose.identify.scene import MOST_GAIN
 from torchpose.target import Target
 
 # of `torchpose calibrate --measure-target`, as docs/calibration.md asks for them: so many views, so far tilted
-MEASURING_VIEWS, MEASURING_TILT = 28, math.radians(30)
+MEASURING_VIEWS = 28
+MEASURING_TILT = math.radians(30)
 
 
 @dataclass(frozen=True)
@@ -94,12 +95,11 @@ def measured(camera: Camera, target: Target, volume: WorkingVolume, imaging: Ima
     """The target as `torchpose calibrate --measure-target` would leave it, with the covariance of places and gain.
 
     `MEASURING_VIEWS` views from the middle of the volume, tilted in all directions, tell of them what is left when each
-    view has a pose of its own; what no view tells stays as the file states it. The frame is the one that fits the
-    places of the file best, so shift, turn and scale have no part: a millimetre is that of the file
-    (`scale_deviation`). The camera is taken as known.
+    view has a pose of its own, and every ring its turn; what no view tells stays as the file states it. The frame is
+    the one that fits the places of the file best, so shift, turn and scale have no part: a millimetre is that of the
+    file (`scale_deviation`). The camera is taken as known.
     """
     target = replace(target, adjustment=None, cross_covariance=None)
-    assert target.covariance is not None
     z = float(volume.middle[1][0, 2])
     poses = volume.poses(distances=[z], tilts=[MEASURING_TILT], azimuths=MEASURING_VIEWS)
     R, t = (part.to(camera.matrix) for part in poses)
@@ -112,7 +112,8 @@ def measured(camera: Camera, target: Target, volume: WorkingVolume, imaging: Ima
     told.diagonal().add_(1)  # what the file states
     root = torch.linalg.cholesky(told)
     # as a square, which no rounding makes negative: what is left may be 1e-5 of what the file states
-    factor = _inner(target.centers) @ covariance_factor(target.covariance)
+    numbers = print_numbers(target, camera)[0]
+    factor = _inner(target.centers) @ torch.cat([numbers[:, :3].flatten(0, 1), numbers[0, 6:]])
     left = torch.linalg.solve_triangular(root, factor.mT, upper=False)
     return replace(target, covariance=left.mT @ left)
 

@@ -61,7 +61,8 @@ def checked_values(values: Mapping[str, Any], hints: Mapping[str, Any]) -> dict[
 def tensor_of(value: Any) -> Any:
     """A NumPy array as a tensor, anything else as it is."""
     if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
-        return torch.from_numpy(np.ascontiguousarray(value.astype(value.dtype.newbyteorder("="), copy=False)))
+        native = np.ascontiguousarray(value.astype(value.dtype.newbyteorder("="), copy=False))
+        return torch.from_numpy(native if native.flags.writeable else native.copy())  # torch warns of others
     return value
 
 

@@ -221,7 +221,8 @@ class _Averaged:
             by_y.addcmul_(density, y, value=weight)
             step.add_(y.erf_(), alpha=0.5 * weight)
         norm = self.scale / math.sqrt(math.pi)
-        by_core = (half * slope).addcmul_(by_y, self.scale, value=-1) * (norm * self.scale) / self.scale
+        # the core both widens the edge and, where it is curved, moves it: dy / ds = k / 2 / sqrt(2 s) - y / (2 s)
+        by_core = (half * slope).addcmul_(by_y, self.scale.square(), value=-1) * (1 / math.sqrt(math.pi))
         return _Nodes(step, slope * norm, by_core, by_place * norm, by_square * norm)
 
 

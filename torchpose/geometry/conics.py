@@ -33,23 +33,31 @@ def from_matrix(matrix: Matrix) -> Conic:
 
 def ellipse_from_conic(conic: Conic) -> Ellipse:
     """Ellipses of conic coefficients; NaN where the conic is no real ellipse."""
-    a, b, c, _, _, f = conic.unbind(-1)
-    squares, linear = conic[..., :3:2], conic[..., 3:5]
+    a, b, c, d, e, f = conic.unbind(-1)
     disc = 4 * a * c - b * b
-    center = (b[..., None] * linear.flip(-1) - 2 * squares.flip(-1) * linear) / disc[..., None]
-    f0 = f + 0.5 * (linear * center).sum(-1)  # value at the centre
-    half = torch.where(a + c < 0, -0.5, 0.5)
-    mean, f0 = (a + c) * half, f0 * (2 * half)
+    center_x, center_y = (b * e - 2 * c * d) / disc, (b * d - 2 * a * e) / disc
+    trace = a + c
+    side = trace.sign()  # of the inside; the conic is taken so that this is negative
+    level = (f + 0.5 * (d * center_x + e * center_y)) * -side  # less its value at the centre
     # the smaller eigenvalue as a quotient: mean - diff cancels for slender ellipses; rounding must not exchange a and b
-    large = mean + 0.5 * torch.hypot(a - c, b)
+    large = 0.5 * (trace.abs() + torch.hypot(a - c, b))
     small = torch.minimum(0.25 * disc / large, large)
-    axes = (-f0[..., None] / torch.stack([small, large], -1)).sqrt()
-    theta = torch.remainder(0.5 * torch.atan2(-b * half, (c - a) * half), torch.pi)
+    theta = torch.remainder(0.5 * torch.atan2(b * -side, (c - a) * side), torch.pi)
     # remainder may round a tiny negative angle up to pi itself
-    theta = torch.where(theta >= torch.pi, 0.0, theta)
-    ellipse = torch.cat([center, axes, theta[..., None]], -1)
-    valid = (disc > 0) & (f0 < 0) & ellipse.isfinite().all(-1)
-    return torch.where(valid[..., None], ellipse, torch.nan)
+    theta = theta.masked_fill(theta >= torch.pi, 0.0)
+    ellipse = torch.stack([center_x, center_y, (level / small).sqrt(), (level / large).sqrt(), theta], -1)
+    valid = (disc > 0) & (level > 0) & ((0 * ellipse).sum(-1) == 0)
+    return ellipse.masked_fill(~valid[..., None], torch.nan)
+
+
+def axes_of(square: Float[Tensor, "*N 2 2"]) -> Float[Tensor, "*N 3"]:
+    """Semi-axes and angle a, b, theta of ellipses by the square S S^T of their `shape_matrix`, positive definite."""
+    s11, s12, s22 = square[..., 0, 0], square[..., 0, 1], square[..., 1, 1]
+    large = 0.5 * (s11 + s22 + torch.hypot(s11 - s22, 2 * s12))
+    small = (s11 * s22 - s12.square()) / large  # a difference would cancel for slender ones
+    theta = torch.remainder(0.5 * torch.atan2(2 * s12, s11 - s22), torch.pi)
+    theta = torch.where(theta >= torch.pi, 0.0, theta)  # a tiny negative angle is rounded up to pi
+    return torch.cat([torch.stack([large, small.minimum(large)], -1).sqrt(), theta[..., None]], -1)
 
 
 def conic_from_ellipse(ellipse: Ellipse) -> Conic:

@@ -6,14 +6,16 @@ from torchpose.identify.company import in_company, named
 from torchpose.identify.copies import MIN_MARKERS
 from torchpose.identify.markers import Identified, identify
 from torchpose.identify.scene import MarkerTable, Scene, drawn_radii
-from torchpose.identify.second_look import look_again
+from torchpose.identify.second_look import Views, held, look_again
 
 __all__ = [
     "MIN_MARKERS",
     "Identified",
     "MarkerTable",
     "Scene",
+    "Views",
     "drawn_radii",
+    "held",
     "identify",
     "identify_boards",
     "in_company",

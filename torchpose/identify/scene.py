@@ -11,6 +11,7 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.geometry.arguments import checked
 from torchpose.geometry.least_squares import covariance_factor
+from torchpose.geometry.rotations import plane_axes
 from torchpose.geometry.rows import Rows, shared
 from torchpose.grids import Grid
 from torchpose.target import MIN_RATIO_GAP, Target
@@ -38,8 +39,8 @@ class MarkerTable(Rows):
         gain_scale: the same, or that of a plausible print where the file states none.
         half_gap: half of the least difference between two codes of each target, as ratios of radii; inf where there is
             one.
-        by_print: how place (mm) and edge gain (mm) of the markers vary with each of Q numbers of unit variance, as
-            `Target.covariance` says and those of the camera leave open.
+        by_print: how place (mm), turn about the place (rad) and edge gain (mm) of the markers, target frame, vary with
+            each of Q numbers of unit variance, as `Target.covariance` says and those of the camera leave open.
         by_camera: the same with each of the C uncertain numbers of a camera that was calibrated together with the
             target (`Target.cross_covariance`); 0 with any other.
         scale_sigma: `Target.scale_sigma`, the last of the Q numbers where any target has one.
@@ -56,8 +57,8 @@ class MarkerTable(Rows):
     gain_sigma: Float[Tensor, " T"]
     gain_scale: Float[Tensor, " T"]
     half_gap: Float[Tensor, " T"]
-    by_print: Float[Tensor, "T M 4 Q"]
-    by_camera: Float[Tensor, "T M 4 C"]
+    by_print: Float[Tensor, "T M 7 Q"]
+    by_camera: Float[Tensor, "T M 7 C"]
     scale_sigma: Float[Tensor, " T"]
     layouts: tuple[Grid | None, ...] = shared(())
 
@@ -135,19 +136,18 @@ def _by_numbers(targets: Sequence[Target], camera: Camera | None) -> tuple[Tenso
     markers = max(map(len, targets))
 
     def laid_out(factors: Sequence[Tensor], numbers: int) -> Tensor:
-        table = torch.zeros(len(factors), markers, 4, numbers, dtype=torch.float64)
+        table = torch.zeros(len(factors), markers, 7, numbers, dtype=torch.float64)
         for of_target, factor in zip(table, factors, strict=True):
-            of_target[: len(factor) // 3, :3, : factor.shape[1]] = factor[:-1].unflatten(0, (-1, 3))
-            of_target[: len(factor) // 3, 3, : factor.shape[1]] = factor[-1]
+            of_target[: len(factor), :, : factor.shape[2]] = factor
         return table
 
     alone, together = ([part[k] for part in parts] for k in range(2))
     scaled = int(any(target.scale_sigma for target in targets))
-    return laid_out(alone, max(f.shape[1] for f in alone) + scaled), laid_out(together, lens.shape[1])
+    return laid_out(alone, max(f.shape[2] for f in alone) + scaled), laid_out(together, lens.shape[1])
 
 
 def _by_both(target: Target, camera: Camera | None, lens: Tensor) -> tuple[Tensor, Tensor]:
-    """Factors (3 M + 1, Q) and (3 M + 1, C) of what is open of a target: by numbers of its own, by the camera's.
+    """Factors (M, 7, Q) and (M, 7, C) of what is open of a target: by numbers of its own, by the camera's.
 
     The camera's parameters are L u, by its factor L ``lens`` (n, C), so that the target has the covariance
     S L^+T with u, S that with the parameters; what u leaves open of the target is its own.
@@ -155,13 +155,39 @@ def _by_both(target: Target, camera: Camera | None, lens: Tensor) -> tuple[Tenso
     size, covariance = 3 * len(target) + 1, target.covariance
     by_camera = torch.zeros(size, lens.shape[1], dtype=torch.float64)
     if covariance is None:
-        return torch.zeros(size, 0, dtype=torch.float64), by_camera
+        return torch.zeros(len(target), 7, 0, dtype=torch.float64), _by_marker(by_camera)
     covariance, cross = covariance.double(), target.cross_covariance
     same = camera is not None and camera.adjustment is not None and camera.adjustment == target.adjustment
     if same and cross is not None and cross.shape[1] == len(lens):
         by_camera = cross.double() @ torch.linalg.pinv(lens).mT
         covariance = covariance - by_camera @ by_camera.mT
-    return covariance_factor(covariance), by_camera
+    return torch.cat([_by_marker(covariance_factor(covariance)), _turns(target)], -1), _by_marker(by_camera)
+
+
+def _by_marker(factor: Tensor) -> Tensor:
+    """Factors (M, 7, Q) of those (3 M + 1, Q) of places and edge gain: nothing is turned."""
+    places = factor[:-1].unflatten(0, (-1, 3))
+    return torch.cat([places, torch.zeros_like(places), factor[-1:].expand(len(places), 1, -1)], 1)
+
+
+def _turns(target: Target) -> Tensor:
+    """Factors (M, 7, 2 M) of the rings' turns: a plate that may be off in height is bent, and turns its rings with it.
+
+    One that is off by s at its rim, r from its middle, has the height s (x / r)^2 and there the slope 2 s / r. Of a
+    target that was measured, the turns were measured, too.
+    """
+    count = len(target)
+    if target.covariance is None or target.adjustment is not None:
+        return torch.zeros(count, 7, 0, dtype=torch.float64)
+    normals = target.normals.double()
+    places = target.covariance.double()[:-1, :-1].unflatten(1, (count, 3)).unflatten(0, (count, 3))
+    own = places.diagonal(dim1=0, dim2=2).permute(2, 0, 1)
+    height = (normals[:, None] @ own @ normals[..., None])[:, 0, 0].clamp_min(0).sqrt()
+    reach = torch.linalg.vector_norm(target.centers - target.centers.mean(0), dim=-1).max()
+    turn = torch.stack(plane_axes(normals), -1) * (2 * height / reach)[:, None, None]  # (M, 3, 2)
+    each = torch.eye(count, dtype=torch.float64)[:, None, :, None] * turn[:, :, None]
+    turned = torch.nn.functional.pad(each.flatten(-2), (0, 0, 3, 1))
+    return turned[..., turned.any(0).any(0)]
 
 
 class Scene(NamedTuple):

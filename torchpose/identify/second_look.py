@@ -6,6 +6,7 @@ candidate is, and counts if it has the place and the code of the marker.
 """
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,24 +15,44 @@ from torchpose.camera import Camera
 from torchpose.detect import Candidates
 from torchpose.geometry import conics
 from torchpose.geometry.arguments import checked
+from torchpose.geometry.segments import marked, near_pairs
 from torchpose.identify.assignments import Codes, Marks
 from torchpose.identify.copies import MIN_MARKERS
-from torchpose.identify.hypotheses import PLACE_TOLERANCE
+from torchpose.identify.hypotheses import PLACE_TOLERANCE, SIZE_TOLERANCE
 from torchpose.identify.markers import Identified
 from torchpose.identify.scene import MarkerTable, Scene
 from torchpose.rings import Rings, mapped, measure_predicted
 
 
+class Views(NamedTuple):
+    """Where N rows of M markers may be.
+
+    seen (N, M) bool: the markers that fit. R (N, S, 3, 3), t (N, S, 3): S possible poses, NaN where there are fewer.
+    least: markers that must have been seen; 0 where something else tells the poses.
+    """
+
+    seen: Tensor
+    R: Tensor
+    t: Tensor
+    least: int = MIN_MARKERS - 1
+
+
+class _Missing(NamedTuple):
+    """P places of markers that are missing: row, number, outer ellipse in ideal pixels, both in raw ones (P, 2, 5)."""
+
+    row: Tensor
+    marker: Tensor
+    ideal: Tensor
+    raw: Tensor
+
+    def where(self, some: Tensor) -> "_Missing":
+        index = some.nonzero()[:, 0]
+        return _Missing(*(value[index] for value in self))
+
+
 @checked
 def look_again(
-    scene: Scene,
-    rings: Rings,
-    identified: Identified,
-    seen: Tensor,
-    poses: tuple[Tensor, Tensor],
-    *,
-    least: int = MIN_MARKERS - 1,
-    correct: bool = True,
+    scene: Scene, rings: Rings, identified: Identified, views: Views, blurred: Rings, *, correct: bool = True
 ) -> tuple[Rings, Identified]:
     """The rings and their markers, with those that were found at the predicted places.
 
@@ -39,35 +60,24 @@ def look_again(
         scene: frames, camera and targets.
         rings: found so far.
         identified: the same, of N rows.
-        seen: (N, M) bool, the markers that fit the poses.
-        poses: R (N, S, 3, 3) and t (N, S, 3) of S possible poses of each row; NaN where there are fewer.
-        least: markers of a row that must have been seen; 0 where something else tells the pose.
+        views: of the rows.
+        blurred: rings measured so far of which no other look shows more: nothing is looked for where one of them is.
         correct: as for `rings.measure_rings`.
     """
-    markers, camera, (R, t) = scene.table[scene.target], scene.camera, poses
-    rings_of = markers.valid & (markers.radii[..., 1] > 0)  # discs have no codes, and one circle
-    wanted = rings_of & ~seen & (seen.sum(-1) >= least)[:, None]
-    row, option, marker = (wanted[:, None] & R.isfinite().all(-1).all(-1)[..., None]).nonzero().unbind(-1)
-    if row.numel() == 0:
+    there = _missing(scene, identified, views)
+    there = there.where(~_occupied(scene, there, blurred))
+    if there.row.numel() == 0:
         return rings, identified
-    printed = replace(markers, radii=scene.printed_radii(scene.stated_gain(identified.gain)))
-    ideal, raw, depth = _predicted(printed, camera, R[row, option], t[row, option], (row, marker))
-    outer, limit = raw[:, 0], torch.tensor([camera.width - 1, camera.height - 1], device=R.device)
-    # a circle that reaches behind the camera, or a plane seen edge-on, has no ellipse
-    in_view = ((outer[:, :2] > 0) & (outer[:, :2] < limit)).all(-1) & (outer[:, 2] < limit.amin()) & (depth > 0)
-    kept = in_view.nonzero()[:, 0]
-    if kept.numel() == 0:
-        return rings, identified
-    candidates = Candidates.unscored(scene.frame[row[kept]], outer[kept], markers.polarity[row[kept]])
-    found, which = measure_predicted(scene.frames, candidates, raw[kept, 1], camera, correct=correct)
-    row, marker, ideal = row[kept[which]], marker[kept[which]], ideal[kept[which], 0]
+    polarity = scene.table.polarity[scene.target]
+    candidates = Candidates.unscored(scene.frame[there.row], there.raw[:, 0], polarity[there.row])
+    found, which = measure_predicted(scene.frames, candidates, there.raw[:, 1], scene.camera, correct=correct)
+    row, marker, ideal = there.row[which], there.marker[which], there.ideal[which]
     measured = found.outer.params
     miss = torch.linalg.vector_norm(measured[:, :2] - ideal[:, :2], dim=-1)
     clipping = _clipping(rings, identified.ring, scene)[row]
     codes = Codes.of(found, Marks.of(scene.table, scene.target[row], marker))
     off = codes.under(torch.where(found.clipped, clipping, identified.gain[row]))
-    px, of_size, _ = PLACE_TOLERANCE  # half of it: a pose is known, not guessed
-    good = (miss < 0.5 * (px + of_size * measured[:, 2])) & (off < 1)
+    good = (miss < _near(measured)) & (off < 1)
     # of several poses of a row, the one that was nearest
     slot = row * identified.ring.shape[1] + marker
     nearest = torch.full((identified.ring.numel(),), torch.inf, dtype=miss.dtype, device=miss.device)
@@ -78,6 +88,51 @@ def look_again(
     assigned = identified.ring.index_put((place[:, 0], place[:, 1]), ring)
     more = replace(identified, ring=assigned, proposal=torch.cat([identified.proposal, place]))
     return Rings.cat([rings, found[index]]), more
+
+
+@checked
+def held(scene: Scene, identified: Identified, views: Views, blurred: Rings) -> Tensor:
+    """Missing markers (N, M) bool in whose place, at any of the poses, one of the ``blurred`` rings is."""
+    there = _missing(scene, identified, views)
+    there = there.where(_occupied(scene, there, blurred))
+    number = there.row * identified.ring.shape[1] + there.marker
+    return marked(number, identified.ring.numel()).view_as(identified.ring)
+
+
+def _missing(scene: Scene, identified: Identified, views: Views) -> _Missing:
+    """The places in the frames where the views put markers that they lack."""
+    markers, camera, seen = scene.table[scene.target], scene.camera, views.seen
+    rings_of = markers.valid & (markers.radii[..., 1] > 0)  # discs have no codes, and one circle
+    wanted = rings_of & ~seen & (seen.sum(-1) >= views.least)[:, None]
+    row, option, marker = (wanted[:, None] & views.R.isfinite().all(-1).all(-1)[..., None]).nonzero().unbind(-1)
+    if row.numel() == 0:
+        nothing = markers.radii.new_zeros(0, 2, 5)
+        return _Missing(row, marker, nothing[:, 0], nothing)
+    printed = replace(markers, radii=scene.printed_radii(scene.stated_gain(identified.gain)))
+    ideal, raw, depth = _predicted(printed, camera, views.R[row, option], views.t[row, option], (row, marker))
+    outer, limit = raw[:, 0], torch.tensor([camera.width - 1, camera.height - 1], device=row.device)
+    # a circle that reaches behind the camera, or a plane seen edge-on, has no ellipse
+    in_view = ((outer[:, :2] > 0) & (outer[:, :2] < limit)).all(-1) & (outer[:, 2] < limit.amin()) & (depth > 0)
+    return _Missing(row, marker, ideal[:, 0], raw).where(in_view)
+
+
+def _occupied(scene: Scene, there: _Missing, rings: Rings) -> Tensor:
+    """Places (P,) bool at which there is a ring of the right polarity and size."""
+    none = torch.zeros_like(there.row, dtype=torch.bool)
+    if len(rings) == 0 or there.row.numel() == 0:
+        return none
+    frame, outer = scene.frame[there.row], rings.outer.params
+    i, j = near_pairs(there.ideal[:, :2], outer[:, :2], _near(there.ideal), (frame, rings.frame))
+    size = outer[j, 2] / there.ideal[i, 2]
+    alike = (size < SIZE_TOLERANCE) & (size > 1 / SIZE_TOLERANCE)
+    alike &= rings.polarity[j] == scene.table.polarity[scene.target][there.row[i]]
+    return none.index_fill(0, i[alike], True)
+
+
+def _near(ellipse: Tensor) -> Tensor:
+    """px, how far from their places rings (K, 5) may be: half of what is allowed for a pose that is guessed."""
+    px, of_size, _ = PLACE_TOLERANCE
+    return 0.5 * (px + of_size * ellipse[:, 2])
 
 
 def _clipping(rings: Rings, ring: Tensor, scene: Scene) -> Tensor:

@@ -82,7 +82,7 @@ class Journal:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        if path.exists():
+        if os.path.exists(path):
             check_regular(path)
         while True:
             # unbuffered: what a full disk refuses must not be tried again when the file is closed

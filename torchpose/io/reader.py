@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchpose.camera import LINEAR, Tone
 from torchpose.errors import ConfigError
+from torchpose.io.films import NoFrameError
 from torchpose.io.images import UnreadableImageError, WrongSizeError
 from torchpose.io.sources import Source
 from torchpose.results import Status
@@ -82,7 +83,7 @@ class FrameReader:
         buffers = [_Buffer(largest, (self.height, self.width), self.threads, self.tone) for _ in range(2)]
         pool = ThreadPoolExecutor(self.threads, thread_name_prefix="decode")
 
-        def submit(number: int) -> list[Future[Fault | np.dtype]]:
+        def submit(number: int) -> list[Future[Fault | np.dtype | None]]:
             buffer = buffers[number % 2]
             return [pool.submit(buffer.load, slot, source) for slot, source in enumerate(self.batches[number])]
 
@@ -118,10 +119,12 @@ class _Buffer:
         self._planes: dict[np.dtype, Tensor] = {}
         self._lock = threading.Lock()
 
-    def load(self, slot: int, source: Source) -> Fault | np.dtype:
-        """Decodes a source into a slot; returns its pixel type, or what is wrong with it."""
+    def load(self, slot: int, source: Source) -> Fault | np.dtype | None:
+        """Decodes a source into a slot; returns its pixel type, what is wrong with it, or None if there is no frame."""
         try:
             image = source.decode(threads=self._threads, size=(self._size[2], self._size[1]))
+        except NoFrameError:
+            return None
         except UnreadableImageError as error:
             return Fault(Status.UNREADABLE, error.reason)
         except WrongSizeError as error:
@@ -142,12 +145,15 @@ class _Buffer:
             fix = "give a smaller --batch" if frames > 1 else "free some memory"
             raise ConfigError(f"--batch: no memory for {frames} frames of {width}x{height}; {fix}") from None
 
-    def batch(self, sources: Sequence[Source], outcomes: Sequence[Fault | np.dtype]) -> Batch:
-        faults = {i: outcome for i, outcome in enumerate(outcomes) if isinstance(outcome, Fault)}
+    def batch(self, sources: Sequence[Source], outcomes: Sequence[Fault | np.dtype | None]) -> Batch:
+        slots = [slot for slot, outcome in enumerate(outcomes) if outcome is not None]  # films end, and nothing follows
+        kept = [outcomes[slot] for slot in slots]
+        faults = {i: outcome for i, outcome in enumerate(kept) if isinstance(outcome, Fault)}
         groups = []
         for dtype, plane in self._planes.items():
-            positions = [i for i, outcome in enumerate(outcomes) if i not in faults and outcome == dtype]
+            positions = [i for i, outcome in enumerate(kept) if i not in faults and outcome == dtype]
             if positions:
-                contiguous = positions == list(range(len(positions)))
-                groups.append((positions, plane[: len(positions)] if contiguous else plane[positions]))
-        return Batch(sources, faults, groups)
+                mine = [slots[i] for i in positions]
+                contiguous = mine == list(range(len(mine)))
+                groups.append((positions, plane[: len(mine)] if contiguous else plane[mine]))
+        return Batch([sources[slot] for slot in slots], faults, groups)

@@ -10,20 +10,24 @@ from pathlib import Path
 
 import numpy as np
 
+from torchpose.config import real
 from torchpose.errors import ConfigError
 from torchpose.io import images, remote
+from torchpose.io.films import FILM_SUFFIXES, Film, frames_of_film
+from torchpose.io.lists import common_folder
 from torchpose.io.manifest import read_manifest
 from torchpose.io.storage import Listed, Place, StorageError, refused
 
 IMAGE_SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg", ".pgm")
 MANIFEST_SUFFIX = ".jsonl"
 _STACKS = (".tif", ".tiff")  # that may have several pages
-# pictures and films in a folder that are not read, so that a user is told: raw files of cameras among them
+FRAME_SUFFIXES = (*IMAGE_SUFFIXES, *FILM_SUFFIXES)
+# pictures in a folder that are not read, so that a user is told: raw files of cameras among them
 _OTHERS = frozenset(
     (  # noqa: SIM905  # a list would be five times as long
-        ".apng .arw .avi .avif .cr2 .cr3 .dib .dng .exr .fit .fits .gif .hdr .heic .heif .ico .j2c .j2k .jfif "
-        ".jif .jng .jp2 .jpc .jpe .jpf .jpx .jxl .jxr .mkv .mov .mp4 .nef .npy .npz .orf .pam .pbm .pcx .pfm "
-        ".pgx .pic .pnm .ppm .psd .raf .ras .raw .rw2 .sr .svg .tga .webp"
+        ".apng .arw .avif .cr2 .cr3 .dib .dng .exr .fit .fits .gif .hdr .heic .heif .ico .j2c .j2k .jfif "
+        ".jif .jng .jp2 .jpc .jpe .jpf .jpx .jxl .jxr .mpg .nef .npy .npz .orf .pam .pbm .pcx .pfm "
+        ".pgx .pic .pnm .ppm .psd .raf .ras .raw .rw2 .sr .svg .tga .webp .wmv"
     ).split()
 )
 _PIPE = "is a pipe or a device, no file"
@@ -39,8 +43,9 @@ class Source:
         path: where the image lies, on a disk or in a store.
         root: the folder that ``name`` is relative to, resolved.
         robot_pose: tool in the robot base, mm and rad, if a manifest recorded it.
-        directory: of a TIFF file with several pages, see `images.pages`.
+        directory: of a TIFF file with several pages, see `images.pages`; the number of a film's frame, from 0.
         listed: size in bytes and time of change in ns, where a store has told them.
+        film: that the frame is of.
     """
 
     name: str
@@ -49,15 +54,20 @@ class Source:
     robot_pose: tuple[float, ...] | None = None
     directory: int = 0
     listed: tuple[int, int] | None = None
+    film: Film | None = None
 
     def decode(self, *, threads: int = 1, size: tuple[int, int] | None = None) -> np.ndarray:
-        """Grey values, see `images.decode`."""
+        """Grey values, see `images.decode` and `Film.decode`."""
+        if self.film is not None:
+            return self.film.decode(self.directory, threads=threads, size=size)
         decode = images.decode if isinstance(self.path, Path) else remote.decode
         return decode(self.path, threads=threads, directory=self.directory, size=size)  # type: ignore[arg-type]
 
     def likely_encoded(self) -> bool:
-        """See `images.likely_encoded`."""
+        """See `images.likely_encoded`; films are."""
         of = self.path
+        if self.film is not None:
+            return True
         return images.likely_encoded(of) if isinstance(of, Path) else remote.likely_encoded(of)
 
     def stamp(self) -> list[int] | None:
@@ -84,33 +94,38 @@ def natural_key(name: str) -> tuple[tuple[tuple[str | int, ...], ...], str]:
     return parts, name
 
 
-def find_sources(inputs: Sequence[Path | Place], tell: Callable[[str], None] = _silent) -> list[Source]:
-    """Frames of image files, folders (searched recursively, in natural order) and capture manifests, input by input.
+def find_sources(
+    inputs: Sequence[Path | Place], tell: Callable[[str], None] = _silent, *, more: Sequence[Path] = ()
+) -> list[Source]:
+    """Frames of image files, folders (searched recursively, in natural order), films and manifests, input by input.
 
     In folders, hidden files and folders and everything without an image's suffix are passed over. A file with an
     image's suffix is listed whatever it holds: that it cannot be read is a result of its own. Every page of a TIFF file
-    is a frame; from the second on ``#2``, ``#3``, ... stands behind the file's name. A manifest has one frame a record.
+    is a frame; from the second on ``#2``, ``#3``, ... stands behind the file's name. So is every frame of a film, from
+    ``#1`` on. A manifest has one frame a record.
 
     Args:
         inputs: files, folders and manifests.
         tell: is given a line for pictures that are passed over.
+        more: further inputs; files among them are called by their place below the folder that holds all of them.
 
     Raises:
         ConfigError: an input is missing, holds no image or is of another kind, or two frames have the same name.
     """
     sources: list[Source] = []
     seen: dict[str, Source] = {}
-    for given in inputs:
+    below = common_folder(more) if more else None
+    for given, root in [*((one, None) for one in inputs), *((one, below) for one in more)]:
         passed: Counter[str] = Counter()  # what, and how many of it
-        found = list(_sources_of(given, passed))
+        found = list(_sources_of(given, passed, root))
         if not found:
             also = f" but {_summary(passed)}" if passed.total() else ""
             raise ConfigError(
-                f"{given}: INPUT: holds no image{also}; give files that end in {', '.join(IMAGE_SUFFIXES)}"
+                f"{given}: INPUT: holds no image{also}; give files that end in {', '.join(FRAME_SUFFIXES)}"
             )
         if passed.total():
             tell(
-                f"{_text(str(given))}: passed over {_summary(passed)}; what is read ends in {', '.join(IMAGE_SUFFIXES)}"
+                f"{_text(str(given))}: passed over {_summary(passed)}; what is read ends in {', '.join(FRAME_SUFFIXES)}"
             )
         for source in found:
             twin = seen.setdefault(source.name, source)
@@ -128,30 +143,30 @@ def _summary(passed: Counter[str]) -> str:
     return ", ".join(f"{count} {kind}" for kind, count in kinds if count)
 
 
-def _sources_of(given: Path | Place, passed: Counter[str]) -> Iterator[Source]:
-    """Frames of an input; pictures that are not read are counted in ``passed``."""
+def _sources_of(given: Path | Place, passed: Counter[str], below: Path | None) -> Iterator[Source]:
+    """Frames of an input, files called by their place ``below``; what is not read is counted in ``passed``."""
     if isinstance(given, Place):
         yield from _stored(given, passed)
         return
     if _state(given) == "folder":
-        root = given.resolve()
+        root = real(given)
         pairs = [(_text(path.relative_to(given).as_posix()), path) for path in _walk(given, passed)]
         for name, path in sorted(pairs, key=lambda pair: natural_key(pair[0])):
-            yield from _pages(name, path, root)
+            yield from sources_of_file(name, path, root)
         return
     name, _, camera = given.name.partition(f"{MANIFEST_SUFFIX}#")  # FILE#CAMERA
     path = given.with_name(f"{name}{MANIFEST_SUFFIX}") if camera else given
-    state, suffixes = _state(path), (*IMAGE_SUFFIXES, MANIFEST_SUFFIX)
+    state, suffixes = _state(path), (*FRAME_SUFFIXES, MANIFEST_SUFFIX)
     if path.suffix.lower() not in suffixes and state in ("file", _PIPE):
-        raise ConfigError(
-            f"{given}: INPUT: of an unknown kind; give a folder or a file that ends in {', '.join(suffixes)}"
-        )
+        why = "of a kind that is not read" if path.suffix.lower() in _OTHERS else "of an unknown kind"
+        raise ConfigError(f"{given}: INPUT: {why}; give a folder or a file that ends in {', '.join(suffixes)}")
     if state != "file":
         raise ConfigError(f"{path}: INPUT: {state}; give image files, folders or a capture manifest")
     if path.suffix.lower() == MANIFEST_SUFFIX:
         yield from _recorded(path, camera or None, passed)
     else:
-        yield from _pages(_text(given.name), given, given.parent.resolve())
+        name = given.name if below is None else Path(os.path.relpath(given, below)).as_posix()
+        yield from sources_of_file(_text(name), given, real(below or given.parent))
 
 
 def _stored(given: Place, passed: Counter[str]) -> Iterator[Source]:
@@ -160,16 +175,16 @@ def _stored(given: Place, passed: Counter[str]) -> Iterator[Source]:
         if given.suffix.lower() == MANIFEST_SUFFIX:
             yield from _recorded_in_store(given.parent / given.name, given.fragment or None, passed)
         elif given.suffix.lower() in IMAGE_SUFFIXES and given.kind() == "file":
-            yield from _pages(given.name, given, given.parent, _stamp(given.stat()))
+            yield from sources_of_file(given.name, given, given.parent, _stamp(given.stat()))
         else:
             for one in sorted(given.listed(), key=lambda one: natural_key(one.name)):
                 suffix = Path(one.name).suffix.lower()
-                if suffix not in _OTHERS.union(IMAGE_SUFFIXES) or any(p.startswith(".") for p in one.name.split("/")):
+                if suffix not in _OTHERS.union(FRAME_SUFFIXES) or any(p.startswith(".") for p in one.name.split("/")):
                     continue
-                if suffix in _OTHERS:
+                if suffix in _OTHERS or suffix in FILM_SUFFIXES:  # films are read from a disk alone
                     passed[suffix] += 1
                 else:
-                    yield from _pages(one.name, given / one.name, given, _stamp(one))
+                    yield from sources_of_file(one.name, given / one.name, given, _stamp(one))
     except StorageError as error:
         raise refused(error, given, "INPUT") from None
 
@@ -180,30 +195,41 @@ def _stamp(one: Listed) -> tuple[int, int]:
 
 def _recorded_in_store(manifest: Place, camera: str | None, passed: Counter[str]) -> Iterator[Source]:
     for frame in remote.manifest_frames(manifest, camera):
-        pages = list(_pages(frame.image, manifest.parent / frame.image, manifest.parent))
+        pages = list(sources_of_file(frame.image, manifest.parent / frame.image, manifest.parent))
         passed["pages behind the first"] += len(pages) - 1
         yield replace(pages[0], robot_pose=frame.robot_pose)
 
 
 def _recorded(manifest: Path, camera: str | None, passed: Counter[str]) -> Iterator[Source]:
     """The frames of a manifest: one a record, so what a file holds behind its first page is passed over."""
-    root = manifest.parent.resolve()
+    root = real(manifest.parent)
     for frame in read_manifest(manifest, camera):
         path = manifest.parent / frame.image
-        pages = list(_pages(frame.image, path, root))
+        pages = list(sources_of_file(frame.image, path, root))
         passed["pages behind the first"] += len(pages) - 1
         yield replace(pages[0], robot_pose=frame.robot_pose)
 
 
-def _pages(
+def sources_of_file(
     name: str, path: Path | Place, root: Path | Place, listed: tuple[int, int] | None = None
 ) -> Iterator[Source]:
-    """The frames of a file."""
+    """The frames of a file that is called ``name`` below ``root``."""
+    if path.suffix.lower() in FILM_SUFFIXES and isinstance(path, Path):
+        yield from _film(name, path, root)
+        return
     places = [0]
     if path.suffix.lower() in _STACKS:
         places = images.pages(path) if isinstance(path, Path) else remote.pages(path)
     for number, place in enumerate(places, start=1):
         yield Source(name if number == 1 else f"{name}#{number}", path, root, directory=place, listed=listed)
+
+
+def _film(name: str, path: Path, root: Path | Place) -> Iterator[Source]:
+    """The frames of a film, and one more where it was to have more."""
+    count, broken = frames_of_film(path)
+    film = Film(path, count)
+    for number in range(count + broken):
+        yield Source(f"{name}#{number + 1}" if count else name, path, root, directory=number, film=film)
 
 
 def _state(path: Path) -> str:
@@ -239,7 +265,7 @@ def _walk(folder: Path, passed: Counter[str]) -> Iterator[Path]:
         for file in files:
             path = Path(base, file)
             suffix = path.suffix.lower()
-            if file.startswith(".") or suffix not in _OTHERS.union(IMAGE_SUFFIXES):
+            if file.startswith(".") or suffix not in _OTHERS.union(FRAME_SUFFIXES):
                 continue
             if suffix in _OTHERS:
                 passed[suffix] += 1

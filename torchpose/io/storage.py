@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl, quote, unquote, urlsplit
 
+from torchpose.config import real
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -207,7 +208,7 @@ def place_of(text: str) -> Path | Place:
 
 def as_place(where: Path | Place) -> Place:
     """The same as a place."""
-    return where if isinstance(where, Place) else Place(where.resolve().as_uri())
+    return where if isinstance(where, Place) else Place(real(where).as_uri())
 
 
 def refused(error: StorageError, where: object, field: str) -> ConfigError:

@@ -12,19 +12,20 @@ size, what was changed since, and what a damaged line of the journal held.
 """
 
 import json
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
-from torchpose.config import parse_json, read_text
+from torchpose.config import parse_json, read_text, real
 from torchpose.errors import ConfigError
 from torchpose.io.cells import row_check
 from torchpose.io.journal import Journal, Place
 from torchpose.io.rows import DETECTION_SCHEMA, NEWER, Row, Schema
 from torchpose.io.tally import Tally
-from torchpose.io.writers import atomic_path, check_table_path, read_rows, write_rows
+from torchpose.io.writers import atomic_path, check_table_path, make_folder_of, read_rows, write_rows
 from torchpose.results import Status
 
 _UNSAID = {"--instances": 1}  # in what older runs were made from
@@ -83,7 +84,7 @@ class ResultStore:
         check_table_path(out, "--out")
         if detections is not None:
             check_table_path(detections, "--detections")
-            if detections.resolve() == out.resolve():
+            if real(detections) == real(out):
                 raise ConfigError(f"{detections}: --detections: is the file of --out too; give another")
         self.damaged = 0
         self._out, self._detections = out, detections
@@ -92,6 +93,7 @@ class ResultStore:
         self._files = dict(files or {})
         self._origin_path = out.with_name(out.name + ".run.json")
         self._forget()
+        make_folder_of(out, "--out")
         try:
             self._journal = Journal(out.with_name(out.name + ".partial"))
             try:
@@ -112,7 +114,7 @@ class ResultStore:
         """Takes over what an earlier run has left, or starts over."""
         if resume and self._load():
             return
-        finished = list(self._finished()) if resume and self._out.exists() else []
+        finished = list(self._finished()) if resume and os.path.exists(self._out) else []
         self._journal.clear()
         self._journal.append([{"origin": self._origin}])
         self._keep(finished)

@@ -29,11 +29,12 @@ def check_table_path(path: Path, option: str) -> None:
     """Raises ConfigError unless a table can be written to ``path``, the argument of ``option``."""
     if path.suffix.lower() not in TABLE_SUFFIXES:
         raise ConfigError(f"{path}: {option}: of an unknown type; give a file that ends in {', '.join(TABLE_SUFFIXES)}")
-    if path.is_dir():
+    if os.path.isdir(path):
         raise ConfigError(f"{path}: {option}: is a folder; give a file")
-    if not path.parent.is_dir():
-        raise ConfigError(f"{path}: {option}: folder {path.parent} does not exist; create it or choose another")
+    check_folder_of(path, option)
     longest = path.with_name(f"{path.name}.run.json")  # of what a run writes
+    if not os.path.isdir(path.parent):  # `make_folder_of` makes it once there is something to write
+        longest = Path(_there(path), longest.name)
     probe = _temporary(longest)
     try:
         with contextlib.suppress(FileNotFoundError):
@@ -44,6 +45,37 @@ def check_table_path(path: Path, option: str) -> None:
         raise ConfigError(f"{path}: {option}: cannot be written ({error.strerror}); choose another place") from None
 
 
+def check_folder_of(path: Path, option: str) -> None:
+    """Raises ConfigError where the folder of ``path``, the argument of ``option``, cannot be made or is no folder."""
+    there = _there(path)
+    problem = "" if os.path.isdir(there) else "is no folder"
+    if not problem and not os.path.isdir(path.parent):
+        probe = there / path.absolute().relative_to(there).parts[0]
+        try:
+            probe.mkdir()
+            probe.rmdir()
+        except (OSError, ValueError) as error:
+            problem = f"cannot be written ({getattr(error, 'strerror', None) or error})"
+    if problem:
+        raise ConfigError(f"{path}: {option}: {there} {problem}; choose another place")
+
+
+def make_folder_of(path: Path, option: str) -> None:
+    """Makes the folder of ``path``, the argument of ``option``, and those above it. ConfigError: it cannot be made."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise ConfigError(
+            f"{path}: {option}: folder {path.parent} cannot be made ({reason}); choose another place"
+        ) from None
+
+
+def _there(path: Path) -> Path:
+    """The nearest of the places above ``path`` that exists."""
+    return next((one for one in path.absolute().parents if os.path.lexists(one)), Path(os.sep))
+
+
 def write_rows(path: Path, rows: Iterable[Row], schema: Schema) -> None:
     """Writes a table; ``path`` holds either what it held before or all of the rows.
 
@@ -52,8 +84,21 @@ def write_rows(path: Path, rows: Iterable[Row], schema: Schema) -> None:
     Raises:
         ConfigError: the place cannot be written, for example because the disk is full.
     """
+    make_folder_of(path, "--out")
     with atomic_path(path) as temporary:
         _WRITERS[path.suffix.lower()](temporary, rows, schema)
+
+
+def json_line(row: Row, schema: Schema) -> str:
+    """A row as a line of JSON, its end included."""
+    return json.dumps({column: row.get(column) for column in schema}, allow_nan=False) + "\n"
+
+
+def csv_lines(rows: Iterable[Row], schema: Schema, *, head: bool) -> str:
+    """Rows as lines of CSV, with or without the line of the columns."""
+    text = io.StringIO(newline="")
+    _to_csv(text, rows, schema, head=head)
+    return text.getvalue()
 
 
 def read_rows(path: Path, schema: Schema) -> Iterator[Row]:
@@ -151,11 +196,16 @@ def _cells(schema: Schema) -> list[str]:
 
 
 def _write_csv(path: Path, rows: Iterable[Row], schema: Schema) -> None:
-    columns = _cells(schema)
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")  # floats are written by repr, which reads back to the same bits
+        _to_csv(file, rows, schema, head=True)
+
+
+def _to_csv(file: io.TextIOBase, rows: Iterable[Row], schema: Schema, *, head: bool) -> None:
+    columns = _cells(schema)
+    writer = csv.writer(file, lineterminator="\n")  # floats are written by repr, which reads back to the same bits
+    if head:
         writer.writerow(columns)
-        writer.writerows([row.get(column) for column in columns] for row in rows)
+    writer.writerows([row.get(column) for column in columns] for row in rows)
 
 
 def _read_csv(path: Path) -> Iterator[Row]:
@@ -168,9 +218,7 @@ def _read_csv(path: Path) -> Iterator[Row]:
 
 def _write_jsonl(path: Path, rows: Iterable[Row], schema: Schema) -> None:
     with path.open("w", encoding="utf-8") as file:
-        file.writelines(
-            json.dumps({column: row.get(column) for column in schema}, allow_nan=False) + "\n" for row in rows
-        )
+        file.writelines(json_line(row, schema) for row in rows)
 
 
 def _read_jsonl(path: Path) -> Iterator[Row]:

@@ -143,6 +143,10 @@ def _checked(
 ) -> tuple[Inputs, tuple[Tensor, Tensor] | None]:
     """The arguments in float64, and the starts R (B, S, 3, 3), t (B, S, 3); raises ArgumentError where one is wrong."""
     batch, count = expect_pixels(given.pixels)
+    if count == 0:
+        raise ArgumentError(
+            "image_points: has no points; give three or more a pose, and a mask where some are not seen"
+        )
     pixels, camera = given.pixels.double(), given.camera
     shapes = {"object_points": (given.points, (count, 3)), "covariances": (given.covariances, (count, 2, 2))}
     shapes |= {"weights": (given.weights, (count,))}
@@ -154,6 +158,7 @@ def _checked(
     expect_mask(given.mask, (count,), (batch, count))
     one_device(image_points=pixels, **{name: value for name, (value, _) in shapes.items()}, mask=given.mask)
     expect_positive(sigma_px=given.sigma_px)
+    _expect_symmetric(given.covariances)
     if given.weights is not None:
         expect_not_negative(weights=given.weights)
     if given.huber is not None and not given.huber > 0:
@@ -167,6 +172,16 @@ def _checked(
     camera = camera if isinstance(camera, Camera) else camera.to(pixels)
     huber = None if given.huber in (None, float("inf")) else float(given.huber)
     return replace(given, points=given.points.to(pixels), pixels=pixels, camera=camera, huber=huber), initial
+
+
+def _expect_symmetric(covariances: Tensor | None) -> None:
+    """To half the digits of single precision: one triangle alone would be used."""
+    if covariances is None:
+        return
+    one, other = covariances[..., 0, 1], covariances[..., 1, 0]
+    slack = torch.finfo(torch.float32).eps ** 0.5 * torch.maximum(one.abs(), other.abs())
+    if bool(((one - other).abs() > slack).any()):
+        raise ArgumentError("covariances: are not symmetric; give [[uu, uv], [uv, vv]], px^2")
 
 
 def _checked_starts(initial: tuple[Tensor, Tensor], method: Method, pixels: Tensor) -> tuple[Tensor, Tensor]:

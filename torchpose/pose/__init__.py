@@ -9,7 +9,7 @@ from torchpose.pose.evidence import CENTER_RMS, SHAPE_FLOOR, Evidence, center_rm
 from torchpose.pose.outcome import Found, outcome
 from torchpose.pose.solutions import AMBIGUOUS_CHI2, PLACE, Solutions
 from torchpose.pose.solve import solve_poses
-from torchpose.pose.systematic import MarkerNormals, OnPrint, Setting, center_normals, on_print
+from torchpose.pose.systematic import MarkerNormals, OnPrint, Setting, center_normals, displaced, on_print
 
 __all__ = [
     "AMBIGUOUS_CHI2",
@@ -28,6 +28,7 @@ __all__ = [
     "common_center",
     "compensate",
     "crossed_out",
+    "displaced",
     "gather_evidence",
     "on_print",
     "outcome",

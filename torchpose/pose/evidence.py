@@ -62,8 +62,8 @@ class Evidence(Rows):
     coplanar: Bool[Tensor, " N"]
     polarity: Float[Tensor, " N"]
     placed: Float[Tensor, "N M 2 2"]
-    by_target: Float[Tensor, "N M 4 L"]
-    by_camera: Float[Tensor, "N M 4 C"]
+    by_target: Float[Tensor, "N M 7 L"]
+    by_camera: Float[Tensor, "N M 7 C"]
     scale_sigma: Float[Tensor, " N"]
     matrix: Float[Tensor, "3 3"] = shared()
     of_camera: int = shared(0)

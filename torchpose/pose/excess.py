@@ -8,7 +8,8 @@ Of every row three explanations are weighed by their evidence (the likelihood, a
 - all else: whatever it is, it makes the scatter larger by one factor (Birge 1932).
 
 The likeliest becomes part of the row's problem with the variance that it has on average over what remains possible: a
-few residuals tell a variance to a factor only, and the mean counts that, as Student's t does.
+few residuals tell a variance to a factor only, and the mean counts that, as Student's t does. Where it is scatter, it
+may yet be a print whose residuals are small by chance, and the pose's covariance is the mean of both.
 """
 
 import math
@@ -46,6 +47,7 @@ SURE = 2.33  # deviations: one row in 100 that is as its files say is made wider
 _GRID = 16  # values, logarithmic, apart by a factor of 1.5, of a camera 2.3, which few residuals do not tell
 _COARSE = 10  # of each of three: 2.3
 _FEW_FACTORS = 4  # of ten, of the scatter beside a print or a camera (convention)
+_SCATTER = int(Misfit.SCATTER) - 1  # among the explanations
 _AT_ONCE = 10_000_000  # numbers: 80 MB
 
 
@@ -58,6 +60,8 @@ class Excess(Rows):
             (`OF_EDGES`, mm), camera (px); 0 where they need not be off.
         printed: the same if the print is behind it; 0 where nothing is.
         factor: of the variance of all noise, 1 where it suffices.
+        printed_factor: the same if the print is behind it.
+        maybe: how likely it is the print where scatter is likelier, of these two; 0 elsewhere.
         misfit: `Misfit`, what is behind it.
         explained: whether the residuals then agree with all that.
         chi2: of the residuals, under noise and stated uncertainties alone.
@@ -67,6 +71,8 @@ class Excess(Rows):
     deviation: Float[Tensor, "N E"]
     printed: Float[Tensor, "N E"]
     factor: Float[Tensor, " N"]
+    printed_factor: Float[Tensor, " N"]
+    maybe: Float[Tensor, " N"]
     misfit: Int[Tensor, " N"]
     explained: Bool[Tensor, " N"]
     chi2: Float[Tensor, " N"]
@@ -93,17 +99,26 @@ class _Family(NamedTuple):
     chi2: Tensor
 
 
-def excess_of(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) -> Excess:
-    """What speaks from the information about the further unknowns, and their right side, all else being unknown."""
+def excess_of(
+    information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"], even: Float[Tensor, " N"] | None = None
+) -> Excess:
+    """What speaks from the information about the further unknowns, and their right side, all else being unknown.
+
+    Args:
+        even: degrees of freedom of other residuals that are those of noise: what makes all noise larger would have made
+            them larger, too.
+    """
     modes = _modes(information, right)
     none = _none(right, modes)
     row = (~none.explained).nonzero()[:, 0]
     if row.numel() == 0:
         return none
     some = _Modes(*(x[row] for x in modes))
+    even = torch.zeros_like(none.factor) if even is None else even
     # in the order of `Misfit`
-    families = (_beside_scatter(_print, some), _beside_scatter(_camera, some), _scatter(some))
-    best = torch.stack([f.evidence for f in families], -1).argmax(-1)
+    families = (_beside_scatter(_print, some), _beside_scatter(_camera, some), _scatter(some, even[row]))
+    evidence = torch.stack([f.evidence for f in families], -1)
+    best = evidence.argmax(-1)
     at = torch.arange(len(row), device=row.device)
     deviation, factor, chi2 = (torch.stack([f[k] for f in families], 1)[at, best] for k in (1, 2, 3))
     explained = chi2 < _most(none.freedom[row])
@@ -115,6 +130,8 @@ def excess_of(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) 
             deviation=deviation,
             printed=families[0].deviation,
             factor=factor,
+            printed_factor=families[0].factor,
+            maybe=torch.where(best == _SCATTER, torch.sigmoid(evidence[:, 0] - evidence[:, _SCATTER]), 0.0),
             misfit=misfit,
             explained=explained,
         ),
@@ -142,7 +159,8 @@ def _none(right: Tensor, modes: _Modes) -> Excess:
     chi2, freedom = modes.residual.square().sum(-1), modes.there.sum(-1)
     zero, one = torch.zeros_like(right), torch.ones_like(chi2)
     by_chance = chi2 < quantile(freedom.clamp_min(1), SURE)
-    return Excess(zero, zero, one, torch.zeros_like(freedom), by_chance, chi2, freedom)
+    nothing = torch.zeros_like(freedom)
+    return Excess(zero, zero, one, one, torch.zeros_like(one), nothing, by_chance, chi2, freedom)
 
 
 def _most(freedom: Tensor) -> Tensor:
@@ -187,8 +205,19 @@ def _print(modes: _Modes) -> _Family:
     every, bent = (weight.sum(-1) @ places).split(1, -1)
     of_marker = torch.cat([every, every, every + bent, bent, bent], -1).repeat(1, markers.shape[-2])
     none = torch.zeros_like(camera[:, 0])
-    deviation = torch.cat([of_marker, weight.sum(1) @ of_edges, none], -1).sqrt()
-    return _Family(evidence, deviation, torch.ones_like(evidence), chi2)
+    deviation = torch.cat([of_marker, weight.sum(1) @ of_edges, none], -1)
+    more = _between(chi2, modes.there.sum(-1), values)
+    return _Family(evidence, (more[:, None] * deviation).sqrt(), torch.ones_like(evidence), chi2 / more)
+
+
+def _between(chi2: Tensor, freedom: Tensor, values: Tensor) -> Tensor:
+    """Factors (N,) of variances that were tried at ``values`` alone, and may lie half a step above the best of them.
+
+    A hundred residuals of a board tell a variance to a tenth. Where what they leave is beyond chance, it is that share.
+    """
+    most = (values[1] / values[0]).sqrt()
+    freedom = freedom.clamp_min(1)
+    return torch.where(chi2 > quantile(freedom, SURE), (chi2 / freedom).minimum(most), 1.0)
 
 
 def _camera(modes: _Modes) -> _Family:
@@ -201,12 +230,14 @@ def _camera(modes: _Modes) -> _Family:
     return _Family(evidence, deviation, torch.ones_like(evidence), chi2)
 
 
-def _scatter(modes: _Modes) -> _Family:
+def _scatter(modes: _Modes, even: Tensor) -> _Family:
+    """Of ``even`` (N,) other residuals the mean square is 1: they speak against it, and not of how large it is."""
     factor, freedom = _values(_SCALE, modes), modes.there.sum(-1, keepdim=True)
     square = modes.residual.square().sum(-1, keepdim=True)
     likelihood = -0.5 * (square / factor + freedom * factor.log())
     mean = (torch.softmax(likelihood, -1) * factor).sum(-1)
-    return _Family(_mean(likelihood), torch.zeros_like(modes.by[:, 0]), mean, square[:, 0] / mean)
+    against = 0.5 * even[:, None] * (1 / factor + factor.log() - 1)
+    return _Family(_mean(likelihood - against), torch.zeros_like(modes.by[:, 0]), mean, square[:, 0] / mean)
 
 
 _Part = tuple[Tensor, Tensor]

@@ -16,23 +16,24 @@ _SIZE_ERROR = 0.1
 
 def sizes_beyond(evidence: Evidence, predicted: Tensor) -> tuple[Tensor, Tensor]:
     """By how many codes (N,) at least the sums of the rings' radii differ from those of their markers, in the mean, and
-    how far (N,) both edges of the rings lie further from their centres, mm, where it is certain.
+    how far (N,) all edges of the rings, or discs, lie further from their centres, mm, where it is certain.
 
     Args:
         evidence: N rows.
         predicted: (N, M, 2, 5), circles of every marker under a pose that the centres tell, ideal px.
     """
     outer, inner = evidence.radii.unbind(-1)
+    there = evidence.radii > 0  # of a disc the inner edge is nowhere
     excess = evidence.shape[..., 2:4] / predicted[..., 2:4] - 1
-    difference = (evidence.radii[..., None] * excess).sum(-2)
+    further = torch.where(there[..., None], evidence.radii[..., None] * excess, 0.0)
+    difference, edge = further.sum(-2), further.sum((-2, -1)) / (2 * there.sum(-1))
     error = 2 * _SIZE_ERROR * evidence.blur.sqrt().clamp_min(1.0) / evidence.shape[..., 0, 3]
-    each = torch.cat([difference / outer[..., None], difference, error[..., None], (error * outer)[..., None]], -1)
+    each = torch.cat([difference / outer[..., None], torch.stack([edge, error, 0.5 * error * outer], -1)], -1)
     seen = evidence.mask[..., None]
-    one, two, *grown, error, error_mm = (torch.where(seen, each, 0.0).sum(1) / seen.sum(1)).unbind(-1)
+    one, two, larger, error, error_mm = (torch.where(seen, each, 0.0).sum(1) / seen.sum(1)).unbind(-1)
     # blur that bends the shapes draws one axis alone
     both = torch.where(one * two > 0, torch.minimum(one.abs(), two.abs()), 0.0)
-    larger = 0.5 * (grown[0] + grown[1])
-    beyond = torch.where(larger.abs() > error_mm, 0.5 * larger, 0.0)
+    beyond = torch.where(larger.abs() > error_mm, larger, 0.0)
     return (both - error).clamp_min(0) / _code_gap(inner / outer), beyond
 
 

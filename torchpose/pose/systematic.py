@@ -97,7 +97,8 @@ class OnPrint(Rows):
         look: the same if the print is behind the misfit, whatever is likeliest: where to look for the markers next.
         misfit: `Misfit`, what the residuals show beyond noise and stated uncertainties; it is in the covariance.
         explained: whether the residuals agree with all that.
-        chi2, freedom: of the residuals, as in `Excess`.
+        chi2: of the residuals, as in `Excess`.
+        freedom: its degrees of freedom.
         known: whether the pose is determined.
     """
 
@@ -116,7 +117,12 @@ class OnPrint(Rows):
 
 @checked
 def on_print(
-    normals: MarkerNormals, setting: Setting, moved: Float[Tensor, "N M 5"], *, estimate: bool = True
+    normals: MarkerNormals,
+    setting: Setting,
+    moved: Float[Tensor, "N M 5"],
+    *,
+    estimate: bool = True,
+    even: Float[Tensor, " N"] | None = None,
 ) -> OnPrint:
     """The joint problem of N rows.
 
@@ -126,6 +132,7 @@ def on_print(
         moved: where the markers were looked for beside their places, when the normal equations were formed.
         estimate: find poses; without, those that noise alone weighs stay, and their covariance counts what the rest
             does to them.
+        even: see `excess.excess_of`.
     """
     R, n = setting.R, normals.right.shape[-1]
     aside = (R[:, None] @ moved[..., :3, None])[..., 0]
@@ -135,7 +142,8 @@ def on_print(
     own = torch.eye(n, dtype=right.dtype, device=right.device)[:, :-1].expand(*right.shape[:2], n, n - 1)
     by_camera, by_target = _by_camera(setting), _by_target(setting)
     stated = torch.cat([by_camera, by_target], -1)
-    excess, further = _excess(normals, torch.cat([own, _among(stated, n)], -1), stated.shape[-1], setting)
+    known = torch.cat([own, _among(stated, n)], -1)
+    excess, further = _excess(normals, known, stated.shape[-1], setting, even)
     printed, lens = by_target, by_camera
     if further is not None:
         beside = further * excess.deviation[:, None, None]
@@ -149,6 +157,9 @@ def on_print(
         if_printed = torch.cat([by_target, (further * excess.printed[:, None, None])[..., :-OF_CAMERA]], -1)[other]
         alone = _Joint.of(normals[other], own[other], _among(if_printed, n), _among(lens[other], n), True)
         look = place.index_copy(0, other, _places(if_printed, alone, setting.of_rows(other), excess.printed[other]))
+        noisy = normals[other].over(excess.printed_factor[other])
+        alone = _Joint.of(noisy, own[other], _among(if_printed, n), _among(lens[other], n), estimate)
+        joint = joint.perhaps(other, alone, excess.maybe[other])
     sure = joint.known & (torch.linalg.cholesky_ex(joint.covariance)[1] == 0)
     parts = (joint.by_camera[..., : by_camera.shape[-1]], joint.by_print[..., : by_target.shape[-1]])
     common = torch.cat(parts, -1)
@@ -222,8 +233,17 @@ class _Joint(NamedTuple):
         step = step[..., 0] * float(estimate)
         return cls(step, numbers[..., 0], covariance, noise, held @ vectors.mT, lens, known & finite)
 
+    def perhaps(self, rows: Tensor, other: Self, share: Tensor) -> Self:
+        """With the covariance about these poses of solutions of which some ``rows`` are the ``other`` by a share."""
+        apart = (other.step - self.step[rows])[..., None]
+        there = other.covariance + apart @ apart.mT
+        mean = self.covariance[rows] + share[:, None, None] * (there - self.covariance[rows])
+        return self._replace(covariance=self.covariance.index_copy(0, rows, mean))
 
-def _excess(normals: MarkerNormals, known: Tensor, count: int, setting: Setting) -> tuple[Excess, Tensor | None]:
+
+def _excess(
+    normals: MarkerNormals, known: Tensor, count: int, setting: Setting, even: Tensor | None
+) -> tuple[Excess, Tensor | None]:
     """What the residuals show beyond the ``known`` columns, and the motions (N, M, 7, E) of what may be behind it.
 
     Without them where the markers agree: then each of them alone, free to move, would not move far.
@@ -236,7 +256,9 @@ def _excess(normals: MarkerNormals, known: Tensor, count: int, setting: Setting)
         return excess, None
     some = setting.of_rows(odd)
     shifts = torch.cat([_print_shifts(some), _camera_shifts(some)], -1)
-    again = excess_of(*_remaining(normals[odd], known[odd], _among(shifts, n), count))
+    again = excess_of(
+        *_remaining(normals[odd], known[odd], _among(shifts, n), count), None if even is None else even[odd]
+    )
     every = shifts.new_zeros(rows, *shifts.shape[1:]).index_copy(0, odd, shifts)
     nothing = shifts.new_zeros(rows, shifts.shape[-1])
     excess = replace(excess, deviation=nothing, printed=nothing)
@@ -248,7 +270,7 @@ def _by_target(setting: Setting) -> Tensor:
 
     A target that is larger as a whole looks like the same one that is nearer: all markers move towards the camera.
     """
-    moved, scale = _displaced(setting.R, setting.evidence.by_target), setting.evidence.scale_sigma
+    moved, scale = displaced(setting.R, setting.arms, setting.evidence.by_target), setting.evidence.scale_sigma
     if not bool((scale > 0).any()):
         return moved
     nearer = moved.new_zeros(*moved.shape[:3])
@@ -256,10 +278,22 @@ def _by_target(setting: Setting) -> Tensor:
     return torch.cat([moved[..., :-1], nearer[..., None]], -1)
 
 
-def _displaced(R: Tensor, by: Tensor) -> Tensor:
-    """Motions (N, M, 7, L) of markers whose places (target frame) and edge gain vary so (N, M, 4, L)."""
-    aside = R[:, None] @ by[:, :, :3]
-    return torch.cat([aside, torch.zeros_like(aside), by[:, :, 3:]], 2)
+@checked
+def displaced(
+    R: Float[Tensor, "N 3 3"], arms: Float[Tensor, "N M 3"], by: Float[Tensor, "*N M 7 L"]
+) -> Float[Tensor, "N M 7 L"]:
+    """How markers seem moved, each as a pose of its own, and their edge gain, by places and turns on the print.
+
+    Args:
+        R: target to camera.
+        arms: the markers as seen from the target's origin, camera axes, mm.
+        by: as `MarkerTable.by_print`.
+    """
+    R = R[:, None]
+    aside, turn = R @ by[..., :3, :], R @ by[..., 3:6, :]
+    # a pose turns about the target's origin, a ring about its own centre
+    aside = aside + torch.linalg.cross(arms[..., None].expand_as(turn), turn, dim=-2)
+    return torch.cat([aside, turn, by[..., 6:, :].expand(*turn.shape[:2], 1, -1)], -2)
 
 
 def _by_camera(setting: Setting) -> Tensor:
@@ -274,7 +308,7 @@ def _by_camera(setting: Setting) -> Tensor:
     factor = covariance_factor(camera.covariance.to(like))
     moved = _as_motions(setting, lambda xy: by_intrinsics(camera, xy)[..., : len(factor)] @ factor)
     together = setting.evidence.by_camera  # of a target that was measured by this camera
-    return moved + _displaced(setting.R, together) if together.shape[-1] else moved
+    return moved + displaced(setting.R, setting.arms, together) if together.shape[-1] else moved
 
 
 def _camera_shifts(setting: Setting) -> Tensor:
@@ -329,12 +363,16 @@ def _by_bloom(setting: Setting) -> Tensor:
 
 
 def _by_size(setting: Setting) -> Tensor:
-    """Motions (N, M, 7) that do to a ring what both its edges do 1 mm further out: it is nearer, with less gain."""
+    """Motions (N, M, 7) that do to a ring what both its edges do 1 mm further out: it is nearer, with less gain.
+
+    A disc has one edge, and nothing but gain.
+    """
     evidence = setting.evidence
     outer, inner = evidence.radii.unbind(-1)
     x = setting.arms + setting.t[:, None]
-    nearer = -2 / (outer + inner)[..., None] * x
-    less = -evidence.polarity[:, None] * (outer - inner) / (outer + inner)
+    ring = inner > 0
+    nearer = torch.where(ring, -2 / (outer + inner), 0.0)[..., None] * x
+    less = -evidence.polarity[:, None] * torch.where(ring, (outer - inner) / (outer + inner), -1.0)
     return torch.cat([nearer, torch.zeros_like(x), less[..., None]], -1)
 
 

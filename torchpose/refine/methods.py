@@ -131,7 +131,8 @@ def _on_print(
     refined: Refined, rows: Solutions, seen: Evidence, sight: Sight, place: Tensor
 ) -> tuple[Solutions, OnPrint, Tensor]:
     """Rows refined on frames with markers displaced to ``place``, then on the print; and where that holds (N,) bool."""
-    joint = on_print(refined.normals, Setting(seen, refined.R, refined.t, sight.camera, True), place)
+    setting = Setting(seen, refined.R, refined.t, sight.camera, True)
+    joint = on_print(refined.normals, setting, place, even=refined.even)
     found = _of_joint(rows, seen, Pose(refined.R, refined.t), joint)
     near = found.rms < torch.maximum(rows.rms, torch.full_like(rows.rms, CENTER_RMS))
     kept = (refined.kept > LEAST_KEPT) | (near & (refined.kept > LEAST_KEPT_NEAR))

@@ -188,6 +188,7 @@ class Refined(Rows):
         doubt: something in the frame contradicts the model of the rings.
         normals: what each marker tells, at the pose.
         gain: by which every dark edge lies outwards, mm, where it was an unknown.
+        even: degrees of freedom in which edges along the rims scatter as noise does, 0 where by more, if it is known.
         look: where the fit may have seen its rows in several ways.
     """
 
@@ -201,6 +202,7 @@ class Refined(Rows):
     doubt: Bool[Tensor, " N"]
     normals: MarkerNormals
     gain: Float[Tensor, " N"] | None = None
+    even: Float[Tensor, " N"] | None = None
     look: Look | None = None
 
     @property

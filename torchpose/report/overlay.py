@@ -95,7 +95,7 @@ class Overlay:
         Raises:
             ConfigError: a picture cannot be written.
         """
-        lines = self._project_axes(poses)
+        lines = self.project_axes(poses)
 
         def write_one(index: int) -> None:
             picture = self._draw(frames[index], index, poses, lines, names[index])
@@ -106,9 +106,9 @@ class Overlay:
 
     def draw(self, frame: Tensor, poses: Poses, name: str) -> np.ndarray:
         """Picture (H, W, 3) uint8, blue-green-red, of one frame (H, W) with the poses of a batch of one."""
-        return self._draw(frame, 0, poses, self._project_axes(poses), name)
+        return self._draw(frame, 0, poses, self.project_axes(poses), name)
 
-    def _project_axes(self, poses: Poses) -> np.ndarray:
+    def project_axes(self, poses: Poses) -> np.ndarray:
         """Pixels (N, 3, points, 2) of the axes of each pose, NaN where there is none or it is behind the camera."""
         points = self._axes[poses.target] @ poses.R[:, None].mT + poses.t[:, None, None]
         pixels = self._camera.project(points)
@@ -181,10 +181,10 @@ def _fixed(values: Sequence[float] | np.ndarray) -> tuple[int, ...]:
     return tuple(round(v * (1 << _SHIFT)) for v in values)
 
 
-def draw_ellipse(picture: np.ndarray, ellipse: Sequence[float], colour: Colour) -> None:
+def draw_ellipse(picture: np.ndarray, ellipse: Sequence[float], colour: Colour, width: int = 1) -> None:
     cx, cy, a, b, theta = ellipse
-    turn = float(np.rad2deg(theta))
-    cv2.ellipse(picture, _fixed((cx, cy)), _fixed((a, b)), turn, 0, 360, colour, 1, lineType=cv2.LINE_AA, shift=_SHIFT)
+    center, axes, turn = _fixed((cx, cy)), _fixed((a, b)), float(np.rad2deg(theta))
+    cv2.ellipse(picture, center, axes, turn, 0, 360, colour, width, lineType=cv2.LINE_AA, shift=_SHIFT)
 
 
 def _cross(picture: np.ndarray, center: Sequence[float], arm: float) -> None:

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 from torch import Tensor
 
-from torchpose.config import read_yaml, validate
+from torchpose.config import example, read_yaml, validate
 from torchpose.config.kinds import Degrees, Length, Seed, Text, Word
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
@@ -242,6 +242,7 @@ class CapturePlan:
 
 def load_plan(path: str | os.PathLike[str]) -> CapturePlan:
     """Reads a capture plan and expands it. Raises ConfigError: one line ``FILE: FIELD: what is wrong; the fix``."""
+    path = example(path, "rig")
     file = validate(PlanFile, read_yaml(path), path)
     origin = as_pose([*file.origin.translation, *file.origin.rotation])
     R, t = to_transform(origin)

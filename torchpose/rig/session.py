@@ -41,12 +41,17 @@ class Session:
 
     Attributes:
         done: ids of the frames that are there.
+        begins_with: the record that it begins with; a session without a robot has another.
+        frame_record: the record of a frame.
 
     Raises:
         ConfigError: another process writes it; a session is there and ``resume`` is not given; or it is, and none is
             there, it has another plan or other cameras, one of its records is wrong or one of its images is missing or
             not the one that was written; or the folder cannot be written.
     """
+
+    begins_with: type[BaseModel] = SessionRecord
+    frame_record: type[BaseModel] = FrameRecord
 
     def __init__(self, folder: Path, *, plan: str, images: Mapping[str, Any], resume: bool = False) -> None:
         self.folder = folder
@@ -57,7 +62,7 @@ class Session:
         self._file: int | None = None
         self._lock: Lock | None = None
         if resume:
-            if not self.manifest.exists():
+            if not os.path.exists(self.manifest):
                 problem = "does not exist; leave --resume out to start the session"
                 raise ConfigError(f"{self.manifest}: --resume: {problem}")
             self._hold()  # before a torn line is dropped, which may be one that is being written
@@ -70,7 +75,7 @@ class Session:
             self._check_new()
 
     def _check_new(self) -> None:
-        if self.manifest.exists():
+        if os.path.exists(self.manifest):
             raise ConfigError(f"{self.manifest}: --out: holds a session already; add --resume or choose another folder")
 
     def _hold(self) -> None:
@@ -85,7 +90,7 @@ class Session:
     @property
     def begun(self) -> bool:
         """Whether there is a manifest to go on with."""
-        return self.manifest.exists()
+        return os.path.exists(self.manifest)
 
     def __enter__(self) -> Self:
         try:
@@ -134,7 +139,7 @@ class Session:
             self._file = os.open(self.manifest, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
         versions = {name: _version(name) for name in ("torchpose", "pypylon", "ur-rtde")}
         self._append(
-            SessionRecord(
+            self.begins_with(
                 **self._origin,
                 started=_now(),
                 emulated=emulated,
@@ -172,7 +177,7 @@ class Session:
                 temporary.unlink(missing_ok=True)
         height, width = image.shape
         digest = hashlib.sha256(encoded).hexdigest()
-        self._append(FrameRecord(id=frame, image=name, sha256=digest, width=width, height=height, **taken))
+        self._append(self.frame_record(id=frame, image=name, sha256=digest, width=width, height=height, **taken))
         self.done.add(frame)
 
     def end(self, reason: str, detail: str = "") -> None:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, field_validator, model_validator
 
-from torchpose.config import read_yaml, validate
+from torchpose.config import example, read_yaml, validate
 from torchpose.config.kinds import MOST_LENGTH, MOST_SIDE_PX, Length, Side, Word
 from torchpose.target import Vector
 
@@ -135,4 +135,5 @@ class Rig(Strict):
 
 def load_rig(path: str | os.PathLike[str]) -> Rig:
     """Reads a rig file. Raises ConfigError: one line ``FILE: FIELD: what is wrong; the fix``."""
+    path = example(path, "rig")
     return validate(Rig, read_yaml(path), path)

@@ -1,7 +1,7 @@
 """Stage: concentric pairs. From candidate ellipses to rings with both circles measured."""
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -90,10 +90,17 @@ class Circles(Rows):
     Attributes:
         outer: the candidates.
         inside: what is inside of each.
+        alone: whether no other one could be a marker beside it: its edges may tell its code, more it is not worth.
     """
 
     outer: Candidates
     inside: InnerCircles
+    alone: Bool[Tensor, " K"]
+
+    @classmethod
+    def of(cls, outer: Candidates, inside: InnerCircles) -> Self:
+        """Any of which may be a marker."""
+        return cls(outer, inside, torch.zeros_like(inside.found))
 
     def __len__(self) -> int:
         return len(self.outer)
@@ -105,9 +112,9 @@ def find_circles(frames: Tensor, candidates: Candidates, camera: Camera) -> Circ
     if len(candidates) == 0:  # frames without any cost nothing here
         none, found = candidates.ellipse, candidates.frame > 0
         seen = found.new_empty(0, SECTORS)
-        return Circles(candidates, InnerCircles(candidates.polarity, found, none, seen, none[:, :3], found))
+        return Circles.of(candidates, InnerCircles(candidates.polarity, found, none, seen, none[:, :3], found))
     inside = find_inner(frames, candidates, camera)
-    return Circles(candidates, inside)[inside.found]
+    return Circles.of(candidates, inside)[inside.found]
 
 
 @checked
@@ -154,7 +161,7 @@ def measure_predicted(
 ) -> tuple[Rings, Tensor]:
     """The same where the inner ellipses (M, 5) are known, about; also which candidate each ring is of, (K,) int64."""
     inside = replace(find_inner(frames, candidates, camera), ellipse=inner)
-    return _both(frames, Circles(candidates, inside), camera, correct)
+    return _both(frames, Circles.of(candidates, inside), camera, correct)
 
 
 def _both(frames: Tensor, circles: Circles, camera: Camera, correct: bool) -> tuple[Rings, Tensor]:
@@ -177,16 +184,17 @@ def measure_exactly(frames: Tensor, rings: Rings, camera: Camera) -> tuple[Rings
         return rings, left
     candidates = Candidates.unscored(some.frame, some.outer_raw, some.polarity)
     inside = replace(find_inner(frames, candidates, camera), ellipse=some.inner_raw, blur=some.blur)
-    again, of = _measured(frames, Circles(candidates, inside), camera, _How(correct=True, begun=True))
+    again, of = _measured(frames, Circles.of(candidates, inside), camera, _How(correct=True, begun=True))
     return Rings.cat([rings[left], again]), torch.cat([left, index[of]])
 
 
 class _How(NamedTuple):
-    """correct, hopeful: as for `measure_circles`. begun: as for `fit_small_rings`."""
+    """correct, hopeful: as for `measure_circles`. begun: as for `fit_small_rings`. reduced: in frames that are."""
 
     correct: bool
     hopeful: bool = False
     begun: bool = False
+    reduced: bool = False
 
 
 def _measured(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tuple[Rings, Tensor]:
@@ -205,7 +213,9 @@ def _measured(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
         outer, inner = (conics.rescaled(e[index], 1 / value) for e in (candidates.ellipse, inside.ellipse))
         some = replace(candidates[index], frame=own, ellipse=outer)
         part = replace(inside[index], ellipse=inner, blur=blurs.reduced(inside.blur[index], value))
-        found, of = _measure(small, Circles(some, part), camera.reduced(value), how)
+        found, of = _measure(
+            small, Circles(some, part, circles.alone[index]), camera.reduced(value), how._replace(reduced=value > 1)
+        )
         rings.append(_enlarged(replace(found, frame=frame[found.frame]), value))
         which.append(index[of])
     if not rings:
@@ -243,13 +253,13 @@ def _measure(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tup
         return _as_a_whole(frames, circles, camera, how)
     # ... and so do two edges with less than a pixel beside it
     narrow = torch.minimum((1 - ratio) * outer[:, 3] - 1, ratio * outer[:, 3]) < _SMALL
-    small = narrow & (outer[:, 3] < _LARGE)
+    # a frame was reduced because a mask sees little of such edges; the whole ring tells as much, and its blur as well
+    small = (narrow | (how.reduced & how.correct)) & (outer[:, 3] < _LARGE)
     parts, index = [], (~small).nonzero()[:, 0]
     if index.numel():
         rings, of = _by_edges(frames, circles[index], camera, how)
         # a narrow ring may hide its blur from its profile, not from its edges
-        least, most = blurs.axes(rings.blur)
-        wide = (least > _SOFT_ALL_AROUND**2) & (most > zernike.WIDEST**2) & (outer[index[of], 3] < _LARGE)
+        wide = _soft(rings.blur) & (outer[index[of], 3] < _LARGE) & ~circles.alone[index[of]]
         parts.append((rings[~wide], index[of[~wide]]))
         small = small.index_fill(0, index[of[wide]], True)
     index = small.nonzero()[:, 0]
@@ -257,6 +267,12 @@ def _measure(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tup
         rings, of = _as_a_whole(frames, circles[index], camera, how)
         parts.append((rings, index[of]))
     return Rings.cat([rings for rings, _ in parts]), torch.cat([which for _, which in parts])
+
+
+def _soft(blur: Tensor) -> Tensor:
+    """Whether edges of these blurs (K, 3) are too wide for a mask, all around."""
+    least, most = blurs.axes(blur)
+    return (least > _SOFT_ALL_AROUND**2) & (most > zernike.WIDEST**2)
 
 
 def _by_edges(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tuple[Rings, Tensor]:

@@ -31,7 +31,7 @@ from torchpose.geometry import conics
 from torchpose.geometry.blurred_edge import BLUR, MOST, Spread
 from torchpose.geometry.blurred_ellipse import nodes_of_each
 from torchpose.geometry.least_squares import (
-    Eliminated,
+    Block,
     Normal,
     Unknowns,
     Vector,
@@ -163,14 +163,15 @@ class _Start(Rows):
     clipped: Bool[Tensor, " K"]
 
     @property
-    def known(self) -> Float[Tensor, "K 11 11"]:
-        """Prior information: both centres are one, and the blur is round."""
+    def known(self) -> Float[Tensor, "K 15 15"]:
+        """Prior information: both centres are one, and the blur is round; none about the grey levels."""
         size = self.spread.values[:, 0] + self.spread.values[:, 2]
         lean, turn = (size.new_zeros(RING + BLUR) for _ in range(2))
         lean[RING], lean[RING + 2], turn[RING + 1] = 0.5, -0.5, 1.0
         oval = torch.outer(lean, lean) + torch.outer(turn, turn)
         centers = torch.nn.functional.pad(self.parted.pow(-2)[:, None].expand(-1, 2), (RING - 2, BLUR))
-        return torch.diag_embed(centers) + oval * (0.5 * _OVAL * size).pow(-2)[:, None, None]
+        known = torch.diag_embed(centers) + oval * (0.5 * _OVAL * size).pow(-2)[:, None, None]
+        return torch.nn.functional.pad(known, (0, _LEVELS, 0, _LEVELS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,7 +225,9 @@ def _fitted(window: _Window, begun: _Start, scheme: _Scheme) -> _Fit:
     """Fits of K rings to the pixels of their windows."""
     middle = torch.nn.functional.pad(window.middle, (0, RING - 2))
     limits = [begun.theta.new_tensor(x) for x in (_LEAST, _MOST, _MOST_MOVE)]
-    unknowns = Unknowns({"ring": Vector(begun.theta - middle, *limits), "blur": begun.spread})
+    own: dict[str, Block] = {"ring": Vector(begun.theta - middle, *limits), "blur": begun.spread}
+    own["levels"] = Vector(middle.new_zeros(len(middle), _LEVELS))  # only how they move with the others counts
+    unknowns = Unknowns(own)
     pixels = _Pixels(window, unknowns.values("ring"), begun, scheme)
     for stage in scheme.stages:
         pixels.stage = stage
@@ -245,7 +248,7 @@ def _fitted(window: _Window, begun: _Start, scheme: _Scheme) -> _Fit:
     mean = (weight * grey).sum(-1, keepdim=True) / number[:, None]
     total = (weight * (grey - mean).square()).sum(-1) / number
     covariance, determined = found.covariance()
-    covariance = covariance * (uncertain / pixels.spread.square())[:, None, None]
+    covariance = covariance[:, : RING + BLUR, : RING + BLUR] * (uncertain / pixels.spread.square())[:, None, None]
     sound = window.whole & determined & covariance.isfinite().all(-1).all(-1)
     theta, spread = unknowns.values("ring") + middle, cast(Spread, unknowns.own["blur"])
     kept, explained = number / window.valid.sum(-1), 1 - variance / total
@@ -295,12 +298,9 @@ class _Pixels:
         columns = torch.cat([derivative.to(basis) * self.levels[:, 3:, None], basis, residual[:, None]], 1)
         weighted = columns[:, :-1] * (self.weight / self.spread.square()[:, None])[:, None]
         sums = weighted @ columns.mT
-        products, right = sums[..., :-1], sums[..., -1]
-        owner = torch.arange(len(theta), device=theta.device)
-        part = Eliminated(products[:, :n, n:], products[:, n:, n:], right[:, n:], owner)
         blur = cast(Spread, unknowns.own["blur"]).values
-        pull = (self.known @ torch.cat([theta, blur], -1)[..., None]).squeeze(-1)
-        return Normal(products[:, :n, :n] + self.known, right[:, :n] - pull, torch.zeros_like(right[:, 0]), part)
+        pull = (self.known[..., :n] @ torch.cat([theta, blur], -1)[..., None]).squeeze(-1)
+        return Normal(sums[..., :-1] + self.known, sums[..., -1] - pull, torch.zeros_like(sums[:, 0, 0]))
 
     def _agreeing(self, residual: Tensor) -> Tensor:
         """Pixels (K, P) 0 or 1 whose sector of the ring leaves no more than the median sector does, chance, and a blur

@@ -20,8 +20,8 @@ from torchpose.sim.fields import keys_of, smooth_field, uniform
 from torchpose.sim.sensor import normal_deviates
 
 _PAD = 16  # px on every side, mirrored: what is blurred or moved by a few px does not come round from the other side
-# the comatic spot: Gaussians along a line, shares, distances and deviations in its length (as scripts/corruptions.py)
-_COMA = ((0.6, 0.0, 0.0), (0.28, 0.5, 0.2), (0.12, 1.0, 0.35))
+# the comatic spot: Gaussians along a line, shares, distances and deviations in its length (convention)
+COMA = ((0.6, 0.0, 0.0), (0.28, 0.5, 0.2), (0.12, 1.0, 0.35))
 _TAYLOR = 4  # order in the displacement: 0.4 px leave less than 1 % of the contrast at the Nyquist frequency
 
 
@@ -126,9 +126,9 @@ def coma(
     spectrum, u, v = _spectrum(frames)
     along = direction.cos()[:, None, None] * u + direction.sin()[:, None, None] * v
     size = length[:, None, None]
-    middle = sum(share * place for share, place, _ in _COMA)
+    middle = sum(share * place for share, place, _ in COMA)
     way = torch.zeros((), dtype=torch.complex128, device=frames.device)
-    for share, place, width in _COMA:
+    for share, place, width in COMA:
         damped = (-2 * (math.pi * width * size) ** 2 * (u * u + v * v)).exp()
         way = way + share * torch.polar(damped, -2 * math.pi * (place - middle) * size * along)
     return _picture(spectrum * way.to(spectrum), frames)

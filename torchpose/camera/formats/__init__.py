@@ -10,7 +10,6 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from torchpose.camera.formats import native, reconstruction, sensors, slam, xml
@@ -43,7 +42,7 @@ def load(path: str | os.PathLike[str]) -> Camera:
         ConfigError: one line ``FILE: FIELD: what is wrong; the fix``.
     """
     name, selector = os.fspath(path), None
-    if "#" in name and not Path(name).is_file():
+    if "#" in name and not os.path.isfile(name):
         name, selector = name.rsplit("#", 1)
     text = read_text(name)
     with within(f"{name}: "), _one_line():

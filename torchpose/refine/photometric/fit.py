@@ -233,7 +233,9 @@ def _refined(
     """Rows refined in stages from poses and blurs, and from levels (N, M, 6) where there are any."""
     found = _minimised(fit, start, spread, stages, None if levels is None else levels[fit.mask])
     pose, owner, rows = found.unknowns.pose, fit.blocks.row, len(spread)
-    wider = overdispersion(fit.sectors.scaled(fit.factor), fit.variance[owner], owner, rows)
+    wider, even = overdispersion(fit.sectors.scaled(fit.factor), fit.variance[owner], owner, rows)
+    if stages[-1].tempered:  # its weights have what the rims scatter by
+        even = overdispersion(fit.sectors.scaled(fit.clear.to(fit.factor)), fit.variance[owner], owner, rows)[1]
     covariance, determined = found.covariance()
     covariance = wider[:, None, None] * covariance[:, :6, :6]
     kept, usable = (segment_sum((x > 0).sum(-1), owner, rows) for x in (fit.weight, fit.usable))
@@ -246,7 +248,7 @@ def _refined(
     doubt = doubtful(fit.sectors, fit.clear, fit.variance[owner], owner, found.step.own_chi2, more)
     noise, kept = fit.variance.sqrt(), kept / usable
     gain = found.unknowns.values("gain")[:, 0] if fit.gain else None
-    refined = Refined(pose.R, pose.t, covariance, spread.covariance, noise, kept, good, doubt, normals, gain)
+    refined = Refined(pose.R, pose.t, covariance, spread.covariance, noise, kept, good, doubt, normals, gain, even)
     return _Result(refined, fit.look(spread, found.unknowns.values("levels")), fit.misshapen)
 
 

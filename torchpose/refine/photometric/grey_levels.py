@@ -75,7 +75,7 @@ def columns_of(blocks: PixelBlocks, model: RingModel, levels: Tensor) -> tuple[T
     residual = blocks.grey - (ring + contrast * model.fraction)
     basis = _basis(model, bool(curved))
     by_blur = (contrast * v for v in model.by_blur)
-    by_pose = (by_d * v for v in model.by_pose)
+    by_pose = (by_d * model.by_pose).unbind(0)
     return _tiled((*by_pose, *by_blur, *basis, residual, contrast * model.by_gain)), by_d
 
 

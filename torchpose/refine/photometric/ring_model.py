@@ -101,7 +101,7 @@ class PixelBlocks(Rows):
 class RingModel(NamedTuple):
     """Prediction and derivatives at one pose; planes (K, P) in float32.
 
-    fraction: of paper, F. by_d: dF/dd through both circles. by_blur: 3 planes. by_pose: 6 planes, derivative of d.
+    fraction: of paper, F. by_d: dF/dd through both circles. by_blur: 3 planes. by_pose: (6, K, P), derivative of d.
     by_gain: dF/d(edge gain), 1/mm.
     x, y: plane coordinates over the outer radius. sound: bool, False where the expansions below do not hold: deep in
     a hole that is small for its blur, or where it is flat; None if not asked for.
@@ -110,7 +110,7 @@ class RingModel(NamedTuple):
     fraction: Tensor
     by_d: Tensor
     by_blur: tuple[Tensor, ...]
-    by_pose: tuple[Tensor, ...]
+    by_pose: Tensor
     by_gain: Tensor
     x: Tensor
     y: Tensor
@@ -198,7 +198,7 @@ class _Foot(NamedTuple):
 
     x, y: mm, about the circles' centre. radius: their length. outer, inner: less that of the circle. toward: growth of
     the depth with the ray's angle, 1 / (n . ray). depth: of the point over that of the plane's foot.
-    axes: of the plane, its normal and the arm of the marker, (x, y, z) each, camera axes. one_c, two_c: the circles'
+    axes: (4, 3, K, 1), of the plane, its normal and the arm of the marker, camera axes. one_c, two_c: the circles'
     centre along the axes. away: distance of the plane, over which it is 1 / away.
     """
 
@@ -209,7 +209,7 @@ class _Foot(NamedTuple):
     inner: Tensor
     toward: Tensor
     depth: Tensor
-    axes: tuple[tuple[Tensor, ...], ...]
+    axes: Tensor
     one_c: Tensor
     two_c: Tensor
     over_away: Tensor
@@ -228,17 +228,16 @@ def _feet(blocks: PixelBlocks, R: Tensor, t: Tensor) -> _Foot:
     near = torch.nn.functional.pad(blocks.origin, (0, 1), value=1.0)
     over = (normal * near).sum(-1, keepdim=True)
 
-    def linear(vector: Tensor) -> Tensor:
-        at_x, at_y, _ = (vector / over).split(1, -1)
-        return (vector * near).sum(-1, keepdim=True) / over + at_x * blocks.ray_x + at_y * blocks.ray_y
-
     one_c, two_c = (one * center).sum(-1, keepdim=True), (two * center).sum(-1, keepdim=True)
-    toward = 1 / linear(normal)
-    x, y = linear(away * one - one_c * normal) * toward, linear(away * two - two_c * normal) * toward
+    linear = torch.stack([normal, away * one - one_c * normal, away * two - two_c * normal]) / over
+    at_x, at_y, _ = linear.split(1, -1)
+    planes = (linear * near).sum(-1, keepdim=True) + at_x * blocks.ray_x + at_y * blocks.ray_y
+    toward = planes[0].reciprocal()
+    x, y = (planes[1:] * toward).unbind(0)
     radius = (x * x + y * y).sqrt().clamp_min(1e-9)
-    outer, inner = ((radius - size).float() for size in blocks.radii.split(1, -1))
+    outer, inner = (radius - blocks.radii.mT[..., None]).float().unbind(0)
     x, y, radius, toward = (v.float() for v in (x, y, radius, toward / over))
-    axes = tuple(v.float().split(1, -1) for v in (one, two, normal, arm))
+    axes = torch.stack([one, two, normal, arm]).float().mT.unsqueeze(-1)
     depth, over_away = away.float() * toward, 1 / away.float()
     return _Foot(x, y, radius, outer, inner, toward, depth, axes, one_c.float(), two_c.float(), over_away)
 
@@ -248,25 +247,25 @@ class _Rim(NamedTuple):
 
     per_mm: px for a mm of radius. bend: curvature of the circle's image, 1/px. second: to second order in the distance,
     half the second over the first derivative of the radius, 1/px. normal: (nu, nv) of the image. by_pose: derivatives
-    of the distance, 6 planes.
+    (6, K, P) of the distance.
     """
 
     per_mm: Tensor
     bend: Tensor
     second: Tensor
     normal: tuple[Tensor, Tensor]
-    by_pose: tuple[Tensor, ...]
+    by_pose: Tensor
 
 
 def _rims(blocks: PixelBlocks, foot: _Foot) -> _Rim:
     x, y, radius, toward, depth = foot.x, foot.y, foot.radius, foot.toward, foot.depth
-    (ax, ay, az), (bx, by, bz), (nx, ny, nz), (cx, cy, cz) = foot.axes
+    one, two, normal, arm = foot.axes.unbind(0)
     ex, ey = x / radius, y / radius
     # a displacement w of the ray's foot, or of the plane against it, changes the radius by m . w
     s = (radius + ex * foot.one_c + ey * foot.two_c) * foot.over_away
-    mx, my, mz = ex * ax + ey * bx - s * nx, ex * ay + ey * by - s * ny, ex * az + ey * bz - s * nz
+    m = ex * one + ey * two - s * normal
     w00, w01, w10, w11 = blocks.warp
-    gu, gv = mx * w00 + my * w10, mx * w01 + my * w11  # gradient of the radius in the image, over the depth
+    gu, gv = m[0] * w00 + m[1] * w10, m[0] * w01 + m[1] * w11  # gradient of the radius in the image, over the depth
     flat = (gu.square() + gv.square()).clamp_min(1e-30).rsqrt()
     per_mm = flat / depth
     area = depth.square() * (w00 * w11 - w01 * w10).abs() * toward.abs()  # of a pixel in the plane, mm^2
@@ -274,12 +273,12 @@ def _rims(blocks: PixelBlocks, foot: _Foot) -> _Rim:
     # along the image's normal the radius bends where that normal is oblique in the plane, and by perspective
     nu, nv = gu * flat, gv * flat
     side = (ex * foot.two_c - ey * foot.one_c) * foot.over_away
-    hx, hy = ex * bx - ey * ax - side * nx, ex * by - ey * ay - side * ny  # as m, but across the radius
-    oblique = (hx * w00 + hy * w10) * nu + (hx * w01 + hy * w11) * nv
-    recede = ((nx * w00 + ny * w10) * nu + (nx * w01 + ny * w11) * nv) * toward
+    h = ex * two[:2] - ey * one[:2] - side * normal[:2]  # as m, but across the radius
+    ray_u, ray_v = w00 * nu + w01 * nv, w10 * nu + w11 * nv
+    oblique = h[0] * ray_u + h[1] * ray_v
+    recede = (normal[0] * ray_u + normal[1] * ray_v) * toward
     second = 0.5 * oblique.square() * depth * flat / radius - recede
-    px, py, pz = x * ax + y * bx + cx, x * ay + y * by + cy, x * az + y * bz + cz
-    by_pose = tuple(-per_mm * v for v in (mx, my, mz, py * mz - pz * my, pz * mx - px * mz, px * my - py * mx))
+    by_pose = torch.cat([m, torch.linalg.cross(x * one + y * two + arm, m, dim=0)]) * -per_mm
     return _Rim(per_mm, bend, second, (nu, nv), by_pose)
 
 

@@ -142,8 +142,9 @@ def misfit(sectors: Sectors, clear: Tensor, variance: Tensor, row: Tensor, rows:
     return segment_sum(chi2.double().sum(-1), row, rows) / count
 
 
-def overdispersion(sectors: Sectors, variance: Tensor, row: Tensor, rows: int) -> Tensor:
-    """By how much the scatter of edges along the rims exceeds that of independent noise (N,), as a factor of variance.
+def overdispersion(sectors: Sectors, variance: Tensor, row: Tensor, rows: int) -> tuple[Tensor, Tensor]:
+    """By how much the scatter of edges along the rims exceeds that of independent noise (N,), as a factor of variance,
+    and the degrees of freedom (N,) in which it is that of noise, 0 where it is more.
 
     Noise that is correlated between pixels (paper, compression, filters of the camera) pulls at an edge in step over
     many of them. Every cell's displacement shows how much. What moves a circle as a whole, makes it larger, or draws it
@@ -166,7 +167,8 @@ def overdispersion(sectors: Sectors, variance: Tensor, row: Tensor, rows: int) -
     freedom = segment_sum(((hold > 0).sum(-1) - basis.shape[-1]).clamp_min(0).sum(-1).double(), row, rows).clamp_min(1)
     factor = chi2 / freedom
     # half of the deviations that make a value no noise: a wrong factor costs little, and comes once in forty frames
-    return torch.where(factor > 1 + 0.5 * CUT * (2 / freedom).sqrt(), factor, 1.0)
+    more = factor > 1 + 0.5 * CUT * (2 / freedom).sqrt()
+    return torch.where(more, factor, 1.0), torch.where(more, 0.0, freedom)
 
 
 def doubtful(sectors: Sectors, clear: Tensor, variance: Tensor, row: Tensor, step_chi2: Tensor, more: Tensor) -> Tensor:

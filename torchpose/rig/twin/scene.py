@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol
 
 import cv2
 import torch
@@ -21,14 +21,14 @@ from pydantic import Field, FiniteFloat, model_validator
 from torch import Tensor
 
 from torchpose.camera import Camera
-from torchpose.config import beside, read_yaml, validate
+from torchpose.config import beside, example, read_yaml, validate
 from torchpose.config.kinds import Grey, Seed, Word
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.rig.child import ChildEnded
 from torchpose.rig.poses import from_transform, to_transform
 from torchpose.rig.settings import AS_TUPLE, MOST_CAMERAS, Positive, Rig, Strict
-from torchpose.rig.twin.controller import TwinController, TwinErrors
+from torchpose.rig.twin.controller import START_POSE, TwinController, TwinErrors
 from torchpose.sim import add_noise, render
 from torchpose.target import RigidTransformFile, Target
 
@@ -91,7 +91,7 @@ class Scene:
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Scene:
         """Reads a twin file; files that it names are relative to it. Raises ConfigError."""
-        path = Path(path)
+        path = example(path, "rig")
         file = validate(TwinFile, read_yaml(path), path)
         cameras = {}
         for given in file.cameras:
@@ -140,10 +140,26 @@ def _in_base(
     return local if fixed else rotations.compose(*to_transform(tool), *local)
 
 
-class Twin:
-    """A running twin of a rig, see `running_twin`; `rig` has it in the place of its robot."""
+class HasPose(Protocol):
+    """What knows where the tool really is: mm, and a rotation vector in rad."""
 
-    def __init__(self, scene: Scene, rig: Rig, controller: TwinController, folder: Path, number: int) -> None:
+    def true_pose(self) -> tuple[float, ...]: ...
+
+
+class Standing:
+    """Stands where it is. There is no controller, so nothing can move it."""
+
+    def __init__(self, pose: Sequence[float]) -> None:
+        self._pose = tuple(pose)
+
+    def true_pose(self) -> tuple[float, ...]:
+        return self._pose
+
+
+class Twin:
+    """A running twin of a rig, see `running_twin` and `standing_twin`; `rig` has it in the place of its robot."""
+
+    def __init__(self, scene: Scene, rig: Rig, controller: HasPose, folder: Path, number: int) -> None:
         self.scene = scene
         self.rig = rig.model_copy(update={"robot": rig.robot.model_copy(update={"host": scene.file.host})})
         self.controller = controller
@@ -191,6 +207,23 @@ def running_twin(
         TwinController(host, start_pose=start, errors=errors, seed=scene.file.seed) as controller,
     ):
         yield Twin(scene, rig, controller, Path(folder), number)
+
+
+@contextlib.contextmanager
+def standing_twin(path: str | os.PathLike[str], rig: Rig, number: int = 0) -> Iterator[Twin]:
+    """The cameras of a rig's twin alone: the tool stands in the middle of the workspace, pointing down.
+
+    Arguments and errors as of `running_twin`; there is no controller whose address could be in use.
+    """
+    scene = Scene.load(path)
+    scene.check(rig, path)
+    box = rig.robot.workspace
+    middle = [0.5 * (low + high) for low, high in zip(box.min, box.max, strict=True)]
+    with (
+        _emulated_cameras(len(rig.cameras)),
+        tempfile.TemporaryDirectory(prefix="torchpose-twin-") as folder,
+    ):
+        yield Twin(scene, rig, Standing([*middle, *START_POSE[3:]]), Path(folder), number)
 
 
 @contextlib.contextmanager
