@@ -76,10 +76,10 @@ def read_manifest_cameras(path: Path) -> list[str]:
     Raises:
         ConfigError: the file cannot be read, or a line is not a JSON object.
     """
-    found = {}
+    found: set[str] = set()
     for number, record in read_records(path):
         if record.get("record") == "frame" and record.get("image", "") is not None:
-            found[_checked(ManifestFrame, record, f"{path}: line {number}").camera] = None
+            found.add(_checked(ManifestFrame, record, f"{path}: line {number}").camera)
     return sorted(found)
 
 
