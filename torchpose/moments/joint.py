@@ -350,7 +350,8 @@ def _taken(information: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
 # deviations of what the pictures tell best, by which a camera may be off: from none that would show to what nobody
 # would call a calibration (convention)
 _OFF, _GRID = (-1.0, 3.0), 24
-# times, of rigs that are as they say one in a hundred is loosened (measured: `scripts/rig_statistics.py`)
+# times as likely as not at all: of rows of rigs that are as they say, one in ten is widened (measured:
+# `scripts/rig_statistics.py`); from 1 on knocks of five deviations are not covered
 _LIKELIER = 0.5
 
 
