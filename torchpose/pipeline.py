@@ -34,6 +34,7 @@ from torchpose.identify import (
     MarkerTable,
     Scene,
     Views,
+    find_near,
     held,
     identify,
     identify_boards,
@@ -195,23 +196,28 @@ class PoseEstimator(nn.Module):
         return f"camera={self.camera.width}x{self.camera.height}, targets=[{names}]"
 
     @torch.no_grad()
-    def forward(self, frames: Tensor | NDArray[Any]) -> Poses:
+    def forward(self, frames: Tensor | NDArray[Any], near: Poses | None = None) -> Poses:
         """Poses of every target in every frame.
 
         Args:
             frames: (H, W), (B, H, W) or (B, 1, H, W) grey, or (B, 3, H, W) RGB, of which the luma counts; tensors or
                 NumPy arrays of uint8, uint16, or floating point with white at ``float_range``.
+            near: poses not long before, row by row of the frame of the batch that they are near to: of a sequence, what
+                the last call gave. The rings are looked for where these put them, up to `identify.near.MOST_MOVE` px
+                away, and all over the frame only where a target is not found whole there; so one that was lost is found
+                again. The result is the same to a fraction of its deviation, but for `Poses.copies`, which then counts
+                what is near. Boards, and several instances, are looked for everywhere.
 
         Returns:
             Rows sorted by frame, target and instance, on the device of the frames: B * T of them with
             ``instances=1``. With more, every frame and target has at least one row, and one for each copy with a pose.
 
         Raises:
-            FrameError: wrong shape, size or dtype.
+            FrameError: wrong shape, size or dtype. ConfigError: ``near`` is of other targets.
         """
         frames = self._checked(frames)
         scene = Scene.of(frames, self.camera.to(frames.device), self.table.to(frames.device))
-        scene, found, tried = self._found(scene)
+        scene, found, tried = self._found(scene, near)
         again = self._second_look(scene, found, tried)
         if len(again[0]) > len(found.rings):
             found = self._solved(scene, *again)
@@ -239,7 +245,7 @@ class PoseEstimator(nn.Module):
             frames = frames.float() * (255.0 / self.float_range)
         return frames.contiguous()
 
-    def _found(self, scene: Scene) -> tuple[Scene, Found, Rings]:
+    def _found(self, scene: Scene, near: Poses | None = None) -> tuple[Scene, Found, Rings]:
         """What is found in all frames: at the coarse scale alone where that shows every target whole.
 
         Also the rings that were measured for that.
@@ -252,12 +258,17 @@ class PoseEstimator(nn.Module):
             circles = self._useful(scene, find_candidates(frames, wanted=wanted, float_range=255.0))
             scene, found = self._read(scene, self._measured(scene, circles))
             return scene, found, found.rings
-        coarse = find_coarse(frames, wanted=wanted, float_range=255.0)
+        coarse = None if near is None else find_near(scene, *_placed(scene, near), wanted)
+        tracked = coarse is not None
+        if coarse is None:
+            coarse = find_coarse(frames, wanted=wanted, float_range=255.0)
         rings, copies, tried = self._likely(scene, coarse)
         first = self._read(scene, rings, copies)
         settled = self._settled(*first, tried.rings)
         if bool(settled.all()):
             return *first, tried.rings
+        if tracked:
+            return self._found_elsewhere(scene, first, settled, tried.rings)
         rest, number = (~settled).nonzero()[:, 0], (~settled).cumsum(0) - 1
         known = coarse[~settled[coarse.frame]]
         known = replace(known, frame=number[known.frame])
@@ -265,6 +276,23 @@ class PoseEstimator(nn.Module):
         circles = self._useful(scene, replace(finer, frame=rest[finer.frame]))
         every = Rings.cat([rings[settled[rings.frame]], self._measured(scene, circles, tried)])
         return *self._read(scene, every, copies), Rings.cat([tried.rings, every])
+
+    def _found_elsewhere(
+        self, scene: Scene, near: tuple[Scene, Found], settled: Tensor, tried: Rings
+    ) -> tuple[Scene, Found, Rings]:
+        """The same where some frames are settled by what is near the last poses, and the others searched as ever."""
+        rest, rows = (~settled).nonzero()[:, 0], len(scene.table)
+        whole = near[1].rings
+        other = Scene.of(scene.frames[rest], scene.camera, scene.table)
+        _, found, searched = self._found(other)
+        more = replace(found.rings, frame=rest[found.rings.frame])
+        copies = torch.zeros(scene.groups, dtype=torch.int64, device=rest.device)
+        for identified, frame in ((near[1].identified, None), (found.identified, rest)):
+            group = identified.group
+            group = group if frame is None else frame[group // rows] * rows + group % rows
+            copies.scatter_reduce_(0, group, identified.copies, "amax")
+        tried = Rings.cat([tried[settled[tried.frame]], replace(searched, frame=rest[searched.frame])])
+        return *self._read(scene, Rings.cat([whole[settled[whole.frame]], more]), copies), tried
 
     def _found_with_boards(self, scene: Scene) -> tuple[Scene, Found]:
         """The same where there are boards among the targets: at finer and finer scales where they are not whole."""
@@ -564,6 +592,23 @@ class RigEstimator(PoseEstimator):
             found = found._replace(solvable=found.solvable[mine], solutions=found.solutions[mine])
             parts.append(Alone(own, k, self._of(view.camera)._finished(view.scene, found)))
         return parts
+
+
+def _placed(scene: Scene, near: Poses) -> tuple[Tensor, Tensor]:
+    """The poses as those of the rows (N, 3, 3), (N, 3) of a scene with one for every frame and target; NaN elsewhere.
+
+    Raises:
+        ConfigError: they are of other targets.
+    """
+    if len(near) and int(near.target.max()) >= len(scene.table):
+        raise ConfigError(f"near: poses of {int(near.target.max()) + 1} targets, but there are {len(scene.table)}")
+    some = near[(near.instance == 0) & (near.frame < len(scene.frames))]
+    group = some.frame * len(scene.table) + some.target
+    R, t = (
+        torch.full((scene.groups, *shape), torch.nan, dtype=torch.float64, device=group.device)
+        for shape in ((3, 3), (3,))
+    )
+    return R.index_copy(0, group, some.R.to(R)), t.index_copy(0, group, some.t.to(t))
 
 
 def _legible(blur: Tensor) -> Tensor:

@@ -1,11 +1,15 @@
 """Options of the commands that estimate poses: the same words and letters in all of them."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from torchpose.cli.common import built_in_targets
+from torchpose.errors import ConfigError
 
 _CAMERA = (
     "Camera file: OpenCV YAML, JSON or XML, ROS camera_info, Kalibr camchain, COLMAP cameras.txt and others "
@@ -34,6 +38,37 @@ _FROM = (
     "List of further INPUTs, one a line or with zeros between them; `-`: standard input. Frames are called by their "
     "place below the folder that holds all of them."
 )
+
+
+ENGINE = "What runs the work: processes of this machine, or the workers of a Ray cluster (extra: ray)."
+ADDRESS = "With --engine ray: a cluster that is there; without it, one starts here and ends with the command."
+
+
+class Engine(StrEnum):
+    local = "local"
+    ray = "ray"
+
+
+@contextmanager
+def crew_of(engine: Engine, address: str | None, threads: int) -> Iterator[tuple[Any, int]]:
+    """Who shares out the work, as `Crew` does, and how many they are. ConfigError: nobody answers."""
+    check_address(engine, address)
+    if engine is Engine.local:
+        from torchpose.io.processes import Crew
+
+        yield Crew, threads
+        return
+    from torchpose.scale.cluster import cluster
+    from torchpose.scale.crew import RayCrew
+
+    with cluster(address, threads) as workers:
+        yield RayCrew, workers.count
+
+
+def check_address(engine: Engine, address: str | None) -> None:
+    """Raises ConfigError for an address that nothing would use."""
+    if address is not None and engine is not Engine.ray:
+        raise ConfigError("--address: is of --engine ray alone; add it or leave --address out")
 
 
 def camera_option(text: str) -> Any:

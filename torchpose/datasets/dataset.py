@@ -13,9 +13,9 @@ A data set is a folder:
 import hashlib
 import json
 import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
@@ -33,6 +33,7 @@ from torchpose.datasets.plan import Plan
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.io.images import UnreadableImageError, decode
+from torchpose.io.processes import Crew
 from torchpose.io.truth import Truth, read_truth, write_truth
 from torchpose.io.writers import atomic_path, write_rows
 from torchpose.sim import Processing, SensorPattern, disturbed, faults_of, processed, read_out, with_faults
@@ -47,6 +48,7 @@ Renderer = Callable[[Int[Tensor, " B"]], Float[Tensor, "B H W"]]
 BLUR = ("psf_sigma", "psf_ratio", "psf_deg", "smear_px", "smear_deg", "disc_px")
 DISTURBANCES = ("coma_px", "coma_deg", "haze_px", "ghost", "speckle", "flicker")
 BOUND = ("sx", "sy", "sz", "srx", "sry", "srz")
+_BOUNDS_AT_ONCE = 16  # poses, as many as are differentiated at a time
 _BATCH_PIXELS = 7_000_000  # larger buffers go back to the system and are cleared anew each time
 
 
@@ -162,6 +164,7 @@ def write_dataset(
     batch: int | None = None,
     threads: int = 1,
     progress: Callable[[int], None] = lambda done: None,
+    crew: Callable[..., Any] = Crew,
 ) -> int:
     """Writes a data set; memory does not grow with the number of frames.
 
@@ -171,8 +174,9 @@ def write_dataset(
         backend: who renders.
         resume: keep the frames of an earlier run of the same plan.
         batch: frames at a time.
-        threads: of encoding.
+        threads: cores to use, a process each.
         progress: called with the number of frames just finished.
+        crew: who shares the work out: processes, or what else has the interface of `Crew`.
 
     Returns:
         Number of frames rendered now.
@@ -184,26 +188,16 @@ def write_dataset(
     done = {path.name for path in folder.iterdir()}
     pending = torch.tensor([i for i, name in enumerate(plan.names) if name not in done], dtype=torch.int64)
     progress(len(plan) - len(pending))
-    if backend == "blender":
-        from torchpose.datasets.blender import blender
-
-        renderer, size = blender(plan), 1
-    else:
-        renderer = analytic(plan)
-        size = max(1, min(16, _BATCH_PIXELS // (plan.camera.width * plan.camera.height)))
-    with ThreadPoolExecutor(threads, thread_name_prefix="encode") as pool:
-        ahead: list[Future[None]] = []
-        for which in torch.split(pending, batch or size) if len(pending) else ():
-            frames = simulated_frames(plan, renderer, which)
-            progress(_finished(ahead))
-            ahead = [
-                pool.submit(_write_png, folder / plan.names[i], frame.numpy())
-                for i, frame in zip(which.tolist(), frames, strict=True)
-            ]
-        progress(_finished(ahead))
+    size = max(1, min(16, _BATCH_PIXELS // (plan.camera.width * plan.camera.height))) if backend == "analytic" else 1
+    batches = torch.split(pending, batch or size) if len(pending) else ()
+    processes = threads if backend == "analytic" else 1  # Blender has threads of its own
+    with crew(partial(_write_frames, plan, backend, folder), batches, processes) as rendered:
+        for finished in rendered:
+            progress(finished)
     truth = plan_truth(plan)
     if plan.file.bounds:
-        std = torch.cat([bounds(plan, which) for which in torch.split(torch.arange(len(plan)), 64)])
+        with crew(partial(_bounds_of, plan), torch.split(torch.arange(len(plan)), _BOUNDS_AT_ONCE), threads) as parts:
+            std = torch.cat(list(parts))
         truth.extra.update(zip(BOUND, std.unbind(1), strict=True))
     write_truth(out / "truth.csv", truth)
     _write_prints(plan, out)
@@ -272,11 +266,22 @@ def write_bop(out: Path) -> None:
         os.link(out / "frames" / name, link)
 
 
-def _finished(tasks: Sequence[Future[None]]) -> int:
-    """Waits for all tasks; how many they are."""
-    for task in tasks:
-        task.result()
-    return len(tasks)
+def _write_frames(plan: Plan, backend: Backend, folder: Path, batches: Sequence[Tensor]) -> Iterator[int]:
+    """Renders and writes the frames of each batch of numbers; how many they are."""
+    if backend == "blender":
+        from torchpose.datasets.blender import blender
+
+        renderer = blender(plan)
+    else:
+        renderer = analytic(plan)
+    for which in batches:
+        for i, frame in zip(which.tolist(), simulated_frames(plan, renderer, which), strict=True):
+            _write_png(folder / plan.names[i], frame.numpy())
+        yield len(which)
+
+
+def _bounds_of(plan: Plan, batches: Sequence[Tensor]) -> Iterator[Tensor]:
+    yield from (bounds(plan, which) for which in batches)
 
 
 def _write_png(path: Path, frame: np.ndarray) -> None:

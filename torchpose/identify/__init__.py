@@ -5,6 +5,7 @@ from torchpose.identify.boards import identify_boards
 from torchpose.identify.company import in_company, named
 from torchpose.identify.copies import MIN_MARKERS
 from torchpose.identify.markers import Identified, identify
+from torchpose.identify.near import find_near
 from torchpose.identify.scene import MarkerTable, Scene, drawn_radii
 from torchpose.identify.second_look import Views, held, look_again
 
@@ -15,6 +16,7 @@ __all__ = [
     "Scene",
     "Views",
     "drawn_radii",
+    "find_near",
     "held",
     "identify",
     "identify_boards",

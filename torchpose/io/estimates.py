@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from importlib.metadata import version
 from typing import Any
@@ -11,10 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpose.camera import Camera
+from torchpose.camera import LINEAR, Camera
 from torchpose.geometry import rotations
 from torchpose.handeye import HandEye
-from torchpose.io.reader import Batch
+from torchpose.io.reader import Batch, FrameReader
 from torchpose.io.rows import BASE_SCHEMA, POSE_SCHEMA, Row, Schema, base_cells, detection_rows, fault_row, pose_rows
 from torchpose.io.sources import Source
 from torchpose.pipeline import PoseEstimator
@@ -93,7 +93,7 @@ class Estimation:
         for positions, frames in batch.groups:
             sources = [batch.sources[position] for position in positions]
             frame_names = [source.name for source in sources]
-            poses = estimator(frames).cpu()
+            poses = estimator(frames.to(estimator.table.ids.device, non_blocking=True)).cpu()
             if paint is not None:
                 paint(frames, poses, frame_names)
             for row in self.rows(poses, sources):
@@ -112,6 +112,23 @@ class Estimation:
         if self.hand_eye is not None:
             _add_base_cells(rows, given, sources, self.hand_eye)
         return rows
+
+
+@torch.inference_mode()
+def estimated(
+    work: Estimation, estimator: PoseEstimator, paint: Paint | None, threads: int, batches: Sequence[Sequence[Source]]
+) -> Iterator[list[Row]]:
+    """Records of batches of sources, one list a batch, see `Estimation.records`.
+
+    Args:
+        threads: that decode ahead.
+        paint: see `Estimation.records`.
+    """
+    camera = work.camera
+    pinned = estimator.table.ids.is_cuda
+    tone = camera.tone or LINEAR
+    for batch in FrameReader(batches, camera.width, camera.height, threads=threads, tone=tone, pinned=pinned):
+        yield work.records(batch, estimator, paint)
 
 
 def _of_parts(poses: Poses, targets: list[Target]) -> Poses:
