@@ -30,6 +30,7 @@ from torchpose.cli.common import (
     say,
     with_tone,
 )
+from torchpose.cli.moments import check_several, estimate_moments
 from torchpose.cli.options import (
     ADDRESS,
     ENGINE,
@@ -104,8 +105,6 @@ def estimate(
     One row a frame and target, or with --instances one a copy: status, translation in mm, rotation vector in rad
     (target to camera), their standard deviations, reprojection RMS in px, number of markers.
     """
-    from torchpose.cli.moments import check_several, estimate_moments
-
     with importing():
         from torchpose.cli.terminal import native_stderr_silenced
         from torchpose.io.estimates import Estimation  # noqa: F401  # imports all that is needed
@@ -124,10 +123,12 @@ def estimate(
     stated = settings([*places, *listed], **options, tone="srgb" if srgb and tone is None else tone)
     how: _How = {"resume": resume, "batch": batch, "threads": threads or cores(), "quiet": quiet, "told": stated.told}
     if cameras is not None:
-        check_several(camera, {"-d": detections, "--overlay": overlay, "--engine ray": on_ray, "-f": files_from})
-        return estimate_moments(
-            cameras, places, partial(estimation, stated), tables.out, {**how, "tone": stated["tone"]}
+        other = {"--device": device != "cpu"}
+        check_several(
+            camera, {"-d": detections, "--overlay": overlay, "--engine ray": on_ray, "-f": files_from, **other}
         )
+        rest, several = partial(estimation, stated), {**how, "tone": stated["tone"]}
+        return estimate_moments(cameras, places, rest, tables.out, several)
     sources = frames_of(places, listed)
     work = estimation(stated, sources)
     check_outputs([*places, *listed], sources, tables.paths, overlay)
