@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from functools import partial
 from typing import Any, NamedTuple
 
 import cv2
@@ -185,8 +186,8 @@ def rendered_set(cameras: int, moments: int, seed: int) -> Row:
         facing = ((R[:, :, 2] * t).sum(-1) / t.norm(dim=-1) > math.cos(math.radians(TURNED))).nonzero()[:, 0]
         clean = render(camera, target, R[facing], t[facing], psf_sigma=0.7)
         frames = add_noise(clean, NOISE, seed=1000 * seed + number)
-        batches = [([f"{k}.png" for k in facing.tolist()], frames)]
-        several.append(OneCamera(f"cam{number}", lambda batches=batches: batches, camera, guess=False))
+        names = [f"{k}.png" for k in facing.tolist()]
+        several.append(OneCamera(f"cam{number}", partial(list, [(names, frames)]), camera, guess=False))
     found = calibrate_cameras(several, target, lens=LENS, tone=LINEAR)
     off = errors(found.rig, scene.rig).flatten()
     assert found.rig.covariance is not None

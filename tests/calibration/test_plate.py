@@ -91,7 +91,7 @@ def test_gradient_of_the_adjustment(cameras: int, rims: bool) -> None:
     z = 1e-3 * torch.randn(1, len(plate), dtype=F64, generator=torch.Generator().manual_seed(2))
     intrinsics = Vector(torch.full((1, 8 * cameras), 1e-4, dtype=F64))
     places = {"places": Places(rig.R[None, 1:], rig.t[None, 1:])} if cameras == 2 else {}
-    own = {"intrinsics": intrinsics, **places, "plate": Vector(z)}
+    own: dict[str, Vector | Places] = {"intrinsics": intrinsics, **places, "plate": Vector(z)}
     at = Unknowns(own, {"pose": Pose(*scene.views)}, torch.zeros(len(views), dtype=torch.int64))
     normal = problem(at)
     assert normal.eliminated is not None
