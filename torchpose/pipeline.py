@@ -434,6 +434,23 @@ class PoseEstimator(nn.Module):
         return solutions
 
 
+def _placed(scene: Scene, near: Poses) -> tuple[Tensor, Tensor]:
+    """The poses as those of the rows (N, 3, 3), (N, 3) of a scene with one for every frame and target; NaN elsewhere.
+
+    Raises:
+        ConfigError: they are of other targets.
+    """
+    if len(near) and int(near.target.max()) >= len(scene.table):
+        raise ConfigError(f"near: poses of {int(near.target.max()) + 1} targets, but there are {len(scene.table)}")
+    some = near[(near.instance == 0) & (near.frame < len(scene.frames))]
+    group = some.frame * len(scene.table) + some.target
+    R, t = (
+        torch.full((scene.groups, *shape), torch.nan, dtype=torch.float64, device=group.device)
+        for shape in ((3, 3), (3,))
+    )
+    return R.index_copy(0, group, some.R.to(R)), t.index_copy(0, group, some.t.to(t))
+
+
 class RigEstimator(PoseEstimator):
     """Poses of targets that several cameras see at one moment; arguments as of `PoseEstimator`, with a `CameraRig`.
 
@@ -592,23 +609,6 @@ class RigEstimator(PoseEstimator):
             found = found._replace(solvable=found.solvable[mine], solutions=found.solutions[mine])
             parts.append(Alone(own, k, self._of(view.camera)._finished(view.scene, found)))
         return parts
-
-
-def _placed(scene: Scene, near: Poses) -> tuple[Tensor, Tensor]:
-    """The poses as those of the rows (N, 3, 3), (N, 3) of a scene with one for every frame and target; NaN elsewhere.
-
-    Raises:
-        ConfigError: they are of other targets.
-    """
-    if len(near) and int(near.target.max()) >= len(scene.table):
-        raise ConfigError(f"near: poses of {int(near.target.max()) + 1} targets, but there are {len(scene.table)}")
-    some = near[(near.instance == 0) & (near.frame < len(scene.frames))]
-    group = some.frame * len(scene.table) + some.target
-    R, t = (
-        torch.full((scene.groups, *shape), torch.nan, dtype=torch.float64, device=group.device)
-        for shape in ((3, 3), (3,))
-    )
-    return R.index_copy(0, group, some.R.to(R)), t.index_copy(0, group, some.t.to(t))
 
 
 def _legible(blur: Tensor) -> Tensor:

@@ -115,18 +115,18 @@ def estimate(
     on_ray, tables = engine is Engine.ray, _Tables.of(out, detections)
     check_address(engine, address)
     _check_engine(overlay, device, on_ray=on_ray)
-    _check_stream(tables, resume=resume, on_ray=on_ray)
+    tables.check(resume=resume, on_ray=on_ray)
     one_thread_each()
-    check_device(device)
-    if not on_ray:
-        tables.check()
     listed = listed_files(places, files_from)
     options: dict[str, Any] = {"camera": camera, "target": target, "method": method, "instances": instances}
     options |= {"hand_eye": hand_eye, "relative_to": relative_to, "assume_upright": assume_upright}
     stated = settings([*places, *listed], **options, tone="srgb" if srgb and tone is None else tone)
     how: _How = {"resume": resume, "batch": batch, "threads": threads or cores(), "quiet": quiet, "told": stated.told}
     if cameras is not None:
-        check_several(camera, {"-d": detections, "--overlay": overlay, "--engine ray": on_ray, "-f": files_from})
+        other = {"--device": device != "cpu"}
+        check_several(
+            camera, {"-d": detections, "--overlay": overlay, "--engine ray": on_ray, "-f": files_from, **other}
+        )
         rest, several = partial(estimation, stated), {**how, "tone": stated["tone"]}
         return estimate_moments(cameras, places, rest, tables.out, several)
     sources = frames_of(places, listed)
@@ -196,27 +196,23 @@ class _Tables:
 
         return [path for path in (self.out, self.detections) if isinstance(path, Path) and not is_standard(path)]
 
-    def check(self) -> None:
-        """Raises ConfigError unless both can be written."""
+    def check(self, *, resume: bool, on_ray: bool) -> None:
+        """Raises ConfigError unless both can be written, and for what standard output cannot have."""
         from torchpose.io.stream import is_standard
         from torchpose.io.writers import check_table_path
 
+        options = {"--resume": resume, "--detections": self.detections is not None, "--engine ray": on_ray}
+        if isinstance(self.out, Path) and is_standard(self.out):
+            for option in [option for option, given in options.items() if given]:
+                fix = f"give a file, or leave {option} out"
+                raise ConfigError(f"--out: - is standard output, which has no {option}; {fix}")
         for path, option in ((self.out, "--out"), (self.detections, "--detections")):
-            if isinstance(path, Path) and not is_standard(path):
+            if isinstance(path, Path) and not is_standard(path) and not on_ray:
                 check_table_path(path, option)
 
 
-def _check_stream(tables: _Tables, *, resume: bool, on_ray: bool) -> None:
-    """Refuses what standard output cannot have."""
-    from torchpose.io.stream import is_standard
-
-    options = {"--resume": resume, "--detections": tables.detections is not None, "--engine ray": on_ray}
-    for option, given in options.items():
-        if given and isinstance(tables.out, Path) and is_standard(tables.out):
-            raise ConfigError(f"--out: - is standard output, which has no {option}; give a file, or leave {option} out")
-
-
 def _check_engine(overlay: Path | None, device: str, *, on_ray: bool) -> None:
+    check_device(device)
     if overlay is not None and on_ray:
         raise ConfigError("--overlay: is not drawn by --engine ray; run a part of the frames with --engine local")
     if device != "cpu" and on_ray:

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -50,19 +51,19 @@ class Engine(StrEnum):
 
 
 @contextmanager
-def crew_of(engine: Engine, address: str | None, threads: int) -> Iterator[tuple[Any, int]]:
-    """Who shares out the work, as `Crew` does, and how many they are. ConfigError: nobody answers."""
+def crew_of(engine: Engine, address: str | None, threads: int) -> Iterator[Any]:
+    """Who shares out the work: `Crew` or what is like it, of so many. ConfigError: nobody answers."""
     check_address(engine, address)
     if engine is Engine.local:
         from torchpose.io.processes import Crew
 
-        yield Crew, threads
+        yield partial(Crew, count=threads)
         return
     from torchpose.scale.cluster import cluster
     from torchpose.scale.crew import RayCrew
 
     with cluster(address, threads) as workers:
-        yield RayCrew, workers.count
+        yield partial(RayCrew, count=workers.count)
 
 
 def check_address(engine: Engine, address: str | None) -> None:

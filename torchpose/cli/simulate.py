@@ -46,12 +46,13 @@ def simulate(
     if bop and read.rig is not None:
         raise ConfigError("--bop: is of one camera; leave it out for a plan with cameras")
     write = write_dataset if read.rig is None else write_rig_dataset
+    cameras = 1 if read.rig is None else len(read.rig)
     how: dict[str, Any] = {"backend": backend.value, "resume": resume, "batch": batch}
-    with FrameProgress(len(read) * (len(read.rig) if read.rig else 1), 0, quiet=quiet) as progress:
+    with FrameProgress(cameras * len(read), 0, quiet=quiet) as progress:
         how["progress"] = lambda done: progress.advance(done, Counter())
         try:
-            with crew_of(engine, address, threads or cores()) as (crew, count):
-                write(read, out, **how, threads=count, crew=crew)
+            with crew_of(engine, address, threads or cores()) as crew:
+                write(read, out, **how, crew=crew)
             if bop:
                 write_bop(out)
         except KeyboardInterrupt:

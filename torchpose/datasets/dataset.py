@@ -45,6 +45,7 @@ Backend = Literal["analytic", "blender"]
 Renderer = Callable[[Int[Tensor, " B"]], Float[Tensor, "B H W"]]
 """Noise-free frames, float32, of the frames numbered."""
 
+_ALONE = partial(Crew, count=1)  # all work in this process
 BLUR = ("psf_sigma", "psf_ratio", "psf_deg", "smear_px", "smear_deg", "disc_px")
 DISTURBANCES = ("coma_px", "coma_deg", "haze_px", "ghost", "speckle", "flicker")
 BOUND = ("sx", "sy", "sz", "srx", "sry", "srz")
@@ -162,9 +163,8 @@ def write_dataset(
     backend: Backend = "analytic",
     resume: bool = False,
     batch: int | None = None,
-    threads: int = 1,
+    crew: Callable[..., Any] = _ALONE,
     progress: Callable[[int], None] = lambda done: None,
-    crew: Callable[..., Any] = Crew,
 ) -> int:
     """Writes a data set; memory does not grow with the number of frames.
 
@@ -174,9 +174,8 @@ def write_dataset(
         backend: who renders.
         resume: keep the frames of an earlier run of the same plan.
         batch: frames at a time.
-        threads: cores to use, a process each.
+        crew: who shares out the work on items: processes, see `Crew`, or what else has their interface.
         progress: called with the number of frames just finished.
-        crew: who shares the work out: processes, or what else has the interface of `Crew`.
 
     Returns:
         Number of frames rendered now.
@@ -190,13 +189,13 @@ def write_dataset(
     progress(len(plan) - len(pending))
     size = max(1, min(16, _BATCH_PIXELS // (plan.camera.width * plan.camera.height))) if backend == "analytic" else 1
     batches = torch.split(pending, batch or size) if len(pending) else ()
-    processes = threads if backend == "analytic" else 1  # Blender has threads of its own
-    with crew(partial(_write_frames, plan, backend, folder), batches, processes) as rendered:
+    renderers = crew if backend == "analytic" else _ALONE  # Blender has threads of its own
+    with renderers(partial(_write_frames, plan, backend, folder), batches) as rendered:
         for finished in rendered:
             progress(finished)
     truth = plan_truth(plan)
     if plan.file.bounds:
-        with crew(partial(_bounds_of, plan), torch.split(torch.arange(len(plan)), _BOUNDS_AT_ONCE), threads) as parts:
+        with crew(partial(_bounds_of, plan), torch.split(torch.arange(len(plan)), _BOUNDS_AT_ONCE)) as parts:
             std = torch.cat(list(parts))
         truth.extra.update(zip(BOUND, std.unbind(1), strict=True))
     write_truth(out / "truth.csv", truth)
