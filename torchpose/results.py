@@ -41,6 +41,7 @@ class Reason(IntEnum):
     BEHIND_CAMERA = 5
     TWO_SOLUTIONS = 6  # with Status.AMBIGUOUS
     MIRRORED = 7  # the target is seen from behind its printed side: a mirror in the path, or a file drawn y-up
+    CAMERAS_DISAGREE = 8  # cameras of a rig contradict each other beyond their covariance
 
 
 class Misfit(IntEnum):
@@ -66,6 +67,7 @@ class Detections(Rows):
         center_cov: its covariance, px^2.
         outer: fitted ellipse cx, cy, a >= b (semi-axes, px), theta (rad, [0, pi)).
         inner: that of the inner circle.
+        camera: number in the rig, where several cameras look.
     """
 
     frame: Int[Tensor, " K"]
@@ -76,6 +78,7 @@ class Detections(Rows):
     center_cov: Float[Tensor, "K 2 2"]
     outer: Float[Tensor, "K 5"]
     inner: Float[Tensor, "K 5"]
+    camera: Int[Tensor, " K"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,6 +149,10 @@ class Poses(Rows):
         t_alt: its translation.
         rms_alt: its `rms`.
         chi2_alt: its `chi2`.
+        share: of the information about the pose, by camera of a rig, 0 where it contributes nothing; None without rig.
+        consistency: chi-squared of what the C cameras of a rig say against each other, and its degrees of freedom; 0
+            with one camera.
+        odd: the camera of a rig that contradicts the others, where three or more tell; -1 else.
         detections: the markers of the whole batch; selecting rows leaves them alone, their `frame`, `target` and
             `instance` say whose they are.
     """
@@ -174,6 +181,9 @@ class Poses(Rows):
     chi2_alt: Float[Tensor, " N"]
     detections: Detections = shared()
     of_camera: int = shared(0)
+    share: Float[Tensor, "N C"] | None = None
+    consistency: Float[Tensor, "N 2"] | None = None
+    odd: Int[Tensor, " N"] | None = None
 
     @classmethod
     def cat(cls, parts: Sequence[Self]) -> Self:
@@ -190,6 +200,13 @@ class Poses(Rows):
     def ok(self) -> Bool[Tensor, " N"]:
         """Rows with `Status.OK`."""
         return self.status == Status.OK
+
+    @property
+    def cameras(self) -> Int[Tensor, " N"]:
+        """How many cameras of a rig contribute; 1 or 0 of one camera alone."""
+        if self.share is None:
+            return self.t.isfinite().all(1).long()
+        return (self.share > 0).sum(1)
 
     @property
     def rotation_vector(self) -> Float[Tensor, "N 3"]:

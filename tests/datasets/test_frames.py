@@ -1,5 +1,6 @@
 """Frames of a plan as a data set of torch, without files."""
 
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,7 @@ from torch.utils.data import DataLoader
 from torchpose.camera import Camera
 from torchpose.datasets.dataset import write_dataset
 from torchpose.datasets.frames import Sample, SimulatedFrames
+from torchpose.io.processes import Crew
 
 FRAMES = 6
 
@@ -27,7 +29,7 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> SimulatedFrames:
 
 
 def test_frames_are_those_that_simulate_writes(frames: SimulatedFrames, tmp_path: Path) -> None:
-    write_dataset(frames.plan, tmp_path / "set", threads=2)
+    write_dataset(frames.plan, tmp_path / "set", crew=partial(Crew, count=2))
     assert len(frames) == FRAMES
     for number, name in enumerate(frames.plan.names):
         sample = frames[number]

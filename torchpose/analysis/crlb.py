@@ -7,9 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.camera import Camera
+from torchpose.camera import Camera, CameraRig
 from torchpose.geometry.arguments import checked
 from torchpose.geometry.least_squares import scaled_inverse
+from torchpose.moments.views import motion_in_view, motion_of_place
 from torchpose.sim import boundary, renderer
 from torchpose.sim.blur import Blur, Pair, blur_of, blurred, start
 from torchpose.sim.boundary import Boxes
@@ -80,6 +81,29 @@ def pose_crlb(camera: Camera, target: Target, R: Tensor, t: Tensor, **conditions
         + [_fisher(camera, target, R[part], t[part], blur[part], (light - dark)[part]) for part in parts]
     )
     inverse, known = scaled_inverse(information / (noise.square() + step * step / 12)[:, None, None])
+    return torch.where(known[:, None, None], inverse, torch.nan)[:, :6, :6]
+
+
+@checked
+def rig_crlb(rig: CameraRig, target: Target, R: Tensor, t: Tensor, **conditions: Any) -> Float[Tensor, "B 6 6"]:
+    """`pose_crlb` from the frames that all cameras of a rig take at one time; poses in the first camera.
+
+    What the cameras' places leave open counts as further unknowns with the prior that the rig states. A camera in whose
+    frame nothing of the target is contributes nothing.
+    """
+    size = rig.factor().shape[-1]
+    information = torch.zeros(len(t), 6 + size, 6 + size, dtype=torch.float64, device=t.device)
+    for number, camera in enumerate(rig.cameras):
+        own_R, own_t = rig.seen_by(number, R, t)
+        own = pose_crlb(camera, target, own_R, own_t, **conditions)
+        there = own.isfinite().flatten(1).all(1)
+        fisher, known = scaled_inverse(torch.where(there[:, None, None], own, torch.eye(6).to(own)))
+        fisher = torch.where((there & known)[:, None, None], fisher, 0.0)
+        turn = motion_in_view(rig, number).to(own).expand(len(own), -1, -1)
+        columns = torch.cat([turn, motion_of_place(rig, number, own_t)], -1)
+        information = information + columns.mT @ fisher @ columns
+    information.diagonal(dim1=-2, dim2=-1)[:, 6 : 6 + size] += 1
+    inverse, known = scaled_inverse(information)
     return torch.where(known[:, None, None], inverse, torch.nan)[:, :6, :6]
 
 

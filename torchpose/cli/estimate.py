@@ -30,10 +30,12 @@ from torchpose.cli.common import (
     say,
     with_tone,
 )
+from torchpose.cli.moments import check_several, estimate_moments
 from torchpose.cli.options import (
     ADDRESS,
     ENGINE,
     CameraFile,
+    Cameras,
     Engine,
     FilesFrom,
     HandEyeFile,
@@ -78,6 +80,7 @@ def estimate(
     out: Annotated[str, typer.Option("--out", "-o", help=_OUT)],
     inputs: Annotated[list[str] | None, typer.Argument(metavar="INPUT...", help=_INPUTS)] = None,
     camera: CameraFile = None,
+    cameras: Cameras = None,
     target: Targets = None,
     files_from: FilesFrom = None,
     detections: Annotated[str | None, typer.Option("--detections", "-d", help=_DETECTIONS)] = None,
@@ -112,37 +115,44 @@ def estimate(
     on_ray, tables = engine is Engine.ray, _Tables.of(out, detections)
     check_address(engine, address)
     _check_engine(overlay, device, on_ray=on_ray)
-    _check_stream(tables, resume=resume, on_ray=on_ray)
+    tables.check(resume=resume, on_ray=on_ray)
     one_thread_each()
-    check_device(device)
-    if not on_ray:
-        tables.check()
     listed = listed_files(places, files_from)
     options: dict[str, Any] = {"camera": camera, "target": target, "method": method, "instances": instances}
     options |= {"hand_eye": hand_eye, "relative_to": relative_to, "assume_upright": assume_upright}
     stated = settings([*places, *listed], **options, tone="srgb" if srgb and tone is None else tone)
+    how: _How = {"resume": resume, "batch": batch, "threads": threads or cores(), "quiet": quiet, "told": stated.told}
+    if cameras is not None:
+        other = {"--device": device != "cpu"}
+        check_several(
+            camera, {"-d": detections, "--overlay": overlay, "--engine ray": on_ray, "-f": files_from, **other}
+        )
+        rest, several = partial(estimation, stated), {**how, "tone": stated["tone"]}
+        return estimate_moments(cameras, places, rest, tables.out, several)
     sources = frames_of(places, listed)
     work = estimation(stated, sources)
     check_outputs([*places, *listed], sources, tables.paths, overlay)
-    how: _How = {"resume": resume, "batch": batch, "threads": threads or cores(), "quiet": quiet, "told": stated.told}
     with native_stderr_silenced():
         if on_ray:
             return _run_on_ray(work, sources, tables, address, **how)
         return _run(work, sources, tables, overlay, device=device, **how)
 
 
-def estimation(stated: Settings, sources: Sequence[Source]) -> Estimation:
-    """What the rows depend on, by the options. ConfigError: one is missing, or they do not go together."""
+def estimation(stated: Settings, sources: Sequence[Source], lens: Camera | None = None) -> Estimation:
+    """What the rows depend on, by the options, or with a camera that is given.
+
+    ConfigError: one is missing, or they do not go together.
+    """
     from torchpose.camera import Camera
     from torchpose.io.estimates import Estimation
     from torchpose.target import Target
 
-    lens = Camera.load(stated.needed("camera"))
+    given, lens = lens, lens or Camera.load(stated.needed("camera"))
     targets = [Target.load(name) for name in stated.needed("target")]
     if stated["assume_upright"]:
         targets = [one.upright() for one in targets]
     lens = with_tone(lens, stated["tone"])
-    lens = lens if lens.tone is not None else with_judged_tone(lens, targets[0], sources)
+    lens = lens if lens.tone is not None or given else with_judged_tone(lens, targets[0], sources)
     instances = stated["instances"] or 1
     _check_relative(stated["relative_to"], targets, stated["hand_eye"], instances)
     return Estimation(
@@ -186,27 +196,23 @@ class _Tables:
 
         return [path for path in (self.out, self.detections) if isinstance(path, Path) and not is_standard(path)]
 
-    def check(self) -> None:
-        """Raises ConfigError unless both can be written."""
+    def check(self, *, resume: bool, on_ray: bool) -> None:
+        """Raises ConfigError unless both can be written, and for what standard output cannot have."""
         from torchpose.io.stream import is_standard
         from torchpose.io.writers import check_table_path
 
+        options = {"--resume": resume, "--detections": self.detections is not None, "--engine ray": on_ray}
+        if isinstance(self.out, Path) and is_standard(self.out):
+            for option in [option for option, given in options.items() if given]:
+                fix = f"give a file, or leave {option} out"
+                raise ConfigError(f"--out: - is standard output, which has no {option}; {fix}")
         for path, option in ((self.out, "--out"), (self.detections, "--detections")):
-            if isinstance(path, Path) and not is_standard(path):
+            if isinstance(path, Path) and not is_standard(path) and not on_ray:
                 check_table_path(path, option)
 
 
-def _check_stream(tables: _Tables, *, resume: bool, on_ray: bool) -> None:
-    """Refuses what standard output cannot have."""
-    from torchpose.io.stream import is_standard
-
-    options = {"--resume": resume, "--detections": tables.detections is not None, "--engine ray": on_ray}
-    for option, given in options.items():
-        if given and isinstance(tables.out, Path) and is_standard(tables.out):
-            raise ConfigError(f"--out: - is standard output, which has no {option}; give a file, or leave {option} out")
-
-
 def _check_engine(overlay: Path | None, device: str, *, on_ray: bool) -> None:
+    check_device(device)
     if overlay is not None and on_ray:
         raise ConfigError("--overlay: is not drawn by --engine ray; run a part of the frames with --engine local")
     if device != "cpu" and on_ray:

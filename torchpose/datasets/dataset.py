@@ -26,7 +26,7 @@ import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-from torchpose.analysis.crlb import pose_crlb
+from torchpose.analysis.crlb import pose_crlb, rig_crlb
 from torchpose.camera import Camera
 from torchpose.config import parse_json, read_text, write_text
 from torchpose.datasets.plan import Plan
@@ -45,6 +45,7 @@ Backend = Literal["analytic", "blender"]
 Renderer = Callable[[Int[Tensor, " B"]], Float[Tensor, "B H W"]]
 """Noise-free frames, float32, of the frames numbered."""
 
+_ALONE = partial(Crew, count=1)  # all work in this process
 BLUR = ("psf_sigma", "psf_ratio", "psf_deg", "smear_px", "smear_deg", "disc_px")
 DISTURBANCES = ("coma_px", "coma_deg", "haze_px", "ghost", "speckle", "flicker")
 BOUND = ("sx", "sy", "sz", "srx", "sry", "srz")
@@ -85,24 +86,24 @@ def plan_truth(plan: Plan) -> Truth:
 def bounds(plan: Plan, which: Int[Tensor, " B"]) -> Float[Tensor, "B 6"]:
     """Cramer-Rao standard deviations of the frames numbered ``which``; NaN where no pose is determined.
 
-    Of the evenly lit frame at rest, blurred by all but ``defocus``, with the noise of its dark parts, see
-    `torchpose.analysis.pose_crlb`: a bound still, but one that defocus, motion, shot noise, clutter and covers keep any
-    estimator away from.
+    With several cameras those of the pose from all of them. Of the evenly lit frame at rest, blurred by all but
+    ``defocus``, with the noise of its dark parts, see `torchpose.analysis.pose_crlb`: a bound still, but one that
+    defocus, motion, shot noise, clutter and covers keep any estimator away from.
     """
     sensor, part = plan.file.sensor, plan[which]
     taken = part.conditions
     variance = taken.noise.square() + (0.0 if sensor.full_well is None else 255.0 / sensor.full_well * taken.dark)
-    covariance = pose_crlb(
-        plan.camera,
-        plan.target,
-        part.R,
-        part.t,
+    given = {
+        "dark": taken.dark,
+        "light": taken.light,
+        "noise_sigma": variance.sqrt(),
+        "bits": sensor.bits,
         **taken.blur,
-        dark=taken.dark,
-        light=taken.light,
-        noise_sigma=variance.sqrt(),
-        bits=sensor.bits,
-    )
+    }
+    if plan.rig is None:
+        covariance = pose_crlb(plan.camera, plan.target, part.R, part.t, **given)
+    else:
+        covariance = rig_crlb(plan.rig, plan.target, part.R, part.t, **given)
     return covariance.diagonal(dim1=1, dim2=2).sqrt()
 
 
@@ -162,9 +163,8 @@ def write_dataset(
     backend: Backend = "analytic",
     resume: bool = False,
     batch: int | None = None,
-    threads: int = 1,
+    crew: Callable[..., Any] = _ALONE,
     progress: Callable[[int], None] = lambda done: None,
-    crew: Callable[..., Any] = Crew,
 ) -> int:
     """Writes a data set; memory does not grow with the number of frames.
 
@@ -174,9 +174,8 @@ def write_dataset(
         backend: who renders.
         resume: keep the frames of an earlier run of the same plan.
         batch: frames at a time.
-        threads: cores to use, a process each.
+        crew: who shares out the work on items: processes, see `Crew`, or what else has their interface.
         progress: called with the number of frames just finished.
-        crew: who shares the work out: processes, or what else has the interface of `Crew`.
 
     Returns:
         Number of frames rendered now.
@@ -190,18 +189,36 @@ def write_dataset(
     progress(len(plan) - len(pending))
     size = max(1, min(16, _BATCH_PIXELS // (plan.camera.width * plan.camera.height))) if backend == "analytic" else 1
     batches = torch.split(pending, batch or size) if len(pending) else ()
-    processes = threads if backend == "analytic" else 1  # Blender has threads of its own
-    with crew(partial(_write_frames, plan, backend, folder), batches, processes) as rendered:
+    renderers = crew if backend == "analytic" else _ALONE  # Blender has threads of its own
+    with renderers(partial(_write_frames, plan, backend, folder), batches) as rendered:
         for finished in rendered:
             progress(finished)
     truth = plan_truth(plan)
     if plan.file.bounds:
-        with crew(partial(_bounds_of, plan), torch.split(torch.arange(len(plan)), _BOUNDS_AT_ONCE), threads) as parts:
+        with crew(partial(_bounds_of, plan), torch.split(torch.arange(len(plan)), _BOUNDS_AT_ONCE)) as parts:
             std = torch.cat(list(parts))
         truth.extra.update(zip(BOUND, std.unbind(1), strict=True))
     write_truth(out / "truth.csv", truth)
     _write_prints(plan, out)
     return len(pending)
+
+
+def write_rig_dataset(plan: Plan, out: Path, **options: Any) -> int:
+    """Writes a data set of several cameras: one of each in a folder of its name, the rig, and the truth of all.
+
+    ``truth.csv`` has the poses in the first camera, and the joint bounds. Arguments and result as of `write_dataset`.
+    """
+    rig = plan.rig
+    assert rig is not None
+    count = sum(write_dataset(plan.of_camera(k), out / name, **options) for k, name in enumerate(rig.names))
+    rig.save(out / "rig.yaml")
+    replace(plan.target, part_rotation=None, part_translation=None).save(out / "target.yaml")
+    truth = plan_truth(plan)
+    if plan.file.bounds:
+        std = torch.cat([bounds(plan, which) for which in torch.split(torch.arange(len(plan)), 64)])
+        truth.extra.update(zip(BOUND, std.unbind(1), strict=True))
+    write_truth(out / "truth.csv", replace(truth, frame=[f"frames/{name}" for name in plan.names]))
+    return count
 
 
 def _write_prints(plan: Plan, out: Path) -> None:
@@ -315,7 +332,7 @@ def _origin(plan: Plan, backend: Backend) -> dict[str, object]:
     return {
         "torchpose version": version("torchpose"),
         "backend": backend,
-        "plan": plan.file.model_dump(exclude={"camera", "target", "bounds"}),
+        "plan": plan.file.model_dump(exclude={"camera", "cameras", "target", "bounds"}),
         "camera": [camera.width, camera.height, camera.model, digest(camera.matrix, camera.distortion)],
         "target": [target.name, target.background, digest(target.centers, target.normals, target.radii)],
         "poses": digest(plan.R, plan.t),

@@ -66,9 +66,9 @@ class Estimation:
         """
         return {
             "torchpose version": version("torchpose"),
-            "--camera": _digest(self.camera),
-            "--target": [[target.name, _digest(target)] for target in self.targets],
-            "--hand-eye": None if self.hand_eye is None else _digest(self.hand_eye),
+            "--camera": digest(self.camera),
+            "--target": [[target.name, digest(target)] for target in self.targets],
+            "--hand-eye": None if self.hand_eye is None else digest(self.hand_eye),
             "--method": self.method,
             "--tone": str(self.camera.tone or "linear"),
             "--instances": self.instances,
@@ -96,13 +96,14 @@ class Estimation:
             poses = estimator(frames.to(estimator.table.ids.device, non_blocking=True)).cpu()
             if paint is not None:
                 paint(frames, poses, frame_names)
-            for row in self._rows(poses, sources):
+            for row in self.rows(poses, sources):
                 records[row["frame"]]["rows"].append(row)
             for row in detection_rows(poses.detections, frame_names, names):
                 records[row["frame"]]["detections"].append(row)
         return list(records.values())
 
-    def _rows(self, poses: Poses, sources: Sequence[Source]) -> list[Row]:
+    def rows(self, poses: Poses, sources: Sequence[Source]) -> list[Row]:
+        """Rows of the poses of frames, which are of these sources."""
         names = [target.name for target in self.targets]
         given = _of_parts(poses, self.targets)
         if self.relative_to is not None:
@@ -153,7 +154,7 @@ def _add_base_cells(rows: list[Row], poses: Poses, sources: Sequence[Source], ha
         row.update(cells)
 
 
-def _digest(model: Any) -> str:
+def digest(model: Any) -> str:
     """SHA-256 of the values of a dataclass: the same for the same numbers, however the file is laid out."""
     values = [(field.name, getattr(model, field.name)) for field in fields(model) if field.name != "source"]
     plain = [(name, value.tolist() if hasattr(value, "tolist") else value) for name, value in values]
