@@ -4,8 +4,10 @@
 
 Frames: quad40 at the 20 MP camera and at its third (2 MP), noise sigma 2, 8 poses each, rendered here. CPU time is that
 of the whole process (time.process_time), one thread for torch and OpenCV alike; every round times decoding, torchpose
-and OpenCV one after the other, and the ratios are medians over the rounds. Memory is the largest resident set of
-`torchpose estimate` as a process of its own, on 8 and on 200 frames.
+and OpenCV one after the other, and the ratios are medians over the rounds. `torchpose estimate` is run as a process of
+its own, start and all, on few and on many frames: the difference is what a frame costs, decoding, tables and all, and
+what is left of the few is its start. Memory is the largest resident set of any of its processes. The load of the
+machine stands beside: frames/s say nothing where others work.
 """
 
 from __future__ import annotations
@@ -13,7 +15,6 @@ from __future__ import annotations
 import argparse
 import os
 import platform
-import shutil
 import statistics
 import subprocess
 import sys
@@ -24,7 +25,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -34,11 +35,13 @@ import torchpose as tp
 from torchpose import pipeline
 from torchpose.detect import reduce
 from torchpose.geometry import rotations
+from torchpose.io import images
 from torchpose.refine import METHODS
 from torchpose.sim import add_noise, render
 
 SIZES = {"2 MP": (1824, 1216, 1111.11), "20 MP": (5472, 3648, 3333.33)}
 FRAMES = 8
+COUNTS = {"2 MP": (16, 144), "20 MP": (4, 28)}  # frames of a short and a long run of the command, whole batches
 REFINEMENT = "refine_photometric"
 STAGES = (
     "find_coarse",
@@ -116,6 +119,44 @@ def timed(module: ModuleType, name: str, spent: dict[str, float]) -> Callable[[]
     return lambda: setattr(module, name, original)
 
 
+def with_numpy(data: bytes) -> np.ndarray:
+    """By OpenCV, as whoever has no other decoder does it."""
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    return np.asarray(image)
+
+
+def bench_decoders(folder: Path, rounds: int, report: list[str]) -> None:
+    """CPU of decoding the frames by each decoder, and by torchpose with all that it checks."""
+    from kornia_rs import io
+
+    paths = sorted(folder.iterdir())
+    plain = [path.read_bytes() for path in paths]
+    shape = with_numpy(plain[0]).shape
+    jpeg = [cv2.imencode(".jpg", with_numpy(data))[1].tobytes() for data in plain]
+    (folder.parent / "jpeg").mkdir()
+    files = [folder.parent / "jpeg" / f"{i}.jpg" for i in range(len(jpeg))]
+    for path, data in zip(files, jpeg, strict=True):
+        path.write_bytes(data)
+    work: dict[str, Callable[[], object]] = {
+        "PNG, OpenCV": lambda: [with_numpy(data) for data in plain],
+        "PNG, kornia_rs": lambda: [io.decode_image_png_u8(data, shape, "mono") for data in plain],
+        "PNG, torchpose": lambda: [images.decode(path) for path in paths],
+        "JPEG, OpenCV": lambda: [with_numpy(data) for data in jpeg],
+        "JPEG, kornia_rs": lambda: [io.decode_image_jpegturbo(data, "mono") for data in jpeg],
+        "JPEG, torchpose": lambda: [images.decode(path) for path in files],
+    }
+    times: dict[str, list[float]] = {name: [] for name in work}
+    for _ in range(rounds):
+        for name, function in work.items():
+            times[name].append(cpu(function))
+    report += ["| decoder | CPU ms a frame | of OpenCV, PNG |", "|---|---|---|"]
+    for name, spent in times.items():
+        of = statistics.median(a / b for a, b in zip(spent, times["PNG, OpenCV"], strict=True))
+        report += [f"| {name} | {1e3 * statistics.median(spent) / len(paths):.1f} | {of:.2f} |"]
+    report += [""]
+
+
 def cpu(function: Callable[[], object]) -> float:
     start = time.process_time()
     function()
@@ -177,19 +218,82 @@ def bench_reduction(rounds: int, report: list[str]) -> None:
     report += [f"Area reduction of 20 MP frames by 4: avg_pool2d takes {ratio:.1f} times the CPU of cv2.resize.", ""]
 
 
-def peak_memory(folder: Path, camera: Path, count: int) -> float:
-    """Largest resident set of `torchpose estimate` on ``count`` frames, MB."""
-    many = folder.parent / f"many{count}"
-    many.mkdir()
-    for i in range(count):
-        os.link(folder / f"{i % FRAMES}.png", many / f"{i:04d}.png")
-    command = [sys.executable, "-m", "torchpose", "estimate", str(many), "--camera", str(camera), "--target", "quad40"]
-    process = subprocess.Popen([*command, "--out", str(folder.parent / f"{count}.csv"), "--quiet"])
+class Run(NamedTuple):
+    """A run of the command: seconds of CPU and of the clock, and the largest resident set of its processes, MB."""
+
+    cpu: float
+    wall: float
+    memory: float
+
+
+def run(*words: str) -> Run:
+    start = time.perf_counter()
+    process = subprocess.Popen([sys.executable, "-m", "torchpose", *words], stdout=subprocess.DEVNULL)
     _, status, usage = os.wait4(process.pid, 0)
     if status != 0:
-        raise SystemExit(f"estimate failed on {count} frames")
-    shutil.rmtree(many)
-    return usage.ru_maxrss / 1024
+        raise SystemExit(f"torchpose {words[0]} failed")
+    return Run(usage.ru_utime + usage.ru_stime, time.perf_counter() - start, usage.ru_maxrss / 1024)
+
+
+def estimated(folder: Path, count: int, threads: int) -> Run:
+    """`torchpose estimate` on ``count`` frames."""
+    many, camera = folder.parent / f"many{count}", folder.parent / "camera.yaml"
+    if not many.exists():
+        many.mkdir()
+        for i in range(count):
+            os.link(folder / f"{i % FRAMES}.png", many / f"{i:04d}.png")
+    out = str(folder.parent / f"{count}.csv")
+    options = ["--camera", str(camera), "--target", "quad40", "--out", out, "--threads", str(threads), "--quiet"]
+    return run("estimate", str(many), *options)
+
+
+def bench_command(label: str, rounds: int, folder: Path, report: list[str]) -> None:
+    """The whole command beside OpenCV's decoding of the same files, on one core and on two."""
+    few, many = COUNTS[label]
+    plain = [path.read_bytes() for path in sorted(folder.iterdir())]
+    rows: dict[str, list[float]] = defaultdict(list)
+    for _ in range(rounds):
+        decoding = cpu(lambda: [with_numpy(data) for data in plain]) / len(plain)
+        rows["decode"].append(decoding)
+        for threads in (1, 2):
+            short, long = estimated(folder, few, threads), estimated(folder, many, threads)
+            frame = (long.cpu - short.cpu) / (many - few)
+            rows[f"frame {threads}"].append(frame)
+            rows[f"of decoding {threads}"].append(frame / decoding)
+            rows[f"start {threads}"].append(short.cpu - few * frame)
+            rows[f"rate {threads}"].append((many - few) / (long.wall - short.wall))
+            rows[f"memory {threads}"].append(long.memory)
+    of = {name: statistics.median(values) for name, values in rows.items()}
+    report += ["| `torchpose estimate` on | CPU ms a frame | of OpenCV's decoding | frames/s | start, CPU s | MB |"]
+    report += ["|---|---|---|---|---|---|"]
+    for threads in (1, 2):
+        frame, ratio, rate, start, memory = (
+            of[f"{name} {threads}"] for name in ("frame", "of decoding", "rate", "start", "memory")
+        )
+        cores = "one core" if threads == 1 else "two cores"
+        report += [f"| {cores} | {1e3 * frame:.1f} | {ratio:.2f} | {rate:.1f} | {start:.2f} | {memory:.0f} |"]
+    gain = statistics.median(b / a for a, b in zip(rows["rate 1"], rows["rate 2"], strict=True))
+    report += ["", f"{many} frames; two cores give {gain:.2f} times the frames/s of one. {loaded()}", ""]
+
+
+def bench_start(rounds: int, report: list[str]) -> None:
+    """CPU of commands that have nothing to do, beside that of importing torch alone."""
+    imports = [python_cpu("import torch") for _ in range(rounds)]
+    helps = [run("--help").cpu for _ in range(rounds)]
+    stages = [python_cpu("import torchpose.pipeline, torchpose.io.store") for _ in range(rounds)]
+    times = (statistics.median(times) for times in (helps, imports, stages))
+    text = "CPU of `torchpose --help` {:.2f} s, of `import torch` {:.2f} s, of all that `estimate` imports {:.2f} s."
+    report += [text.format(*times), ""]
+
+
+def python_cpu(code: str) -> float:
+    process = subprocess.Popen([sys.executable, "-c", code])
+    usage = os.wait4(process.pid, 0)[2]
+    return usage.ru_utime + usage.ru_stime
+
+
+def loaded() -> str:
+    return f"Load of the machine (1 minute): {os.getloadavg()[0]:.1f}."
 
 
 def main() -> None:
@@ -204,7 +308,7 @@ def main() -> None:
         "# Pipeline benchmark",
         "",
         f"Made by `scripts/bench_pipeline.py` at commit {commit}; Python {platform.python_version()}, torch "
-        f"{torch.__version__}, OpenCV {cv2.__version__}, {os.cpu_count()} cores; one thread each, medians.",
+        f"{torch.__version__}, OpenCV {cv2.__version__}, {os.cpu_count()} cores; one thread each, medians. {loaded()}",
         "",
     ]
     with tempfile.TemporaryDirectory() as scratch:
@@ -212,8 +316,9 @@ def main() -> None:
             folder = Path(scratch) / label.replace(" ", "") / "frames"
             folder.mkdir(parents=True)
             bench_size(label, options.rounds, folder, report)
-            few, many = (peak_memory(folder, folder.parent / "camera.yaml", n) for n in (8, 200))
-            report += [f"Peak memory of `torchpose estimate`: {few:.0f} MB on 8 frames, {many:.0f} MB on 200.", ""]
+            bench_decoders(folder, options.rounds, report)
+            bench_command(label, min(3, options.rounds), folder, report)
+    bench_start(min(3, options.rounds), report)
     bench_reduction(options.rounds, report)
     text = "\n".join(report)
     print(text)

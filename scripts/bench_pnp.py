@@ -32,6 +32,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
+import torchpose as tp
 from torchpose import pnp
 from torchpose.geometry import rotations
 from torchpose.kernels import has_compiler
@@ -294,6 +295,64 @@ def profile(points: Tensor, compile: bool, most: int = 12) -> list[dict[str, obj
     return rows
 
 
+def several(batch: int, rounds: int) -> list[dict[str, object]]:
+    """Generalised poses: points that three cameras share, beside PoseLib's estimator, one by one."""
+    camera = tp.Camera(1824, 1216, MATRIX, [])
+    turns = rotations.exp(torch.tensor([[0.0, math.radians(a), 0.0] for a in (0, 35, -35)], dtype=torch.float64))
+    middle = torch.tensor([0.0, 0.0, 500.0], dtype=torch.float64)
+    shifts = middle - turns @ middle
+    shifts[0] = 0
+    rig = tp.CameraRig([camera] * 3, turns, shifts)
+    rows: list[dict[str, object]] = []
+    for count, points in ((8, TARGETS[9][:8]), (12, torch.cat([TARGETS[4], TARGETS[4], TARGETS[4]]))):
+        index = torch.arange(count) // (count // 4) % 3 if count == 8 else torch.arange(12) // 4
+        g = torch.Generator().manual_seed(count)
+        R = rotations.exp(0.3 * torch.randn(batch, 3, dtype=torch.float64, generator=g))
+        t = middle + 40 * (torch.rand(batch, 3, dtype=torch.float64, generator=g) - 0.5)
+        at = (points @ R.mT + t[:, None])[:, :, None]
+        at = (turns @ at[..., None])[..., 0] + shifts
+        pixels = camera.project(at)[:, torch.arange(count), index]
+        pixels = pixels + SIGMA_PX * torch.randn(pixels.shape, dtype=torch.float64, generator=g)
+        calls: dict[str, Callable[[], object]] = {
+            "torchpose, rig": partial(pnp.solve, points, pixels, rig, camera_index=index, sigma_px=SIGMA_PX)
+        }
+        if (loop := poselib_rig(rig, points, pixels[:LOOP], index)) is not None:
+            calls["PoseLib estimate_generalized_absolute_pose"] = loop
+        times: dict[str, list[float]] = {name: [] for name in calls}
+        for _ in range(rounds):
+            for name, call in calls.items():
+                start = time.process_time()
+                call()
+                size = batch if name.startswith("torchpose") else min(batch, LOOP)
+                times[name].append((time.process_time() - start) / size)
+        for name, each in times.items():
+            rows.append({"points": count, "batch": batch, "method": name, "us_per_pose": 1e6 * statistics.median(each)})
+    return rows
+
+
+def poselib_rig(rig: tp.CameraRig, points: Tensor, pixels: Tensor, index: Tensor) -> Callable[[], None] | None:
+    """A loop of PoseLib's estimator for several cameras."""
+    try:
+        import poselib
+    except ImportError:
+        return None
+    lens = {"model": "PINHOLE", "width": 1824, "height": 1216, "params": [1111.0, 1111.0, 912.0, 608.0]}
+    places = []
+    for R, t in zip(rig.R, rig.t, strict=True):
+        place = poselib.CameraPose()
+        place.R, place.t = R.numpy(), t.numpy()
+        places.append(place)
+    own = [(index == n).numpy() for n in range(len(rig))]
+    model = [points.numpy()[some] for some in own]
+
+    def run() -> None:
+        for image in pixels.numpy():
+            parts = [image[some] for some in own]
+            poselib.estimate_generalized_absolute_pose(parts, model, places, [lens] * len(places), {}, {})
+
+    return run
+
+
 def markdown(rows: list[dict[str, object]], names: list[str]) -> str:
     def cell(value: object) -> str:
         return f"{value:.4g}" if isinstance(value, float) else str(value)
@@ -311,6 +370,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--no-compile", dest="compile", action="store_false")
     parser.add_argument("--profile", action="store_true", help="only what bounds it")
+    parser.add_argument("--several", type=int, nargs="*", help="batches of generalised poses; only these are timed")
     parser.add_argument("--out", type=Path, help="Markdown file")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
@@ -322,6 +382,10 @@ def main() -> None:
         + ("" if compile else ", nothing compiled")
     )
     print(machine)
+    if args.several is not None:
+        for batch in args.several or [1, 64, 1024]:
+            print(markdown(several(batch, args.rounds), ["points", "batch", "method", "us_per_pose"]), flush=True)
+        return
     names = ["points", "batch", "method", "us_per_pose", "us_quartiles", "rounds", "poses_per_s"]
     names += ["times_cv2_iterative", "working_mb", "result_mb", "note"]
     rows: list[dict[str, object]] = []

@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-ROOMS = ("detect", "rings", "identify", "pose", "refine", "geometry", "pipeline.py", "ellipse.py")
+ROOMS = ("detect", "rings", "identify", "pose", "refine", "moments", "geometry", "pipeline.py", "ellipse.py")
 ORIGIN = re.compile(r"\((a )?(derived|convention|measured|contract)|^contract", re.I)
 PLAIN = {-1, 0, 1, 2, 3, 4, 0.5}
 COMPARING = {"near_pairs", "reduction_for", "merge_duplicates", "ratio_tolerance"}

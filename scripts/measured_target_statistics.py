@@ -34,7 +34,8 @@ from torch import Tensor
 
 import torchpose as tp
 from torchpose.calibration import Views, calibrate_intrinsics
-from torchpose.calibration.bundle import adjust, moved_camera
+from torchpose.calibration.bundle import adjust
+from torchpose.calibration.lenses import moved_camera
 from torchpose.calibration.measured import measured_target
 from torchpose.calibration.plate import free_plate, motions
 from torchpose.calibration.rings import rim_derivatives, rims_by_camera
@@ -219,7 +220,7 @@ def drawn_views(scene: Scene, poses: tuple[Tensor, Tensor], g: torch.Generator) 
         information,
         torch.zeros_like(off),
         rims_by_camera(scene.camera, rotation, at, normals, radii),
-        scene.camera,
+        (scene.camera,),
     )
     xy = rims.t[:, :2] / rims.t[:, 2:]
     by_place = scene.camera.J_distort(xy) @ image_by_point(xy, rims.t[:, 2])

@@ -7,9 +7,9 @@ import inspect
 import torchpose as tp
 
 PUBLIC = [
-    "ArgumentError", "Camera", "ConfigError", "Detections", "FrameError", "HandEye", "Misfit", "Motions",
-    "PoseEstimator", "Poses", "Reason", "Status", "Target", "TorchposeError", "analysis", "calibration", "centers",
-    "design", "detect", "ellipse", "pnp", "sim", "zernike",
+    "ArgumentError", "Camera", "CameraRig", "ConfigError", "Detections", "FrameError", "HandEye", "Misfit",
+    "Motions", "PoseEstimator", "Poses", "Reason", "Status", "Target", "TorchposeError", "analysis", "calibration",
+    "centers", "design", "detect", "ellipse", "pnp", "sim", "zernike",
 ]  # fmt: skip
 
 

@@ -23,6 +23,7 @@ FLOW = [
     ["identify"],
     ["pose"],
     ["refine"],
+    ["moments"],
     ["pipeline"],
     ["io", "sim"],
     ["analysis"],

@@ -28,7 +28,11 @@ _NUMBER: Any = float | int | torch.Tensor
 _beartype: Any = beartype(conf=BeartypeConf(hint_overrides=FrozenDict({float: _NUMBER})))
 OFTEN = 100  # calls of a function after which every tenth is checked
 # constructors that take what `torch.as_tensor` takes, and say with the field's name what is wrong with the rest
-COERCING = {"torchpose.camera.model.Camera.__init__", "torchpose.pipeline.PoseEstimator.__init__"}
+COERCING = {
+    "torchpose.camera.model.Camera.__init__",
+    "torchpose.camera.rig.CameraRig.__init__",
+    "torchpose.pipeline.PoseEstimator.__init__",
+}
 
 
 def install() -> None:

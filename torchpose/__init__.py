@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from torchpose import analysis, calibration, design, detect, ellipse, pnp, sim
-    from torchpose.camera import Camera
+    from torchpose.camera import Camera, CameraRig
     from torchpose.errors import ArgumentError, ConfigError, FrameError, TorchposeError
     from torchpose.handeye import HandEye
     from torchpose.pipeline import PoseEstimator
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 __all__ = [
     "ArgumentError",
     "Camera",
+    "CameraRig",
     "ConfigError",
     "Detections",
     "FrameError",
@@ -46,6 +47,7 @@ __version__ = "0.2.0.dev0"
 _HOME = {
     "ArgumentError": "errors",
     "Camera": "camera",
+    "CameraRig": "camera",
     "ConfigError": "errors",
     "Detections": "results",
     "FrameError": "errors",

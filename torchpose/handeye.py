@@ -78,7 +78,8 @@ class HandEye:
 
     Attributes:
         mount: 'base' for a camera fixed in the cell, 'tool' for one carried by the robot.
-        rotation, translation: (3, 3) and (3,) float64, mm.
+        rotation: (3, 3) float64.
+        translation: (3,) float64, mm.
         source: the file, for messages.
         covariance: (6, 6) float64 of the translation (mm), then the rotation w (rad) with R_true = exp(w) R, along and
             about the axes of the mount; None where it is not known.

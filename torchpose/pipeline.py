@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from torchpose.camera import LINEAR, Camera, Tone
+from torchpose.camera import LINEAR, Camera, CameraRig, Tone
 from torchpose.camera.model import Model
 from torchpose.camera.plausible import check_intrinsics
 from torchpose.detect import (
@@ -36,6 +36,7 @@ from torchpose.identify import (
     Scene,
     Views,
     beside_another,
+    find_near,
     identify,
     identify_boards,
     in_company,
@@ -44,8 +45,9 @@ from torchpose.identify import (
     named,
 )
 from torchpose.kernels import find_compiler
+from torchpose.moments import Moments, Start, View, begin, joined, refine_moments
+from torchpose.moments.outcome import Alone
 from torchpose.pose import (
-    Evidence,
     Found,
     Solutions,
     best_copies,
@@ -93,7 +95,8 @@ class PoseEstimator(nn.Module):
     """Poses of one or more targets in batches of frames (paper, Algorithm 1).
 
     Args:
-        camera: intrinsics and distortion; frames must have its size.
+        camera: intrinsics and distortion; frames must have its size. With a `CameraRig` it is a `RigEstimator`: frames
+            of all cameras in, poses in the first camera out.
         target: one target or several, as `Target`, name or path; each gets a row for every frame. A board of equal
             marks that looks the same after a turn is ambiguous, unless measured places tell or it is said to be upright
             (`Target.upright`).
@@ -116,9 +119,13 @@ class PoseEstimator(nn.Module):
 
     made_for: Tensor
 
+    def __new__(cls, camera: Any = None, target: Any = None, *args: Any, **options: Any) -> PoseEstimator:
+        several = cls is PoseEstimator and isinstance(camera, CameraRig)
+        return super().__new__(RigEstimator if several else cls)
+
     def __init__(
         self,
-        camera: Camera,
+        camera: Camera | CameraRig,
         target: Target | str | PathLike[str] | Sequence[Target | str | PathLike[str]],
         *,
         instances: int = 1,
@@ -199,26 +206,35 @@ class PoseEstimator(nn.Module):
         return f"camera={self.camera.width}x{self.camera.height}, targets=[{names}]"
 
     @torch.no_grad()
-    def forward(self, frames: Tensor | NDArray[Any]) -> Poses:
+    def forward(self, frames: Tensor | NDArray[Any], near: Poses | None = None) -> Poses:
         """Poses of every target in every frame.
 
         Args:
             frames: (H, W), (B, H, W) or (B, 1, H, W) grey, or (B, 3, H, W) RGB, of which the luma counts; tensors or
                 NumPy arrays of uint8, uint16, or floating point with white at ``float_range``.
+            near: poses not long before, row by row of the frame of the batch that they are near to: of a sequence, what
+                the last call gave. The rings are looked for where these put them, up to `identify.near.MOST_MOVE` px
+                away, and all over the frame only where a target is not found whole there; so one that was lost is found
+                again. The result is the same to a fraction of its deviation, but for `Poses.copies`, which then counts
+                what is near. Boards, and several instances, are looked for everywhere.
 
         Returns:
             Rows sorted by frame, target and instance, on the device of the frames: B * T of them with
             ``instances=1``. With more, every frame and target has at least one row, and one for each copy with a pose.
 
         Raises:
-            FrameError: wrong shape, size or dtype.
+            FrameError: wrong shape, size or dtype. ConfigError: ``near`` is of other targets.
         """
         frames = self._checked(frames)
         scene = Scene.of(frames, self.camera.to(frames.device), self.table.to(frames.device))
-        scene, found, tried = self._found(scene)
+        scene, found, tried = self._found(scene, near)
         again = self._second_look(scene, found, tried)
         if len(again[0]) > len(found.rings):
             found = self._solved(scene, *again)
+        return self._finished(scene, found)
+
+    def _finished(self, scene: Scene, found: Found) -> Poses:
+        """Rows of solutions, refined."""
         if found.solvable.numel():
             found = found._replace(solutions=self._refined(scene, found))
             found = found._replace(solutions=still_open(scene, found))
@@ -239,7 +255,7 @@ class PoseEstimator(nn.Module):
             frames = frames.float() * (255.0 / self.float_range)
         return frames.contiguous()
 
-    def _found(self, scene: Scene) -> tuple[Scene, Found, Rings]:
+    def _found(self, scene: Scene, near: Poses | None = None) -> tuple[Scene, Found, Rings]:
         """What is found in all frames: at the coarse scale alone where that shows every target whole.
 
         Also the rings that were measured for that.
@@ -252,12 +268,17 @@ class PoseEstimator(nn.Module):
             circles, others = self._useful(scene, find_candidates(frames, wanted=wanted, float_range=255.0))
             scene, found = self._read(scene, Rings.cat([self._measured(scene, circles), others]))
             return scene, found, found.rings
-        coarse = find_coarse(frames, wanted=wanted, float_range=255.0)
+        coarse = None if near is None else find_near(scene, *_placed(scene, near), wanted)
+        tracked = coarse is not None
+        if coarse is None:
+            coarse = find_coarse(frames, wanted=wanted, float_range=255.0)
         rings, copies, tried = self._likely(scene, coarse)
         first = self._read(scene, rings, copies)
         settled = self._settled(*first)
         if bool(settled.all()):
             return *first, tried.rings
+        if tracked:
+            return self._found_elsewhere(scene, first, settled, tried.rings)
         rest, number = (~settled).nonzero()[:, 0], (~settled).cumsum(0) - 1
         known = coarse[~settled[coarse.frame]]
         known = replace(known, frame=number[known.frame])
@@ -266,6 +287,23 @@ class PoseEstimator(nn.Module):
         circles, others = self._useful(scene, replace(finer, frame=rest[finer.frame]))
         every = Rings.cat([rings[settled[rings.frame]], self._measured(scene, circles, tried), others])
         return *self._read(scene, every, copies), Rings.cat([tried.rings, every])
+
+    def _found_elsewhere(
+        self, scene: Scene, near: tuple[Scene, Found], settled: Tensor, tried: Rings
+    ) -> tuple[Scene, Found, Rings]:
+        """The same where some frames are settled by what is near the last poses, and the others searched as ever."""
+        rest, rows = (~settled).nonzero()[:, 0], len(scene.table)
+        whole = near[1].rings
+        other = Scene.of(scene.frames[rest], scene.camera, scene.table)
+        _, found, searched = self._found(other)
+        more = replace(found.rings, frame=rest[found.rings.frame])
+        copies = torch.zeros(scene.groups, dtype=torch.int64, device=rest.device)
+        for identified, frame in ((near[1].identified, None), (found.identified, rest)):
+            group = identified.group
+            group = group if frame is None else frame[group // rows] * rows + group % rows
+            copies.scatter_reduce_(0, group, identified.copies, "amax")
+        tried = Rings.cat([tried[settled[tried.frame]], replace(searched, frame=rest[searched.frame])])
+        return *self._read(scene, Rings.cat([whole[settled[whole.frame]], more]), copies), tried
 
     def _found_with_boards(self, scene: Scene) -> tuple[Scene, Found]:
         """The same where there are boards among the targets: at finer and finer scales where they are not whole."""
@@ -399,7 +437,7 @@ class PoseEstimator(nn.Module):
     def _refined(self, scene: Scene, found: Found) -> Solutions:
         """The solutions after the steps of the method."""
         evidence, solutions = found.evidence[found.solvable], _doubted(scene, found)
-        sight = _sight(scene, found, evidence)
+        sight = Sight.of_scene(scene, found, found.solvable)
         for step in self._recipe.steps:
             solutions = step(solutions, evidence, sight)
         return solutions
@@ -412,6 +450,183 @@ def _hopeful(scene: Scene, frames: int, found: Candidates) -> Tensor:
     ideal = mapped(found.ellipse, lambda points: ideal_pixels(scene.camera, points))
     together = beside_another((found.frame, found.polarity, ideal), scene.table, scene.camera.matrix)
     return marked(found.frame[together], frames)
+
+
+def _placed(scene: Scene, near: Poses) -> tuple[Tensor, Tensor]:
+    """The poses as those of the rows (N, 3, 3), (N, 3) of a scene with one for every frame and target; NaN elsewhere.
+
+    Raises:
+        ConfigError: they are of other targets.
+    """
+    if len(near) and int(near.target.max()) >= len(scene.table):
+        raise ConfigError(f"near: poses of {int(near.target.max()) + 1} targets, but there are {len(scene.table)}")
+    some = near[(near.instance == 0) & (near.frame < len(scene.frames))]
+    group = some.frame * len(scene.table) + some.target
+    R, t = (
+        torch.full((scene.groups, *shape), torch.nan, dtype=torch.float64, device=group.device)
+        for shape in ((3, 3), (3,))
+    )
+    return R.index_copy(0, group, some.R.to(R)), t.index_copy(0, group, some.t.to(t))
+
+
+class RigEstimator(PoseEstimator):
+    """Poses of targets that several cameras see at one moment; arguments as of `PoseEstimator`, with a `CameraRig`.
+
+    Every camera's pictures go through the stages of one camera's up to what each of them solves. From there on there
+    are moments: a common start, a second look in every camera that found too little where the others put the markers,
+    one refinement on the pictures of all. Rows that one camera has alone are that camera's.
+    """
+
+    def __init__(
+        self,
+        camera: Camera | CameraRig,
+        target: Target | str | PathLike[str] | Sequence[Target | str | PathLike[str]],
+        *,
+        instances: int = 1,
+        **options: Any,
+    ) -> None:
+        nn.Module.__init__(self)
+        if not isinstance(camera, CameraRig):
+            raise ConfigError(f"camera: is of type {type(camera).__name__}; pass a CameraRig")
+        if instances != 1:
+            raise ConfigError(f"instances: {instances} given; several cameras look for one copy, leave it out")
+        self.rig, self.targets = camera, _targets(target)
+        self.views = nn.ModuleList([PoseEstimator(one, self.targets, **options) for one in camera.cameras])
+        self.instances, self.method = instances, self._of(0).method
+        if self.method == "paper":
+            raise ConfigError("method: 'paper' is of one camera; use photometric, edges or centers with several")
+
+    def _of(self, camera: int) -> PoseEstimator:
+        view = self.views[camera]
+        assert isinstance(view, PoseEstimator)
+        return view
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> PoseEstimator:
+        nn.Module._apply(self, fn, recurse)
+        return self
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any) -> None:
+        nn.Module._load_from_state_dict(self, state_dict, prefix, *args)
+
+    def extra_repr(self) -> str:
+        return f"cameras={', '.join(self.rig.names)}, targets=[{', '.join(t.name for t in self.targets)}]"
+
+    @torch.no_grad()
+    def forward(self, frames: Sequence[Tensor | NDArray[Any]], seen: Tensor | None = None) -> Poses:  # type: ignore[override]
+        """Poses of every target at every moment, in the axes of the first camera.
+
+        Args:
+            frames: of each camera its B frames, as `PoseEstimator` takes them, moment by moment.
+            seen: (C, B) bool, False where a camera has no picture of a moment; what its frame holds is not looked at.
+
+        Returns:
+            B * T rows, sorted by moment and target, with `Poses.share`, `Poses.consistency` and `Poses.odd`.
+
+        Raises:
+            FrameError: wrong shape, size or dtype, or not one tensor for each camera.
+        """
+        if isinstance(frames, Tensor) or len(frames) != len(self.rig):
+            raise FrameError(f"frames: give a sequence of {len(self.rig)} tensors, one for each camera")
+        every = [self._of(k)._checked(of_camera) for k, of_camera in enumerate(frames)]
+        sizes = {len(of_camera) for of_camera in every}
+        if len(sizes) > 1:
+            raise FrameError(
+                f"frames: the cameras have {', '.join(map(str, sorted(sizes)))} frames; give as many of each"
+            )
+        count, device = sizes.pop(), every[0].device
+        if seen is None:
+            seen = torch.ones(len(every), count, dtype=torch.bool, device=device)
+        if seen.shape != (len(every), count) or seen.dtype != torch.bool:
+            raise FrameError(f"seen: has shape {tuple(seen.shape)} and {seen.dtype}; give ({len(every)}, {count}) bool")
+        # a moment that no camera has is an empty picture of the first
+        seen = seen.clone()
+        seen[0] |= ~seen.any(0)
+        kept = [of_camera if bool(own.all()) else of_camera[own] for of_camera, own in zip(every, seen, strict=True)]
+        views = [self._view(k, own, seen[k]) for k, own in enumerate(kept) if len(own)]
+        return self._joined(Moments(self.rig.to(device), views, count, len(self.targets)))
+
+    def _view(self, camera: int, frames: Tensor, seen: Tensor) -> View:
+        """What one camera's pictures show, as far as it goes alone."""
+        one, targets = self._of(camera), len(self.targets)
+        scene = Scene.of(frames, one.camera.to(frames.device), one.table.to(frames.device))
+        scene, found, tried = one._found(scene)
+        again = one._second_look(scene, found, tried)
+        if len(again[0]) > len(found.rings):
+            found = one._solved(scene, *again)
+        moment = seen.nonzero()[:, 0]
+        number = torch.full_like(seen, -1, dtype=torch.int64).index_copy(
+            0, moment, torch.arange(len(moment), device=moment.device)
+        )
+        every = torch.arange(len(seen) * targets, device=moment.device)
+        row = torch.where(number[every // targets] >= 0, number[every // targets] * targets + every % targets, -1)
+        return View(camera, scene, found, row, moment)
+
+    def _joined(self, moments: Moments) -> Poses:
+        every = torch.arange(moments.rows, device=moments.views[0].row.device)
+        seen = moments.seen(every)
+        rows = (seen.any(1).sum(-1) >= MIN_MARKERS).nonzero()[:, 0]
+        if len(moments.views) == 1:
+            rows = rows[:0]
+        start = None
+        if rows.numel():
+            start = begin(moments, rows)
+            moments, start = self._looked_again(moments, rows, start)
+            several = start.known & ((start.mask.any(-1) | start.against).sum(1) > 1)
+            rows, start = rows[several], start[several]
+        fused = None
+        if start is not None and rows.numel():
+            refine = self._of(0)._recipe.refine
+            fused = refine_moments(moments, rows, start, refine)
+        return joined(moments, rows, fused, self._alone(moments, every[~marked(rows, moments.rows)]))
+
+    def _looked_again(self, moments: Moments, rows: Tensor, start: Start) -> tuple[Moments, Start]:
+        """With what cameras that have no pose of their own show where the others put the markers."""
+        views, changed = [], torch.zeros_like(start.known)
+        for k, view in enumerate(moments.views):
+            own, place, solutions = view.row[rows], view.place(rows), view.found.solutions
+            solved = (place >= 0) & (solutions.solved[place.clamp_min(0)] if len(solutions) else place >= 0)
+            some = (start.known & (own >= 0) & ~solved & ~start.against.any(1)).nonzero()[:, 0]
+            again = view if some.numel() == 0 else self._found_there(moments, view, own[some], start[some], k)
+            if len(again.found.rings) > len(view.found.rings):
+                changed[some] = True
+            views.append(again)
+        moments = moments.of_views(views)
+        some = changed.nonzero()[:, 0]
+        if some.numel() == 0:
+            return moments, start
+        return moments, start.replaced(some, begin(moments, rows[some], (start.R[some], start.t[some])))
+
+    def _found_there(self, moments: Moments, view: View, own: Tensor, start: Start, number: int) -> View:
+        """A view with the rings that lie where poses of its rows ``own`` put them."""
+        one, identified = self._of(view.camera), view.found.identified
+        R, t = moments.in_view(view, start.R, start.t)
+        nowhere = torch.full_like(identified.R, torch.nan), torch.full_like(identified.t, torch.nan)
+        R, t = nowhere[0].index_copy(0, own, R), nowhere[1].index_copy(0, own, t)
+        # rings that do not agree with the others are not those markers
+        kept = start.mask[:, number]
+        ring = identified.ring.index_copy(0, own, torch.where(kept, identified.ring[own], -1))
+        identified = replace(identified, ring=ring)
+        rings, there = view.found.rings, Views(ring >= 0, R[:, None], t[:, None], 0)
+        again = look_again(view.scene, rings, identified, there, rings[:0], correct=one._recipe.correct)
+        return view._replace(found=one._solved(view.scene, *again))
+
+    def _alone(self, moments: Moments, rows: Tensor) -> list[Alone]:
+        """Rows that one camera has alone, by the camera that has most of it."""
+        if rows.numel() == 0:
+            return []
+        most = moments.seen(rows).sum(-1)
+        there = torch.stack([view.row[rows] >= 0 for view in moments.views], 1)
+        best = torch.where(there, most, -1).argmax(1)
+        parts = []
+        for k, view in enumerate(moments.views):
+            own = rows[best == k]
+            if own.numel() == 0:
+                continue
+            found = view.found
+            mine = marked(view.row[own], len(found.evidence))[found.solvable].nonzero()[:, 0]
+            found = found._replace(solvable=found.solvable[mine], solutions=found.solutions[mine])
+            parts.append(Alone(own, k, self._of(view.camera)._finished(view.scene, found)))
+        return parts
 
 
 def _legible(blur: Tensor) -> Tensor:
@@ -491,26 +706,6 @@ def _doubted(scene: Scene, found: Found) -> Solutions:
     across = crossed_out(found.rings, scene.frame[row], solutions.R, solutions.t, markers, solutions.mask, matrix)
     bad = across & (solutions.mask.sum(-1) == MIN_MARKERS) & solutions.solved
     return solutions.marked(bad, Status.REJECTED, Reason.RESIDUAL)
-
-
-def _sight(scene: Scene, found: Found, evidence: Evidence) -> Sight:
-    """The solvable rows in their frames."""
-    ring = found.rings[found.identified.ring[found.solvable].clamp_min(0).flatten()]
-    raw = torch.stack([ring.outer_raw, ring.inner_raw], 1).view(*evidence.mask.shape, 2, 5)
-    blur = torch.where(ring.clipped[:, None], torch.nan, ring.blur)  # what is left of a clipped edge tells of none
-    return Sight(
-        scene.frame[found.solvable],
-        evidence.mask,
-        raw,
-        ring.polarity.view_as(evidence.mask),
-        evidence.points,
-        evidence.normals,
-        evidence.radii,
-        scene.frames,
-        scene.camera,
-        blur.view(*evidence.mask.shape, 3),
-        seen=ring.seen.view(*evidence.mask.shape, -1),
-    )
 
 
 def _tensors(owner: Camera | MarkerTable) -> dict[str, Tensor]:

@@ -41,6 +41,7 @@ class Reason(IntEnum):
     BEHIND_CAMERA = 5
     TWO_SOLUTIONS = 6  # with Status.AMBIGUOUS
     MIRRORED = 7  # the target is seen from behind its printed side: a mirror in the path, or a file drawn y-up
+    CAMERAS_DISAGREE = 8  # cameras of a rig contradict each other beyond their covariance
 
 
 class Misfit(IntEnum):
@@ -64,7 +65,9 @@ class Detections(Rows):
         marker: marker id as in the target file.
         center: image of the marker's centre, compensated for perspective, px.
         center_cov: its covariance, px^2.
-        outer, inner: fitted ellipses cx, cy, a >= b (semi-axes, px), theta (rad, [0, pi)).
+        outer: fitted ellipse cx, cy, a >= b (semi-axes, px), theta (rad, [0, pi)).
+        inner: that of the inner circle.
+        camera: number in the rig, where several cameras look.
     """
 
     frame: Int[Tensor, " K"]
@@ -75,6 +78,7 @@ class Detections(Rows):
     center_cov: Float[Tensor, "K 2 2"]
     outer: Float[Tensor, "K 5"]
     inner: Float[Tensor, "K 5"]
+    camera: Int[Tensor, " K"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +86,8 @@ class Motions(Rows):
     """Poses of one row's target in the frame of another's: X_i = R X_j + t.
 
     Attributes:
-        R, t: t in mm.
+        R: rotation.
+        t: translation, mm.
         covariance: translation (mm) first, then rotation (rad, about the axes of frame i), of everything.
         noise: the part of it that is the noise of the two frames.
     """
@@ -120,7 +125,8 @@ class Poses(Rows):
         copies: of the target that the frame shows, each by a pose or by four markers in their places; the same in all
             rows of a frame and target. More than there are rows: the others were left out, or no pose explains them.
             Where one copy is looked for, those at the coarse scale are counted, and there may be more.
-        R, t: target to camera: X_cam = R X_target + t, mm.
+        R: target to camera: X_cam = R X_target + t.
+        t: mm.
         covariance: translation (mm) first, then rotation (rad, left-multiplied: R = exp(w) R_est, that is about the
             camera axes). Of everything: noise, target and camera.
         noise: the part of it that is the frame's own: how far the pose would scatter if the frame were taken again.
@@ -130,14 +136,23 @@ class Poses(Rows):
             edges of a ring further from its centre, all in mm, as far as the file or the residuals leave it open; NaN
             for markers that were not used.
         misfit: `Misfit`.
-        residual_chi2, freedom: chi-squared of what the markers say against each other, under noise and the stated
-            uncertainties alone, and its degrees of freedom; what stands above chance is counted in the covariance.
+        residual_chi2: chi-squared of what the markers say against each other, under noise and the stated
+            uncertainties alone; what stands above chance is counted in the covariance.
+        freedom: its degrees of freedom.
         rms: reprojection RMS of the compensated marker centres, px.
-        status, reason: `Status` and `Reason`.
+        status: `Status`.
+        reason: `Reason`, why it is not OK.
         markers: number of markers used.
         chi2: of all evidence (centres and ring shapes) at the pose.
-        R_alt, t_alt, rms_alt, chi2_alt: the other minimum of the same evidence (the second planar solution); NaN
-            where both coincide or there is none.
+        R_alt: rotation of the other minimum of the same evidence (the second planar solution); NaN where both coincide
+            or there is none.
+        t_alt: its translation.
+        rms_alt: its `rms`.
+        chi2_alt: its `chi2`.
+        share: of the information about the pose, by camera of a rig, 0 where it contributes nothing; None without rig.
+        consistency: chi-squared of what the C cameras of a rig say against each other, and its degrees of freedom; 0
+            with one camera.
+        odd: the camera of a rig that contradicts the others, where three or more tell; -1 else.
         detections: the markers of the whole batch; selecting rows leaves them alone, their `frame`, `target` and
             `instance` say whose they are.
     """
@@ -166,6 +181,9 @@ class Poses(Rows):
     chi2_alt: Float[Tensor, " N"]
     detections: Detections = shared()
     of_camera: int = shared(0)
+    share: Float[Tensor, "N C"] | None = None
+    consistency: Float[Tensor, "N 2"] | None = None
+    odd: Int[Tensor, " N"] | None = None
 
     @classmethod
     def cat(cls, parts: Sequence[Self]) -> Self:
@@ -182,6 +200,13 @@ class Poses(Rows):
     def ok(self) -> Bool[Tensor, " N"]:
         """Rows with `Status.OK`."""
         return self.status == Status.OK
+
+    @property
+    def cameras(self) -> Int[Tensor, " N"]:
+        """How many cameras of a rig contribute; 1 or 0 of one camera alone."""
+        if self.share is None:
+            return self.t.isfinite().all(1).long()
+        return (self.share > 0).sum(1)
 
     @property
     def rotation_vector(self) -> Float[Tensor, "N 3"]:

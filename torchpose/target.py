@@ -105,8 +105,8 @@ class Target:
         normals: (M, 3) float64, unit, perpendicular to each ring and away from whoever sees its printed side: a
             camera with R = I, whose z axis points at the target, sees the default [0, 0, 1].
         radii: (M, 2) float64, outer and inner radius, mm.
-        part_rotation, part_translation: (3,) float64 rotation vector in rad and translation in mm that map target
-            coordinates to those of the part, both or neither.
+        part_rotation: (3,) float64 rotation vector in rad that maps target coordinates to those of the part.
+        part_translation: (3,) float64, mm, of the same map; both or neither.
         edge_gain: mm, by which the print moved every edge of dark areas outwards, as far as it is known (dot gain):
             `printed_radii` are those of the circles on the part.
         covariance: (3 M + 1, 3 M + 1) float64, mm^2, of the centres on the part, x, y, z by marker, and last of the

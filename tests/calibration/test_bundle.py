@@ -9,8 +9,9 @@ import torch
 import torchpose as tp
 from tests.calibration import calibration_scenes as scenes
 from torchpose.calibration import LENS_MODELS, calibrate_intrinsics
-from torchpose.calibration.bundle import adjust, moved_camera
+from torchpose.calibration.bundle import adjust
 from torchpose.calibration.intrinsics import start_cameras
+from torchpose.calibration.lenses import moved_camera
 from torchpose.camera.derivatives import by_intrinsics
 
 TRUE = {

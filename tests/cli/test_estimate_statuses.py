@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchpose.camera import Camera
-from torchpose.cli import estimate
+from torchpose.cli import options
 from torchpose.cli.main import main
 from torchpose.geometry import rotations
 from torchpose.pipeline import Method
@@ -111,4 +111,4 @@ def test_no_frame_of_the_batch_has_a_target(statuses: Callable[..., tuple[int, d
 
 
 def test_the_help_names_all_methods() -> None:
-    assert tuple(estimate._METHODS.split("|")) == METHODS
+    assert tuple(options._METHODS.split("|")) == METHODS

@@ -3,16 +3,28 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 import yaml
 
-from torchpose.camera import Camera
-from torchpose.datasets.dataset import analytic, bounds, plan_truth, simulated_frames, write_bop, write_dataset
+from torchpose.analysis import rig_crlb
+from torchpose.camera import Camera, CameraRig
+from torchpose.datasets.dataset import (
+    analytic,
+    bounds,
+    plan_truth,
+    simulated_frames,
+    write_bop,
+    write_dataset,
+    write_rig_dataset,
+)
 from torchpose.datasets.plan import Plan, load_plan
 from torchpose.errors import ConfigError
+from torchpose.geometry import rotations
+from torchpose.io.images import decode
 from torchpose.io.rows import Schema
 from torchpose.io.truth import read_truth
 from torchpose.io.writers import read_table
@@ -259,3 +271,38 @@ def test_a_damaged_origin_is_one_clear_line(plan: Plan, tmp_path: Path, text: st
     (out / "plan.json").write_text(text)
     with pytest.raises(ConfigError, match=r"plan\.json: --resume: missing or damaged; choose another folder"):
         write_dataset(plan, out, resume=True)
+
+
+def test_a_plan_of_two_cameras_writes_a_folder_a_camera_and_the_truth_in_the_first(plan: Plan, tmp_path: Path) -> None:
+    """The same plate at the same moments, as each camera sees it; noise of its own in each."""
+    turn = rotations.exp(torch.tensor([0.0, 0.35, 0.0], dtype=torch.float64))
+    middle = plan.t.mean(0)
+    R, t = torch.stack([torch.eye(3).to(turn), turn]), torch.stack([0 * middle, middle - turn @ middle])
+    rig = CameraRig([plan.camera, replace(plan.camera, width=plan.camera.width - 40)], R, t, names=["left", "right"])
+    rig.save(plan.path.with_name("rig.yaml"))
+    text = {key: value for key, value in yaml.safe_load(plan.path.read_text()).items() if key != "camera"}
+    file = plan.path.with_name("several.yaml")
+    file.write_text(yaml.safe_dump(text | {"cameras": "rig.yaml", "out_of_view": "mark", "bounds": True}))
+    several, out = load_plan(file), tmp_path / "several"
+    assert write_rig_dataset(several, out) == 2 * len(plan)
+    truth, one = read_truth(out / "truth.csv"), plan_truth(plan)
+    torch.testing.assert_close(truth.t, one.t)
+    taken, bits = several.conditions, several.file.sensor.bits
+    light = {"dark": taken.dark, "light": taken.light, "noise_sigma": taken.noise, "bits": bits}
+    bound = rig_crlb(rig, plan.target, plan.R, plan.t, **taken.blur, **light)
+    torch.testing.assert_close(truth.extra["sz"], bound[:, 2, 2].sqrt(), rtol=1e-6, atol=0)
+    assert CameraRig.load(out / "rig.yaml").names == ("left", "right")
+    seen = several.of_camera(1)
+    torch.testing.assert_close(seen.t, plan.t @ turn.mT + t[1])
+    clean = analytic(seen)(torch.zeros(1, dtype=torch.int64))[0]
+    frame = decode(out / "right" / truth.frame[0])
+    assert frame.shape == (plan.camera.height, plan.camera.width - 40)
+    noise = float(seen.conditions.noise[0])
+    off = (torch.from_numpy(frame).float() - clean).std()
+    assert float(off) == pytest.approx(noise, abs=0.1 + 0.1 * noise)
+    assert write_rig_dataset(several, out, resume=True) == 0
+
+
+def test_a_plan_names_one_camera_or_several(plan: Plan) -> None:
+    with pytest.raises(ConfigError, match="names no camera, or both kinds"):
+        with_keys(plan, "both.yaml", cameras="rig.yaml")

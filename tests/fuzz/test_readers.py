@@ -21,11 +21,12 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, note, settings
 
+from tests.camera.test_camera_rig import three as rig_of_three
 from tests.fuzz.mutations import Change, changed, changes, drawn
 from tests.io.test_store import ORIGIN, some_poses
 from tests.rig.test_session_folder import IMAGE, TAKEN, begun, opened
 from torchpose.analysis.evaluation import estimates_of, evaluate
-from torchpose.camera import Camera
+from torchpose.camera import Camera, CameraRig
 from torchpose.cli.evaluate import _rows_of
 from torchpose.datasets.plan import load_plan
 from torchpose.errors import TorchposeError
@@ -240,6 +241,16 @@ def unsealed(text: bytes) -> bytes:
 
 with_camera = functools.partial(copied, "", "data/sample/camera.yaml")
 CAMERA = "data/sample/camera.yaml"
+STEREO = """units: mm
+image_width: 640
+image_height: 480
+M1: [[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]
+D1: [-0.1, 0.02, 0, 0, 0]
+M2: {rows: 3, cols: 3, data: [500.0, 0, 320, 0, 500, 240, 0, 0, 1]}
+D2: [0, 0, 0, 0]
+R: [[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]
+T: [[-100.0], [0], [3]]
+"""
 READERS = [
     *(Reader(f"poses{suffix}", make_poses, read_poses) for suffix in (".csv", ".jsonl", ".parquet")),
     Reader("p.csv.partial", make_journal, read_journal),
@@ -252,6 +263,8 @@ READERS = [
     Reader("grid.yaml", with_camera(text=GRID_PLAN), load_plan),
     Reader("camera.yaml", copied(CAMERA), Camera.load),
     *(Reader(f"camera_{form}", camera_text(form), Camera.load) for form in FORMS),
+    Reader("cameras.yaml", lambda path: rig_of_three().save(path), CameraRig.load),
+    Reader("stereo.yaml", copied(text=STEREO), CameraRig.load),
     Reader("target.yaml", copied("data/sample/target.yaml"), Target.load),
     Reader("hand_eye.yaml", copied(text=HAND_EYE), HandEye.load),
     Reader("twin.yaml", with_camera(text=TWIN), Scene.load),

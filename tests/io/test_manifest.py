@@ -5,9 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
+from torchpose.camera import Camera, CameraRig
 from torchpose.errors import ConfigError
 from torchpose.io.manifest import read_manifest
+from torchpose.io.moments import find_moments
 
 SESSION = {"record": "session", "schema": 1, "units": {"length": "mm"}}
 FRAME = {"record": "frame", "id": 0, "image": "0.png", "robot_pose": [1, 2, 3, 0.1, 0.2, 0.3], "sha256": "ignored"}
@@ -85,3 +88,27 @@ def test_frames_of_one_camera(tmp_path: Path) -> None:
         read_manifest(path)
     with pytest.raises(ConfigError, match="no frame of camera 'c'; known are a, b"):
         read_manifest(path, "c")
+
+
+def test_pictures_of_a_moment_that_were_not_taken_at_one_time_are_told(tmp_path: Path) -> None:
+    """The largest difference and its moment; nothing where all are within a millisecond or no time is recorded."""
+    camera = Camera.ideal(8, 8, 8.0)
+    eye = torch.eye(3, dtype=torch.float64).repeat(2, 1, 1)
+    rig = CameraRig([camera, camera], eye, torch.zeros(2, 3, dtype=torch.float64), names=["a", "b"])
+
+    def told(times: list[float | None]) -> list[str]:
+        lines = []
+        for number, time in enumerate(times):
+            moment, name = divmod(number, 2)
+            record = {"record": "frame", "id": number, "image": f"{moment}_{'ab'[name]}.png", "camera": "ab"[name]}
+            lines.append(json.dumps(record | ({} if time is None else {"trigger_time_s": time})))
+        path = tmp_path / "manifest.jsonl"
+        path.write_text("\n".join(lines) + "\n")
+        said: list[str] = []
+        assert len(find_moments(path, rig, said.append)) == len(times) // 2
+        return said
+
+    assert told([1.7e9, 1.7e9 + 4e-4, 1.7e9 + 3, 1.7e9 + 3]) == []
+    assert told([None, None]) == []
+    (line,) = told([1.7e9, 1.7e9 + 0.02, 1.7e9 + 3, 1.7e9 + 3.25])
+    assert "pictures of 2 of 2 moments were triggered up to 250 ms apart (1.png)" in line

@@ -195,6 +195,38 @@ def test_what_the_rims_do_not_show_is_no_scatter() -> None:
     assert (silent.maybe[silent.misfit != Misfit.SCATTER] == 0).all()
 
 
+def test_normals_of_noise_that_is_correlated_are_those_of_the_whole_covariance() -> None:
+    """Sixty edges with noise in common, weighed by the inverse of its whole covariance."""
+    g = torch.Generator().manual_seed(11)
+    by = torch.randn(1, 1, 60, 7, dtype=F64, generator=g)
+    motions = torch.randn(1, 1, 7, 2, dtype=F64, generator=g)
+    measured = torch.randn(1, 1, 60, 1, dtype=F64, generator=g)
+    normals = MarkerNormals(by.mT @ by, (by.mT @ measured)[..., 0])
+    both = normals.scattered(normals.by_motions(motions))
+    apart = by @ motions
+    whole = torch.linalg.inv(torch.eye(60, dtype=F64) + apart @ apart.mT)
+    torch.testing.assert_close(both.information, by.mT @ whole @ by)
+    torch.testing.assert_close(both.right, (by.mT @ whole @ measured)[..., 0])
+
+
+def test_rings_that_shift_more_than_they_scatter() -> None:
+    """Shifts of 20 um beside noise are found, beside its factor, where scatter is the likeliest; noise has none."""
+    g = torch.Generator().manual_seed(12)
+    across = torch.eye(3, 2, dtype=F64).expand(100, MARKERS, 3, 2)
+    information, right = problem(100, 13, of_places(0.0), 20.0)
+    places = torch.zeros(100, information.shape[-1], dtype=F64)
+    moved = 0.02 * torch.randn(100, MARKERS, 2, dtype=F64, generator=g)
+    places[:, : OF_MARKER * MARKERS].view(100, MARKERS, OF_MARKER)[..., :2] = moved
+    shifted = excess_of(information, right + (information @ places[..., None])[..., 0], across=across)
+    still = excess_of(information, right, across=across)
+    scatters = still.misfit == Misfit.SCATTER
+    assert scatters.double().mean() > 0.9
+    assert still.shift[scatters].median() < 0.003
+    assert (still.shift[~scatters] == 0).all()
+    scatters = shifted.misfit == Misfit.SCATTER
+    assert (shifted.shift[scatters] > 0.01).all()
+
+
 def test_what_no_print_may_have_is_not_explained() -> None:
     assert not excess_of(*problem(20, 2, of_places(30.0))).explained.any()
 

@@ -114,7 +114,7 @@ def test_a_stated_height_states_how_rings_are_turned() -> None:
 
 @pytest.mark.slow
 def test_bent_prints_are_covered() -> None:
-    """24 plates, each bent in its own way: a mean NEES of 6 is known to 0.7; saddles are fewer ways than heights are."""
+    """24 plates, each bent in its own way: a mean NEES of 6 is known to 0.7; saddles are fewer than heights."""
     target, count = tp.Target.load("quad40"), 24
     r, t = random_poses(count, 30, (140, 180), seed=21)
     g = torch.Generator().manual_seed(22)

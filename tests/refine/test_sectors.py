@@ -12,7 +12,14 @@ from torchpose.geometry import rotations
 from torchpose.geometry.sectors import SECTORS
 from torchpose.refine import Refined, Sight, refine_photometric
 from torchpose.refine.photometric.grey_chi2 import grey_chi2
-from torchpose.refine.photometric.sectors import Sectors, away_from_unclear, doubtful, trust
+from torchpose.refine.photometric.sectors import (
+    Sectors,
+    away_from_unclear,
+    doubtful,
+    in_step,
+    level_scatter,
+    trust,
+)
 from torchpose.sim import add_noise, render, shapes
 from torchpose.target import Target
 
@@ -55,6 +62,50 @@ def test_trust_finds_the_variance_of_the_displacements() -> None:
     used = weight > 0
     assert used.float().mean() > 0.9
     assert abs(float((weight / expected)[used].mean()) - 1) < 0.2
+
+
+def test_edges_in_step_along_lines_tell_the_variance_of_shifts() -> None:
+    """Lines of 8 px displaced along u: the shift of a ring has the variance that 400 drawings of them give it."""
+    count, tau = 400, 0.1
+    g = torch.Generator().manual_seed(7)
+    rings = torch.tensor([[100.0, 100.0, 36.0, 36.0, 0.0], [100.0, 100.0, 20.0, 20.0, 0.0]], dtype=F64)
+    angle = (torch.arange(SECTORS) + 0.5) * (2 * torch.pi / SECTORS)
+    radius = torch.tensor([20.0, 36.0])[:, None]  # inner circle first
+    line = ((100 + radius * angle.sin()) / 8).floor().long()
+    hold = torch.full((count, 2, SECTORS), 100.0)
+    shift = tau * torch.randn(count, 30, generator=g)[:, line] * angle.cos()
+    noise = hold.rsqrt() * torch.randn(hold.shape, generator=g)
+    one, row = torch.ones(count, dtype=F64), torch.arange(count)
+    empty = torch.ones(count, 2 * SECTORS)
+    for moved, name in ((torch.zeros_like(shift), "noise"), (shift, "lines")):
+        pull, cell = hold * (noise + moved), torch.zeros(count, 1, dtype=torch.int64)
+        sectors = Sectors(empty, empty, empty, pull.flatten(1), hold.flatten(1), cell)
+        factor, freedom, alone = in_step(sectors, one, rings.expand(count, 2, 5), row, count)
+        weight = hold * angle.cos()
+        found = (weight * (noise + moved)).sum((1, 2)) / (weight * angle.cos()).sum((1, 2))
+        assert abs(float(alone[:, 0].mean() * (weight * angle.cos()).sum((1, 2)).mean()) - 1) < 1e-6
+        assert (freedom > 5).all()
+        true = float(found.var() / alone[:, 0].mean())
+        mean = float(factor[:, 0].mean())
+        # bands share most of the lines' edges, not all
+        assert 0.6 < mean / true < 1.2
+        assert (true > 5) == (name == "lines")
+        assert abs(float(factor[:, 1].mean()) / mean - 1) < 0.1 if name == "noise" else factor[:, 1].mean() < 0.6 * mean
+
+
+def test_level_scatter_is_that_of_sums() -> None:
+    """1 for independent pixels; noise that 16 pixels in a row of a sector share makes it 16."""
+    count = 60
+    g = torch.Generator().manual_seed(8)
+    cell = torch.arange(2 * SECTORS).repeat_interleave(16) + 2 * SECTORS * torch.arange(count)[:, None]
+    weight = 0.2 + torch.rand(count, 1, generator=g).expand(cell.shape)
+    empty = torch.ones(count, 2 * SECTORS)
+    sectors = Sectors(empty, empty, empty, empty, empty, cell)
+    apart = torch.randn(cell.shape, generator=g)
+    shared = apart[:, ::16].repeat_interleave(16, 1)
+    one, row = torch.ones(count, dtype=F64), torch.zeros(count, dtype=torch.int64)
+    for residual, expected in ((apart, 1.0), (shared, 16.0)):
+        assert abs(float(level_scatter(sectors, weight, residual, one, row, 1)) / expected - 1) < 0.15
 
 
 def test_doubt_needs_more_than_noise() -> None:

@@ -40,6 +40,7 @@ def test_mistakes_are_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]
     mistakes: list[tuple[list[str | Path], str]] = [
         (["--address", "auto"], "--address: is of --engine ray alone"),
         (["--engine", "ray", "--overlay", tmp_path], "--overlay: is not drawn by --engine ray"),
+        (["--engine", "ray", "--device", "cuda"], "--device: is cpu with --engine ray"),
         (["--engine", "ray", "--address", "here"], "here: --address: is none; give HOST:PORT"),
         (["--engine", "ray", "--address", "127.0.0.1:9"], "127.0.0.1:9: --address: no Ray cluster answers"),
     ]
@@ -101,6 +102,23 @@ def test_rows_are_those_of_the_local_engine(frames: Path, tmp_path: Path, capfd:
     assert rows(poses) == rows(own)
     assert estimate(*on_ray, "--resume", "--instances", "2") == 2
     assert "were made with another --instances" in capfd.readouterr().err
+
+
+def test_simulated_frames_are_those_of_the_local_engine(tmp_path: Path) -> None:
+    pytest.importorskip("ray")
+    plan = tmp_path / "plan.yaml"
+    plan.write_text(
+        f"camera: {SAMPLE / 'camera.yaml'}\ntarget: quad40\nseed: 3\n"
+        "poses: {grid: {distance: 160, angles_deg: [0], positions: [[0, 0, 0], [5, 0, 0], [0, 0, 9]]}}\n"
+    )
+    for name, options in (("own", ["--threads", "1"]), ("ray", ["--engine", "ray", "--threads", "2", "--batch", "1"])):
+        with pytest.raises(SystemExit) as ended:
+            main(["simulate", str(plan), "--out", str(tmp_path / name), *options])
+        assert ended.value.code == 0
+    files = sorted(path.relative_to(tmp_path / "own") for path in (tmp_path / "own").rglob("*.*"))
+    assert len(files) >= 7
+    for file in files:
+        assert (tmp_path / "ray" / file).read_bytes() == (tmp_path / "own" / file).read_bytes(), file
 
 
 def copies(folder: Path, count: int) -> None:

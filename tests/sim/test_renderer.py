@@ -15,8 +15,9 @@ from torchpose.camera import Camera
 from torchpose.camera.model import Model
 from torchpose.errors import ConfigError, FrameError
 from torchpose.geometry import rotations
-from torchpose.sim import add_noise, render
+from torchpose.sim import add_noise, boundary, render
 from torchpose.sim.boundary import Boxes, Samples, fill
+from torchpose.sim.shapes import rings
 from torchpose.target import Target
 
 F64 = torch.float64
@@ -311,6 +312,30 @@ def test_fill_gradcheck() -> None:
     assert torch.autograd.gradcheck(
         lambda p, s, w: fill(Samples(shape, shape, p, step, s, w), boxes).flatten()[::5], (position, sigma, half)
     )
+
+
+def test_motion_of_a_boundary_is_the_derivative_of_what_it_fills() -> None:
+    """Against forward-mode differentiation, of rings under lens distortion, cut by the frame."""
+    matrix = torch.tensor([[180.0, 0, 40.0], [0, 185.0, 30.0], [0, 0, 1]], dtype=F64)
+    lens = Camera(84, 64, matrix, torch.tensor([-0.2, 0.05, 0.01, -0.01], dtype=F64))
+    R = rotations.exp(torch.tensor([[0.3, -0.4, 0.5]], dtype=F64))
+    t = torch.tensor([[4.0, 2.0, 130.0]], dtype=F64)
+    shapes = rings(Target.load("quad40")).to(t).in_frames(torch.zeros(1, dtype=torch.int64))
+    edges = boundary.sample_boundary(lens, shapes, R, t, t.new_full((1,), 0.8), t.new_full((len(shapes),), 5.0))
+    sigma = t.new_tensor([0.8, 1.0]).expand(len(edges), 2)
+
+    def samples(delta: Tensor) -> Samples:
+        pixel, dv = boundary.project(lens, edges, rotations.exp(delta[3:]) @ R, t + delta[:3])
+        return Samples(edges.frame, edges.shape, pixel, dv, sigma)
+
+    at = samples(t.new_zeros(6))
+    boxes = boundary.boxes_around(at.pixel, at.shape, t.new_full((len(shapes),), 6.0), lens)
+    wanted = torch.func.jacfwd(lambda delta: fill(samples(delta), boxes))(t.new_zeros(6))
+    moved = replace(at, swept=boundary.swept_by_pose(lens, edges, R, t))
+    found = boundary.fill_moved(moved, boxes)
+    assert wanted.abs().amax((0, 1)).min() > 0.02
+    # the two agree in the continuum; the trapezoidal rule leaves of either what the steps of one sigma do
+    assert (found - wanted).abs().amax() < 1e-6 * wanted.abs().amax()
 
 
 def test_gradient_is_that_of_finite_differences() -> None:

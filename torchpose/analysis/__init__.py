@@ -1,8 +1,9 @@
 """What a measurement can reach, and what it reached."""
 
-from torchpose.analysis.crlb import pose_crlb
+from torchpose.analysis.crlb import pose_crlb, rig_crlb
 from torchpose.analysis.errors import PoseErrors, pose_errors, rms
 from torchpose.analysis.monte_carlo import simulate_frames, simulate_points
+from torchpose.analysis.placing import second_camera_crlb
 from torchpose.analysis.sensitivity import ErrorBudget, Uncertainty, edge_noise, propagate
 
 __all__ = [
@@ -13,7 +14,9 @@ __all__ = [
     "pose_crlb",
     "pose_errors",
     "propagate",
+    "rig_crlb",
     "rms",
+    "second_camera_crlb",
     "simulate_frames",
     "simulate_points",
 ]

@@ -7,13 +7,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.camera import Camera
-from torchpose.geometry import rotations
+from torchpose.camera import Camera, CameraRig
 from torchpose.geometry.arguments import checked
 from torchpose.geometry.least_squares import scaled_inverse
+from torchpose.moments.views import motion_in_view, motion_of_place
 from torchpose.sim import boundary, renderer
 from torchpose.sim.blur import Blur, Pair, blur_of, blurred, start
-from torchpose.sim.boundary import Boxes, Samples
+from torchpose.sim.boundary import Boxes
 from torchpose.sim.sensor import GREY_MAX
 from torchpose.sim.shapes import rings
 from torchpose.target import Target
@@ -42,14 +42,15 @@ class Conditions:
 
 
 @checked
-@torch.enable_grad()
+@torch.no_grad()
 def pose_crlb(camera: Camera, target: Target, R: Tensor, t: Tensor, **conditions: Any) -> Float[Tensor, "B 6 6"]:
     """Lower bound of the pose covariance from frames of `torchpose.sim.render` with white Gaussian noise.
 
     Inverse Fisher information of the grey values (Kay 1993, section 3.9), of all pixels of every marker's bounding box
-    and of a margin as wide as the blur reaches; derivatives by forward-mode differentiation of the renderer, those by
-    the blur after the heat equation. The camera is exact. Quantisation counts as noise of step^2 / 12, which holds from
-    a noise of about half a step upwards; clipping is not modelled.
+    and of a margin as wide as the blur reaches; derivatives by the pose are integrals along the rings' edges
+    (`torchpose.sim.boundary.fill_moved`), those by the blur follow from the heat equation. The camera is exact.
+    Quantisation counts as noise of step^2 / 12, which holds from a noise of about half a step upwards; clipping is not
+    modelled.
 
     Unknown besides the pose: the three numbers of the blur's covariance per frame, a dark and a light level per marker.
     Of smear and disc only the shape is known: whatever changes the covariance, theirs or the Gaussian's, changes the
@@ -83,6 +84,29 @@ def pose_crlb(camera: Camera, target: Target, R: Tensor, t: Tensor, **conditions
     return torch.where(known[:, None, None], inverse, torch.nan)[:, :6, :6]
 
 
+@checked
+def rig_crlb(rig: CameraRig, target: Target, R: Tensor, t: Tensor, **conditions: Any) -> Float[Tensor, "B 6 6"]:
+    """`pose_crlb` from the frames that all cameras of a rig take at one time; poses in the first camera.
+
+    What the cameras' places leave open counts as further unknowns with the prior that the rig states. A camera in whose
+    frame nothing of the target is contributes nothing.
+    """
+    size = rig.factor().shape[-1]
+    information = torch.zeros(len(t), 6 + size, 6 + size, dtype=torch.float64, device=t.device)
+    for number, camera in enumerate(rig.cameras):
+        own_R, own_t = rig.seen_by(number, R, t)
+        own = pose_crlb(camera, target, own_R, own_t, **conditions)
+        there = own.isfinite().flatten(1).all(1)
+        fisher, known = scaled_inverse(torch.where(there[:, None, None], own, torch.eye(6).to(own)))
+        fisher = torch.where((there & known)[:, None, None], fisher, 0.0)
+        turn = motion_in_view(rig, number).to(own).expand(len(own), -1, -1)
+        columns = torch.cat([turn, motion_of_place(rig, number, own_t)], -1)
+        information = information + columns.mT @ fisher @ columns
+    information.diagonal(dim1=-2, dim2=-1)[:, 6 : 6 + size] += 1
+    inverse, known = scaled_inverse(information)
+    return torch.where(known[:, None, None], inverse, torch.nan)[:, :6, :6]
+
+
 def _fisher(camera: Camera, target: Target, R: Tensor, t: Tensor, blur: Blur, contrast: Tensor) -> Tensor:
     """Fisher information (B, 9, 9) of translation, rotation and blur at unit noise, grey levels eliminated."""
     marks = rings(target).to(t).in_frames(torch.arange(t.shape[0], device=t.device))
@@ -93,33 +117,25 @@ def _fisher(camera: Camera, target: Target, R: Tensor, t: Tensor, blur: Blur, co
     frame = marks.frame[pair]
     edges = replace(edges, shape=window)
 
-    def sampled(delta: Tensor) -> Samples:
-        """Samples of a pose that is off by (6,), translation and rotation."""
-        pixel, dv = boundary.project(camera, edges, rotations.exp(delta[3:6]) @ R, t + delta[:3])
-        return blurred(start(edges, pixel[None], dv[None], blur), blur, blur.disc[frame])
-
-    zero = t.new_zeros(6)
-    samples = sampled(zero)
+    pixel, dv = boundary.project(camera, edges, R, t)
+    sharp = start(edges, pixel[None], dv[None], blur)
+    samples = blurred(replace(sharp, swept=boundary.swept_by_pose(camera, edges, R, t)), blur, blur.disc[frame])
     # windows of one size for every marker in view, of which only its own part counts
     own = boundary.boxes_around(samples.pixel, samples.shape, (blur.margin + blur.disc)[frame], camera)
     boxes = Boxes(own.corner, own.size.amax(0).expand(len(pair), 2))
     width, height = boxes.size[0].tolist()
 
     def image(rows: Tensor) -> Tensor:
-        return rows.view(len(pair), height, width + 1)[..., :width].flatten(1)
+        return rows.view(len(pair), height, width + 1, -1)[:, :, :width].flatten(1, 2)
 
-    def coverage(delta: Tensor) -> tuple[Tensor, Tensor]:
-        covered = image(boundary.fill(sampled(delta), boxes))
-        return covered, covered
-
-    jacobian, c = torch.func.jacfwd(coverage, has_aux=True)(zero)  # (P, h w, 6), (P, h w)
-    # by S11, S12 and S22, after the heat equation
-    with torch.no_grad():
-        by_blur = [scale * image(boundary.fill(samples, boxes, by)) for by, scale in _HEAT]
+    c = image(boundary.fill(samples, boxes))[..., 0]
+    # by the pose, and by S11, S12 and S22 after the heat equation
+    by_blur = [scale * image(boundary.fill(samples, boxes, by)) for by, scale in _HEAT]
+    jacobian = torch.cat([image(boundary.fill_moved(samples, boxes)), *by_blur], -1)  # (P, h w, 9)
     row, column = (torch.arange(n, device=t.device) for n in (height, width))
     use = (row[:, None] < own.size[:, 1, None, None]) & (column < own.size[:, 0, None, None])
     use = use.flatten(1).to(t)
-    jacobian = torch.cat([jacobian, torch.stack(by_blur, -1)], -1) * (contrast[frame, None] * use)[..., None]
+    jacobian = jacobian * (contrast[frame, None] * use)[..., None]
     # levels: grey = dark c + light (1 - c) for rings darker than their ground, and the same two columns otherwise
     levels = torch.stack([c, 1 - c], -1) * use[..., None]
     cross = levels.mT @ jacobian

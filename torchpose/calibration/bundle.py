@@ -1,20 +1,25 @@
-"""Joint least squares of a camera's intrinsics, the poses of all views and what is unknown of the target."""
+"""Joint least squares of cameras' intrinsics and places, the poses of all views and what is unknown of the target.
+
+A view is what one camera sees at a time, or what all cameras of a rig do: its pose is that in the first one.
+"""
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple, Self, cast
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchpose.calibration import lenses
 from torchpose.calibration.plate import Plate
 from torchpose.calibration.views import Views
-from torchpose.camera import Camera
-from torchpose.camera.derivatives import by_intrinsics
+from torchpose.camera import Camera, CameraRig
 from torchpose.errors import ConfigError
 from torchpose.geometry import least_squares, rotations
 from torchpose.geometry.least_squares import Code, Eliminated, Normal, Pose, Unknowns, Vector
 from torchpose.geometry.projection import by_pose, image_by_point
+from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import segment_sum
 
 _ITERATIONS = 200
@@ -24,19 +29,37 @@ _RELATIVE = 1e-10  # decrease that a step must promise, of the cost
 
 
 @dataclass(frozen=True, eq=False)
-class Bundle:
-    """Least-squares estimate of n intrinsics (fx, fy, cx, cy, then the distortion), k unknowns of the plate, N poses.
+class Places(Rows):
+    """Where the C - 1 other cameras of a rig are; steps are a translation, then a rotation from the left, of each."""
 
-    Poses are target to camera. What is said of the intrinsics is said whether they were unknown or not; k is 0 where
-    the plate is known.
+    R: Float[Tensor, "1 c 3 3"]
+    t: Float[Tensor, "1 c 3"]
+
+    @property
+    def size(self) -> int:
+        return 6 * self.t.shape[1]
+
+    def moved(self, step: Tensor) -> Self:
+        shift, turn = step.unflatten(-1, (-1, 6)).split(3, -1)
+        return replace(self, R=rotations.exp(turn) @ self.R, t=self.t + shift)
+
+
+@dataclass(frozen=True, eq=False)
+class Bundle:
+    """Least-squares estimate of n intrinsics (of each camera fx, fy, cx, cy, then the distortion), of the places of the
+    other cameras of a rig (6 each), of k unknowns of the plate, and of N poses.
+
+    Poses are target to (first) camera. What is said of the intrinsics is said whether they were unknown or not; k is 0
+    where the plate is known.
     """
 
-    camera: Camera
+    rig: CameraRig
     R: Float[Tensor, "N 3 3"]
     t: Float[Tensor, "N 3"]  # mm
     residual: Float[Tensor, "K 2"]  # seen - predicted, px
     chi2: Float[Tensor, " K"]  # in the covariances of the points
-    information: Float[Tensor, "u u"]  # about these u = n + k unknowns, the poses being unknown, with what is known
+    # about these u = n + 6 (C - 1) + k unknowns, the poses being unknown, with what is known
+    information: Float[Tensor, "u u"]
     pose_covariance: Float[Tensor, "N 6 6"]  # translation (mm), rotation about the camera axes; for exact intrinsics
     gain: Float[Tensor, "N 6 u"]  # d pose / d intrinsics and plate at the optimum
     converged: bool  # whether the last step promised next to nothing
@@ -45,10 +68,15 @@ class Bundle:
     predicted: Float[Tensor, "K d d"]
     rims: Float[Tensor, "K r"]  # what rims tell less what is predicted (r = 7); none where they were not asked
 
+    @property
+    def camera(self) -> Camera:
+        """The one there is, or the first."""
+        return self.rig.cameras[0]
+
 
 def adjust(
     views: Views,
-    camera: Camera,
+    camera: Camera | CameraRig,
     R: Tensor,
     t: Tensor,
     *,
@@ -56,11 +84,11 @@ def adjust(
     plate: Plate | None = None,
     start: Tensor | None = None,
 ) -> Bundle:
-    """Levenberg-Marquardt over intrinsics, plate and poses, the latter eliminated; residuals are whitened.
+    """Levenberg-Marquardt over intrinsics, places, plate and poses, the last eliminated; residuals are whitened.
 
     Args:
         views: with regular covariances.
-        camera: to start from; its model and number of coefficients stay.
+        camera: to start from; its model and number of coefficients stay. Of a rig the places of the others are unknown.
         R: (N, 3, 3), to start from.
         t: (N, 3), to start from, mm.
         free: whether the intrinsics are unknown.
@@ -70,14 +98,17 @@ def adjust(
     Raises:
         ConfigError: the start puts points behind the camera, or the points of a view leave its pose open.
     """
-    problem = _Problem(views, camera, plate, free)
-    own = {"intrinsics": Vector(views.pixels.new_zeros(1, 4 + len(camera.distortion)))} if free else {}
+    rig = camera if isinstance(camera, CameraRig) else CameraRig.alone(camera)
+    problem, count = _Problem(views, rig, plate, free), lenses.count(rig.cameras)
+    own: dict[str, Vector | Places] = {"intrinsics": Vector(views.pixels.new_zeros(1, count))} if free else {}
+    if len(rig) > 1:
+        own["places"] = Places(rig.R[None, 1:], rig.t[None, 1:])
     if plate is not None:
         own["plate"] = Vector((plate.known.new_zeros(len(plate)) if start is None else start)[None])
     first = Unknowns(own, {"pose": Pose(R, t)}, views.view.new_zeros(len(views)))
     found = least_squares.minimise(problem, first, _ITERATIONS, damping=_DAMPING, adaptive=True, tolerance=_RELATIVE)
     unknowns = found.unknowns
-    moved, pose = problem.camera_at(unknowns), unknowns.pose
+    moved, pose = problem.rig_at(unknowns), unknowns.pose
     normal = found.normal if free or moved is None else problem.normal(unknowns, moved, by_camera=True)
     part = normal.eliminated
     if moved is None or part is None or not bool(normal.cost.isfinite().all()):
@@ -85,7 +116,8 @@ def adjust(
     covariance, determined = least_squares.scaled_inverse(part.information)
     if not bool(determined.all()):
         raise ConfigError("INPUT: the points of a view leave its pose open; use targets whose points are not on a line")
-    residual = problem.of_pixels(unknowns, moved)
+    placed = problem.placed(unknowns, moved)
+    residual = problem.of_pixels(moved, placed)
     whiten = torch.linalg.inv(torch.linalg.cholesky(views.covariance))
     chi2 = (whiten @ residual[..., None]).square().sum((-1, -2))
     gain, converged = -covariance @ part.mixed.mT, int(found.code) == Code.CONVERGED
@@ -93,32 +125,30 @@ def adjust(
     information = normal.information[0] - (part.mixed @ covariance @ part.mixed.mT).sum(0)
     z = residual.new_zeros(0) if plate is None else unknowns.values("plate")[0]
     found_at = (moved, pose.R, pose.t, residual, chi2, information, covariance, gain, converged)
-    unknown = 0 if free else 4 + len(camera.distortion)
+    unknown = 0 if free else count
     predicted = problem.predicted(unknowns, moved, information, covariance, gain, unknown)
-    return Bundle(*found_at, z, predicted, problem.of_rims(unknowns, moved))
+    return Bundle(*found_at, z, predicted, problem.of_rims(unknowns, moved, placed))
 
 
-def moved_camera(camera: Camera, step: Tensor) -> Camera | None:
-    """The camera with intrinsics changed by ``step`` (n,); None where that is no camera."""
-    matrix = camera.matrix.clone()
-    matrix[[0, 1, 0, 1], [0, 1, 2, 2]] += step[:4]
-    if not bool(step.isfinite().all()) or float(matrix.diagonal()[:2].min()) <= 0:
-        return None
-    return replace(camera, matrix=matrix, distortion=camera.distortion + step[4:])
+class Placed(NamedTuple):
+    """K points as the cameras that saw them have them: turn of the target, arm from its origin, and place, mm."""
 
+    R: Float[Tensor, "K 3 3"]
+    arm: Float[Tensor, "K 3"]
+    at: Float[Tensor, "K 3"]
 
-def intrinsics_between(camera: Camera, other: Camera) -> Tensor:
-    """Intrinsics (n,) of a camera less those of another."""
-    one, two = (torch.cat([c.matrix.diagonal()[:2], c.matrix[:2, 2], c.distortion]) for c in (camera, other))
-    return one - two
+    @property
+    def xy(self) -> Float[Tensor, "K 2"]:
+        """Normalised coordinates."""
+        return self.at[:, :2] / self.at[:, 2:]
 
 
 class _Problem:
     """The normal equations of K observations: pixels, or all that rims tell where the plate has unknowns for it."""
 
-    def __init__(self, views: Views, camera: Camera, plate: Plate | None, free: bool) -> None:
-        self.views, self.plate, self.free = views, plate, free
-        self.start = camera
+    def __init__(self, views: Views, rig: CameraRig, plate: Plate | None, free: bool) -> None:
+        self.views, self.plate, self.free, self.lens = views, plate, free, views.lens
+        self.start = rig
         self.point = views.point if plate is None else plate.index(views.point)
         self.rims = views.rims if plate is not None and plate.rims else None
         if self.rims is None:
@@ -127,53 +157,64 @@ class _Problem:
             self.whiten, self.best = self.rims.roots, self.rims.best
 
     def __call__(self, unknowns: Unknowns) -> Normal:
-        moved = self.camera_at(unknowns)
+        moved = self.rig_at(unknowns)
         if moved is None:
             normal = self.normal(unknowns, self.start, by_camera=self.free)
             return replace(normal, cost=torch.full_like(normal.cost, torch.inf))
         return self.normal(unknowns, moved, by_camera=self.free)
 
-    def camera_at(self, unknowns: Unknowns) -> Camera | None:
-        return moved_camera(self.start, unknowns.values("intrinsics")[0]) if self.free else self.start
+    def rig_at(self, unknowns: Unknowns) -> CameraRig | None:
+        """The cameras and their places; None where an intrinsic is impossible."""
+        rig = self.start
+        cameras = lenses.moved_cameras(rig.cameras, unknowns.values("intrinsics")[0]) if self.free else rig.cameras
+        if cameras is None or "places" not in unknowns.own:
+            return rig if cameras is rig.cameras else None if cameras is None else CameraRig.alone(cameras[0])
+        places = cast(Places, unknowns.own["places"])
+        if not bool(places.t.isfinite().all() & places.R.isfinite().all()):
+            return None
+        R, t = torch.cat([rig.R[:1], places.R[0]]), torch.cat([rig.t[:1], places.t[0]])
+        return CameraRig(cameras, R, t, names=rig.names)
 
-    def placed(self, unknowns: Unknowns) -> tuple[Tensor, Tensor]:
-        """Points about the target's origin (K, 3), and in the camera (K, 3), camera axes."""
+    def placed(self, unknowns: Unknowns, rig: CameraRig) -> Placed:
+        """The points as their cameras have them."""
         pose, view = unknowns.pose, self.views.view
         points = self.views.points
         if self.plate is not None:
             points = self.plate.at(unknowns.values("plate")[0]).places[self.point]
-        arm = (pose.R[view] @ points[..., None])[..., 0]
-        return arm, arm + pose.t[view]
+        if len(rig) == 1:
+            R, t = pose.R[view], pose.t[view]
+        else:
+            R, t = rotations.compose(rig.R[self.lens], rig.t[self.lens], pose.R[view], pose.t[view])
+        arm = (R @ points[..., None])[..., 0]
+        return Placed(R, arm, arm + t)
 
-    def of_pixels(self, unknowns: Unknowns, camera: Camera) -> Tensor:
+    def of_pixels(self, rig: CameraRig, placed: Placed) -> Tensor:
         """Seen less predicted (K, 2)."""
-        _, at = self.placed(unknowns)
-        return self.views.pixels - camera.distort(at[:, :2] / at[:, 2:])
+        return self.views.pixels - lenses.distorted(rig.cameras, self.lens, placed.xy)
 
-    def of_rims(self, unknowns: Unknowns, camera: Camera) -> Tensor:
+    def of_rims(self, unknowns: Unknowns, rig: CameraRig, placed: Placed) -> Tensor:
         """What the rims tell less what is predicted (K, 7); (K, 0) where they are not asked."""
         if self.rims is None or self.plate is None:
             return self.views.pixels[:, :0]
-        _, at = self.placed(unknowns)
         layout = self.plate.at(unknowns.values("plate")[0]).of(self.point)
-        rims, turn = self.rims, unknowns.pose.R[self.views.view] @ rotations.exp(layout.turns)
+        rims, turn = self.rims, placed.R @ rotations.exp(layout.turns)
         ring = torch.cat(
             [
-                rims.t - at * torch.exp(-layout.sizes)[:, None],
+                rims.t - placed.at * torch.exp(-layout.sizes)[:, None],
                 rotations.log(rims.R @ turn.mT),
                 (rims.gain - layout.gain)[:, None],
             ],
             -1,
         )
-        return ring + self.best - rims.by_camera @ intrinsics_between(camera, rims.camera)
+        return ring + self.best - rims.by_camera @ lenses.intrinsics_between(rig.cameras, rims.cameras)
 
-    def normal(self, unknowns: Unknowns, camera: Camera, *, by_camera: bool) -> Normal:
+    def normal(self, unknowns: Unknowns, rig: CameraRig, *, by_camera: bool) -> Normal:
         """Normal equations, of infinite cost where a point is behind the camera or beyond the lens model."""
         views = self.views
-        arm, at = self.placed(unknowns)
-        depth, xy = at[:, 2], at[:, :2] / at[:, 2:]
-        possible = (depth > 0).all() & (xy.norm(dim=-1) < camera.fold_radius).all()
-        residual, by_view, columns = self._linear(unknowns, camera, arm, at)
+        placed = self.placed(unknowns, rig)
+        fold = lenses.folds(rig.cameras, placed.at)[self.lens]
+        possible = (placed.at[:, 2] > 0).all() & (placed.xy.norm(dim=-1) < fold).all()
+        residual, by_view, columns = self._linear(unknowns, rig, placed)
         own = torch.cat(columns if by_camera else columns[1:], -1) if by_camera or columns[1:] else by_view[..., :0]
         residual, by_view, own = self.whiten @ residual[..., None], self.whiten @ by_view, self.whiten @ own
 
@@ -198,40 +239,54 @@ class _Problem:
         return normal.with_prior(torch.diag(prior)[None], moved)
 
     def predicted(
-        self, unknowns: Unknowns, camera: Camera, information: Tensor, poses: Tensor, gain: Tensor, known: int
+        self, unknowns: Unknowns, rig: CameraRig, information: Tensor, poses: Tensor, gain: Tensor, known: int
     ) -> Tensor:
         """Covariance (K, d, d) of what is predicted, from that of the fit; the first intrinsics are not unknown."""
-        arm, at = self.placed(unknowns)
-        _, by_view, columns = self._linear(unknowns, camera, arm, at)
+        _, by_view, columns = self._linear(unknowns, rig, self.placed(unknowns, rig))
         view = self.views.view
         by_own = torch.cat(columns, -1)[..., known:] + by_view @ gain[view][..., known:]
         own, _ = least_squares.scaled_inverse(information[known:, known:])
         return by_own @ own @ by_own.mT + by_view @ poses[view] @ by_view.mT
 
-    def _linear(self, unknowns: Unknowns, camera: Camera, arm: Tensor, at: Tensor) -> Linear:
-        return (self._by_rims if self.rims is not None else self._by_pixels)(unknowns, camera, arm, at)
+    def _linear(self, unknowns: Unknowns, rig: CameraRig, placed: Placed) -> Linear:
+        """Residuals (K, d), derivatives of what is predicted by the pose; by intrinsics, places and plate."""
+        of = self._by_rims if self.rims is not None else self._by_pixels
+        residual, by_pose_seen, columns = of(unknowns, rig, placed)
+        if len(rig) == 1:
+            return residual, by_pose_seen, columns
+        turn = rig.R[self.lens]
+        by_view = torch.cat([by_pose_seen[..., :3] @ turn, by_pose_seen[..., 3:] @ turn], -1)
+        # turning a camera turns all about its own origin, from which the target's is t away
+        away = placed.at - placed.arm - rig.t[self.lens]
+        by_place = torch.cat(
+            [by_pose_seen[..., :3], by_pose_seen[..., 3:] - by_pose_seen[..., :3] @ rotations.skew(away)], -1
+        )
+        # of the other cameras each has its own six columns
+        own = torch.nn.functional.one_hot(self.lens, len(rig))[:, 1:].to(by_place)
+        by_places = (own[:, None, :, None] * by_place[:, :, None]).flatten(2)
+        return residual, by_view, [columns[0], by_places, *columns[1:]]
 
-    def _by_pixels(self, unknowns: Unknowns, camera: Camera, arm: Tensor, at: Tensor) -> Linear:
-        """Residuals (K, 2), derivatives of what is predicted by the pose, and by the camera and the plate."""
-        xy = at[:, :2] / at[:, 2:]
-        by_point = camera.J_distort(xy) @ image_by_point(xy, at[:, 2])
-        columns = [by_intrinsics(camera, xy)]
+    def _by_pixels(self, unknowns: Unknowns, rig: CameraRig, placed: Placed) -> Linear:
+        """Residuals (K, 2), derivatives by the pose as the camera sees it, and by the intrinsics and the plate."""
+        xy = placed.xy
+        by_point = lenses.slopes(rig.cameras, self.lens, xy) @ image_by_point(xy, placed.at[:, 2])
+        columns = [lenses.by_all_intrinsics(rig.cameras, self.lens, xy)]
         if self.plate is not None:
-            columns.append(by_point @ unknowns.pose.R[self.views.view] @ self.plate.places[self.point])
-        return self.of_pixels(unknowns, camera), by_pose(by_point, arm), columns
+            columns.append(by_point @ placed.R @ self.plate.places[self.point])
+        return self.of_pixels(rig, placed), by_pose(by_point, placed.arm), columns
 
-    def _by_rims(self, unknowns: Unknowns, camera: Camera, arm: Tensor, at: Tensor) -> Linear:
+    def _by_rims(self, unknowns: Unknowns, rig: CameraRig, placed: Placed) -> Linear:
         """The same of the rims, (K, 7)."""
         assert self.rims is not None
         assert self.plate is not None
-        plate, rotation = self.plate, unknowns.pose.R[self.views.view]
+        plate, at = self.plate, placed.at
         smaller = torch.exp(-self.plate.at(unknowns.values("plate")[0]).sizes[self.point])[:, None, None]
         eye = torch.eye(3, dtype=at.dtype, device=at.device).expand(len(at), 3, 3)
         turning = pad(eye, (3, 0))
-        by_view = pad(torch.cat([by_pose(smaller * eye, arm), turning], 1), (0, 0, 0, 1))
+        by_view = pad(torch.cat([by_pose(smaller * eye, placed.arm), turning], 1), (0, 0, 0, 1))
         sizes = plate.sizes[self.point][:, None]
-        places = smaller * (rotation @ plate.places[self.point] - at[..., None] * sizes)
-        turns = rotation @ plate.turns[self.point]
+        places = smaller * (placed.R @ plate.places[self.point] - at[..., None] * sizes)
+        turns = placed.R @ plate.turns[self.point]
         gain = plate.gain.expand(len(at), 1, -1)
-        residual = self.of_rims(unknowns, camera)
+        residual = self.of_rims(unknowns, rig, placed)
         return residual, by_view, [self.rims.by_camera, torch.cat([places, turns, gain], 1)]

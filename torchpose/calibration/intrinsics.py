@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchpose import pnp
 from torchpose.calibration.bundle import Bundle, adjust
+from torchpose.calibration.lenses import slopes
 from torchpose.calibration.plate import Plate
 from torchpose.calibration.views import Views
 from torchpose.camera import Camera
@@ -92,12 +93,12 @@ def start_cameras(width: int, height: int, lens: str) -> list[Camera]:
     Raises:
         ConfigError: an unknown lens model.
     """
-    model, names = _lens(lens)
+    model, names = coefficients_of(lens)
     ideal = [Camera.ideal(width, height, focal * width) for focal in _START_FOCALS]
     return [replace(camera, model=model, distortion=camera.matrix.new_zeros(len(names))) for camera in ideal]
 
 
-def _lens(name: str) -> tuple[Model, tuple[str, ...]]:
+def coefficients_of(name: str) -> tuple[Model, tuple[str, ...]]:
     if name not in LENS_MODELS:
         raise ConfigError(f"--model: {name!r} is not known; choose one of {', '.join(LENS_MODELS)}")
     return LENS_MODELS[name]
@@ -109,7 +110,7 @@ def with_lens(camera: Camera, lens: str) -> Camera:
     Raises:
         ConfigError: an unknown lens model.
     """
-    model, names = _lens(lens)
+    model, names = coefficients_of(lens)
     old = camera.distortion if camera.model == model else camera.distortion[:0]
     distortion = torch.nn.functional.pad(old, (0, len(names) - len(old)))
     return replace(camera, model=model, distortion=distortion, covariance=None).to(torch.float64)
@@ -136,22 +137,22 @@ def calibrate_intrinsics(
     Raises:
         ConfigError: too few views or points, views that do not determine the intrinsics, or no convergence.
     """
-    _, coefficients = _lens(lens)
+    _, coefficients = coefficients_of(lens)
     names, seen = ("fx", "fy", "cx", "cy", *coefficients), views
     views = views.of_views(views.counts >= MIN_POINTS)
     _check_count(views, len(names))
-    fits = [_first_fit(views, with_lens(start, lens).to(views.pixels)) for start in starts]
+    fits = [first_fit(views, with_lens(start, lens).to(views.pixels)) for start in starts]
     best = min(filter(None, fits), key=lambda one: _robust_cost(one[1], len(views.view)), default=None)
     if best is None:
         raise ConfigError("INPUT: no pose explains the views; give --camera to start from and check the target")
     before = len(best[0].view)
-    views, bundle, common = _weigh(*best, len(names), plate)
+    views, bundle, common = weigh(*best, len(names), plate)
     if not bundle.converged:
         raise ConfigError("INPUT: calibration did not converge; use a simpler --model or more varied views")
-    _check_residuals(views, bundle, before)
-    joint = _covariance(bundle.information, names)
+    check_residuals(views, bundle.residual, before)
+    joint = covariance_of(bundle.information, names)
     covariance = joint[: len(names), : len(names)]
-    _check_lens(bundle.camera, covariance, names)
+    check_lens(bundle.camera, covariance, names)
     return Calibration(
         replace(bundle.camera, covariance=covariance, adjustment=name_of(joint, bundle.camera.matrix)),
         covariance,
@@ -161,11 +162,11 @@ def calibrate_intrinsics(
         bundle,
         before - len(views.view),
         float(bundle.chi2.sum()),
-        _channels(views, bundle)[0].redundancy(common.px),
+        channels(views, bundle)[0].redundancy(common.px),
         common.px,
         plate,
         seen,
-        _warnings(views, bundle, covariance, common.px),
+        doubts_of(views, bundle.camera, bundle.R, covariance, common.px),
     )
 
 
@@ -195,25 +196,37 @@ def measure_plate(views: Views, camera: Camera, plate: Plate) -> Calibration:
     if not bundle.converged:
         raise ConfigError("INPUT: the target could not be measured; use more varied views")
     names = ("fx", "fy", "cx", "cy", *(f"d{k}" for k in range(1, n - 3)))
-    of_plate = _covariance(bundle.information[n:, n:], ())
-    held = bundle.information.new_zeros(n, n)
-    if camera.covariance is not None:
-        known = len(camera.covariance)
-        held[:known, :known] = camera.covariance
-    moved = -of_plate @ bundle.information[n:, :n]  # d plate / d intrinsics
-    cross = moved @ held
-    joint = torch.cat([torch.cat([held, cross.mT], 1), torch.cat([cross, of_plate + cross @ moved.mT], 1)])
-    degrees = _channels(views, bundle)[0].redundancy(common.px)
+    held = stated_intrinsics(camera).to(bundle.information)
+    joint = carried(bundle.information, held, ())
+    degrees = channels(views, bundle)[0].redundancy(common.px)
     left_out, chi2 = len(seen.view) - len(views.view), float(bundle.chi2.sum())
     return Calibration(camera, held, joint, names, views, bundle, left_out, chi2, degrees, common.px, plate, seen)
 
 
+def stated_intrinsics(camera: Camera) -> Float[Tensor, "n n"]:
+    """Covariance of all intrinsics, zero of those of which the camera states none."""
+    covariance = camera.matrix.new_zeros(4 + len(camera.distortion), 4 + len(camera.distortion))
+    if camera.covariance is not None:
+        known = len(camera.covariance)
+        covariance[:known, :known] = camera.covariance
+    return covariance
+
+
+def carried(information: Float[Tensor, "u u"], held: Float[Tensor, "n n"], names: tuple[str, ...]) -> Tensor:
+    """Covariance (u, u) where the first n unknowns were held, which have that covariance; names of the others."""
+    n = len(held)
+    rest = covariance_of(information[n:, n:], names)
+    moved = -rest @ information[n:, :n]  # d the others / d what was held
+    cross = moved @ held
+    return torch.cat([torch.cat([held, cross.mT], 1), torch.cat([cross, rest + cross @ moved.mT], 1)])
+
+
 def _located(views: Views, camera: Camera, plate: Plate | None) -> tuple[Views, Bundle, Common]:
     views = views.of_views(views.counts >= MIN_POINTS)
-    first = _first_fit(views, camera.to(views.pixels), free=False) if len(views) else None
+    first = first_fit(views, camera.to(views.pixels), free=False) if len(views) else None
     if first is None:
         raise ConfigError("INPUT: no view has a pose; check --camera, the target and the frames")
-    return _weigh(*first, 0, plate)
+    return weigh(*first, 0, plate)
 
 
 class Common(NamedTuple):
@@ -224,10 +237,10 @@ class Common(NamedTuple):
     gain: float = 0.0
 
 
-def _weigh(views: Views, bundle: Bundle, unknowns: int, plate: Plate | None = None) -> tuple[Views, Bundle, Common]:
+def weigh(views: Views, bundle: Bundle, unknowns: int, plate: Plate | None = None) -> tuple[Views, Bundle, Common]:
     """Views without contradicting points, their fit, weighted, of n unknown intrinsics, and the common error.
 
-    ``bundle`` is a `_first_fit`: with equal weights.
+    ``bundle`` is a `first_fit`: with equal weights.
     """
     # with wrong places residuals tell nothing of the noise: the first fit that moves them goes by the covariances alone
     told = plate is not None and bool(views.covariance.any())
@@ -236,7 +249,7 @@ def _weigh(views: Views, bundle: Bundle, unknowns: int, plate: Plate | None = No
     def fit(bundle: Bundle, views: Views, common: Common, rows: slice | Tensor = slice(None)) -> Bundle:
         start = bundle.plate if len(bundle.plate) else None
         poses = bundle.R[rows], bundle.t[rows]
-        return adjust(_with_common(views, common), bundle.camera, *poses, free=unknowns > 0, plate=plate, start=start)
+        return adjust(_with_common(views, common), bundle.rig, *poses, free=unknowns > 0, plate=plate, start=start)
 
     for number in range(_ROUNDS + (0 if plate is None else _PLATE_ROUNDS)):
         if number:
@@ -276,17 +289,17 @@ class _Channel(NamedTuple):
 
     def redundancy(self, common: float) -> float:
         """The sum of the observations' redundancies: degrees of freedom of their residuals."""
-        share = torch.linalg.solve(_widened(self.covariance, common), self.predicted)
+        share = torch.linalg.solve(widened(self.covariance, common), self.predicted)
         return float(self.residual.numel() - share.diagonal(dim1=-2, dim2=-1).sum())
 
 
-def _channels(views: Views, bundle: Bundle) -> tuple[_Channel, ...]:
+def channels(views: Views, bundle: Bundle) -> tuple[_Channel, ...]:
     """Pixels, and where rims were asked their relative distances and edge gains."""
     rims = views.rims
     if rims is None or bundle.rims.shape[1] == 0:
         return (_Channel(bundle.residual, views.covariance, bundle.predicted),)
     xy = rims.t[:, :2] / rims.t[:, 2:]
-    by_place = rims.camera.J_distort(xy) @ image_by_point(xy, rims.t[:, 2])
+    by_place = slopes(rims.cameras, views.lens, xy) @ image_by_point(xy, rims.t[:, 2])
     parts = [_Channel(bundle.residual, views.covariance, by_place @ bundle.predicted[:, :3, :3] @ by_place.mT)]
     for k, unit in ((2, rims.t[:, 2]), (6, torch.ones_like(rims.t[:, 2]))):
         of = (
@@ -298,16 +311,16 @@ def _channels(views: Views, bundle: Bundle) -> tuple[_Channel, ...]:
 
 def redundancy(views: Views, bundle: Bundle) -> float:
     """Degrees of freedom of the residuals of a fit to pixels."""
-    return _channels(replace(views, rims=None), bundle)[0].redundancy(0.0)
+    return channels(replace(views, rims=None), bundle)[0].redundancy(0.0)
 
 
 def _common(views: Views, bundle: Bundle, before: Common) -> Common:
     """The common errors that the residuals of a fit show, which was made with other ones."""
-    channels = _channels(views, bundle)
+    told = channels(views, bundle)
     return Common(
         *(
             common_sigma(one.residual, one.covariance, max(1.0, one.redundancy(sigma)))
-            for one, sigma in zip(channels, before, strict=False)
+            for one, sigma in zip(told, before, strict=False)
         )
     )
 
@@ -319,7 +332,7 @@ def common_sigma(residual: Float[Tensor, "K d"], covariance: Float[Tensor, "K d 
     """
 
     def excess(sigma: float) -> float:
-        return float((residual * torch.linalg.solve(_widened(covariance, sigma), residual)).sum()) / degrees - 1
+        return float((residual * torch.linalg.solve(widened(covariance, sigma), residual)).sum()) / degrees - 1
 
     high = max(float(residual.square().sum() / degrees) ** 0.5, 1e-9)
     low = 1e-6 * high
@@ -332,7 +345,7 @@ def common_sigma(residual: Float[Tensor, "K d"], covariance: Float[Tensor, "K d 
     return high
 
 
-def _widened(covariance: Tensor, sigma: float) -> Tensor:
+def widened(covariance: Tensor, sigma: float) -> Tensor:
     size = covariance.shape[-1]
     return covariance + sigma * sigma * torch.eye(size, dtype=covariance.dtype, device=covariance.device)
 
@@ -340,11 +353,11 @@ def _widened(covariance: Tensor, sigma: float) -> Tensor:
 def _with_common(views: Views, common: Common) -> Views:
     rims = views.rims
     if rims is not None and any(common):
-        rims = rims.widened(*common)
-    return replace(views, covariance=_widened(views.covariance, common.px), rims=rims)
+        rims = rims.widened(*common, views.lens)
+    return replace(views, covariance=widened(views.covariance, common.px), rims=rims)
 
 
-def _first_fit(views: Views, camera: Camera, *, free: bool = True) -> tuple[Views, Bundle] | None:
+def first_fit(views: Views, camera: Camera, *, free: bool = True) -> tuple[Views, Bundle] | None:
     """Fit with equal weights from one start: poses, everything, poses anew (the other planar solution), everything."""
     found = None
     for _ in range(2):
@@ -358,7 +371,7 @@ def _first_fit(views: Views, camera: Camera, *, free: bool = True) -> tuple[View
         if not bool(solved.any()):
             return None
         views = views.of_views(solved)
-        equal = replace(views, covariance=_widened(torch.zeros_like(views.covariance), _START_SIGMA))
+        equal = replace(views, covariance=widened(torch.zeros_like(views.covariance), _START_SIGMA))
         try:
             found = views, adjust(equal, camera, R[solved], t[solved], free=free)
         except (ConfigError, torch.linalg.LinAlgError):
@@ -387,7 +400,7 @@ def _check_count(views: Views, unknowns: int) -> None:
         )
 
 
-def _check_residuals(views: Views, bundle: Bundle, before: int) -> None:
+def check_residuals(views: Views, residual: Tensor, before: int) -> None:
     """
     Raises:
         ConfigError: the residuals cannot be those of a calibration.
@@ -402,7 +415,7 @@ def _check_residuals(views: Views, bundle: Bundle, before: int) -> None:
     seen = views.padded()[2][..., None]
     reach = torch.where(seen, pixels, -torch.inf).amax(1) - torch.where(seen, pixels, torch.inf).amin(1)
     apart = float((reach.prod(-1) / views.counts).sqrt().median())
-    rms = float(bundle.residual.square().sum(-1).mean().sqrt())
+    rms = float(residual.square().sum(-1).mean().sqrt())
     if rms > _MOST_RESIDUAL * apart:
         raise ConfigError(
             f"INPUT: points that are {apart:.0f} px apart fit to {rms:.2g} px only, which no lens or print explains; "
@@ -410,7 +423,7 @@ def _check_residuals(views: Views, bundle: Bundle, before: int) -> None:
         )
 
 
-def _check_lens(camera: Camera, covariance: Tensor, names: tuple[str, ...]) -> None:
+def check_lens(camera: Camera, covariance: Tensor, names: tuple[str, ...]) -> None:
     """
     Raises:
         ConfigError: numerator and denominator of a rational lens cancel, so that its coefficients mean nothing.
@@ -436,12 +449,12 @@ def _check_lens(camera: Camera, covariance: Tensor, names: tuple[str, ...]) -> N
         )
 
 
-def _covariance(information: Tensor, names: tuple[str, ...]) -> Tensor:
+def covariance_of(information: Tensor, names: tuple[str, ...]) -> Tensor:
     """Inverse of the information about the intrinsics of these names, and whatever follows them."""
     scale = information.diagonal().clamp_min(1e-300).rsqrt()
     values, vectors = torch.linalg.eigh(information * scale[:, None] * scale)
     if not float(values[0]) > _SINGULAR:
-        told, what = dict(enumerate(names)), "intrinsics" if names else "places"
+        told, what = dict(enumerate(names)), "intrinsics" if any(n.endswith("fx") for n in names) else "places"
         most = vectors[:, 0].abs().topk(2).indices.sort().values.tolist()
         direction = ", ".join(dict.fromkeys(told.get(i, "places of the target") for i in most))
         raise ConfigError(
@@ -452,11 +465,12 @@ def _covariance(information: Tensor, names: tuple[str, ...]) -> Tensor:
     return root @ root.T
 
 
-def _warnings(views: Views, bundle: Bundle, covariance: Tensor, common: float) -> list[str]:
-    normal, reach = bundle.R[:, :, 2], views.pixels.amax(0) - views.pixels.amin(0)
+def doubts_of(views: Views, camera: Camera, R: Tensor, covariance: Tensor, common: float) -> list[str]:
+    """What makes the intrinsics of a camera doubtful, with the turns (N, 3, 3) of its views."""
+    normal, reach = R[:, :, 2], views.pixels.amax(0) - views.pixels.amin(0)
     spread = float((normal @ normal.T).clamp(-1, 1).acos().max().rad2deg())
-    focal = float((covariance.diagonal()[:2].sqrt() / bundle.camera.matrix.diagonal()[:2]).max())
-    covered = reach > _LITTLE_COVER * reach.new_tensor([bundle.camera.width, bundle.camera.height])
+    focal = float((covariance.diagonal()[:2].sqrt() / camera.matrix.diagonal()[:2]).max())
+    covered = reach > _LITTLE_COVER * reach.new_tensor([camera.width, camera.height])
     doubts = [
         (
             common > _LARGE_ERROR,
@@ -474,7 +488,7 @@ def _warnings(views: Views, bundle: Bundle, covariance: Tensor, common: float) -
             "add tilted views, or views that fill the frame",
         ),
         (
-            len(bundle.camera.distortion) > 0 and not bool(covered.all()),
+            len(camera.distortion) > 0 and not bool(covered.all()),
             "the points cover less than half of the frame's width or height, so the distortion beyond them is "
             "extrapolated; add views with the target near borders and corners",
         ),

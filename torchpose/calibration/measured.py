@@ -142,25 +142,34 @@ def measured_target(calibration: Calibration, target: Target) -> tuple[Target, C
     """
     plate, n = calibration.plate, len(calibration.covariance)
     assert plate is not None  # what was measured
-    layout = plate.at(calibration.bundle.plate)
-    order = plate.index(target.ids)
-    rows = torch.cat([plate.places[order].flatten(0, 1), plate.gain[None]])
-    of_plate, cross = calibration.joint[n:, n:], rows @ calibration.joint[n:, :n]
-    covariance = rows @ of_plate @ rows.mT
+    measured = measured_plate(plate, calibration.bundle.plate, calibration.joint[n:, n:], target)
+    cross = _rows(plate, target) @ calibration.joint[n:, :n]
+    name = name_of(calibration.joint, plate.at(calibration.bundle.plate).places)
+    measured = replace(measured, adjustment=name, cross_covariance=cross)
+    return measured, replace(calibration.camera, adjustment=name)
+
+
+def measured_plate(plate: Plate, z: Tensor, covariance: Float[Tensor, "k k"], target: Target) -> Target:
+    """The target with what was found of its plate, z (k,) with a covariance; arguments as of `measured_target`."""
+    layout, order, rows = plate.at(z), plate.index(target.ids), _rows(plate, target)
+    whole = rows @ covariance @ rows.mT
     # files hold the deviation of the gain, not what it shares with the places, which is next to nothing
-    covariance[-1, :-1] = covariance[:-1, -1] = 0.0
-    name = name_of(calibration.joint, layout.places)
-    measured = replace(
+    whole[-1, :-1] = whole[:-1, -1] = 0.0
+    return replace(
         target,
         centers=layout.places[order],
         normals=(rotations.exp(layout.turns[order]) @ target.normals[..., None]).squeeze(-1),
         radii=target.radii * layout.sizes[order, None].exp(),
         edge_gain=target.edge_gain + float(layout.gain),
-        covariance=0.5 * (covariance + covariance.mT),
-        adjustment=name,
-        cross_covariance=cross,
+        covariance=0.5 * (whole + whole.mT),
+        adjustment=None,
+        cross_covariance=None,
     )
-    return measured, replace(calibration.camera, adjustment=name)
+
+
+def _rows(plate: Plate, target: Target) -> Tensor:
+    """How places, marker by marker, and the edge gain of a target follow the unknowns of its plate."""
+    return torch.cat([plate.places[plate.index(target.ids)].flatten(0, 1), plate.gain[None]])
 
 
 def check_seen(views: Views, target: Target) -> None:
@@ -182,18 +191,19 @@ def of_seen(target: Target, views: Views) -> Target:
 
 def doubts(calibration: Calibration, target: Target) -> list[str]:
     """What makes a measured target doubtful, one sentence each."""
-    return [*_poorly_known(calibration, target), *(_left_out(calibration) or _moved(calibration) or _bent(calibration))]
-
-
-def _poorly_known(calibration: Calibration, target: Target) -> list[str]:
     plate, n = calibration.plate, len(calibration.covariance)
     assert plate is not None  # what was measured
-    of_plate = calibration.joint[n:, n:]
+    poor = poorly_known(plate, calibration.bundle.plate, calibration.joint[n:, n:], target)
+    return [*poor, *(_left_out(calibration) or _moved(calibration) or _bent(calibration))]
+
+
+def poorly_known(plate: Plate, z: Tensor, of_plate: Float[Tensor, "k k"], target: Target) -> list[str]:
+    """Places that the views tell worse than they should; arguments as of `measured_plate`."""
     sigma = (plate.places @ of_plate * plate.places).sum(-1).clamp_min(0).sqrt()  # (M, 3)
     stated = torch.full_like(sigma, torch.inf)
     if target.covariance is not None:
         stated = target.covariance.diagonal()[:-1].sqrt().view(-1, 3)[target_order(plate, target)]
-    places = plate.at(calibration.bundle.plate).places
+    places = plate.at(z).places
     extent = float((places - places.mean(0)).norm(dim=-1).max())
     worst, axis = divmod(int(sigma.argmax()), 3)
     found = []

@@ -127,7 +127,7 @@ def _rims(refined: Refined, sight: Sight) -> Rims:
     by_camera = rims_by_camera(sight.camera, refined.R, refined.t, sight.normals[:, 0], radii)
     by_camera[:, 6] *= sight.polarity  # its gain is that of the rings, not of what is dark
     information = 0.5 * (information + information.mT)
-    return Rims(refined.R, refined.t, refined.gain, information, pull, by_camera, sight.camera)
+    return Rims(refined.R, refined.t, refined.gain, information, pull, by_camera, (sight.camera,))
 
 
 def rims_by_camera(camera: Camera, R: Tensor, t: Tensor, normals: Tensor, radii: Tensor) -> Tensor:

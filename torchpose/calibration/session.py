@@ -93,7 +93,7 @@ def calibrate_camera(
     plate = None
     if shown.covariance is not None:
         plate = stated_plate(shown.ids, shown.centers, shown.covariance[:-1, :-1])
-    seen = _all_centers(linear_frames(stored, tone), shown, camera)
+    seen = all_centers(linear_frames(stored, tone), shown, camera)
     found = calibrate_intrinsics(seen, [camera], lens=lens, plate=plate)
     return replace(found, camera=replace(found.camera, tone=tone))
 
@@ -158,7 +158,7 @@ def measure_target(
     target = nominal_board(_all_marks(frames, shown, camera), shown, camera) if isinstance(shown, Grid) else shown
     known = target
     for _ in range(_MEASURED):
-        views = _all_centers(frames, known, camera, rims=True)
+        views = all_centers(frames, known, camera, rims=True)
         if isinstance(shown, Grid):
             known, target = of_seen(known, views), of_seen(target, views)
             views = views[torch.isin(views.point, target.ids)]
@@ -235,7 +235,7 @@ def locate_camera(frames: Frames, shown: Shown, camera: Camera) -> tuple[Views, 
     camera = replace(camera, tone=None)
     if isinstance(shown, Grid):
         return locate_views(_all_mark_centers(frames, shown, camera, _all_marks(frames, shown, camera)), camera)
-    seen = _all_corners(frames, shown) if isinstance(shown, Board) else _all_centers(frames, shown, camera)
+    seen = _all_corners(frames, shown) if isinstance(shown, Board) else all_centers(frames, shown, camera)
     return locate_views(seen, camera)
 
 
@@ -261,7 +261,7 @@ def _all_mark_centers(frames: Frames, grid: Grid, camera: Camera, marks: Marks) 
     return Views.cat([measure_marks(names, part, some, grid, camera) for names, part, some in batches])
 
 
-def _all_centers(frames: Frames, target: Target, camera: Camera, *, rims: bool = False) -> Views:
+def all_centers(frames: Frames, target: Target, camera: Camera, *, rims: bool = False) -> Views:
     return Views.cat([measure_centers(names, part, camera, target, rims=rims) for names, part in frames()])
 
 

@@ -31,7 +31,7 @@ class Rims(Rows):
         information: of the grey values alone.
         pull: of the grey values at the fit, where something else held it.
         by_camera: how the unknowns would follow the intrinsics of the camera that they were fitted with.
-        camera: this one.
+        cameras: these; `Views.lens` says which one each was fitted with.
     """
 
     R: Float[Tensor, "K 3 3"]
@@ -40,7 +40,7 @@ class Rims(Rows):
     information: Float[Tensor, "K 7 7"]
     pull: Float[Tensor, "K 7"]
     by_camera: Float[Tensor, "K 7 n"]
-    camera: Camera = shared()
+    cameras: tuple[Camera, ...] = shared()
 
     @property
     def covariance(self) -> Float[Tensor, "K 7 7"]:
@@ -60,11 +60,12 @@ class Rims(Rows):
         """The change to the unknowns of least chi-squared, with turns as in `covariance`."""
         return (self.covariance @ self.pull[..., None]).squeeze(-1)
 
-    def widened(self, px: float, depth: float, gain: float) -> Self:
+    def widened(self, px: float, depth: float, gain: float, lens: Tensor) -> Self:
         """The same with errors besides: of the centre's pixel, per axis, of the relative distance, and of the gain."""
         distance = self.t[:, 2]
+        focal = torch.stack([camera.matrix.diagonal()[:2] for camera in self.cameras])
         root = torch.diag_embed(torch.nn.functional.pad(self.t.new_zeros(len(self), 6), (0, 1), value=gain))
-        root[:, [0, 1], [0, 1]] = (px / self.camera.matrix.diagonal()[:2]).to(distance) * distance[:, None]
+        root[:, [0, 1], [0, 1]] = (px / focal[lens]).to(distance) * distance[:, None]
         root[:, :3, 2] = depth * self.t  # along the ray: the pixel stays
         # (A^-1 + S S^T)^-1 = A - A S (1 + S^T A S)^-1 S^T A, which needs no inverse of what is zero
         left = root.mT @ self.information
@@ -84,7 +85,7 @@ class Rims(Rows):
 
 @dataclass(frozen=True, eq=False)
 class Views(Rows):
-    """K points seen in N views of one camera. Indexing selects points, `len` is the number of views.
+    """K points seen in N views of one camera, or at N moments by several. Indexing selects points, `len` is N.
 
     Attributes:
         view: index of the view.
@@ -94,6 +95,7 @@ class Views(Rows):
         covariance: px^2; zero where it is not known, see `torchpose.calibration.intrinsics.calibrate_intrinsics`.
         names: of the N views (of the frames).
         rims: of the rings, where they were measured.
+        camera: number of the camera that saw each point, where there are several.
     """
 
     view: Int[Tensor, " K"]
@@ -103,9 +105,15 @@ class Views(Rows):
     covariance: Float[Tensor, "K 2 2"]
     names: tuple[str, ...] = shared()
     rims: Rims | None = None
+    camera: Int[Tensor, " K"] | None = None
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @property
+    def lens(self) -> Int[Tensor, " K"]:
+        """Number of the camera that saw each point."""
+        return torch.zeros_like(self.view) if self.camera is None else self.camera
 
     @property
     def counts(self) -> Int[Tensor, " N"]:
@@ -120,6 +128,16 @@ class Views(Rows):
         return super().cat(
             [replace(part, names=names, view=part.view + start) for part, start in zip(parts, first, strict=False)]
         )
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """The points of parts that have their N views, moments of several cameras, in common."""
+        return super().cat(parts)
+
+    def of_lens(self, number: int) -> Self:
+        """What one camera has of moments, those without it left out."""
+        rest = self[self.lens == number]
+        return rest.of_views(rest.counts > 0)
 
     def of_views(self, keep: Tensor) -> Self:
         """Some of the views, a mask (N,), numbered anew."""

@@ -47,7 +47,8 @@ class Camera:
       (x, y) theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) / r.
 
     Attributes:
-        width, height: size of the frame, px.
+        width: of the frame, px.
+        height: of the frame, px.
         matrix: (3, 3) float64, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] px. Skew is rejected: none of the file formats but
             the bare matrix could hold it, and OpenCV ignores it.
         distortion: (0|4|5|8,) float64 for brown_conrady, (4,) for kannala_brandt. The 12 or 14 coefficients of OpenCV's

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
 
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from torchpose.calibration.session import Measurement, Shown
     from torchpose.camera import Camera
     from torchpose.io.sources import Source
+    from torchpose.target import Target
 
 _BOARD = (
     "Instead of a target: circles:7x6:20mm (columns, rows, pitch), acircles:4x11:20mm (OpenCV's asymmetric grid), "
@@ -54,7 +55,17 @@ _DISTANCE = (
     "deviation in mm if it is not 0. By default the scale is that of the nominal places."
 )
 _LENSES = "pinhole|brown4|brown5|rational8|kannala_brandt"
-_INPUTS = "Image files, folders or capture manifests (.jsonl) of one camera."
+_INPUTS = (
+    "Image files, folders or capture manifests (.jsonl) of one camera; with --cameras-out one folder with a folder a "
+    "camera, or one manifest: pictures of one name are of one moment."
+)
+_CAMERAS_OUT = (
+    "File to write of several cameras (Kalibr camchain): intrinsics, places and their covariances, in one adjustment."
+)
+_CAMERAS = (
+    "With --cameras-out: a file of all cameras, or once a camera its file, in the order of their names. Intrinsics are "
+    "held, and their covariances carried through."
+)
 _OUT = "Camera file to write; without it --camera is taken as it is."
 
 
@@ -68,6 +79,8 @@ def calibrate(
     target_out: Annotated[Path | None, typer.Option("--measure-target", metavar="FILE", help=_MEASURE_TARGET)] = None,
     distance: Annotated[tuple[int, int, float] | None, typer.Option(metavar="ID ID MM [SIGMA]", help=_DISTANCE)] = None,
     hand_eye_out: Annotated[Path | None, typer.Option(help=_HAND_EYE_OUT)] = None,
+    cameras_out: Annotated[Path | None, typer.Option(metavar="RIG", help=_CAMERAS_OUT)] = None,
+    cameras: Annotated[list[Path] | None, typer.Option(metavar="RIG", help=_CAMERAS)] = None,
     tone: Tone = None,
     plots: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for residual plots and tables.")] = None,
     threads: Threads = None,
@@ -76,11 +89,17 @@ def calibrate(
     """Calibrate a camera from views of a target, and where it sits on the robot, each with its covariance."""
     from torchpose.calibration.session import parse_board
     from torchpose.camera import Camera
-    from torchpose.cli.terminal import native_stderr_silenced
     from torchpose.target import Target
 
     if (target is None) == (board is None):
         raise ConfigError("--target: give either --target or --board, what the frames show")
+    if cameras_out is not None or cameras:
+        from torchpose.cli.calibrate_rig import Request, calibrate_rig
+
+        single = {"--out": out, "--camera": camera, "--hand-eye-out": hand_eye_out, "--distance": distance}
+        outs = (cameras_out, target_out, plots)
+        shown = Target.load(target) if target is not None else parse_board(board or "")
+        return calibrate_rig(Request(inputs, shown, model, cameras or [], *outs, tone, threads, quiet), single)
     _check_files(out, hand_eye_out, camera, target_out)
     shown = Target.load(target) if target is not None else parse_board(board or "")
     between, inputs = _distance(distance, inputs, shown, target_out)
@@ -89,30 +108,54 @@ def calibrate(
         check_robot_poses(sources)
     start = None if camera is None else with_tone(Camera.load(camera), tone)
     said = start.tone if start is not None else read_tone(tone)
-    frames = _Frames(sources, start, threads=threads or cores(), quiet=quiet)
+    frames = CameraFrames(sources, start, threads=threads or cores(), quiet=quiet)
+    return _run(frames, shown, start, model, between, said, _Outputs(out, target_out, hand_eye_out, plots))
+
+
+class _Outputs(NamedTuple):
+    """Files to write, and the folder of plots."""
+
+    camera: Path | None
+    target: Path | None
+    hand_eye: Path | None
+    plots: Path | None
+
+
+def _run(
+    frames: CameraFrames,
+    shown: Shown,
+    start: Camera | None,
+    model: str,
+    between: Distance | None,
+    said: cameras.Tone | None,
+    out: _Outputs,
+) -> int:
+    """Calibrates and writes one after the other; returns the exit code."""
+    from torchpose.cli.terminal import native_stderr_silenced
+
     calibration = fit = measured = None
     try:
         with native_stderr_silenced():
-            if target_out is not None:
-                measured = _measured(frames, shown, start, model, between, said, held=out is None)
+            if out.target is not None:
+                measured = _measured(frames, shown, start, model, between, said, held=out.camera is None)
                 calibration = measured.calibration
-                _show(calibration, len(sources), held=out is None)
-                _show_target(measured)
-                _save(measured.target, target_out, "--measure-target")
-                if out is not None:
-                    _save(measured.camera, out, "--out")
-            elif out is not None:
+                _show(calibration, len(frames.sources), held=out.camera is None)
+                show_places(measured.target, measured.nominal)
+                save(measured.target, out.target, "--measure-target")
+                if out.camera is not None:
+                    save(measured.camera, out.camera, "--out")
+            elif out.camera is not None:
                 calibration = _calibrate(frames, shown, start, model, said)
-                _show(calibration, len(sources))
-                _save(calibration.camera, out, "--out")
-            if hand_eye_out is not None:
+                _show(calibration, len(frames.sources))
+                save(calibration.camera, out.camera, "--out")
+            if out.hand_eye is not None:
                 fit = _hand_eye(frames, shown, calibration, start)
                 _show_hand_eye(fit)
-                _save(fit.hand_eye, hand_eye_out, "--hand-eye-out")
-            if plots is not None:
+                save(fit.hand_eye, out.hand_eye, "--hand-eye-out")
+            if out.plots is not None:
                 from torchpose.report.calibration import save_calibration
 
-                for path in save_calibration(calibration, fit, plots, measured):
+                for path in save_calibration(calibration, fit, out.plots, measured):
                     say(str(path))
     except KeyboardInterrupt:
         return interrupted("nothing more was written; run again")
@@ -130,11 +173,16 @@ def _check_files(
     if out is None and camera is None:
         found = "--measure-target" if target_out is not None else "--hand-eye-out"
         raise ConfigError(f"--camera: needed to find {found}; give the camera file, or --out to calibrate it now")
+    check_places({"--out": out, "--hand-eye-out": hand_eye_out, "--measure-target": target_out})
+
+
+def check_places(given: Mapping[str, Path | None]) -> None:
+    """Refuses files, by option, that cannot be written or that two options name."""
     from torchpose.config import real
     from torchpose.io.writers import check_folder_of
 
     files: dict[Path, str] = {}
-    for path, option in ((out, "--out"), (hand_eye_out, "--hand-eye-out"), (target_out, "--measure-target")):
+    for option, path in given.items():
         if path is None:
             continue
         check_folder_of(path, option)
@@ -144,7 +192,7 @@ def _check_files(
             raise ConfigError(f"{path}: {option}: is the file of {other}, too; choose another")
 
 
-def _save(found: Any, path: Path, option: str) -> None:
+def save(found: Any, path: Path, option: str) -> None:
     """Writes the file of a camera, target or hand-eye transform, its folder made where it is missing."""
     from torchpose.io.writers import make_folder_of
 
@@ -182,12 +230,12 @@ def _is_number(text: str) -> bool:
     return True
 
 
-class _Frames:
+class CameraFrames:
     """The frames of all sources in batches, anew at every call; what could not be read is remembered."""
 
     def __init__(self, sources: Sequence[Source], start: Camera | None, *, threads: int, quiet: bool) -> None:
         self.sources, self._threads, self._quiet = sources, threads, quiet
-        self.width, self.height = (start.width, start.height) if start is not None else _first_size(sources)
+        self.width, self.height = (start.width, start.height) if start is not None else first_size(sources)
         self.unreadable: dict[str, str] = {}
 
     def __call__(self) -> Iterator[tuple[list[str], Tensor]]:
@@ -213,7 +261,7 @@ class _Frames:
                 progress.advance(len(batch.sources), Counter())
 
 
-def _first_size(sources: Sequence[Source]) -> tuple[int, int]:
+def first_size(sources: Sequence[Source]) -> tuple[int, int]:
     from torchpose.io.images import UnreadableImageError
 
     for source in sources:
@@ -226,7 +274,7 @@ def _first_size(sources: Sequence[Source]) -> tuple[int, int]:
 
 
 def _calibrate(
-    frames: _Frames, shown: Shown, start: Camera | None, model: str, tone: cameras.Tone | None
+    frames: CameraFrames, shown: Shown, start: Camera | None, model: str, tone: cameras.Tone | None
 ) -> Calibration:
     from torchpose.calibration.intrinsics import start_cameras
     from torchpose.calibration.session import calibrate_camera
@@ -236,7 +284,7 @@ def _calibrate(
 
 
 def _measured(
-    frames: _Frames,
+    frames: CameraFrames,
     shown: Shown,
     start: Camera | None,
     model: str,
@@ -255,7 +303,7 @@ def _measured(
     return measure_target(frames, shown, first, given=given, lens=model, distance=distance, tone=tone)
 
 
-def _hand_eye(frames: _Frames, shown: Shown, calibration: Calibration | None, camera: Camera | None) -> HandEyeFit:
+def _hand_eye(frames: CameraFrames, shown: Shown, calibration: Calibration | None, camera: Camera | None) -> HandEyeFit:
     from torchpose.calibration.session import calibrate_robot, locate_camera
 
     robot = {source.name: source.robot_pose for source in frames.sources if source.robot_pose is not None}
@@ -280,9 +328,8 @@ def _show(found: Calibration, frames: int, *, held: bool = False) -> None:
         say(f"warning: {warning}", err=True)
 
 
-def _show_target(found: Measurement) -> None:
-    """How far the markers are from their nominal places, and how well that is known."""
-    target, nominal = found.target, found.nominal
+def show_places(target: Target, nominal: Target) -> None:
+    """How far the markers of a measured target are from their nominal places, and how well that is known."""
     assert target.covariance is not None  # always there after a measurement
     off = target.centers - nominal.centers
     sigma = target.covariance.diagonal()[:-1].view(-1, 3).sqrt()

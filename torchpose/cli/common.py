@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,7 +24,7 @@ CLOSED = 141  # 128 + SIGPIPE: nobody reads on, as behind `| head`
 MOST_SEED = 2**63 - 1  # of torch's generators
 _MOST_THREADS = 256  # (convention) more than any machine of today gains from; thousands of stacks end the process
 _MOST_BATCH = 4096  # frames (convention): of 20 megapixels they fill 80 GB
-_THREADS = "Threads to use; by default one a core."
+_THREADS = "Cores to use; by default all."
 Threads = Annotated[int | None, typer.Option("--threads", "-j", min=1, max=_MOST_THREADS, help=_THREADS)]
 Tone = Annotated[
     str | None,
@@ -53,6 +55,40 @@ def use_threads(threads: int | None, *, share: float = 1.0) -> int:
     wanted = threads or cores()
     torch.set_num_threads(max(1, min(int(share * wanted), cores())))
     return wanted
+
+
+@contextmanager
+def importing() -> Iterator[None]:
+    """Around imports: what modules are made of is no garbage, and is not searched for any again and again."""
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        gc.enable()
+
+
+def one_thread_each() -> None:
+    """Has torch and OpenCV use one thread: the cores are shared out among processes (`torchpose.io.processes`).
+
+    Results then do not depend on the number of cores, and a process that has no threads can be forked.
+    """
+    import cv2
+    import torch
+
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+
+
+def check_device(name: str) -> None:
+    """Raises ConfigError unless frames can be worked on there."""
+    import torch
+
+    if name not in ("cpu", "cuda"):
+        raise ConfigError(f"--device: {name} is not known; give cpu or cuda")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("--device: torch finds no CUDA device here; leave --device out, or install torch for CUDA")
 
 
 def frames_of(inputs: Sequence[Path | Place], listed: Sequence[Path] = ()) -> list[Source]:

@@ -226,7 +226,7 @@ def _tell_precision(target: Target, scene: _Scene, promise: _Promise, need: Need
     say(_focus(scene))
     table, picture = out / f"{target.name}_precision.csv", out / f"{target.name}_map.png"
     write_rows(table, rows, {column: str if column in ("axis", "unit") else float for column in rows[0]})
-    save_plot(precision_map(scene.camera, target, scene.volume, scene.imaging), target.name, picture)
+    save_plot(precision_map(scene.camera, target, scene.volume, scene.imaging), target.name, picture, scene.volume)
     return [table, picture]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypedDict
 
@@ -17,19 +17,26 @@ from torchpose.cli.common import (
     Silent,
     Threads,
     Tone,
+    check_device,
     check_outputs,
     check_robot_poses,
     cores,
     ended,
     frames_of,
+    importing,
     interrupted,
     listed_files,
+    one_thread_each,
     say,
-    use_threads,
     with_tone,
 )
+from torchpose.cli.moments import check_several, estimate_moments
 from torchpose.cli.options import (
+    ADDRESS,
+    ENGINE,
     CameraFile,
+    Cameras,
+    Engine,
     FilesFrom,
     HandEyeFile,
     Instances,
@@ -37,6 +44,7 @@ from torchpose.cli.options import (
     RelativeTo,
     Targets,
     Upright,
+    check_address,
 )
 from torchpose.errors import ConfigError
 
@@ -57,8 +65,6 @@ _OUT = (
     "Table of the poses: .csv, .jsonl or .parquet, on a disk or in a store, with --engine ray a folder of parts; or "
     "`-`: JSON lines on standard output."
 )
-_ENGINE = "What runs the work: this process, or the workers of a Ray cluster (extra: ray)."
-_ADDRESS = "With --engine ray: a cluster that is there; without it, one starts here and ends with the command."
 _INPUTS = (
     "Image files (PNG, TIFF, BMP, JPEG, PGM; 8 or 16 bit, grey or colour), films (.mp4, .avi, .mov, .mkv, .webm), "
     "folders of both, searched recursively and taken in natural order, or capture manifests (.jsonl); paths, or URLs "
@@ -66,18 +72,15 @@ _INPUTS = (
 )
 _JUDGED = 16  # frames that the tone is judged by
 _RESUME = "Keep the frames that an earlier run finished and do the rest."
+_DEVICE = "Where the frames are worked on; with cuda, --threads decode for it."
 _DETECTIONS = "Table of the markers found: .csv, .jsonl or .parquet."
-
-
-class Engine(StrEnum):
-    local = "local"
-    ray = "ray"
 
 
 def estimate(
     out: Annotated[str, typer.Option("--out", "-o", help=_OUT)],
     inputs: Annotated[list[str] | None, typer.Argument(metavar="INPUT...", help=_INPUTS)] = None,
     camera: CameraFile = None,
+    cameras: Cameras = None,
     target: Targets = None,
     files_from: FilesFrom = None,
     detections: Annotated[str | None, typer.Option("--detections", "-d", help=_DETECTIONS)] = None,
@@ -92,8 +95,9 @@ def estimate(
     srgb: Annotated[bool, typer.Option("--srgb", help="The same as --tone srgb.")] = False,
     batch: Batch = None,
     threads: Threads = None,
-    engine: Annotated[Engine, typer.Option(help=_ENGINE)] = Engine.local,
-    address: Annotated[str | None, typer.Option(help=_ADDRESS)] = None,
+    device: Annotated[str, typer.Option(metavar="cpu|cuda", help=_DEVICE)] = "cpu",
+    engine: Annotated[Engine, typer.Option(help=ENGINE)] = Engine.local,
+    address: Annotated[str | None, typer.Option(help=ADDRESS)] = None,
     quiet: Silent = False,
 ) -> int:
     """Measure the pose of ring targets in every frame, with its uncertainty.
@@ -101,42 +105,54 @@ def estimate(
     One row a frame and target, or with --instances one a copy: status, translation in mm, rotation vector in rad
     (target to camera), their standard deviations, reprojection RMS in px, number of markers.
     """
-    from torchpose.cli.terminal import native_stderr_silenced
-    from torchpose.io.project import settings
-    from torchpose.io.storage import place_of
+    with importing():
+        from torchpose.cli.terminal import native_stderr_silenced
+        from torchpose.io.estimates import Estimation  # noqa: F401  # imports all that is needed
+        from torchpose.io.project import settings
+        from torchpose.io.storage import place_of
 
     places = [place_of(name) for name in inputs or []]
     on_ray, tables = engine is Engine.ray, _Tables.of(out, detections)
-    _check_engine(address, overlay, on_ray=on_ray)
-    _check_stream(tables, resume=resume, on_ray=on_ray)
-    if not on_ray:
-        tables.check()
+    check_address(engine, address)
+    _check_engine(overlay, device, on_ray=on_ray)
+    tables.check(resume=resume, on_ray=on_ray)
+    one_thread_each()
     listed = listed_files(places, files_from)
     options: dict[str, Any] = {"camera": camera, "target": target, "method": method, "instances": instances}
     options |= {"hand_eye": hand_eye, "relative_to": relative_to, "assume_upright": assume_upright}
     stated = settings([*places, *listed], **options, tone="srgb" if srgb and tone is None else tone)
+    how: _How = {"resume": resume, "batch": batch, "threads": threads or cores(), "quiet": quiet, "told": stated.told}
+    if cameras is not None:
+        other = {"--device": device != "cpu"}
+        check_several(
+            camera, {"-d": detections, "--overlay": overlay, "--engine ray": on_ray, "-f": files_from, **other}
+        )
+        rest, several = partial(estimation, stated), {**how, "tone": stated["tone"]}
+        return estimate_moments(cameras, places, rest, tables.out, several)
     sources = frames_of(places, listed)
     work = estimation(stated, sources)
     check_outputs([*places, *listed], sources, tables.paths, overlay)
-    how: _How = {"resume": resume, "batch": batch, "threads": threads or cores(), "quiet": quiet, "told": stated.told}
     with native_stderr_silenced():
         if on_ray:
             return _run_on_ray(work, sources, tables, address, **how)
-        return _run(work, sources, tables, overlay, **how)
+        return _run(work, sources, tables, overlay, device=device, **how)
 
 
-def estimation(stated: Settings, sources: Sequence[Source]) -> Estimation:
-    """What the rows depend on, by the options. ConfigError: one is missing, or they do not go together."""
+def estimation(stated: Settings, sources: Sequence[Source], lens: Camera | None = None) -> Estimation:
+    """What the rows depend on, by the options, or with a camera that is given.
+
+    ConfigError: one is missing, or they do not go together.
+    """
     from torchpose.camera import Camera
     from torchpose.io.estimates import Estimation
     from torchpose.target import Target
 
-    lens = Camera.load(stated.needed("camera"))
+    given, lens = lens, lens or Camera.load(stated.needed("camera"))
     targets = [Target.load(name) for name in stated.needed("target")]
     if stated["assume_upright"]:
         targets = [one.upright() for one in targets]
     lens = with_tone(lens, stated["tone"])
-    lens = lens if lens.tone is not None else with_judged_tone(lens, targets[0], sources)
+    lens = lens if lens.tone is not None or given else with_judged_tone(lens, targets[0], sources)
     instances = stated["instances"] or 1
     _check_relative(stated["relative_to"], targets, stated["hand_eye"], instances)
     return Estimation(
@@ -180,31 +196,27 @@ class _Tables:
 
         return [path for path in (self.out, self.detections) if isinstance(path, Path) and not is_standard(path)]
 
-    def check(self) -> None:
-        """Raises ConfigError unless both can be written."""
+    def check(self, *, resume: bool, on_ray: bool) -> None:
+        """Raises ConfigError unless both can be written, and for what standard output cannot have."""
         from torchpose.io.stream import is_standard
         from torchpose.io.writers import check_table_path
 
+        options = {"--resume": resume, "--detections": self.detections is not None, "--engine ray": on_ray}
+        if isinstance(self.out, Path) and is_standard(self.out):
+            for option in [option for option, given in options.items() if given]:
+                fix = f"give a file, or leave {option} out"
+                raise ConfigError(f"--out: - is standard output, which has no {option}; {fix}")
         for path, option in ((self.out, "--out"), (self.detections, "--detections")):
-            if isinstance(path, Path) and not is_standard(path):
+            if isinstance(path, Path) and not is_standard(path) and not on_ray:
                 check_table_path(path, option)
 
 
-def _check_stream(tables: _Tables, *, resume: bool, on_ray: bool) -> None:
-    """Refuses what standard output cannot have."""
-    from torchpose.io.stream import is_standard
-
-    options = {"--resume": resume, "--detections": tables.detections is not None, "--engine ray": on_ray}
-    for option, given in options.items():
-        if given and isinstance(tables.out, Path) and is_standard(tables.out):
-            raise ConfigError(f"--out: - is standard output, which has no {option}; give a file, or leave {option} out")
-
-
-def _check_engine(address: str | None, overlay: Path | None, *, on_ray: bool) -> None:
-    if address is not None and not on_ray:
-        raise ConfigError("--address: is of --engine ray alone; add it or leave --address out")
+def _check_engine(overlay: Path | None, device: str, *, on_ray: bool) -> None:
+    check_device(device)
     if overlay is not None and on_ray:
         raise ConfigError("--overlay: is not drawn by --engine ray; run a part of the frames with --engine local")
+    if device != "cpu" and on_ray:
+        raise ConfigError("--device: is cpu with --engine ray; leave one of them out")
 
 
 def with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -> Camera:
@@ -254,37 +266,38 @@ def _run(
     resume: bool,
     batch: int | None,
     threads: int,
+    device: str,
     quiet: bool,
     told: str,
 ) -> int:
     """Estimates what is not done yet and writes the tables; returns the exit code."""
-    import cv2
-    import torch
-
-    from torchpose.camera import LINEAR
     from torchpose.cli.terminal import FrameProgress
-    from torchpose.io.reader import FrameReader, default_batch, in_batches
+    from torchpose.io.estimates import estimated
+    from torchpose.io.processes import Crew
+    from torchpose.io.reader import default_batch, in_batches
     from torchpose.io.staged import Staged
     from torchpose.io.stream import StreamedRows
     from torchpose.report.overlay import Overlay
 
-    cv2.setNumThreads(1)  # frames are decoded side by side; threads inside of one would only compete
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    # decoding is the larger part of the work; torch's threads wait actively and would take its cores away
-    use_threads(threads, share=0.5)
-    camera, targets = work.camera, work.targets
-    tone, estimator = camera.tone or LINEAR, work.estimator()
-    painter = None if overlay is None else Overlay(camera, targets, overlay, threads=threads)
+    estimator = work.estimator().to(device)
+    painter = None if overlay is None else Overlay(work.camera, work.targets, overlay, threads=1)
     staged = Staged(tables.out, tables.detections, resume=resume)
     store = _opened(work, sources, staged.out, staged.detections, resume)
     # a resumed run works on the same batches as one that was not interrupted, so that rows agree to the last bit
-    batches = in_batches(sources, batch or default_batch(camera.width, camera.height))
+    batches = in_batches(sources, batch or default_batch(work.camera.width, work.camera.height))
     pending = [one for one in batches if any(source.name not in store for source in one)]
-    reader = FrameReader(pending, camera.width, camera.height, threads=threads, tone=tone)
+    # a single process decodes ahead with all threads, several do so with one each; neither a GPU, nor a connection to a
+    # store, nor an open film, whose decoder has threads of its own, can be shared with processes
+    shared = device == "cpu" and all(isinstance(source.path, Path) and source.film is None for source in sources)
+    processes = threads if shared else 1
+    decoding = threads if min(processes, len(pending)) < 2 else 1
+    job = partial(estimated, work, estimator, None if painter is None else painter.write, decoding)
     try:
-        with FrameProgress(len(sources), len(store), quiet=quiet) as progress, torch.inference_mode():
-            for frames in reader:
-                records = work.records(frames, estimator, None if painter is None else painter.write)
+        with (
+            Crew(job, pending, processes, let_go=store.close) as crew,
+            FrameProgress(len(sources), len(store), quiet=quiet) as progress,
+        ):
+            for records in crew:
                 new = [record for record in records if record["frame"] not in store]
                 store.append(new)
                 progress.advance(len(new), store.tally.counts)
@@ -300,10 +313,8 @@ def _run(
         store.close()
     progress.summary(store.tally.counts, tables.out)
     if store.damaged:
-        say(
-            f"torchpose: {store.damaged} damaged lines of {staged.out}.partial left out, their frames done again",
-            err=True,
-        )
+        lost = f"{store.damaged} damaged lines of {staged.out}.partial left out, their frames done again"
+        say(f"torchpose: {lost}", err=True)
     return _told(store.tally, work, len(sources), quiet=quiet, told=told)
 
 
@@ -341,11 +352,13 @@ def _run_on_ray(
     with FrameProgress(len(sources), len(sources) - left, quiet=quiet) as progress:
         try:
             with cluster(address, threads) as workers:
-                for records in measured(work, blocks, poses, marks, workers=workers):
+                for records in measured(work, blocks, poses, marks, workers=workers.count):
                     for frame, rows in records:
                         tally.add(frame, rows)
                     left -= len(records)
                     progress.advance(len(records), tally.counts)
+                if lost := workers.lost():
+                    say(f"torchpose: {lost} nodes were lost on the way; others have done their blocks again", err=True)
         except KeyboardInterrupt:
             return interrupted(f"{len(sources) - left} of {len(sources)} frames are kept; add --resume to go on")
     for parts in (marks, poses):

@@ -1,15 +1,25 @@
 """Options of the commands that estimate poses: the same words and letters in all of them."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from torchpose.cli.common import built_in_targets
+from torchpose.errors import ConfigError
 
 _CAMERA = (
     "Camera file: OpenCV YAML, JSON or XML, ROS camera_info, Kalibr camchain, COLMAP cameras.txt and others "
     "(docs/cameras.md). FILE#cam1 or FILE#2 picks one of several."
+)
+_CAMERAS = (
+    "Several cameras, instead of --camera: Kalibr camchain, OpenCV's stereo calibration, or a folder of ROS "
+    "camera_info with tf_static.yaml. INPUT has one folder a camera (cam0, cam1, ...), or is a capture manifest "
+    "(docs/rigs.md)."
 )
 _METHODS = "photometric|edges|centers|paper"  # torchpose.pipeline.Method, which takes a second to import
 _METHOD = "Last stage: grey values (the default), edge points, ring centres, or the paper's own chain."
@@ -31,6 +41,37 @@ _FROM = (
 )
 
 
+ENGINE = "What runs the work: processes of this machine, or the workers of a Ray cluster (extra: ray)."
+ADDRESS = "With --engine ray: a cluster that is there; without it, one starts here and ends with the command."
+
+
+class Engine(StrEnum):
+    local = "local"
+    ray = "ray"
+
+
+@contextmanager
+def crew_of(engine: Engine, address: str | None, threads: int) -> Iterator[Any]:
+    """Who shares out the work: `Crew` or what is like it, of so many. ConfigError: nobody answers."""
+    check_address(engine, address)
+    if engine is Engine.local:
+        from torchpose.io.processes import Crew
+
+        yield partial(Crew, count=threads)
+        return
+    from torchpose.scale.cluster import cluster
+    from torchpose.scale.crew import RayCrew
+
+    with cluster(address, threads) as workers:
+        yield partial(RayCrew, count=workers.count)
+
+
+def check_address(engine: Engine, address: str | None) -> None:
+    """Raises ConfigError for an address that nothing would use."""
+    if address is not None and engine is not Engine.ray:
+        raise ConfigError("--address: is of --engine ray alone; add it or leave --address out")
+
+
 def camera_option(text: str) -> Any:
     """--camera with a help text."""
     return typer.Option("--camera", "-c", help=text)
@@ -47,6 +88,7 @@ def folder_option(text: str) -> Any:
 
 
 CameraFile = Annotated[str | None, camera_option(_CAMERA)]
+Cameras = Annotated[Path | None, typer.Option("--cameras", metavar="RIG", help=_CAMERAS)]
 Targets = Annotated[list[str] | None, target_option(_TARGET)]
 Instances = Annotated[int | None, typer.Option(min=1, max=1000, metavar="K", help=_INSTANCES)]
 Upright = Annotated[bool | None, typer.Option("--assume-upright", help=_UPRIGHT)]

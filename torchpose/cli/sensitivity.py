@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
@@ -31,6 +31,16 @@ _NOISE = (
 )
 _LEVELS = "Grey levels of print and paper, with --noise."
 _FOCAL = "Error of the focal length; by default 0.25, or 0 where the camera file states a covariance."
+_CAMERAS = "File of several cameras: what each tells alone, and all together, over the distance; and --second-camera."
+_SECOND = "What a second camera like the first tells besides, by the angle between the two; ends the prediction there."
+_SIZES = (
+    "--focal-error-percent",
+    "--principal-point-px",
+    "--print-um",
+    "--flatness-um",
+    "--radius-um",
+    "--scale-percent",
+)
 _DISTORTION = "Standard deviations of the camera's coefficients: 1e-3,1e-3,1e-5,1e-5."
 
 
@@ -52,6 +62,8 @@ def sensitivity(
     noise: Annotated[float | None, typer.Option(help=_NOISE)] = None,
     blur: Annotated[float, typer.Option(help="Standard deviation of the lens's blur, px, with --noise.")] = 0.7,
     levels: Annotated[tuple[float, float], typer.Option(metavar="DARK LIGHT", help=_LEVELS)] = (30.0, 220.0),
+    cameras: Annotated[Path | None, typer.Option(metavar="RIG", help=_CAMERAS)] = None,
+    second_camera: Annotated[bool, typer.Option("--second-camera", help=_SECOND)] = False,
     draws: Annotated[int, typer.Option(min=2, max=100000, help="Random draws at every distance.")] = 300,
     seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Of the draws.")] = 0,
 ) -> int:
@@ -60,19 +72,21 @@ def sensitivity(
     What target file and camera file state of themselves is counted: center_sigma, edge_gain_sigma, centers_covariance,
     and the covariance of the camera's parameters.
     """
+    if cameras is not None or second_camera:
+        _check({}, [], distance, tilt_deg)
+        return _several(cameras, camera, target, _Range(distance, steps, tilt_deg), (noise, blur, levels), out)
     lens = _lens(camera)
     if focal_error_percent is None:
         focal_error_percent = 0.25 if lens.covariance is None else 0.0
-    options = ("focal-error-percent", "principal-point-px", "print-um", "flatness-um", "radius-um", "scale-percent")
     values = (focal_error_percent, principal_point_px, print_um, flatness_um, radius_um, scale_percent)
-    sizes = {f"--{option}": value for option, value in zip(options, values, strict=True)}
+    sizes = dict(zip(_SIZES, values, strict=True))
     sigmas = list(dict.fromkeys(sigma_px or [0.2, 1.0]))
     _check(sizes, sigmas, distance, tilt_deg)
     import torch
 
     from torchpose.analysis.sensitivity import Uncertainty
     from torchpose.analysis.sweep import sweep, sweep_rings
-    from torchpose.studies.fig04_sensitivity import cases_of, tabulate
+    from torchpose.studies.fig04_sensitivity import cases_of
     from torchpose.target import Target
 
     printed = Target.load(target)
@@ -89,11 +103,58 @@ def sensitivity(
     if noise is not None:
         edges = replace(size, image=_of_edges(noise, levels, blur))
         rings[f"edges of the rings, noise {noise:g}"] = sweep_rings(lens, printed, at, edges, tilt=tilt)
+    return _written(cases, rings, size, lens, printed, out)
+
+
+def _written(
+    cases: dict[str, Sweep],
+    rings: dict[str, Swept],
+    size: Uncertainty,
+    lens: Camera,
+    printed: Target,
+    out: Path,
+) -> int:
+    """Writes and shows what was predicted; returns the exit code."""
+    from torchpose.studies.fig04_sensitivity import tabulate
+
     files = tabulate(cases, rings).save(out)
     _show(cases | rings, size)
     for line in (*_unstated(lens, printed), *files):
         say(str(line))
     return 0
+
+
+class _Range(NamedTuple):
+    distance: tuple[float, float]
+    steps: int
+    tilt_deg: float
+
+
+def _several(
+    cameras: Path | None,
+    camera: Path | None,
+    target: str,
+    places: _Range,
+    picture: tuple[float | None, float, tuple[float, float]],
+    out: Path,
+) -> int:
+    """Several cameras by the bound of the grey values; ``picture`` is noise, blur and levels."""
+    import torch
+
+    from torchpose.camera import CameraRig
+    from torchpose.cli.sensitivity_rig import Setting, noise_of, predict
+    from torchpose.target import Target
+
+    if cameras is not None and camera is not None:
+        raise ConfigError("sensitivity: --camera: stands beside --cameras; give one of them")
+    noise, (dark, light) = noise_of(picture[0]), picture[2]
+    _of_edges(noise, picture[2], picture[1])  # checks them
+    conditions = {"psf_sigma": picture[1], "dark": dark, "light": light, "noise_sigma": noise}
+    at = torch.linspace(*places.distance, places.steps, dtype=torch.float64)
+    rig = None if cameras is None else CameraRig.load(cameras)
+    first = _lens(camera) if rig is None else rig.cameras[0]
+    setting = Setting(at, math.radians(places.tilt_deg), conditions)
+    return predict(rig, first, Target.load(target), setting, out)
 
 
 def _lens(path: Path | None) -> Camera:

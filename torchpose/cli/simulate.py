@@ -2,11 +2,13 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from torchpose.cli.common import Batch, Quiet, Resume, Threads, cores, interrupted, say, use_threads
+from torchpose.cli.common import Batch, Quiet, Resume, Threads, cores, importing, interrupted, one_thread_each, say
+from torchpose.cli.options import ADDRESS, ENGINE, Engine, crew_of
+from torchpose.errors import ConfigError
 
 _BACKEND = "Who renders: the analytic renderer, or Blender Cycles (extra: blender)."
 
@@ -24,6 +26,8 @@ def simulate(
     bop: Annotated[bool, typer.Option("--bop", help="Export the layout of the BOP challenge besides.")] = False,
     batch: Batch = None,
     threads: Threads = None,
+    engine: Annotated[Engine, typer.Option(help=ENGINE)] = Engine.local,
+    address: Annotated[str | None, typer.Option(help=ADDRESS)] = None,
     quiet: Quiet = False,
 ) -> int:
     """Render the frames of a plan, with their exact truth and the Cramer-Rao bound of every pose.
@@ -32,33 +36,31 @@ def simulate(
     """
     from collections import Counter
 
-    import cv2
+    with importing():
+        from torchpose.cli.terminal import FrameProgress
+        from torchpose.datasets.dataset import write_bop, write_dataset, write_rig_dataset
+        from torchpose.datasets.plan import load_plan
 
-    from torchpose.cli.terminal import FrameProgress
-    from torchpose.datasets.dataset import write_bop, write_dataset
-    from torchpose.datasets.plan import load_plan
-
-    cv2.setNumThreads(1)
-    use_threads(threads, share=0.5)
+    one_thread_each()
     read = load_plan(plan)
-    with FrameProgress(len(read), 0, quiet=quiet) as progress:
+    if bop and read.rig is not None:
+        raise ConfigError("--bop: is of one camera; leave it out for a plan with cameras")
+    write = write_dataset if read.rig is None else write_rig_dataset
+    cameras = 1 if read.rig is None else len(read.rig)
+    how: dict[str, Any] = {"backend": backend.value, "resume": resume, "batch": batch}
+    with FrameProgress(cameras * len(read), 0, quiet=quiet) as progress:
+        how["progress"] = lambda done: progress.advance(done, Counter())
         try:
-            write_dataset(
-                read,
-                out,
-                backend=backend.value,
-                resume=resume,
-                batch=batch,
-                threads=threads or cores(),
-                progress=lambda done: progress.advance(done, Counter()),
-            )
+            with crew_of(engine, address, threads or cores()) as crew:
+                write(read, out, **how, crew=crew)
             if bop:
                 write_bop(out)
         except KeyboardInterrupt:
             return interrupted(f"{out} keeps its frames; add --resume to go on")
     if not quiet:
         marked = int((read.seen < len(read.target)).sum())
-        say(f"{len(read)} frames in {out / 'frames'}, truth in {out / 'truth.csv'}", err=True)
+        where = out / "frames" if read.rig is None else f"each of {', '.join(str(out / n) for n in read.rig.names)}"
+        say(f"{len(read)} frames in {where}, truth in {out / 'truth.csv'}", err=True)
         if marked:
             say(f"{marked} of them without the whole target in view, marked in the truth", err=True)
     return 0

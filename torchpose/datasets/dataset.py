@@ -13,9 +13,9 @@ A data set is a folder:
 import hashlib
 import json
 import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
@@ -26,13 +26,14 @@ import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-from torchpose.analysis.crlb import pose_crlb
+from torchpose.analysis.crlb import pose_crlb, rig_crlb
 from torchpose.camera import Camera
 from torchpose.config import parse_json, read_text, write_text
 from torchpose.datasets.plan import Plan
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.io.images import UnreadableImageError, decode
+from torchpose.io.processes import Crew
 from torchpose.io.truth import Truth, read_truth, write_truth
 from torchpose.io.writers import atomic_path, write_rows
 from torchpose.sim import Processing, SensorPattern, disturbed, faults_of, processed, read_out, with_faults
@@ -44,9 +45,11 @@ Backend = Literal["analytic", "blender"]
 Renderer = Callable[[Int[Tensor, " B"]], Float[Tensor, "B H W"]]
 """Noise-free frames, float32, of the frames numbered."""
 
+_ALONE = partial(Crew, count=1)  # all work in this process
 BLUR = ("psf_sigma", "psf_ratio", "psf_deg", "smear_px", "smear_deg", "disc_px")
 DISTURBANCES = ("coma_px", "coma_deg", "haze_px", "ghost", "speckle", "flicker")
 BOUND = ("sx", "sy", "sz", "srx", "sry", "srz")
+_BOUNDS_AT_ONCE = 16  # poses, as many as are differentiated at a time
 _BATCH_PIXELS = 7_000_000  # larger buffers go back to the system and are cleared anew each time
 
 
@@ -83,24 +86,24 @@ def plan_truth(plan: Plan) -> Truth:
 def bounds(plan: Plan, which: Int[Tensor, " B"]) -> Float[Tensor, "B 6"]:
     """Cramer-Rao standard deviations of the frames numbered ``which``; NaN where no pose is determined.
 
-    Of the evenly lit frame at rest, blurred by all but ``defocus``, with the noise of its dark parts, see
-    `torchpose.analysis.pose_crlb`: a bound still, but one that defocus, motion, shot noise, clutter and covers keep any
-    estimator away from.
+    With several cameras those of the pose from all of them. Of the evenly lit frame at rest, blurred by all but
+    ``defocus``, with the noise of its dark parts, see `torchpose.analysis.pose_crlb`: a bound still, but one that
+    defocus, motion, shot noise, clutter and covers keep any estimator away from.
     """
     sensor, part = plan.file.sensor, plan[which]
     taken = part.conditions
     variance = taken.noise.square() + (0.0 if sensor.full_well is None else 255.0 / sensor.full_well * taken.dark)
-    covariance = pose_crlb(
-        plan.camera,
-        plan.target,
-        part.R,
-        part.t,
+    given = {
+        "dark": taken.dark,
+        "light": taken.light,
+        "noise_sigma": variance.sqrt(),
+        "bits": sensor.bits,
         **taken.blur,
-        dark=taken.dark,
-        light=taken.light,
-        noise_sigma=variance.sqrt(),
-        bits=sensor.bits,
-    )
+    }
+    if plan.rig is None:
+        covariance = pose_crlb(plan.camera, plan.target, part.R, part.t, **given)
+    else:
+        covariance = rig_crlb(plan.rig, plan.target, part.R, part.t, **given)
     return covariance.diagonal(dim1=1, dim2=2).sqrt()
 
 
@@ -160,7 +163,7 @@ def write_dataset(
     backend: Backend = "analytic",
     resume: bool = False,
     batch: int | None = None,
-    threads: int = 1,
+    crew: Callable[..., Any] = _ALONE,
     progress: Callable[[int], None] = lambda done: None,
 ) -> int:
     """Writes a data set; memory does not grow with the number of frames.
@@ -171,7 +174,7 @@ def write_dataset(
         backend: who renders.
         resume: keep the frames of an earlier run of the same plan.
         batch: frames at a time.
-        threads: of encoding.
+        crew: who shares out the work on items: processes, see `Crew`, or what else has their interface.
         progress: called with the number of frames just finished.
 
     Returns:
@@ -184,30 +187,38 @@ def write_dataset(
     done = {path.name for path in folder.iterdir()}
     pending = torch.tensor([i for i, name in enumerate(plan.names) if name not in done], dtype=torch.int64)
     progress(len(plan) - len(pending))
-    if backend == "blender":
-        from torchpose.datasets.blender import blender
-
-        renderer, size = blender(plan), 1
-    else:
-        renderer = analytic(plan)
-        size = max(1, min(16, _BATCH_PIXELS // (plan.camera.width * plan.camera.height)))
-    with ThreadPoolExecutor(threads, thread_name_prefix="encode") as pool:
-        ahead: list[Future[None]] = []
-        for which in torch.split(pending, batch or size) if len(pending) else ():
-            frames = simulated_frames(plan, renderer, which)
-            progress(_finished(ahead))
-            ahead = [
-                pool.submit(_write_png, folder / plan.names[i], frame.numpy())
-                for i, frame in zip(which.tolist(), frames, strict=True)
-            ]
-        progress(_finished(ahead))
+    size = max(1, min(16, _BATCH_PIXELS // (plan.camera.width * plan.camera.height))) if backend == "analytic" else 1
+    batches = torch.split(pending, batch or size) if len(pending) else ()
+    renderers = crew if backend == "analytic" else _ALONE  # Blender has threads of its own
+    with renderers(partial(_write_frames, plan, backend, folder), batches) as rendered:
+        for finished in rendered:
+            progress(finished)
     truth = plan_truth(plan)
     if plan.file.bounds:
-        std = torch.cat([bounds(plan, which) for which in torch.split(torch.arange(len(plan)), 64)])
+        with crew(partial(_bounds_of, plan), torch.split(torch.arange(len(plan)), _BOUNDS_AT_ONCE)) as parts:
+            std = torch.cat(list(parts))
         truth.extra.update(zip(BOUND, std.unbind(1), strict=True))
     write_truth(out / "truth.csv", truth)
     _write_prints(plan, out)
     return len(pending)
+
+
+def write_rig_dataset(plan: Plan, out: Path, **options: Any) -> int:
+    """Writes a data set of several cameras: one of each in a folder of its name, the rig, and the truth of all.
+
+    ``truth.csv`` has the poses in the first camera, and the joint bounds. Arguments and result as of `write_dataset`.
+    """
+    rig = plan.rig
+    assert rig is not None
+    count = sum(write_dataset(plan.of_camera(k), out / name, **options) for k, name in enumerate(rig.names))
+    rig.save(out / "rig.yaml")
+    replace(plan.target, part_rotation=None, part_translation=None).save(out / "target.yaml")
+    truth = plan_truth(plan)
+    if plan.file.bounds:
+        std = torch.cat([bounds(plan, which) for which in torch.split(torch.arange(len(plan)), 64)])
+        truth.extra.update(zip(BOUND, std.unbind(1), strict=True))
+    write_truth(out / "truth.csv", replace(truth, frame=[f"frames/{name}" for name in plan.names]))
+    return count
 
 
 def _write_prints(plan: Plan, out: Path) -> None:
@@ -254,11 +265,22 @@ def write_bop(out: Path) -> None:
         os.link(out / "frames" / name, link)
 
 
-def _finished(tasks: Sequence[Future[None]]) -> int:
-    """Waits for all tasks; how many they are."""
-    for task in tasks:
-        task.result()
-    return len(tasks)
+def _write_frames(plan: Plan, backend: Backend, folder: Path, batches: Sequence[Tensor]) -> Iterator[int]:
+    """Renders and writes the frames of each batch of numbers; how many they are."""
+    if backend == "blender":
+        from torchpose.datasets.blender import blender
+
+        renderer = blender(plan)
+    else:
+        renderer = analytic(plan)
+    for which in batches:
+        for i, frame in zip(which.tolist(), simulated_frames(plan, renderer, which), strict=True):
+            _write_png(folder / plan.names[i], frame.numpy())
+        yield len(which)
+
+
+def _bounds_of(plan: Plan, batches: Sequence[Tensor]) -> Iterator[Tensor]:
+    yield from (bounds(plan, which) for which in batches)
 
 
 def _write_png(path: Path, frame: np.ndarray) -> None:
@@ -310,7 +332,7 @@ def _origin(plan: Plan, backend: Backend) -> dict[str, object]:
     return {
         "torchpose version": version("torchpose"),
         "backend": backend,
-        "plan": plan.file.model_dump(exclude={"camera", "target", "bounds"}),
+        "plan": plan.file.model_dump(exclude={"camera", "cameras", "target", "bounds"}),
         "camera": [camera.width, camera.height, camera.model, digest(camera.matrix, camera.distortion)],
         "target": [target.name, target.background, digest(target.centers, target.normals, target.radii)],
         "poses": digest(plan.R, plan.t),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchpose.camera import Camera
+from torchpose.camera import Camera, CameraRig
 from torchpose.config import beside, example, read_yaml, validate, within
 from torchpose.datasets.plan_file import MOST_FRAMES, PlanFile, Random
 from torchpose.errors import ConfigError
@@ -26,6 +26,7 @@ from torchpose.sim import Disturbances, PrintErrors, Prints, Texture, faults_of,
 from torchpose.sim.fields import keys_of
 from torchpose.target import Target
 
+_APART = 1_000_003  # between the seeds of a rig's cameras (convention: a prime)
 _HALTON_BASES = (2, 3, 5, 7, 11, 13)
 _CHUNK = 500  # poses whose markers are looked for at once: half a MB a plane, which stays in the cache
 _HOPELESS = 20_000  # poses without one in view, after which no more are drawn
@@ -81,6 +82,7 @@ class Plan(Rows):
         prints: what was printed, where the plan says that it differs from the target.
         texture: of the paper, where it has one.
         file: what the plan file ``path`` says, with the ``camera`` and the ``target`` that it names.
+        rig: of several cameras, of which ``camera`` is the first; see `Plan.of_camera`.
         backgrounds: pictures, in natural order; frame i takes the one of the number i modulo their count.
     """
 
@@ -97,6 +99,17 @@ class Plan(Rows):
     camera: Camera = shared()
     target: Target = shared()
     backgrounds: list[Path] = shared()
+    rig: CameraRig | None = shared(None)
+
+    def of_camera(self, number: int) -> Plan:
+        """What one camera of the rig sees, with noise of its own; markers may be out of its view."""
+        assert self.rig is not None
+        camera, turn = self.rig.cameras[number], self.rig.R[number]
+        R, t = self.rig.seen_by(number, self.R, self.t)
+        motion = torch.cat([self.motion[:, :3] @ turn.T, self.motion[:, 3:] @ turn.T], 1)
+        file = self.file.model_copy(update={"seed": self.file.seed + number * _APART})
+        seen = markers_in_view(camera, self.target, R, t)
+        return replace(self, R=R, t=t, motion=motion, seen=seen, camera=camera, file=file, rig=None)
 
     @property
     def names(self) -> list[str]:
@@ -120,7 +133,8 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
     """
     path = example(path, "plans")
     file = validate(PlanFile, read_yaml(path), path)
-    camera = Camera.load(beside(path, file.camera))
+    rig = CameraRig.load(beside(path, file.cameras)) if file.cameras else None
+    camera = Camera.load(beside(path, file.camera)) if rig is None else rig.cameras[0]
     target = Target.load(beside(path, file.target))
     if file.faults:
         with within(f"{path}: "):
@@ -165,6 +179,7 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
         camera,
         target,
         _backgrounds(path, image.background),
+        rig,
     )
     if file.out_of_view == "error":
         _check_view(plan)

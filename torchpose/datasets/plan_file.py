@@ -266,9 +266,10 @@ def _small(value: Any) -> bool:
 
 
 class PlanFile(_Section):
-    """A plan file, see docs/simulation.md."""
+    """A plan file, see docs/simulation.md; ``camera`` or, with poses in the first of them, ``cameras``."""
 
-    camera: Word
+    camera: Word = ""
+    cameras: Word = ""
     target: Word
     seed: Seed = 0
     poses: Poses
@@ -280,6 +281,12 @@ class PlanFile(_Section):
     depth_range: Pair | None = None
     out_of_view: Literal["error", "mark"] = "error"
     bounds: bool = True
+
+    @model_validator(mode="after")
+    def _one_of(self) -> PlanFile:
+        if bool(self.camera) == bool(self.cameras):
+            raise ValueError("names no camera, or both kinds; give camera, or cameras (a rig)")
+        return self
 
     @field_validator("faults")
     @classmethod

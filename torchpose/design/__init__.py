@@ -1,6 +1,6 @@
 """Target design: from camera, working volume and accuracy to a target, its predicted precision and a print sheet."""
 
-from torchpose.design.precision import Need, Precision, PrecisionMap, precision_map, predict_volume
+from torchpose.design.precision import Need, Precision, PrecisionMap, precision_map, predict_volume, surroundings
 from torchpose.design.predict import (
     Imaging,
     best_focus,
@@ -41,5 +41,6 @@ __all__ = [
     "save_tiles",
     "scale_deviation",
     "sharp_range",
+    "surroundings",
     "tile_sheet",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -23,6 +23,11 @@ FRAME_MARGIN_PX = 10.0  # between rings and the border of the frame
 _TILTS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the largest one
 _DIRECTIONS = 8  # of the tilt, and turns about the axis, among which the weakest pose is searched
 _STEPS = 4  # of distance and tilt in a map
+# what a map shows where one distance or no tilt is asked for, so that it is no single dot: so much nearer and farther,
+# and so far tilted, on a coarser grid (convention)
+_AROUND = 0.2
+_SHOWN_TILT = math.radians(30)
+_SHOWN_STEPS, _SHOWN_DIRECTIONS = 3, 4
 _PLACES = 3  # across the offset, along x and y
 _COLUMNS = ["axis", "unit", "needed", "middle", "worst", "worst_x_mm", "worst_y_mm", "worst_z_mm", "worst_tilt_deg"]
 _MEASURED = "worst_measured"
@@ -83,7 +88,7 @@ class PrecisionMap:
 
     distance: Float[Tensor, " D"]  # mm
     tilt: Float[Tensor, " T"]  # rad
-    by_tilt: Float[Tensor, "D T 3"]  # on the optical axis, over all directions of the tilt
+    by_tilt: Float[Tensor, "D T 3"]  # on the optical axis, over all directions of the tilt; beyond the volume, too
     x: Float[Tensor, " X"]  # mm
     y: Float[Tensor, " Y"]  # mm
     by_place: Float[Tensor, "Y X 3"]  # at the farthest distance, over tilts of 0 and the largest
@@ -116,24 +121,40 @@ def predict_volume(camera: Camera, target: Target, volume: WorkingVolume, imagin
 
 @checked
 def precision_map(camera: Camera, target: Target, volume: WorkingVolume, imaging: Imaging) -> PrecisionMap:
-    """Maps of the predicted deviations over distance and tilt, and over the offset; the roll is 0."""
-    distance, tilt = _steps(*volume.distance), _steps(0.0, volume.tilt)
+    """Maps of the predicted deviations over distance and tilt, and over the offset; the roll is 0.
+
+    Of a volume with one distance or without tilt the first map shows more than the volume: the surroundings of that
+    distance, and tilts.
+    """
+    shown = surroundings(volume)
+    whole = shown == volume
+    distance = _steps(*shown.distance, _STEPS if volume.distance[0] < volume.distance[1] else _SHOWN_STEPS)
+    tilt = _steps(0.0, shown.tilt, _STEPS if volume.tilt else _SHOWN_STEPS)
     x, y = (_steps(-half, half, _PLACES) for half in volume.offset)
 
-    def largest(tilts: Tensor, distances: Tensor, places: Offsets) -> Tensor:
+    def largest(tilts: Tensor, distances: Tensor, places: Offsets, azimuths: int = _DIRECTIONS) -> Tensor:
         """Largest deviations (distances * places, tilts, 3)."""
         columns = []
         for angle in tilts.tolist():
-            poses = volume.poses(distances=distances.tolist(), tilts=[angle], azimuths=_DIRECTIONS, offsets=places)
+            poses = volume.poses(distances=distances.tolist(), tilts=[angle], azimuths=azimuths, offsets=places)
             found = deviations(predicted_covariance(camera, target, *on_device(poses, camera), imaging))
             found = found.unflatten(0, (len(distances) * len(places), -1)).amax(1)
             columns.append(torch.stack([found[:, :2].amax(1), found[:, 2], found[:, 3:].amax(1)], 1))
         return torch.stack(columns, 1)
 
-    by_tilt = largest(tilt, distance, [(0.0, 0.0)])
+    by_tilt = largest(tilt, distance, [(0.0, 0.0)], _DIRECTIONS if whole else _SHOWN_DIRECTIONS)
     grid = [(across, down) for down in y.tolist() for across in x.tolist()]
-    by_place = largest(tilt[[0, -1]], distance[-1:], grid).amax(1).view(len(y), len(x), 3)
-    return PrecisionMap(distance, tilt, by_tilt, x, y, by_place)
+    ends = tilt.new_tensor([0.0, volume.tilt])
+    far = tilt.new_tensor(volume.distance[1:])
+    places = largest(ends, far, grid).amax(1) if len(grid) > 1 else by_tilt[-1:, -1]
+    return PrecisionMap(distance, tilt, by_tilt, x, y, places.view(len(y), len(x), 3))
+
+
+def surroundings(volume: WorkingVolume) -> WorkingVolume:
+    """The volume, with a range of distance where it has a single one, and tilts where it has none."""
+    near, far = volume.distance
+    around = (near, far) if near < far else ((1 - _AROUND) * near, (1 + _AROUND) * far)
+    return replace(volume, distance=around, tilt=volume.tilt or _SHOWN_TILT)
 
 
 def _steps(low: float, high: float, count: int = _STEPS) -> Tensor:

@@ -19,7 +19,8 @@ from torchpose.identify.scene import MOST_GAIN
 from torchpose.target import Target
 
 # of `torchpose calibrate --measure-target`, as docs/calibration.md asks for them: so many views, so far tilted
-MEASURING_VIEWS, MEASURING_TILT = 28, math.radians(30)
+MEASURING_VIEWS = 28
+MEASURING_TILT = math.radians(30)
 
 
 @dataclass(frozen=True)

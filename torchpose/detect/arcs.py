@@ -110,7 +110,8 @@ def fit_pairs(
 ) -> Float[Tensor, "Q 5"]:
     """`fit_joint` of the cells of pairs of arcs, each arc summed once however many pairs it is in."""
     arc, member = pair.flatten().unique(return_inverse=True)
-    number = torch.full((len(about),), -1, device=pair.device).index_copy(0, arc, torch.arange(len(arc)))
+    order = torch.arange(len(arc), device=pair.device)
+    number = torch.full((len(about),), -1, device=pair.device).index_copy(0, arc, order)
     own = number.index_select(0, regions.region)
     cell = positions(own >= 0)
     own, gradient, xy = own[cell], regions.gradient[cell], xy[cell]

@@ -65,7 +65,8 @@ def free_of_stumps(
 
 def _ridge_of(ridge: Ridge, some: Tensor) -> Ridge:
     """The ridge of some (K,) of its ellipses only."""
-    number = torch.full_like(ridge.support, -1).index_copy(0, some, torch.arange(len(some)).to(ridge.support))
+    order = torch.arange(len(some), dtype=ridge.support.dtype, device=some.device)
+    number = torch.full_like(ridge.support, -1).index_copy(0, some, order)
     of = number.long().index_select(0, ridge.of)
     sample = positions(of >= 0)
     return replace(ridge[sample], of=of[sample], support=ridge.support[some])

@@ -186,7 +186,8 @@ def merge_duplicates(found: Candidates, tolerance: float = SAME, *, explain: boo
     order = torch.argsort(found.log10_nfa, stable=True)  # NaN, of those rejected without a score, comes last
     found = found[order[torch.argsort(found.frame[order], stable=True)]]
     # each against those near it that come before it in its frame, which have fewer false alarms
-    some = positions(found.verdict == Verdict.ACCEPTED) if explain else torch.arange(len(found)).to(found.frame)
+    every = torch.arange(len(found), device=found.frame.device)
+    some = positions(found.verdict == Verdict.ACCEPTED) if explain else every
     better, later = same_ellipses(found[some], found[some], tolerance)
     later = later[positions(better < later)]
     again = marked(some[later], len(found))

@@ -88,7 +88,7 @@ def expect_not_negative(**values: float | Tensor) -> None:
     if torch.compiler.is_compiling():
         return
     for name, value in values.items():
-        if bool((torch.as_tensor(value) < 0).any()):
+        if bool((value < 0).any()) if isinstance(value, Tensor) else value < 0:
             raise ArgumentError(
                 f"{name}: is negative; give {'numbers' if isinstance(value, Tensor) else 'a number'} from 0"
             )

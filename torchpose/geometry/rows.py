@@ -86,6 +86,8 @@ class Rows:
 
 
 def _same(a: Any, b: Any) -> bool:
+    if isinstance(a, tuple) and isinstance(b, tuple):
+        return len(a) == len(b) and all(map(_same, a, b))
     if a is b or not (isinstance(a, Tensor) and isinstance(b, Tensor)):
         return a is b
     return a.device == b.device and torch.equal(a, b)

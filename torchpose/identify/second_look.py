@@ -28,11 +28,13 @@ class Views(NamedTuple):
     """Where N rows of M markers may be.
 
     seen (N, M) bool: the markers that fit. R (N, S, 3, 3), t (N, S, 3): S possible poses, NaN where there are fewer.
+    least: markers that must have been seen; 0 where something else tells the poses.
     """
 
     seen: Tensor
     R: Tensor
     t: Tensor
+    least: int = MIN_MARKERS - 1
 
 
 class _Missing(NamedTuple):
@@ -92,7 +94,7 @@ def _missing(scene: Scene, identified: Identified, views: Views) -> _Missing:
     """The places in the frames where the views put markers that they lack."""
     markers, camera, seen = scene.table[scene.target], scene.camera, views.seen
     rings_of = markers.valid & (markers.radii[..., 1] > 0)  # discs have no codes, and one circle
-    wanted = rings_of & ~seen & (seen.sum(-1) >= MIN_MARKERS - 1)[:, None]
+    wanted = rings_of & ~seen & (seen.sum(-1) >= views.least)[:, None]
     row, option, marker = (wanted[:, None] & views.R.isfinite().all(-1).all(-1)[..., None]).nonzero().unbind(-1)
     if row.numel() == 0:
         nothing = markers.radii.new_zeros(0, 2, 5)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from importlib.metadata import version
 from typing import Any
@@ -11,10 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpose.camera import Camera
+from torchpose.camera import LINEAR, Camera
 from torchpose.geometry import rotations
 from torchpose.handeye import HandEye
-from torchpose.io.reader import Batch
+from torchpose.io.reader import Batch, FrameReader
 from torchpose.io.rows import BASE_SCHEMA, POSE_SCHEMA, Row, Schema, base_cells, detection_rows, fault_row, pose_rows
 from torchpose.io.sources import Source
 from torchpose.pipeline import PoseEstimator
@@ -66,9 +66,9 @@ class Estimation:
         """
         return {
             "torchpose version": version("torchpose"),
-            "--camera": _digest(self.camera),
-            "--target": [[target.name, _digest(target)] for target in self.targets],
-            "--hand-eye": None if self.hand_eye is None else _digest(self.hand_eye),
+            "--camera": digest(self.camera),
+            "--target": [[target.name, digest(target)] for target in self.targets],
+            "--hand-eye": None if self.hand_eye is None else digest(self.hand_eye),
             "--method": self.method,
             "--tone": str(self.camera.tone or "linear"),
             "--instances": self.instances,
@@ -93,16 +93,17 @@ class Estimation:
         for positions, frames in batch.groups:
             sources = [batch.sources[position] for position in positions]
             frame_names = [source.name for source in sources]
-            poses = estimator(frames).cpu()
+            poses = estimator(frames.to(estimator.table.ids.device, non_blocking=True)).cpu()
             if paint is not None:
                 paint(frames, poses, frame_names)
-            for row in self._rows(poses, sources):
+            for row in self.rows(poses, sources):
                 records[row["frame"]]["rows"].append(row)
             for row in detection_rows(poses.detections, frame_names, names):
                 records[row["frame"]]["detections"].append(row)
         return list(records.values())
 
-    def _rows(self, poses: Poses, sources: Sequence[Source]) -> list[Row]:
+    def rows(self, poses: Poses, sources: Sequence[Source]) -> list[Row]:
+        """Rows of the poses of frames, which are of these sources."""
         names = [target.name for target in self.targets]
         given = _of_parts(poses, self.targets)
         if self.relative_to is not None:
@@ -111,6 +112,23 @@ class Estimation:
         if self.hand_eye is not None:
             _add_base_cells(rows, given, sources, self.hand_eye)
         return rows
+
+
+@torch.inference_mode()
+def estimated(
+    work: Estimation, estimator: PoseEstimator, paint: Paint | None, threads: int, batches: Sequence[Sequence[Source]]
+) -> Iterator[list[Row]]:
+    """Records of batches of sources, one list a batch, see `Estimation.records`.
+
+    Args:
+        threads: that decode ahead.
+        paint: see `Estimation.records`.
+    """
+    camera = work.camera
+    pinned = estimator.table.ids.is_cuda
+    tone = camera.tone or LINEAR
+    for batch in FrameReader(batches, camera.width, camera.height, threads=threads, tone=tone, pinned=pinned):
+        yield work.records(batch, estimator, paint)
 
 
 def _of_parts(poses: Poses, targets: list[Target]) -> Poses:
@@ -136,7 +154,7 @@ def _add_base_cells(rows: list[Row], poses: Poses, sources: Sequence[Source], ha
         row.update(cells)
 
 
-def _digest(model: Any) -> str:
+def digest(model: Any) -> str:
     """SHA-256 of the values of a dataclass: the same for the same numbers, however the file is laid out."""
     values = [(field.name, getattr(model, field.name)) for field in fields(model) if field.name != "source"]
     plain = [(name, value.tolist() if hasattr(value, "tolist") else value) for name, value in values]

@@ -7,6 +7,7 @@ A manifest is a file of JSON lines (``.jsonl``), appended to while capturing:
 - ``{"record": "frame", "id": 7, "image": "images/0007.png", "robot_pose": [x, y, z, rx, ry, rz], ...}`` one a frame.
   ``image`` is relative to the manifest's folder, with forward slashes; null where the camera delivered none.
   ``camera`` (optional) is the name of the camera, where there are several.
+  ``trigger_time_s`` (optional) is when it was taken, by the clock of the machine that triggers.
   ``robot_pose`` (optional) is the tool in the robot base: position in the session's unit, rotation vector in rad.
 - ``{"record": "end", ...}`` last. Its absence means that the capture was cut short.
 
@@ -22,7 +23,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 
 from torchpose.config import check_regular, parse_json, shown
-from torchpose.config.kinds import Length, Radians, Text, Word
+from torchpose.config.kinds import Length, Number, Radians, Text, Word
 from torchpose.errors import ConfigError
 
 _LONGEST_LINE = 1 << 20  # bytes (convention): a record has one or two thousand
@@ -49,6 +50,7 @@ class ManifestFrame(_Record):
     id: int | Text
     image: Word
     camera: Annotated[Text, BeforeValidator(lambda name: str(name) if isinstance(name, int) else name)] = ""
+    trigger_time_s: Number | None = None
     robot_pose: (
         Annotated[
             tuple[Length, Length, Length, Radians, Radians, Radians],
@@ -63,8 +65,22 @@ _WRONG = {
     "id": "missing or not a number or a text of one line; give every frame its own",
     "image": "missing or not a text of one line; give the image's path relative to the manifest",
     "camera": "{} is not a text of one line; give the camera's name",
+    "trigger_time_s": "{} is no time; give seconds, or leave it out",
     "robot_pose": "{}; give six finite numbers x, y, z, rx, ry, rz",
 }
+
+
+def read_manifest_cameras(path: Path) -> list[str]:
+    """Names of the cameras that have frames with an image.
+
+    Raises:
+        ConfigError: the file cannot be read, or a line is not a JSON object.
+    """
+    found: set[str] = set()
+    for number, record in read_records(path):
+        if record.get("record") == "frame" and record.get("image", "") is not None:
+            found.add(_checked(ManifestFrame, record, f"{path}: line {number}").camera)
+    return sorted(found)
 
 
 def read_manifest(path: Path, camera: str | None = None) -> list[ManifestFrame]:

@@ -70,6 +70,7 @@ class FrameReader:
         height: of the camera, px.
         threads: decoding threads.
         tone: of the files; frames that are not linear come as linear ones, uint16.
+        pinned: in memory that is not swapped, from which a GPU copies by itself.
     """
 
     batches: Sequence[Sequence[Source]]
@@ -77,10 +78,11 @@ class FrameReader:
     height: int
     threads: int = field(kw_only=True)
     tone: Tone = field(default=LINEAR, kw_only=True)
+    pinned: bool = field(default=False, kw_only=True)
 
     def __iter__(self) -> Iterator[Batch]:
         largest = max((len(batch) for batch in self.batches), default=0)
-        buffers = [_Buffer(largest, (self.height, self.width), self.threads, self.tone) for _ in range(2)]
+        buffers = [_Buffer(largest, (self.height, self.width), self.threads, self.tone, self.pinned) for _ in range(2)]
         pool = ThreadPoolExecutor(self.threads, thread_name_prefix="decode")
 
         def submit(number: int) -> list[Future[Fault | np.dtype | None]]:
@@ -112,8 +114,8 @@ def _table(tone: Tone, size: int) -> np.ndarray:
 class _Buffer:
     """Memory of one batch for each pixel type, allocated when the first frame of the type arrives."""
 
-    def __init__(self, frames: int, shape: tuple[int, int], threads: int, tone: Tone) -> None:
-        self._threads = threads
+    def __init__(self, frames: int, shape: tuple[int, int], threads: int, tone: Tone, pinned: bool) -> None:
+        self._threads, self._pinned = threads, pinned
         self._tone = tone
         self._size = (frames, *shape)
         self._planes: dict[np.dtype, Tensor] = {}
@@ -140,7 +142,7 @@ class _Buffer:
         """Memory of one batch. ConfigError: there is none."""
         frames, height, width = self._size
         try:
-            return torch.empty(self._size, dtype=dtype)
+            return torch.empty(self._size, dtype=dtype, pin_memory=self._pinned)
         except RuntimeError:
             fix = "give a smaller --batch" if frames > 1 else "free some memory"
             raise ConfigError(f"--batch: no memory for {frames} frames of {width}x{height}; {fix}") from None

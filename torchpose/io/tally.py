@@ -16,6 +16,7 @@ class Tally:
         unreadable: frames that could not be read, with their reason.
         crowded: frames that show more copies of a target than they have rows.
         most: by target, the most copies of it that one of these frames shows.
+        disagree: number of rows whose cameras contradict each other.
         misfits: by target, what its rows say together of target and camera file.
         whole_run: what only all rows together show.
     """
@@ -25,6 +26,7 @@ class Tally:
         self.unreadable: dict[str, str] = {}
         self.crowded: set[str] = set()
         self.most: dict[str, int] = {}
+        self.disagree = 0
         self.misfits: dict[str, Misfits] = {}
         self.whole_run = WholeRun()
 
@@ -37,6 +39,7 @@ class Tally:
         for row in rows:
             self.misfits.setdefault(row["target"], Misfits()).add(row)
             self.whole_run.add(row)
+            self.disagree += row["reason"] == "cameras_disagree"
             if (row.get("copies") or 0) > of_target[row["target"]]:
                 self.crowded.add(frame)
                 self.most[row["target"]] = max(self.most.get(row["target"], 0), row["copies"])

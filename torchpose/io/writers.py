@@ -253,6 +253,7 @@ def _write_groups(file: BinaryIO, rows: Iterable[Row], schema: Schema, metadata:
     matrices = ("covariance", "noise_covariance", "systematic", "place", "base_covariance")
     nested = dict.fromkeys(matrices, pa.list_(pa.list_(number))) | {
         "quaternion": pa.list_(number),
+        "shares": pa.list_(pa.struct({"camera": pa.string(), "share": number})),
         "solutions": pa.list_(pa.struct(parts | {"rms_px": number, "chi2": number})),
     }
     plain = {str: pa.string(), int: pa.int64(), float: number}

@@ -15,7 +15,6 @@ from torch.utils._pytree import TreeSpec, tree_map, tree_unflatten
 from torchpose.errors import ConfigError
 from torchpose.kernels.build import Kernel, build, find_compiler, has_compiler
 from torchpose.kernels.program import Layout
-from torchpose.kernels.trace import trace
 
 # problems that a call needs: the lanes of the widest vectors there are
 LEAST = 8
@@ -169,6 +168,8 @@ def _call(
 
 
 def _make(function: Callable[..., Any], inputs: list[Layout], state: int) -> _Made:
+    from torchpose.kernels.trace import trace  # torch's tracer brings sympy: half a second that few calls need
+
     _thread.tracing = True
     try:
         program, results, structure = trace(function, inputs, state)

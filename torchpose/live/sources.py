@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpose.errors import ConfigError
-from torchpose.io.images import UnreadableImageError, WrongSizeError, likely_encoded
+from torchpose.io.images import UnreadableImageError, WrongSizeError
 from torchpose.io.reader import Fault
 from torchpose.io.sources import Source, find_sources
 from torchpose.results import Status
@@ -111,7 +111,7 @@ class Player:
 
     def __init__(self, sources: Sequence[Source], size: tuple[int, int], rate: float = FOLDER_RATE) -> None:
         self._sources, self._size = sources, size
-        self.encoded = likely_encoded(sources[0].path)
+        self.encoded = sources[0].likely_encoded()
         self._clock, self._number = Clock(rate), -1
 
     def __enter__(self) -> Player:

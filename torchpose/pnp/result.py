@@ -37,9 +37,11 @@ class PnPResult(Rows):
         chi2: (B,) float64, sum of squared whitened residuals (Huber's cost where chosen).
         iterations: (B,) int64, of Levenberg-Marquardt, 0 for a closed-form method.
         code: (B,) int64, `PnPCode`.
-        R_alt, t_alt, rms_alt, chi2_alt: the other minimum, NaN where there is none. Where it is out of the question,
-            from where its search was stopped: chi2_alt is then an upper bound that is sure to stay above
-            2 chi2 + 40. Minima from starts given as ``initial`` are always followed to their end.
+        R_alt: (B, 3, 3), the other minimum, NaN where there is none. Where it is out of the question, from where its
+            search was stopped. Minima from starts given as ``initial`` are always followed to their end.
+        t_alt: (B, 3), its translation.
+        rms_alt: (B,), its `rms`.
+        chi2_alt: (B,), its `chi2`; where the search was stopped an upper bound that is sure to stay above 2 chi2 + 40.
         ratio: (B,) float64, rms_alt / rms, NaN where there is no other minimum.
     """
 

@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchpose.camera import Camera
+from torchpose.camera import Camera, CameraRig
 from torchpose.camera.plausible import check_pinhole
 from torchpose.errors import ArgumentError
 from torchpose.geometry.arguments import expect_not_negative, expect_positive, one_device
@@ -27,6 +27,7 @@ from torchpose.pnp.posit import posit
 from torchpose.pnp.problem import Body, Inputs, Problem, prepare
 from torchpose.pnp.result import PnPCode, PnPError, PnPResult
 from torchpose.pnp.second_pass import second_pass
+from torchpose.pnp.several import solve_rig
 from torchpose.pnp.starts import as_poses, batch_first, of_planes, planes, starts
 from torchpose.pnp.third_pass import every_start, firm, start_roughly, third_pass, verdicts
 from torchpose.pnp.verdict import Bad, Found, Minima, Table, choose, relevant, write
@@ -51,8 +52,9 @@ _COMPILED_POINTS = 128
 def solve(
     object_points: Tensor,
     image_points: Tensor,
-    camera: Camera | Tensor,
+    camera: Camera | CameraRig | Tensor,
     *,
+    camera_index: Tensor | None = None,
     method: Method = "iterative",
     sigma_px: float = 1.0,
     covariances: Tensor | None = None,
@@ -64,12 +66,14 @@ def solve(
     compile: bool = False,
     raise_on_failure: bool = False,
 ) -> PnPResult:
-    """Poses of B sets of N points. Line features have a solver of their own, `torchpose.pnp.lines`.
+    """Poses of B sets of N points; of lines, see `torchpose.pnp.lines`.
 
     Args:
         object_points: (N, 3) shared by all poses, or (B, N, 3).
         image_points: (B, N, 2) px.
-        camera: `Camera`, or the pinhole matrix (3, 3) or (B, 3, 3).
+        camera: `Camera`, pinhole matrix (3, 3) or (B, 3, 3), or `CameraRig` (method "iterative"): poses are
+            then in its first camera, and what is uncertain of places and lenses is weighed with the noise.
+        camera_index: (N,) or (B, N), of each point, with a rig.
         method: "iterative" is the maximum-likelihood estimate (Levenberg-Marquardt through the full camera model from
             every start that a closed form finds); the others return their closed form, with its covariance there.
         sigma_px: standard deviation of the image points, per axis.
@@ -92,22 +96,46 @@ def solve(
         PnPError: with ``raise_on_failure``.
         ConfigError: ``compile`` without a C++ compiler; a matrix that cannot be that of the points (`check_pinhole`).
     """
+    rig, one = _rig_of(camera, camera_index, method, huber)
     inputs, starts = _checked(
-        Inputs(object_points, image_points, camera, sigma_px, covariances, weights, mask, huber), method, initial
+        Inputs(object_points, image_points, one, sigma_px, covariances, weights, mask, huber), method, initial
     )
     if max_iterations < 1:
         raise ArgumentError(f"max_iterations: is {max_iterations}; give 1 or more")
     compile = compile and inputs.pixels.device.type == "cpu" and inputs.pixels.shape[1] <= _COMPILED_POINTS
     with torch.no_grad():
-        result = _solve(inputs, method, starts, max_iterations, compile)
-    if torch.is_grad_enabled() and method == "iterative" and inputs.requires_grad:
+        several = None if rig is None else solve_rig(inputs, *rig, starts, max_iterations)
+        result = _solve(inputs, method, starts, max_iterations, compile) if several is None else several
+    if rig is None and torch.is_grad_enabled() and method == "iterative" and inputs.requires_grad:
         result = attach_gradient(result, inputs)
+    return _raised(result, raise_on_failure)
+
+
+def _raised(result: PnPResult, wanted: bool) -> PnPResult:
+    """The result; raises PnPError where that is wanted and a pose failed."""
     failed = result.code > PnPCode.AMBIGUOUS
-    if raise_on_failure and bool(failed.any()):
+    if wanted and bool(failed.any()):
         first = int(failed.nonzero()[0])
         code = PnPCode(int(result.code[first])).name
         raise PnPError(f"pose {first}: {code}; {int(failed.sum())} of {len(failed)} poses failed")
     return result
+
+
+def _rig_of(
+    camera: Camera | CameraRig | Tensor, index: Tensor | None, method: Method, huber: float
+) -> tuple[tuple[CameraRig, Tensor] | None, Camera | Tensor]:
+    """The rig with the camera of each point, if it is one; and a camera, of which nothing is used then."""
+    if not isinstance(camera, CameraRig):
+        if index is not None:
+            raise ArgumentError("camera_index: goes with a CameraRig; give one, or leave it out")
+        return None, camera
+    if not isinstance(index, Tensor):
+        raise ArgumentError("camera_index: is missing; give the number of the camera that saw each point")
+    if method != "iterative":
+        raise ArgumentError(f"method: is {method!r}; points of several cameras are for method 'iterative'")
+    if huber != float("inf"):
+        raise ArgumentError("huber: is for one camera; leave it out with a CameraRig")
+    return (camera, index), camera.cameras[0]
 
 
 def _checked(

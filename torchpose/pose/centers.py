@@ -18,7 +18,9 @@ def compensate(outer: EllipseFit, inner: EllipseFit, radii: Tensor) -> tuple[Ten
     K1 = r1^2 / (r1^2 - r2^2), K2 = r2^2 / (r1^2 - r2^2).
 
     Args:
-        outer, inner: fits of K rings. radii: (K, 2) true outer and inner radius r1, r2, any unit.
+        outer: fits of K outer circles.
+        inner: of the inner ones.
+        radii: (K, 2) true outer and inner radius r1, r2, any unit.
 
     Returns:
         center (K, 2) px and its covariance (K, 2, 2) px^2, both circles measured independently.

@@ -61,6 +61,7 @@ class Excess(Rows):
         printed: the same if the print is behind it; 0 where nothing is.
         factor: of the variance of all noise, 1 where it suffices.
         printed_factor: the same if the print is behind it.
+        shift: standard deviation of the shifts of rings across the line of sight beside that factor, mm.
         maybe: how likely it is the print where scatter is likelier, of these two; 0 elsewhere.
         misfit: `Misfit`, what is behind it.
         explained: whether the residuals then agree with all that.
@@ -72,6 +73,7 @@ class Excess(Rows):
     printed: Float[Tensor, "N E"]
     factor: Float[Tensor, " N"]
     printed_factor: Float[Tensor, " N"]
+    shift: Float[Tensor, " N"]
     maybe: Float[Tensor, " N"]
     misfit: Int[Tensor, " N"]
     explained: Bool[Tensor, " N"]
@@ -100,7 +102,10 @@ class _Family(NamedTuple):
 
 
 def excess_of(
-    information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"], even: Float[Tensor, " N"] | None = None
+    information: Float[Tensor, "N E E"],
+    right: Float[Tensor, "N E"],
+    even: Float[Tensor, " N"] | None = None,
+    across: Float[Tensor, "N M 3 2"] | None = None,
 ) -> Excess:
     """What speaks from the information about the further unknowns, and their right side, all else being unknown.
 
@@ -122,6 +127,17 @@ def excess_of(
     at = torch.arange(len(row), device=row.device)
     deviation, factor, chi2 = (torch.stack([f[k] for f in families], 1)[at, best] for k in (1, 2, 3))
     explained = chi2 < _most(none.freedom[row])
+    shift = torch.zeros_like(factor)
+    scatters = (best == _SCATTER).nonzero()[:, 0]
+    if across is not None and scatters.numel():
+        factor, shift = (
+            x.index_copy(0, scatters, y)
+            for x, y in zip(
+                (factor, shift),
+                _shifted(_Modes(*(x[scatters] for x in some)), across[row[scatters]]),
+                strict=True,
+            )
+        )
     misfit = torch.where((best == 0) & _is_tone(deviation), int(Misfit.TONE), best + 1)
     return none.replaced(
         row,
@@ -131,6 +147,7 @@ def excess_of(
             printed=families[0].deviation,
             factor=factor,
             printed_factor=families[0].factor,
+            shift=shift,
             maybe=torch.where(best == _SCATTER, torch.sigmoid(evidence[:, 0] - evidence[:, _SCATTER]), 0.0),
             misfit=misfit,
             explained=explained,
@@ -160,7 +177,7 @@ def _none(right: Tensor, modes: _Modes) -> Excess:
     zero, one = torch.zeros_like(right), torch.ones_like(chi2)
     by_chance = chi2 < quantile(freedom.clamp_min(1), SURE)
     nothing = torch.zeros_like(freedom)
-    return Excess(zero, zero, one, one, torch.zeros_like(one), nothing, by_chance, chi2, freedom)
+    return Excess(zero, zero, one, one, zero[:, 0], zero[:, 0], nothing, by_chance, chi2, freedom)
 
 
 def _most(freedom: Tensor) -> Tensor:
@@ -238,6 +255,24 @@ def _scatter(modes: _Modes, even: Tensor) -> _Family:
     mean = (torch.softmax(likelihood, -1) * factor).sum(-1)
     against = 0.5 * even[:, None] * (1 / factor + factor.log() - 1)
     return _Family(_mean(likelihood - against), torch.zeros_like(modes.by[:, 0]), mean, square[:, 0] / mean)
+
+
+def _shifted(modes: _Modes, across: Tensor) -> tuple[Tensor, Tensor]:
+    """Factor (N,) of the scatter, and deviation (N,) in mm of shifts of the rings across the line of sight beside it.
+
+    What scatters displaces a ring as a whole more than it changes its size or turns it: air, and lines that shake. The
+    pose stands on the shifts, of which few residuals remain: one factor for all would be that of sizes and turns.
+    """
+    markers = by_kind(modes.by)[0].unflatten(-1, (-1, OF_MARKER))[..., :3]
+    by = torch.einsum("nrmp,nmpa->nrma", markers, across).flatten(-2)
+    values, vectors = torch.linalg.eigh(by @ by.mT)
+    square = (vectors.mT @ modes.residual[..., None])[..., 0].square()[:, None]
+    factors, shifts = _values(_SCALE, modes), _values(_PRINT, modes).square()
+    missing = (~modes.there).sum(-1, keepdim=True) * factors.log()  # these have no residual
+    held = [factors[:, None] + shift * values.clamp_min(0.0)[:, None] for shift in shifts]
+    likelihood = torch.stack([-0.5 * ((square / v + v.log()).sum(-1) - missing) for v in held], -1)
+    weight = torch.softmax(likelihood.flatten(1), -1).view_as(likelihood)
+    return weight.sum(2) @ factors, (weight.sum(1) @ shifts).sqrt()
 
 
 _Part = tuple[Tensor, Tensor]

@@ -39,7 +39,7 @@ def outcome(scene: Scene, found: Found) -> Poses:
     status = torch.full((rows,), int(Status.REJECTED), device=device).index_copy(0, solvable, solutions.status)
     reason = torch.full((rows,), int(Reason.RESIDUAL), device=device).index_copy(0, solvable, solutions.reason)
     support = torch.where(status == Status.REJECTED, 0, mask.sum(-1))
-    awarded, claimed = _awarded(scene, support, mask, found.identified.ring, len(found.rings))
+    awarded, claimed = award((scene.target, len(scene.table)), support, mask, found.identified.ring, len(found.rings))
 
     # without a pose: the rings that nobody else explains tell why
     proposed = found.identified.proposed(~claimed)
@@ -85,7 +85,7 @@ def outcome(scene: Scene, found: Found) -> Poses:
             name: torch.zeros_like(status).index_copy(0, solvable, getattr(solutions, name)) * awarded
             for name in ("misfit", "freedom")
         },
-        detections=_detections(scene, found, mask),
+        detections=detections_of(scene, found, mask),
         of_camera=found.evidence.of_camera,
         **{name: spread(getattr(solutions, name)) for name in names},
     )
@@ -136,7 +136,7 @@ def _instances(scene: Scene, awarded: Tensor, t: Tensor) -> tuple[Tensor, Tensor
     return kept[order], place[order]
 
 
-def _detections(scene: Scene, found: Found, mask: Tensor) -> Detections:
+def detections_of(scene: Scene, found: Found, mask: Tensor) -> Detections:
     """The markers of the rows that the mask (N, M) has; their instance is the row, or 0 where each has one."""
     row, marker = mask.nonzero().unbind(-1)
     ring, target = found.rings[found.identified.ring[row, marker]], scene.target[row]
@@ -149,14 +149,14 @@ def _detections(scene: Scene, found: Found, mask: Tensor) -> Detections:
     return Detections(scene.frame[row], target, number, ids, center, covariance, ring.outer_raw, inner)
 
 
-def _awarded(scene: Scene, support: Tensor, mask: Tensor, ring: Tensor, rings: int) -> tuple[Tensor, Tensor]:
+def award(target: tuple[Tensor, int], support: Tensor, mask: Tensor, ring: Tensor, rings: int) -> tuple[Tensor, Tensor]:
     """Rows (N,) bool that keep their pose, and rings (K,) bool that these explain.
 
     A ring belongs to one copy of one target: where two claim it, to the one that explains more rings; of two copies of
     one target that explain as many, to the better-supported one.
 
     Args:
-        scene: whose each row is.
+        target: of each row (N,), and their number.
         support: (N,) int64, number of rings the pose explains, 0 without one.
         mask: (N, M) bool, which markers' rings.
         ring: (N, M) int64, index into the ``rings`` K.
@@ -167,8 +167,8 @@ def _awarded(scene: Scene, support: Tensor, mask: Tensor, ring: Tensor, rings: i
     best = torch.zeros(rings, dtype=support.dtype, device=support.device)
     best.scatter_reduce_(0, of, support[row], "amax")
     less = support[row] < best[of]
-    slot = of * len(scene.table) + scene.target[row]
-    first = torch.full((rings * len(scene.table),), len(mask), device=row.device)
+    slot = of * target[1] + target[0][row]
+    first = torch.full((rings * target[1],), len(mask), device=row.device)
     first.scatter_reduce_(0, slot[~less], row[~less], "amin")
     outdone = marked(row[less | (row > first[slot])], len(mask))
     claimed = marked(of[~outdone[row]], rings)

@@ -54,6 +54,17 @@ class MarkerNormals(Rows):
         """Of noise with so many times the variance."""
         return type(self)(self.information / variance[:, None, None, None], self.right / variance[:, None, None])
 
+    def scattered(self, more: Float[Tensor, "N M n n"]) -> Self:
+        """Of noise by which right sides have the covariance ``more`` beside the information."""
+        both = torch.cat([self.information, self.right[..., None]], -1)
+        told = self.information @ solve_scaled(self.information + more, both)
+        return type(self)(0.5 * (told[..., :-1] + told[..., :-1].mT), told[..., -1])
+
+    def by_motions(self, by: Float[Tensor, "N M n e"]) -> Float[Tensor, "N M n n"]:
+        """Covariance of the right sides of markers that numbers of unit variance, their own, move by these columns."""
+        pull = self.information @ by
+        return pull @ pull.mT
+
     @classmethod
     def laid_out(cls, information: Tensor, right: Tensor, mask: Tensor) -> Self:
         """Of the parts (K, n, n), (K, n) of the markers seen, in the order of the mask (N, M)."""
@@ -97,7 +108,8 @@ class OnPrint(Rows):
         look: the same if the print is behind the misfit, whatever is likeliest: where to look for the markers next.
         misfit: `Misfit`, what the residuals show beyond noise and stated uncertainties; it is in the covariance.
         explained: whether the residuals agree with all that.
-        chi2, freedom: of the residuals, as in `Excess`.
+        chi2: of the residuals, as in `Excess`.
+        freedom: its degrees of freedom.
         known: whether the pose is determined.
     """
 
@@ -148,7 +160,11 @@ def on_print(
         beside = further * excess.deviation[:, None, None]
         printed = torch.cat([by_target, beside[..., :-OF_CAMERA]], -1)
         lens = torch.cat([by_camera, beside[..., -OF_CAMERA:]], -1)
-    joint = _Joint.of(normals.over(excess.factor), own, _among(printed, n), _among(lens, n), estimate)
+    noisy = normals.over(excess.factor)
+    if bool((excess.shift > 0).any()):
+        shifts = excess.shift[:, None, None, None] * _across(setting, n)
+        noisy = noisy.scattered(noisy.by_motions(shifts))
+    joint = _Joint.of(noisy, own, _among(printed, n), _among(lens, n), estimate)
     place = look = _places(printed, joint, setting, excess.deviation)
     other = ((excess.misfit == Misfit.CAMERA) | (excess.misfit == Misfit.SCATTER)).nonzero()[:, 0]
     if other.numel() and further is not None:
@@ -255,9 +271,8 @@ def _excess(
         return excess, None
     some = setting.of_rows(odd)
     shifts = torch.cat([_print_shifts(some), _camera_shifts(some)], -1)
-    again = excess_of(
-        *_remaining(normals[odd], known[odd], _among(shifts, n), count), None if even is None else even[odd]
-    )
+    remaining = _remaining(normals[odd], known[odd], _among(shifts, n), count)
+    again = excess_of(*remaining, None if even is None else even[odd], _in_places(some))
     every = shifts.new_zeros(rows, *shifts.shape[1:]).index_copy(0, odd, shifts)
     nothing = shifts.new_zeros(rows, shifts.shape[-1])
     excess = replace(excess, deviation=nothing, printed=nothing)
@@ -349,6 +364,19 @@ def _print_shifts(setting: Setting) -> Tensor:
     columns[..., -2] = _by_bloom(setting)
     columns[..., -1] = _by_size(setting)
     return columns
+
+
+def _in_places(setting: Setting) -> Tensor:
+    """Two directions across the line of sight as places (N, M, 3, 2) of the markers in `_print_shifts`."""
+    normal = setting.evidence.normals
+    axes = torch.stack([*plane_axes(normal), normal], -1)
+    return (setting.R[:, None] @ axes).mT[..., :2]
+
+
+def _across(setting: Setting, n: int) -> Tensor:
+    """Columns (N, M, n, 2) of single markers moved in these directions, by 1 mm."""
+    eye = torch.eye(n, 2, dtype=setting.t.dtype, device=setting.t.device)
+    return eye.expand(*setting.evidence.mask.shape, n, 2)
 
 
 def _by_bloom(setting: Setting) -> Tensor:

@@ -113,5 +113,6 @@ def _meet(one: Refined, two: Refined) -> Tensor:
     """Rows (N,) bool whose refined poses differ by no more than their covariances allow."""
     apart = torch.cat([two.t - one.t, rotations.log(two.R @ one.R.mT)], -1)[..., None]
     known = (one.good & two.good)[:, None, None]
-    covariance = torch.where(known, one.covariance + two.covariance, torch.eye(6).to(apart))
+    unit = torch.eye(6, dtype=apart.dtype, device=apart.device)
+    covariance = torch.where(known, one.covariance + two.covariance, unit)
     return (apart.mT @ torch.linalg.solve(covariance, apart))[:, 0, 0] < AMBIGUOUS_CHI2

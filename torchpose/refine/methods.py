@@ -30,10 +30,10 @@ from torchpose.results import Misfit, Reason, Status
 
 # of the pixels, where the pose stays near: of wires over half of every ring 0.27 (measured: `wires 3` of
 # `scripts/corruption_statistics.py`)
-_LEAST_KEPT_NEAR = 0.2
+LEAST_KEPT_NEAR = 0.2
 # px, by which a marker may sit beside its place before it is looked at there: edges bend little so far (convention)
-_BESIDE = 0.03
-_ROUNDS = 3  # of fits with markers where the last one found them; the second one ends nearly always
+BESIDE = 0.03
+ROUNDS = 3  # of fits with markers where the last one found them; the second one ends nearly always
 
 Step = Callable[[Solutions, Evidence, Sight], Solutions]
 """From solutions of N rows, what was measured of them, and the rows in their frames, to better solutions."""
@@ -48,12 +48,14 @@ class Recipe:
         locate: centre of a ring from its two ellipses, as `pose.common_center`.
         steps: after the solution from the centres, one after the other.
         on_rims: the poses are fitted to the edges of the rings in the end, not to their centres.
+        refine: what fits poses to frames; None where centres are all.
     """
 
     correct: bool = True
     locate: Callable[..., tuple[Tensor, Tensor]] = common_center
     steps: tuple[Step, ...] = ()
     on_rims: bool = False
+    refine: Callable[..., Refined] | None = None
 
 
 def _on_solved(change: Step) -> Step:
@@ -81,8 +83,8 @@ def on_frames(refine: Callable[..., Refined]) -> Step:
         start, place = _start(rows, seen, sight.camera)
         found, good = rows, torch.zeros_like(rows.status, dtype=torch.bool)
         active = torch.arange(len(rows), device=good.device)
-        for number in range(_ROUNDS):
-            some = rows[active], seen[active], sight[active].displaced(_beyond(place[active], seen[active]))
+        for number in range(ROUNDS):
+            some = rows[active], seen[active], sight[active].displaced(beyond(place[active], seen[active]))
             # what seems to contradict the model may be a marker beside its place
             refined = refine(some[2], start.R[active], start.t[active], thorough=number > 0)
             now, joint, held = _on_print(refined, *some, place[active])
@@ -97,7 +99,7 @@ def on_frames(refine: Callable[..., Refined]) -> Step:
             start, place = start.replaced(active, Pose(now.R, now.t)), place.index_copy(0, active, joint.look)
             # at first, whatever is amiss is looked at once more with the markers where the print would have them
             amiss = (refined.doubt | (held & (joint.misfit != Misfit.NONE))) & (number == 0)
-            active = active[(held & (beside > _BESIDE)) | amiss]
+            active = active[(held & (beside > BESIDE)) | amiss]
             if active.numel() == 0:
                 break
         bad = (~good).nonzero()[:, 0]
@@ -108,9 +110,9 @@ def on_frames(refine: Callable[..., Refined]) -> Step:
 
 def _start(rows: Solutions, seen: Evidence, camera: Camera) -> tuple[Pose, Tensor]:
     """Poses, and places (N, M, 5) of markers beside those of the file, as `OnPrint.look`, by the ellipses."""
-    start, place = Pose(rows.R, rows.t), -_beyond(rows.t.new_zeros(*seen.mask.shape, PLACE), seen)
+    start, place = Pose(rows.R, rows.t), -beyond(rows.t.new_zeros(*seen.mask.shape, PLACE), seen)
     place = torch.cat([place[..., :4], rows.larger[:, None, None].expand_as(place[..., 4:])], -1)
-    off = (rows.rms > _BESIDE).nonzero()[:, 0]
+    off = (rows.rms > BESIDE).nonzero()[:, 0]
     if off.numel() == 0:
         return start, place
     found, joint = _by_centers(rows[off], seen[off], camera)
@@ -118,7 +120,7 @@ def _start(rows: Solutions, seen: Evidence, camera: Camera) -> tuple[Pose, Tenso
     return start.replaced(off, Pose(found.R, found.t)), place.index_copy(0, off, beside)
 
 
-def _beyond(place: Tensor, seen: Evidence) -> Tensor:
+def beyond(place: Tensor, seen: Evidence) -> Tensor:
     """Places (N, M, 5) with the gain beyond that of the radii in sight."""
     if seen.gain is None:
         return place
@@ -133,7 +135,7 @@ def _on_print(
     joint = on_print(refined.normals, setting, place, even=refined.even)
     found = _of_joint(rows, seen, Pose(refined.R, refined.t), joint)
     near = found.rms < torch.maximum(rows.rms, torch.full_like(rows.rms, CENTER_RMS))
-    kept = (refined.kept > LEAST_KEPT) | (near & (refined.kept > _LEAST_KEPT_NEAR))
+    kept = (refined.kept > LEAST_KEPT) | (near & (refined.kept > LEAST_KEPT_NEAR))
     return found, joint, refined.good & joint.known & kept
 
 
@@ -178,8 +180,10 @@ def _as_they_are(rows: Solutions, seen: Evidence, sight: Sight) -> Solutions:
 
 
 METHODS = {
-    "photometric": Recipe(steps=(decide, decide_on_grey, on_frames(refine_photometric)), on_rims=True),
-    "edges": Recipe(steps=(decide, on_frames(refine_edges)), on_rims=True),
+    "photometric": Recipe(
+        steps=(decide, decide_on_grey, on_frames(refine_photometric)), on_rims=True, refine=refine_photometric
+    ),
+    "edges": Recipe(steps=(decide, on_frames(refine_edges)), on_rims=True, refine=refine_edges),
     "centers": Recipe(steps=(decide, _on_solved(_on_centers))),
     "paper": Recipe(correct=False, locate=compensate, steps=(_on_solved(_as_they_are),)),
 }

@@ -17,7 +17,8 @@ from torchpose.geometry import conics
 from torchpose.geometry.least_squares import Pose, PosePrior
 from torchpose.geometry.robust import LEAST_KEPT as LEAST_KEPT
 from torchpose.geometry.rows import Rows, shared
-from torchpose.pose import MarkerNormals
+from torchpose.identify import Scene
+from torchpose.pose import Found, MarkerNormals
 from torchpose.target import Target
 
 QUANTISATION = 1 / 12  # variance of rounding, in grey levels^2, below which no noise estimate falls
@@ -87,6 +88,27 @@ class Sight(Rows):
         polarity = rings.new_full(rows, 1.0 if target.background == "light" else -1.0)
         mask = torch.ones(rows, dtype=torch.bool, device=rings.device)
         return cls(frame, mask, rings, polarity, centers, normals, radii, frames, camera)
+
+    @classmethod
+    def of_scene(cls, scene: Scene, found: Found, rows: Tensor) -> Self:
+        """Rows (N,) of a scene, with the rings that were found of them."""
+        evidence = found.evidence[rows]
+        ring = found.rings[found.identified.ring[rows].clamp_min(0).flatten()]
+        raw = torch.stack([ring.outer_raw, ring.inner_raw], 1).view(*evidence.mask.shape, 2, 5)
+        blur = torch.where(ring.clipped[:, None], torch.nan, ring.blur)  # what is left of a clipped edge tells of none
+        return cls(
+            scene.frame[rows],
+            evidence.mask,
+            raw,
+            ring.polarity.view_as(evidence.mask),
+            evidence.points,
+            evidence.normals,
+            evidence.radii,
+            scene.frames,
+            scene.camera,
+            blur.view(*evidence.mask.shape, 3),
+            seen=ring.seen.view(*evidence.mask.shape, -1),
+        )
 
     @property
     def quantisation(self) -> float:

@@ -1,36 +1,44 @@
 """Map plots of the precision that a target promises over its working volume."""
 
+import math
 from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from torchpose.design import PrecisionMap
+from torchpose.design import PrecisionMap, WorkingVolume, surroundings
 from torchpose.report.figures import COLOURS, subplots
 from torchpose.report.files import save_figures
 
-_PANELS = ("across the optical axis, um", "along the optical axis, um", "rotation, mdeg")
+_PANELS = ("across the optical axis [um]", "along the optical axis [um]", "rotation [mdeg]")
+_MARK = {"color": "white", "mec": "black", "ms": 11}  # of what was asked for
 _Axis = tuple[str, Tensor]  # label and values
 
 
-def plot_precision(found: PrecisionMap, title: str) -> Figure:
+def plot_precision(found: PrecisionMap, title: str, volume: WorkingVolume | None = None) -> Figure:
     """Predicted standard deviations over distance and tilt, and over the offset: the largest axis of each panel.
 
-    A dimension of the volume without extent is left out: what remains is a curve.
+    A dimension of the volume without extent is left out: what remains is a curve. Stars are the ends of ``volume``,
+    where the map shows more than that.
     """
-    by_tilt = ("distance, mm", found.distance), ("tilt, degrees", found.tilt.rad2deg())
-    by_place = ("x, mm", found.x), ("y, mm", found.y)
+    by_tilt = ("distance [mm]", found.distance), ("tilt [degrees]", found.tilt.rad2deg())
+    by_place = ("x [mm]", found.x), ("y [mm]", found.y)
     with_places = len(found.x) * len(found.y) > 1
     figure, axes = subplots(1 + with_places, 3, (13, 3.9 * (1 + with_places)))
     for k, panel in enumerate(axes[0]):
         _plot(panel, *by_tilt, found.by_tilt[..., k].T, _PANELS[k])
+        if volume is not None and surroundings(volume) != volume:
+            ends = [(z, tilt) for z in volume.distance for tilt in (0.0, math.degrees(volume.tilt))]
+            panel.plot(*zip(*ends, strict=True), "*", **_MARK, clip_on=False)
     for k, panel in enumerate(axes[1] if with_places else ()):
         _plot(panel, *by_place, found.by_place[..., k], _PANELS[k])
-        panel.set_title(f"at {float(found.distance[-1]):g} mm, all tilts", fontsize=10)
+        far = float(found.distance[-1]) if volume is None else volume.distance[1]
+        panel.set_title(f"at {far:g} mm, all tilts", fontsize=10)
         if len(found.x) > 1 and len(found.y) > 1:
             panel.invert_yaxis()  # as in the frame
-    figure.suptitle(f"{title}: predicted standard deviation (one sigma, largest axis)", fontsize=11)
+    asked = "" if volume is None or surroundings(volume) == volume else "; stars: what was asked for"
+    figure.suptitle(f"{title}: predicted standard deviation (one sigma, largest axis){asked}", fontsize=11)
     return figure
 
 
@@ -51,6 +59,6 @@ def _plot(panel: Any, across: _Axis, up: _Axis, values: Tensor, name: str) -> No
     panel.set(xlabel=label_x, ylabel=label_y)
 
 
-def save_plot(found: PrecisionMap, title: str, path: Path) -> None:
+def save_plot(found: PrecisionMap, title: str, path: Path, volume: WorkingVolume | None = None) -> None:
     """Writes `plot_precision` as PNG. ConfigError: the file cannot be written."""
-    save_figures({path.name: plot_precision(found, title)}, path.parent)
+    save_figures({path.name: plot_precision(found, title, volume)}, path.parent)

@@ -19,10 +19,11 @@ def draw_shapes(frame: np.ndarray, rows: list[Row]) -> np.ndarray:
     """
     picture = cv2.cvtColor(eight_bit(frame), cv2.COLOR_GRAY2BGR)
     unit = max(picture.shape[:2]) / 1000
+    width = max(1, round(unit))  # that large frames still show it when they are shrunk to a screen
     for row in rows:
         if row["kind"] != "ellipse":
             points = np.array([float(v) for v in row["vertices"].split()]).reshape(-1, 2)
-            draw_polyline(picture, points, _LINE, 1)
+            draw_polyline(picture, points, _LINE, width)
             continue
         accepted = row["verdict"] == "accepted"
         if row["verdict"] == "duplicate":  # the better one is drawn
@@ -31,7 +32,7 @@ def draw_shapes(frame: np.ndarray, rows: list[Row]) -> np.ndarray:
         params = [row[c] for c in ("cx", "cy", "a", "b", "theta")]
         if max(map(abs, params[:4])) > 10 * max(picture.shape[:2]):  # beyond OpenCV's fixed point
             continue
-        draw_ellipse(picture, params, colour)
+        draw_ellipse(picture, params, colour, width)
         note = "" if accepted else row["verdict"].replace("_", " ")
         if accepted and row["ring_ratio"] is not None:
             note = f"{row['ring_ratio']:.2f}"

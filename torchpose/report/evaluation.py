@@ -12,6 +12,7 @@ from torchpose.report.figures import COLOURS, GREY, band, subplots
 from torchpose.report.files import make_folder, save_figures
 
 _MOST_NEES = 25.0  # shown; larger ones in the last bin
+_MOST_BAND = 20.0  # median deviations that a panel makes room for; what one row claims beyond is cut
 
 
 def plot_errors(evaluation: Evaluation, title: str) -> Figure:
@@ -26,8 +27,9 @@ def plot_errors(evaluation: Evaluation, title: str) -> Figure:
                 panel.plot(number, sign * evaluation.bound[:, i], color=GREY, lw=0.6, ls="--")
         panel.plot(number, error, ".", ms=3, color=COLOURS[i % 3])
         axis = evaluation.axes[i]
-        limit = 1.15 * max(_largest(error), 2.2 * _largest(claimed.nanmedian()[None]))
-        panel.set(ylabel=UNITS[i], ylim=(-limit, limit))
+        band_shown = min(2 * _largest(claimed), _MOST_BAND * _largest(claimed.nanmedian()[None]))
+        limit = 1.1 * max(_largest(error), band_shown)
+        panel.set(ylabel=f"error of {AXES[i]} [{UNITS[i]}]", ylim=(-limit, limit))
         panel.set_title(f"{AXES[i]}: bias {axis.bias:.3g}, spread {axis.spread:.3g} {UNITS[i]}", fontsize=10)
         panel.axhline(0, color=GREY, lw=0.6)
     for panel in axes[1]:
@@ -57,7 +59,7 @@ def plot_consistency(evaluation: Evaluation, title: str) -> Figure:
     x = torch.linspace(0.01, _MOST_NEES, 300, dtype=torch.float64)
     axes[2].plot(x, x.square() * (-x / 2).exp() / 16, color=GREY, lw=1)  # chi-squared, 6 degrees of freedom
     low, high = evaluation.nees_interval
-    axes[2].set_title(f"mean {evaluation.nees:.2f}; {low:.2f} to {high:.2f} if the covariance is right", fontsize=10)
+    axes[2].set_title(f"mean {evaluation.nees:.2f}; {low:.2f} to {high:.2f} if the covariance is right", fontsize=9)
     axes[2].set_xlabel("NEES (larger ones in the last bin)")
     figure.suptitle(f"{title}: is the claimed uncertainty right?", fontsize=11)
     return figure
@@ -68,12 +70,12 @@ def plot_conditions(evaluation: Evaluation, truth: Truth, title: str) -> Figure:
     figure, axes = subplots(2, 3, (13, 6.5), sharey="col")
     ok = evaluation.error[:, 0].isfinite()
     values = (
-        ("lateral, um", evaluation.errors.lateral * 1e3),
-        ("|depth|, um", evaluation.errors.depth.abs() * 1e3),
-        ("rotation, mdeg", evaluation.errors.angle.rad2deg() * 1e3),
+        ("error across the axis [um]", evaluation.errors.lateral * 1e3),
+        ("error along the axis [um]", evaluation.errors.depth.abs() * 1e3),
+        ("error of rotation [mdeg]", evaluation.errors.angle.rad2deg() * 1e3),
     )
     tilt = truth.R[:, 2, 2].abs().clamp(max=1).acos().rad2deg()
-    for row, (name, condition) in zip(axes, (("distance, mm", truth.t[:, 2]), ("tilt, degrees", tilt)), strict=True):
+    for row, (name, condition) in zip(axes, (("distance [mm]", truth.t[:, 2]), ("tilt [degrees]", tilt)), strict=True):
         for panel, (label, value), colour in zip(row, values, COLOURS[:3], strict=True):
             panel.semilogy(condition[ok], value[ok], ".", ms=4, color=colour)
             panel.set(xlabel=name, ylabel=label)

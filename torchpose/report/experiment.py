@@ -20,8 +20,8 @@ def plot_experiment(experiment: Experiment, title: str) -> Figure:
             _plot_static(resting, experiment.static, k)
         for moves in (m for m in experiment.moves if m.axis == axis):
             _plot_moves(moving, moves, COLOURS[k % 3])
-        resting.set(xlabel="frame", ylabel=name)
-        moving.set(xlabel=f"robot, {'degrees' if turn else 'mm'}", ylabel=name)
+        resting.set(xlabel="frame", ylabel=f"deviation [{name}]")
+        moving.set(xlabel=f"move of the robot [{'degrees' if turn else 'mm'}]", ylabel=f"camera - robot [{name}]")
         for panel in (resting, moving):
             panel.axhline(0, color=GREY, lw=0.6)
     robot = "emulated rig" if experiment.emulated else "robot and camera"

@@ -26,7 +26,10 @@ def make_folder(folder: Path, option: str) -> None:
 
 def save_figures(figures: Mapping[str, Figure], folder: Path, dpi: int = 120) -> list[Path]:
     """Writes plots under their file names; the paths. ConfigError: one cannot be written."""
+    from torchpose.report.figures import finish
+
     for name, figure in figures.items():
+        finish(figure)
         with atomic_path(folder / name) as temporary:
             figure.savefig(temporary, format=name.rsplit(".", 1)[-1], dpi=dpi)
     return [folder / name for name in figures]

@@ -74,13 +74,18 @@ def _table(rows: list[Row], fold: bool = True) -> str:
     classes = {column: _class(column, rows) for column in rows[0]}
     head = "".join(f"<th{kind}>{escape(column.replace('_', ' '))}</th>" for column, kind in classes.items())
     body = "".join(
-        "<tr>" + "".join(f"<td{kind}>{escape(cell(row[column]))}</td>" for column, kind in classes.items()) + "</tr>"
-        for row in rows
+        f"<tr>{''.join(_data(column, kind, row[column]) for column, kind in classes.items())}</tr>" for row in rows
     )
     table = f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
     if fold and len(rows) > _SHOWN_ROWS:
         return f"<details><summary>{len(rows)} rows</summary>{table}</details>"
     return table
+
+
+def _data(column: str, kind: str, value: Any) -> str:
+    """One cell; the name of its column stands in it too, for narrow screens, where every row is a list."""
+    name = f' data-name="{escape(column.replace("_", " "))}"' if column else ""
+    return f"<td{kind}{name}>{escape(cell(value))}</td>"
 
 
 def _class(column: str, rows: list[Row]) -> str:

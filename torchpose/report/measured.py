@@ -54,10 +54,11 @@ def _plot_places(panel: Any, found: Measurement) -> None:
     panel.quiver(
         *nominal[:, :2].T, *(enlarged * off[:, :2].T), angles="xy", scale_units="xy", scale=1, width=0.004, color=_BLUE
     )
-    for marker, at, z, known in zip(found.target.ids.tolist(), nominal, off[:, 2], sigma[:, 2], strict=True):
-        text = f"{marker}: z {1e3 * float(z):+.1f} +- {1e3 * float(known):.1f} um"
-        panel.annotate(text, at[:2].tolist(), xytext=(4, -10), textcoords="offset points", fontsize=7)
-    room = 1.5 * _LONGEST * extent
+    for marker, at, move, known in zip(found.target.ids.tolist(), nominal, off, sigma[:, 2], strict=True):
+        text = f"{marker}: z {1e3 * float(move[2]):+.1f} +- {1e3 * float(known):.1f} um"
+        beside = 10 if move[1] > 0 else -16  # points; away from the arrow, y downwards
+        panel.annotate(text, at[:2].tolist(), xytext=(0, beside), textcoords="offset points", fontsize=8, ha="center")
+    room = 2 * _LONGEST * extent  # for the longest arrow and the numbers
     (left, top), (right, bottom) = ((nominal[:, :2].amin(0) - room).tolist(), (nominal[:, :2].amax(0) + room).tolist())
     panel.set(xlim=(left, right), ylim=(bottom, top), xlabel="x, mm", ylabel="y, mm")
     panel.set_aspect("equal", "box")
@@ -88,7 +89,8 @@ def _plot_residuals(panel: Any, found: Measurement) -> None:
 def _plot_correlation(panel: Any, found: Measurement) -> None:
     names, whole = _whole(found)
     scale = whole.diagonal().clamp_min(1e-300).rsqrt()
-    panel.imshow((whole * scale[:, None] * scale).tolist(), cmap="RdBu_r", vmin=-1, vmax=1)
+    shown = panel.imshow((whole * scale[:, None] * scale).tolist(), cmap="RdBu_r", vmin=-1, vmax=1)
+    panel.figure.colorbar(shown, ax=panel, shrink=0.8)
     size = max(3, min(8, 240 // len(names)))
     panel.set_xticks(range(len(names)), names, rotation=90, fontsize=size)
     panel.set_yticks(range(len(names)), names, fontsize=size)

@@ -181,10 +181,10 @@ def _fixed(values: Sequence[float] | np.ndarray) -> tuple[int, ...]:
     return tuple(round(v * (1 << _SHIFT)) for v in values)
 
 
-def draw_ellipse(picture: np.ndarray, ellipse: Sequence[float], colour: Colour) -> None:
+def draw_ellipse(picture: np.ndarray, ellipse: Sequence[float], colour: Colour, width: int = 1) -> None:
     cx, cy, a, b, theta = ellipse
-    turn = float(np.rad2deg(theta))
-    cv2.ellipse(picture, _fixed((cx, cy)), _fixed((a, b)), turn, 0, 360, colour, 1, lineType=cv2.LINE_AA, shift=_SHIFT)
+    center, axes, turn = _fixed((cx, cy)), _fixed((a, b)), float(np.rad2deg(theta))
+    cv2.ellipse(picture, center, axes, turn, 0, 360, colour, width, lineType=cv2.LINE_AA, shift=_SHIFT)
 
 
 def _cross(picture: np.ndarray, center: Sequence[float], arm: float) -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import socket
 from collections.abc import Iterator
+from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any, cast
 
@@ -16,9 +18,21 @@ MEASURING, DECODING = 0.75, 0.25
 _CONNECT = 5.0  # seconds (convention)
 
 
+@dataclass(frozen=True)
+class Workers:
+    """Number of cores of a cluster, and the nodes that it began with."""
+
+    count: int
+    nodes: frozenset[str]
+
+    def lost(self) -> int:
+        """How many of these nodes are gone."""
+        return len(self.nodes - {node["NodeID"] for node in _nodes() if node["Alive"]})
+
+
 @contextlib.contextmanager
-def cluster(address: str | None, workers: int) -> Iterator[int]:
-    """Connects, or starts a cluster of so many cores that ends with the block; gives the number of its cores.
+def cluster(address: str | None, workers: int) -> Iterator[Workers]:
+    """Connects, or starts a cluster of so many cores that ends with the block.
 
     Raises:
         ConfigError: Ray is not installed, the address does not answer, or its nodes lack this version of torchpose.
@@ -40,13 +54,18 @@ def cluster(address: str | None, workers: int) -> Iterator[int]:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         where = "" if address is None else f"{address}: "
         raise ConfigError(f"{where}--address: no Ray cluster answers ({reason}); start one with ray start") from None
+    # on standard output Ray prints the logs of nodes that it loses; commands tell their number in one line
+    nowhere = open(os.devnull, "w")  # noqa: SIM115  # open for as long as Ray's threads may print
     try:
         _silence()
         _check_nodes()
         resources: Any = ray.cluster_resources  # without types
-        yield int(resources().get("CPU", 1))
+        alive = frozenset(node["NodeID"] for node in _nodes() if node["Alive"])
+        with contextlib.redirect_stdout(nowhere):
+            yield Workers(int(resources().get("CPU", 1)), alive)
     finally:
         ray.shutdown()
+        nowhere.close()
 
 
 def _check_answers(address: str) -> None:
@@ -76,6 +95,13 @@ def _silence() -> None:
         logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
+def _nodes() -> list[dict[str, Any]]:
+    import ray
+
+    nodes = cast(Any, ray.nodes)  # without types
+    return list(nodes())
+
+
 def _check_nodes() -> None:
     """Raises ConfigError unless every node has this version of torchpose."""
     import ray
@@ -91,8 +117,8 @@ def _check_nodes() -> None:
         except PackageNotFoundError:
             return ""
 
-    asked, nodes = {}, cast(Any, ray.nodes)  # without types
-    for node in nodes():
+    asked = {}
+    for node in _nodes():
         if node["Alive"] and node["Resources"].get("CPU"):
             strategy = NodeAffinitySchedulingStrategy(node_id=node["NodeID"], soft=True)
             task = ray.remote(installed).options(num_cpus=0, scheduling_strategy=strategy)

@@ -142,7 +142,8 @@ def _copies(samples: Samples, offset: Tensor, weight: Tensor) -> Samples:
     """K copies of N samples, shifted by offset (K, N, 2) and weighted by weight (K, N) or (K, 1)."""
     number = torch.arange(len(samples), device=offset.device).repeat(len(offset))
     pixel, dv = (samples.pixel + offset).flatten(0, 1), (weight * samples.dv).flatten()
-    return replace(samples[number], pixel=pixel, dv=dv)
+    swept = None if samples.swept is None else (weight[..., None] * samples.swept).flatten(0, 1)
+    return replace(samples[number], pixel=pixel, dv=dv, swept=swept)
 
 
 def _gaussian(psf_sigma: Level, like: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:

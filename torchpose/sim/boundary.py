@@ -13,7 +13,7 @@ docs/decisions/0003-renderer.md compares it with supersampling.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -76,6 +76,7 @@ class Samples(Rows):
         dv: v component of the quadrature step.
         sigma: standard deviations of the Gaussian along rows and columns.
         half_chord: blur along the rows by a box of twice this width besides, see `on_chords`.
+        swept: what the step sweeps by each of M numbers that move the boundary, see `fill_moved`.
     """
 
     frame: Int[Tensor, " N"]
@@ -84,6 +85,7 @@ class Samples(Rows):
     dv: Float[Tensor, " N"]
     sigma: Float[Tensor, "N 2"]
     half_chord: Float[Tensor, " N"] | None = None
+    swept: Float[Tensor, "N M"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,6 +172,21 @@ def project(
     return pixel, tangent[:, 1]
 
 
+def swept_by_pose(
+    camera: Camera, edges: Boundary, R: Float[Tensor, "B 3 3"], t: Float[Tensor, "B 3"]
+) -> Float[Tensor, "N 6"]:
+    """What boundary samples sweep a mm of translation and a rad about the camera's axes, see `fill_moved`."""
+    rotation = R[edges.frame]
+    arm = (rotation @ edges.point[:, :, None]).squeeze(-1)
+    step = (rotation @ edges.step[:, :, None]).squeeze(-1)
+    axes = torch.eye(3, dtype=t.dtype, device=t.device)
+    shift, turn = axes[:, None].expand(-1, *arm.shape), torch.linalg.cross(axes[:, None], arm[None])
+    x = arm + t[edges.frame]
+    _, moved, _ = _image(camera, x.expand(7, -1, 3), torch.cat([shift, turn, step[None]]))
+    velocity, (du, dv) = moved[:6], moved[6].unbind(-1)
+    return (velocity[..., 0] * dv - velocity[..., 1] * du).mT
+
+
 @torch.no_grad()
 def boxes_around(
     pixel: Float[Tensor, "N 2"], shape: Int[Tensor, " N"], margin: Float[Tensor, " S"], camera: Camera
@@ -194,9 +211,37 @@ def fill(samples: Samples, boxes: Boxes, derivative: tuple[int, int] = (0, 0)) -
         (boxes.rows, boxes.stride), of the dtype of the samples; the rows of all windows one below the other, 0 to
         rounding behind their ends.
     """
+    increments = samples.pixel.new_zeros(boxes.rows * boxes.stride)
+    for part, across, along, index in _patches(samples, boxes, derivative):
+        across = across * -samples.dv[part, None]
+        increments = accumulate(increments, index.view(-1), (across[:, :, None] * along[:, None]).view(-1))
+    return increments.view(-1, boxes.stride).cumsum(1)
+
+
+def fill_moved(samples: Samples, boxes: Boxes) -> Float[Tensor, "H W M"]:
+    """How the regions of `fill` change with the M numbers that move their boundaries.
+
+    By Reynolds' transport theorem that is the integral of the kernel along the boundary, times the area that each of
+    its steps sweeps: ``V_u dv - V_v du`` where it moves by V px a unit of the number.
+    """
+    swept = samples.swept
+    assert swept is not None
+    increments = swept.new_zeros(boxes.rows * boxes.stride, swept.shape[1])
+    for part, across, along, index in _patches(samples, boxes, (1, 0)):
+        patch = (across[:, :, None] * along[:, None])[..., None] * swept[part, None, None]
+        increments.index_add_(0, index.view(-1), patch.flatten(0, 2))
+    return increments.view(-1, boxes.stride, swept.shape[1]).cumsum(1)
+
+
+def _patches(
+    samples: Samples, boxes: Boxes, derivative: tuple[int, int]
+) -> Iterator[tuple[slice, Tensor, Tensor, Tensor]]:
+    """What samples add to the windows, as products of a column (N, h) and a row (N, w) of differences from pixel to
+    pixel along the rows, with the cells (N, h, w) that they belong to: chunk by chunk of the samples.
+    """
     pixel, chord = samples.pixel, samples.half_chord
     if len(pixel) == 0:
-        return pixel.new_zeros(boxes.rows, boxes.stride)
+        return
     beside, reach = (1.0 + REACH * samples.sigma.detach().amax(0)).tolist()
     beside += 0.0 if chord is None else float(chord.detach().max())
     rows = torch.arange(-math.floor(reach), math.floor(reach) + 1).to(pixel)
@@ -204,7 +249,6 @@ def fill(samples: Samples, boxes: Boxes, derivative: tuple[int, int] = (0, 0)) -
     columns = torch.arange(-math.floor(beside), math.ceil(beside) + 1).to(pixel)
     corner, size, stride = boxes.corner[samples.shape], boxes.size[samples.shape], boxes.stride
     first_row = (boxes.size[:, 1].cumsum(0) - boxes.size[:, 1])[samples.shape]
-    increments = pixel.new_zeros(boxes.rows * stride)
     # each chunk copies all windows where a derivative is wanted
     cells = _CHUNK_CELLS * (16 if torch.is_grad_enabled() else 1)
     together = max(1, cells // (len(rows) * len(columns)))
@@ -220,13 +264,10 @@ def fill(samples: Samples, boxes: Boxes, derivative: tuple[int, int] = (0, 0)) -
         local = nearest.long() - corner[part]
         row, column = local[:, 1:] + rows.long(), local[:, :1] + columns.long()
         inside = (row >= 0) & (row < size[part, 1:])
-        across = across * inside * -samples.dv[part, None]
         # what begins left of the window has its full effect from the first column on
         column = column.clamp(min=0).minimum(size[part, :1])
         cell = (first_row[part, None] + torch.where(inside, row, 0)) * stride
-        index = cell[:, :, None] + column[:, None]
-        increments = accumulate(increments, index.view(-1), (across[:, :, None] * along[:, None]).view(-1))
-    return increments.view(-1, stride).cumsum(1)
+        yield part, across * inside, along, cell[:, :, None] + column[:, None]
 
 
 def on_chords(

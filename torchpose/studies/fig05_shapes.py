@@ -17,7 +17,7 @@ from torchpose.analysis import edge_noise, localisers
 from torchpose.analysis.marks import Mark, cross, cross_extent, ink, marks
 from torchpose.camera import Camera
 from torchpose.io.rows import Row
-from torchpose.report.figures import COLOURS, curve, frames, subplots
+from torchpose.report.figures import COLOURS, curve, frames, legend_below, subplots
 from torchpose.rings import ideal_pixels
 from torchpose.sim import add_noise, render
 from torchpose.sim.shapes import rectangle
@@ -57,6 +57,15 @@ CURVES: dict[str, dict[float, Condition]] = {
     "distortion_k1_uncorrected": {v: Condition(distortion=v, corrected=False) for v in (0.0, -0.05, -0.1, -0.15, -0.2)},
     "distortion_k1_corrected": {v: Condition(distortion=v) for v in (0.0, -0.05, -0.1, -0.15, -0.2)},
     "cover": {v: Condition(cover=v) for v in (0.0, 0.1, 0.2, 0.3, 0.4)},
+}
+
+AXES = {  # what stands below a panel
+    "noise": "noise [grey levels]",
+    "blur_px": "blur [px]",
+    "tilt_deg": "tilt [degrees]",
+    "distortion_k1_uncorrected": "distortion k1, not corrected",
+    "distortion_k1_corrected": "distortion k1, corrected",
+    "cover": "share that is covered",
 }
 
 
@@ -239,7 +248,7 @@ def _statements(rows: list[Row], bars: list[Row], found: list[Row]) -> list[str]
 
 def plot(rows: list[Row]) -> Figure:
     """One panel a condition; dotted: the bound. Lost marks as the second line of panels."""
-    figure, axes = subplots(2, len(CURVES), (21, 8))
+    figure, axes = subplots(2, len(CURVES), (21, 8), sharex="col")
     for (error, lost), name in zip(axes.T, CURVES, strict=True):
         for k, mark in enumerate(dict.fromkeys(row["mark"] for row in rows)):
             part = [
@@ -250,11 +259,11 @@ def plot(rows: list[Row]) -> Figure:
             curve(error, part, "size", "rms_px", ms=3, color=COLOURS[k], label=mark)
             curve(error, [row for row in part if row["bound_px"]], "size", "bound_px", ":", color=COLOURS[k])
             curve(lost, part, "size", "lost_percent", ms=3, color=COLOURS[k])
-        error.set(xlabel=name, yscale="log")
-        lost.set(xlabel=name, ylim=(-3, 103))
-    axes[0, 0].set_ylabel("error of the centre, rms per axis [px]")
+        error.set(yscale="log")
+        lost.set(xlabel=AXES[name], ylim=(-3, 103))
+    axes[0, 0].set_ylabel("error of the centre, RMS per axis [px]")
     axes[1, 0].set_ylabel("lost [%]")
-    axes[0, 0].legend(fontsize=8)
+    legend_below(figure, axes[0, :1], 6, {"Cramer-Rao bound": ":"})
     return figure
 
 
@@ -265,8 +274,8 @@ def plot_bars(bars: list[Row]) -> Figure:
     for k, (name, style) in enumerate((("edges_rms", "o-"), ("centroid_rms", "o-"), ("bound", ":"))):
         curve(panel, part, "ink_percent", f"{name}_px", style, color=COLOURS[k], label=name.split("_")[0])
     panel.axvline(50, color="k", lw=0.8, ls="--", label="the paper's 50 %")
-    panel.set(xlabel="ink over bounding square [%]", ylabel="error of the centre, rms per axis [px]", yscale="log")
-    panel.legend()
+    panel.set(xlabel="ink over bounding square [%]", ylabel="error of the centre, RMS per axis [px]", yscale="log")
+    legend_below(figure, [panel], 4, fontsize=8)
     return figure
 
 

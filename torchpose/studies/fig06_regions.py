@@ -53,7 +53,11 @@ def run(*, full: bool = False, seed: int = 0, progress: Progress = ignore_progre
         row, overlay = _counted(name, images, truth)
         rows.append(row)
         height, width = overlay.shape[:2]
-        sheet = frames([("", images[0].numpy()), ("", overlay)], 1, (13, 6.6 * height / width))
+        first, second = letters.split(", ")
+        titles = f"({first}) the frame", f"({second}) what was found in it"
+        sheet = frames(
+            list(zip(titles, (images[0].numpy(), overlay), strict=True)), 1, (13, 6.8 * height / width + 0.3)
+        )
         title = f"Fig. 6 ({letters}): the {name} and what was found in it"
         pictures.append(Picture(f"fig06_{name}", title, sheet))
         progress(len(rows) / 2)

@@ -16,7 +16,7 @@ from torchpose.camera import Camera
 from torchpose.detect import find_candidates
 from torchpose.geometry import conics, rotations
 from torchpose.io.rows import Row
-from torchpose.report.figures import COLOURS, subplots
+from torchpose.report.figures import COLOURS, legend_below, subplots
 from torchpose.rings import measure_rings, zernike
 from torchpose.rings.edges import RingEdges, ring_edges
 from torchpose.sim import add_noise, render, shapes
@@ -92,7 +92,9 @@ def _steps(frame: Tensor, edges: RingEdges) -> Figure:
         low, high = margin - 0.5, SIZE - 0.5 - margin
         panel.imshow(picture.numpy(), cmap="gray", extent=(low, high, high, low), interpolation="nearest")
         panel.set_title(title)
+        panel.set_xlabel("u, px")
         panel.grid(False)
+    panels[0].set_ylabel("v, px")
     panels[3].plot(*edges.points.T, ".", ms=4, color=COLOURS[1])
     panels[3].set(xlim=(60, 105), ylim=(80, 35))
     return figure
@@ -104,14 +106,14 @@ def _fitted(edges: RingEdges, fits: Tensor, off: Tensor) -> Figure:
     for i, name in enumerate(("outer", "inner")):
         mine = edges.ring == i
         xy, curve = edges.points[mine], conics.points_on(fits[i : i + 1], angle[None])[0]
-        whole.plot(*curve.T, color=COLOURS[i], lw=1, label=f"{name} ellipse")
+        whole.plot(*curve.T, color=COLOURS[i], lw=1, label=f"{name} circle")
         whole.plot(*xy.T, ".", ms=2, color="black")
         direction = torch.atan2(xy[:, 1] - fits[i, 1], xy[:, 0] - fits[i, 0]).rad2deg()
-        residual.plot(direction, off[mine], ".", ms=4, color=COLOURS[i], label=name)
+        residual.plot(direction, off[mine], ".", ms=4, color=COLOURS[i], label=f"{name} circle")
     whole.set_aspect("equal")
     whole.invert_yaxis()
     whole.set(xlabel="u, px", ylabel="v, px")
     residual.set(xlabel="direction from the centre, degrees", ylabel="edge - ellipse, px")
-    for panel in (whole, residual):
-        panel.legend(fontsize=8)
+    whole.set_title("fitted ellipses, and edges as dots", fontsize=10)
+    legend_below(figure, [whole], 2)
     return figure

@@ -18,7 +18,7 @@ from torchpose.analysis.sweep import Sweep, sweep
 from torchpose.camera import Camera
 from torchpose.geometry import rotations
 from torchpose.io.rows import Row
-from torchpose.report.figures import COLOURS, curve, subplots
+from torchpose.report.figures import COLOURS, curve, legend_below, subplots
 from torchpose.studies.fig04_sensitivity import DISTANCES_MM, FOCAL_ERROR, paper_camera
 from torchpose.studies.study import Comparison, Picture, Progress, StudyResult, Table, ignore_progress, load_data
 from torchpose.target import Target
@@ -152,12 +152,17 @@ def reading(kind: str) -> Row:
 def plot(rows: list[Row]) -> Figure:
     """Both axes against the distance, and the paper's numbers."""
     figure, axes = subplots(1, 2, (12, 4.5))
-    styles = {"predicted_rms_deg": "-", "rms_deg": ".", "largest_deg": ".", "worst_within_0.2px_deg": "-"}
+    styles = {
+        "predicted_rms_deg": ("-", "predicted RMS"),
+        "rms_deg": (".", "RMS of the draws"),
+        "largest_deg": (".", "largest of the draws"),
+        "worst_within_0.2px_deg": ("-", "worst within 0.2 px"),
+    }
     for panel, (axis, paper) in zip(axes[0], PAPER_NOISE_DEG.items(), strict=True):
         part = [row for row in rows if row["axis"] == axis]
-        for (name, style), colour in zip(styles.items(), COLOURS, strict=False):
-            curve(panel, part, "distance_mm", name, style, color=colour, label=name)
+        for (name, (style, label)), colour in zip(styles.items(), COLOURS, strict=False):
+            curve(panel, part, "distance_mm", name, style, color=colour, label=label)
         panel.axhline(paper, color="k", ls=":", label="paper")
         panel.set(xlabel="distance [mm]", ylabel=f"{axis.replace('_', ' and ')} error [deg]", yscale="log")
-        panel.legend(fontsize=8)
+    legend_below(figure, axes[0], 5)
     return figure

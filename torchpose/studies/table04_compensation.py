@@ -19,7 +19,7 @@ from torchpose.ellipse import EllipseFit
 from torchpose.geometry import conics, rotations
 from torchpose.io.rows import Row
 from torchpose.pose import common_center, compensate
-from torchpose.report.figures import COLOURS, GREY, curve, subplots
+from torchpose.report.figures import COLOURS, GREY, curve, legend_below, subplots
 from torchpose.rings import measure_rings
 from torchpose.sim import add_noise, render
 from torchpose.studies.study import Comparison, Picture, Progress, StudyResult, Table, ignore_progress, load_data
@@ -105,7 +105,7 @@ def _plot(rows: list[Row]) -> Figure:
             panel.plot(list(PAPER_PX), [p[which] for p in PAPER_PX.values()], marker, color=GREY, ms=9, label=label)
         panel.set(title=f"noise {noise:g}", xlabel="tilt, degrees", yscale="log")
     panels[0].set_ylabel("error of the centre, RMS, px")
-    panels[-1].legend(fontsize=8)
+    legend_below(figure, panels, 3)
     return figure
 
 
@@ -130,7 +130,8 @@ def _ring_picture() -> Figure:
         panel.set_xlabel("u, px")
     reach = 1.6 * max(float(place.abs().max()) for _, place, _ in points)
     near.set(xlim=(-reach, reach), ylim=(reach, -reach))
-    near.legend(fontsize=8)
+    whole.set_ylabel("v, px")
+    legend_below(figure, [near], 4)
     return figure
 
 

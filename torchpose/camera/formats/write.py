@@ -50,7 +50,8 @@ def save(camera: Camera, path: str | os.PathLike[str], format: str | None = None
     write_text(name, text)
 
 
-def _row(values: torch.Tensor) -> str:
+def row(values: torch.Tensor) -> str:
+    """Numbers as a list in a file."""
     return format_list(values.detach().flatten().tolist())
 
 
@@ -61,7 +62,7 @@ def _yaml(entries: Mapping[str, Any], tag: str = "") -> str:
     for name, value in entries.items():
         if isinstance(value, torch.Tensor):
             rows, cols = value.shape if value.ndim == 2 else ((1, len(value)) if len(value) else (0, 0))
-            text += f"{name}:{tag}\n   rows: {rows}\n   cols: {cols}{kind}\n   data: {_row(value)}\n"
+            text += f"{name}:{tag}\n   rows: {rows}\n   cols: {cols}{kind}\n   data: {row(value)}\n"
         elif value is not None:
             # a colon within a word would start a mapping
             text += f'{name}: "{value}"\n' if ":" in str(value) else f"{name}: {value}\n"
@@ -75,13 +76,13 @@ def _entries(camera: Camera) -> dict[str, Any]:
         "camera_matrix": camera.matrix,
         "distortion_model": camera.model,
         "distortion_coefficients": camera.distortion,
-        **_covariances(camera),
+        **covariances(camera),
         "tone": None if camera.tone is None else str(camera.tone),
         "adjustment": camera.adjustment,
     }
 
 
-def _covariances(camera: Camera) -> dict[str, torch.Tensor]:
+def covariances(camera: Camera) -> dict[str, torch.Tensor]:
     """Keys and tables of a camera's covariance: that of the matrix for all readers, and the whole one where known."""
     whole, of_matrix = COVARIANCES
     if camera.covariance is None:
@@ -98,7 +99,7 @@ def _json_text(camera: Camera) -> str:
     def written(value: Any) -> str:
         if not isinstance(value, torch.Tensor):
             return f'"{value}"' if isinstance(value, str) else f"{value}"
-        return _row(value) if value.ndim == 1 else "[" + ", ".join(map(_row, value)) + "]"
+        return row(value) if value.ndim == 1 else "[" + ", ".join(map(row, value)) + "]"
 
     fields = [f'  "{name}": {written(value)}' for name, value in _entries(camera).items() if value is not None]
     return "{\n" + ",\n".join(fields) + "\n}\n"
@@ -126,7 +127,8 @@ def _ros_text(camera: Camera) -> str:
     return _yaml(entries | covariances | last)
 
 
-def _focal_center(camera: Camera) -> tuple[float, float, float, float]:
+def focal_center(camera: Camera) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy."""
     (fx, _, cx), (_, fy, cy), _ = camera.matrix.detach().tolist()
     return fx, fy, cx, cy
 
@@ -137,14 +139,14 @@ def _kalibr_text(camera: Camera) -> str:
         raise ConfigError("distortion_coefficients: Kalibr holds k1 k2 p1 p2 only; save in the format opencv or ros")
     text = (
         "cam0:\n  camera_model: pinhole\n"
-        f"  intrinsics: {format_list(_focal_center(camera))}\n"
+        f"  intrinsics: {format_list(focal_center(camera))}\n"
         f"  distortion_model: {'equidistant' if camera.model == 'kannala_brandt' else 'radtan'}\n"
-        f"  distortion_coeffs: {_row(d[:4])}\n"
+        f"  distortion_coeffs: {row(d[:4])}\n"
         f"  resolution: [{camera.width}, {camera.height}]\n"
         "  rostopic: /cam0/image_raw\n"
     )
-    for name, table in _covariances(camera).items():
-        text += f"  {name}:\n" + "".join(f"    - {_row(row)}\n" for row in table)
+    for name, table in covariances(camera).items():
+        text += f"  {name}:\n" + "".join(f"    - {row(line)}\n" for line in table)
     if camera.adjustment is not None:
         text += f"  adjustment: {camera.adjustment}\n"
     if camera.tone is not None:
@@ -153,7 +155,7 @@ def _kalibr_text(camera: Camera) -> str:
 
 
 def _colmap_text(camera: Camera) -> str:
-    fx, fy, cx, cy = _focal_center(camera)
+    fx, fy, cx, cy = focal_center(camera)
     d = camera.distortion.detach().tolist()
     if camera.model == "kannala_brandt":
         model = "OPENCV_FISHEYE"

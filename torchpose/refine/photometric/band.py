@@ -25,7 +25,11 @@ def band_pixels(outer: Tensor, inner: Tensor, band: Tensor, height: int, width: 
     ends of a grown and a shrunk span belong to the band. Where the ring is thinner than two bands, theirs merge.
 
     Args:
-        outer, inner: (K, 5) ellipses in pixels, the inner one inside. band: (K,) px. height, width: of the frame.
+        outer: (K, 5) ellipses in pixels.
+        inner: (K, 5), inside of them.
+        band: (K,) px.
+        height: of the frame.
+        width: of the frame.
 
     Returns:
         ring (P,), u (P,), v (P,) int64, sorted by ring and row.

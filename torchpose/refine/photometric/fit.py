@@ -37,6 +37,7 @@ from torchpose.geometry.least_squares import (
 from torchpose.geometry.robust import of_chance
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import marked, segment_mean, segment_sum
+from torchpose.pose import MarkerNormals
 from torchpose.refine.photometric.band import band_width
 from torchpose.refine.photometric.grey_levels import (
     TILE,
@@ -47,13 +48,16 @@ from torchpose.refine.photometric.grey_levels import (
     noise_spread,
     sum_products,
 )
-from torchpose.refine.photometric.light import LEVELS, POSE, normal_equations, of_markers
+from torchpose.refine.photometric.light import LEVELS, POSE, normal_equations, of_markers, pulled_by_levels
 from torchpose.refine.photometric.ring_model import gather_pixels, ring_model
 from torchpose.refine.photometric.sectors import (
     Sectors,
     away_from_unclear,
     clear_sectors,
     doubtful,
+    in_step,
+    level_scatter,
+    of_more,
     overdispersion,
     sum_sectors,
     trust,
@@ -237,12 +241,19 @@ def _refined(
     if stages[-1].tempered:  # its weights have what the rims scatter by
         even = overdispersion(fit.sectors.scaled(fit.clear.to(fit.factor)), fit.variance[owner], owner, rows)[1]
     covariance, determined = found.covariance()
-    covariance = wider[:, None, None] * covariance[:, :6, :6]
+    covariance = wider[:, None, None] * covariance
     kept, usable = (segment_sum((x > 0).sum(-1), owner, rows) for x in (fit.weight, fit.usable))
-    good = determined & covariance.isfinite().all(-1).all(-1)
     spread = cast(Spread, found.unknowns.own["blur"])
     part = cast(Eliminated, found.normal.eliminated)
     normals = of_markers(fit.sums, fit.variance, part, fit.mask, found.step.own).over(wider)
+    rough = even == 0
+    if bool(rough.any()):
+        more = _beyond_rims(fit, found, normals, wider) * rough[:, None, None, None]
+        n = covariance.shape[-1]
+        covariance = covariance + covariance @ more.sum(1)[:, :n, :n] @ covariance
+        normals = normals.scattered(more)
+    covariance = covariance[:, :6, :6]
+    good = determined & covariance.isfinite().all(-1).all(-1)
     seen, of_them = (segment_sum(b.valid.sum(-1).double(), owner, rows) for b in (fit.blocks, fit.coarse))
     more = (seen / of_them.clamp_min(1)).clamp_min(1)
     doubt = doubtful(fit.sectors, fit.clear, fit.variance[owner], owner, found.step.own_chi2, more)
@@ -250,6 +261,24 @@ def _refined(
     gain = found.unknowns.values("gain")[:, 0] if fit.gain else None
     refined = Refined(pose.R, pose.t, covariance, spread.covariance, noise, kept, good, doubt, normals, gain, even)
     return _Result(refined, fit.look(spread, found.unknowns.values("levels")), fit.misshapen)
+
+
+def _beyond_rims(fit: _Fit, found: Minimum, normals: MarkerNormals, wider: Tensor) -> Tensor:
+    """Covariance (N, M, n, n) of the right sides of the normals by noise that the scatter along the rims, by which it
+    is ``wider`` (N,), does not show: in step along lines, and in the levels of ring and paper.
+    """
+    row, pose, rows = fit.blocks.row, found.unknowns.pose, len(wider)
+    factor, freedom, alone = in_step(fit.sectors.scaled(fit.factor), fit.variance[row], fit.blocks.rings, row, rows)
+    beyond = torch.where(of_more(factor, freedom), (factor - wider[:, None]).clamp_min(0), 0.0)
+    away = (pose.R[row] @ fit.blocks.center[..., None])[:, 2] + pose.t[row, 2:]
+    mm = (beyond[row] * alone).sqrt() * away / fit.focal
+    shifts = torch.nn.functional.pad(torch.diag_embed(mm), (0, 0, 0, POSE - 1))
+    every = shifts.new_zeros(*fit.mask.shape, POSE + 1, 2).index_put(tuple(fit.mask.nonzero().unbind(-1)), shifts)
+    shares = (fit.of_ring, 1 - fit.of_ring)
+    spread = [level_scatter(fit.sectors, fit.weight * s, fit.residual, fit.variance[row], row, rows) for s in shares]
+    levels = (torch.stack(spread, -1) / wider[:, None] - 1).clamp_min(0)[row]
+    part = cast(Eliminated, found.normal.eliminated)
+    return normals.by_motions(every) + pulled_by_levels(fit.sums, wider * fit.variance, part, fit.mask, levels)
 
 
 def _minimised(fit: _Fit, start: Pose, spread: Spread, stages: tuple[_Stage, ...], levels: Tensor | None) -> Minimum:
@@ -287,6 +316,7 @@ class _Fit:
         self.mask, self.band, self.by = sight.mask, band, sight.reduction
         self.blocks = gather_pixels(sight, band, TILE)
         self.coarse = self.blocks.every(_COARSE, most_coarse, whole=TILE)
+        self.focal = sight.camera.matrix.diagonal()[:2]
         self.prior = prior
         self.gain = prior is not None and prior.more
         self.stage = _QUICK[0]
@@ -318,6 +348,7 @@ class _Fit:
         model = ring_model(part, pose.R, pose.t, spread, check=True)
         columns, slope = columns_of(part, model, levels)
         residual = columns[:, :, -2].flatten(1)
+        self.residual, self.of_ring = residual, columns[:, :, POSE].flatten(1)
         noise = noise_spread(residual, part), model_misfit(levels)
         self.usable, self.weight = inliers(residual, part, model, *noise)
         if stage.coarse:  # the first steps begin with what was seen so far, the others see for themselves

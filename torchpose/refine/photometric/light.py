@@ -19,6 +19,7 @@ from torchpose.pose import MarkerNormals
 # unknowns of a frame (translation, rotation, blur) and of a marker, at least (derived: they are counted)
 POSE, LEVELS = 6 + BLUR, 6
 _GRADIENTS = (1, 2, 4, 5)  # among the levels
+_PLANE = 3  # levels of ring, then of paper; curvatures in the same order
 _CURVATURES = (6, 7, 8, 9, 10, 11)  # where there are any
 _BLUR_KNOWN = 1e-4  # information about each number of a blur, px^-4: a disc has two, so that the third is open
 _LEAST_WIDTH = 0.01  # variance of the prior over that of a gradient's noise: as good as none
@@ -90,6 +91,21 @@ def of_markers(sums: Tensor, variance: Tensor, levels: Eliminated, mask: Tensor,
     held[POSE - BLUR : POSE] = _BLUR_KNOWN
     count = mask.sum(-1)[levels.owner].clamp_min(1)
     return MarkerNormals.laid_out(information + torch.diag(held) / count[:, None, None], right, mask)
+
+
+def pulled_by_levels(sums: Tensor, variance: Tensor, levels: Eliminated, mask: Tensor, more: Tensor) -> Tensor:
+    """Covariance (N, M, 10, 10) of the right sides in `of_markers` by noise of the levels that its information lacks.
+
+    Args:
+        sums, variance, levels, mask: as for `of_markers`.
+        more: (K, 2) variance of what ring and paper tell of their levels, in units of that of the noise.
+    """
+    scaled = sums / variance[levels.owner, None, None]
+    of_levels = scaled[:, POSE:-2, POSE:-2]
+    deviation = more.sqrt().repeat_interleave(_PLANE, 1).repeat(1, 2)[:, : of_levels.shape[-1]]
+    pull = scaled[:, _chosen(sums), POSE:-2] @ solve_scaled(levels.information, torch.diag_embed(deviation))
+    every = pull.new_zeros(*mask.shape, pull.shape[1], pull.shape[1])
+    return every.index_put(tuple(mask.nonzero().unbind(-1)), pull @ of_levels @ pull.mT)
 
 
 def _chosen(sums: Tensor) -> list[int]:

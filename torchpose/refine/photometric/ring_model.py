@@ -47,6 +47,7 @@ class PixelBlocks(Rows):
         sector: of the ring, see `geometry.sectors`.
         seen: 1 or 0, whether the ring was seen there so far; 1 all around where that is less than half of it.
         size: pixels of each marker; what follows in its row repeats the last one and is not valid.
+        rings: ellipses of its two circles, outer one first.
         center: of the marker, target frame.
         normal: the same.
         radii: outer and inner.
@@ -65,6 +66,7 @@ class PixelBlocks(Rows):
     sector: Int[Tensor, "K P"]
     seen: Float[Tensor, "K P"]
     size: Int[Tensor, " K"]
+    rings: Float[Tensor, "K 2 5"]
     center: Float[Tensor, "K 3"]
     normal: Float[Tensor, "K 3"]
     radii: Float[Tensor, "K 2"]
@@ -167,6 +169,7 @@ def gather_pixels(sight: Sight, band: Tensor, grain: int) -> PixelBlocks:
         sector,
         _seen(sight, row, marker).gather(1, sector),
         size,
+        both,
         sight.centers[row, marker],
         sight.normals[row, marker],
         sight.radii[row, marker],

@@ -18,16 +18,18 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose.geometry.least_squares import solve_scaled
+from torchpose.geometry import conics
+from torchpose.geometry.least_squares import scaled_inverse, solve_scaled
 from torchpose.geometry.robust import CUT, of_chance
 from torchpose.geometry.rows import Rows
-from torchpose.geometry.sectors import MOST, SECTORS
-from torchpose.geometry.segments import segment_sum
+from torchpose.geometry.sectors import MOST, SECTORS, middles
+from torchpose.geometry.segments import segment_mean, segment_sum
 from torchpose.refine.photometric.light import POSE
 from torchpose.refine.photometric.ring_model import PixelBlocks, RingModel
 
 _KEPT = 0.9  # of a sector's pixels that must follow the model for it to count (convention; decisions/0064)
 _CELL = 4  # sectors over which a misfit is taken for one
+_BAND = 2  # sectors of the outer circle that a band of lines is high: half as much apart, most of them share it
 _UNCLEAR = 3  # sectors of an outer circle: more are no chance (measured: decisions/0064)
 _DISPLACED = 0.005  # px, displacement that a camera or print slightly off may cause: no reason for doubt
 _TINY = 1e-12  # least divisor (convention: below any sum that counts)
@@ -157,18 +159,113 @@ def overdispersion(sectors: Sectors, variance: Tensor, row: Tensor, rows: int) -
     pull, hold = (v.double().unflatten(1, (2, -1, _CELL)).sum(-1) for v in (sectors.pull, sectors.hold))
     hold = hold / variance[:, None, None]
     error = torch.where(hold > 0, pull / variance[:, None, None] / hold.clamp_min(_TINY), 0.0)
-    angle = (torch.arange(hold.shape[-1], dtype=hold.dtype, device=hold.device) + 0.5) * (2 * math.pi / hold.shape[-1])
-    harmonics = [of(k * angle) for k in (1, 2) for of in (torch.cos, torch.sin)]
-    basis = torch.stack([torch.ones_like(angle), *harmonics], -1)
+    each, free = _beyond_harmonics(error, hold)
+    chi2, freedom = segment_sum(each, row, rows), segment_sum(free, row, rows).clamp_min(1)
+    factor = chi2 / freedom
+    more = of_more(factor, freedom)
+    return torch.where(more, factor, 1.0), torch.where(more, 0.0, freedom)
+
+
+def of_more(factor: Tensor, freedom: Tensor) -> Tensor:
+    """Mean squares that are those of more than noise: by half of the deviations that make a value none.
+
+    A wrong factor costs little, and comes once in forty frames.
+    """
+    return factor > 1 + 0.5 * CUT * (2 / freedom.clamp_min(1)).sqrt()
+
+
+def _beyond_harmonics(error: Tensor, hold: Tensor) -> tuple[Tensor, Tensor]:
+    """Chi-squared (K,) of errors (K, 2, C) around two circles, of variance 1 / hold, with a mean and two harmonics of
+    each taken off, and its degrees of freedom (K,).
+    """
+    basis = _harmonics(hold)
     weighted = hold[..., None] * basis
     right = (weighted * error[..., None]).sum(-2)
     taken = (solve_scaled((weighted.mT @ basis).flatten(0, 1), right.flatten(0, 1)).view_as(right) * right).sum(-1)
-    chi2 = segment_sum(((hold * error.square()).sum(-1) - taken).sum(-1), row, rows)
-    freedom = segment_sum(((hold > 0).sum(-1) - basis.shape[-1]).clamp_min(0).sum(-1).double(), row, rows).clamp_min(1)
-    factor = chi2 / freedom
-    # half of the deviations that make a value no noise: a wrong factor costs little, and comes once in forty frames
-    more = factor > 1 + 0.5 * CUT * (2 / freedom).sqrt()
-    return torch.where(more, factor, 1.0), torch.where(more, 0.0, freedom)
+    free = ((hold > 0).sum(-1) - basis.shape[-1]).clamp_min(0).sum(-1).double()
+    return ((hold * error.square()).sum(-1) - taken).sum(-1), free
+
+
+def _harmonics(around: Tensor) -> Tensor:
+    """A mean and two harmonics (S, 5) of what goes around a circle in S parts, the last dimension."""
+    parts = around.shape[-1]
+    angle = (torch.arange(parts, dtype=around.dtype, device=around.device) + 0.5) * (2 * math.pi / parts)
+    harmonics = [of(k * angle) for k in (1, 2) for of in (torch.cos, torch.sin)]
+    return torch.stack([torch.ones_like(angle), *harmonics], -1)
+
+
+def in_step(
+    sectors: Sectors, variance: Tensor, rings: Tensor, row: Tensor, rows: int
+) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "N 2"], Float[Tensor, "K 2"]]:
+    """By how much the shifts of rings along u and along v scatter more than independent edges would let them, as a
+    factor of variance, the degrees of freedom that tell it, and the variance (px^2) that these edges would give.
+
+    What displaces the lines of a frame displaces all edges on a line alike: those left and right in a ring, of both its
+    circles, and of the rings beside it. These pulls add up in a shift, which no scatter along a rim shows. So pulls
+    along u are summed over bands of lines, and the mean square of the sums is compared with that of independent edges
+    (variance by clusters; Liang and Zeger 1986); along v over bands of columns. Taken off is what `overdispersion`
+    takes off.
+
+    Args:
+        sectors: weighted as in the fit. variance: (K,) of noise. rings: (K, 2, 5) ellipses, outer one first.
+            row: (K,) of ``rows``.
+    """
+    pull, hold = (v.double().unflatten(1, (2, SECTORS)) / variance[:, None, None] for v in (sectors.pull, sectors.hold))
+    error = torch.where(hold > 0, pull / hold.clamp_min(_TINY), 0.0)
+    basis = _harmonics(hold)
+    inverse = scaled_inverse(((hold[..., None] * basis).mT @ basis).flatten(0, 1))[0].unflatten(0, (-1, 2))
+    taken = basis @ inverse @ ((hold * error)[..., None, :] @ basis).mT
+    place, normal = _edges(rings.flip(1))  # inner circle first
+    pulls = hold[..., None] * normal
+    step = rings[:, 0, 2:4].prod(-1).sqrt() * (2 * math.pi / SECTORS)  # px along the outer rim
+    height = _BAND * segment_mean(step, row, rows)[row, None, None, None]
+    band = (place.flip(-1) / height).floor().long().movedim(-1, 0)  # (2, K, 2, 48)
+    same = (band[..., :, None] == band[..., None, :]).to(hold)
+    by_harmonic = pulls.movedim(-1, 0)[..., None] * basis
+    taken_off = ((by_harmonic @ inverse) * (same @ by_harmonic)).sum(-1)
+    alone = (pulls * normal).movedim(-1, 0)
+    usual, sums = alone - taken_off, (pulls * (error[..., None] - taken)).movedim(-1, 0)
+    low = band.amin()
+    count = int(band.amax() - low) + 1
+    of = (band - low + count * row[:, None, None]).flatten(1)
+    bands = hold.new_zeros(2, 2, rows * count)
+    bands[0].scatter_add_(1, of, sums.flatten(1))
+    bands[1].scatter_add_(1, of, usual.flatten(1))
+    found, expected = bands.unflatten(-1, (rows, count)).movedim(1, -1)  # (N, count, 2)
+    total = expected.sum(1).clamp_min(_TINY)
+    freedom = total.square() / expected.square().sum(1).clamp_min(_TINY)
+    return found.square().sum(1) / total, freedom, 1 / alone.sum((-1, -2)).mT.clamp_min(_TINY)
+
+
+def level_scatter(
+    sectors: Sectors, weight: Tensor, residual: Tensor, variance: Tensor, row: Tensor, rows: int
+) -> Tensor:
+    """Mean square (N,) of the sums of residuals over cells, over that of independent pixels.
+
+    Correlated noise pulls at the levels of ring and paper by more than at an edge, which it shifts only where it
+    differs from one side to the other. What the levels themselves may take is taken off as in `overdispersion`.
+
+    Args:
+        weight: (K, P) of the pixels, by their share of the ring, or of the paper. residual: (K, P), grey levels.
+            variance: (K,) of noise. row: (K,) of ``rows``.
+    """
+    planes = weight * residual, weight.square() * variance[:, None].to(weight)
+    flat, empty = sectors.cell.flatten(), torch.zeros_like(sectors.used)
+    sums, usual = (
+        empty.flatten().scatter_add(0, flat, plane.flatten()).view(len(row), 2, -1, _CELL).sum(-1).double()
+        for plane in planes
+    )
+    chi2, freedom = _beyond_harmonics(torch.where(usual > 0, sums / usual.clamp_min(_TINY), 0.0), usual)
+    return segment_sum(chi2, row, rows) / segment_sum(freedom, row, rows).clamp_min(1)
+
+
+def _edges(rings: Tensor) -> tuple[Tensor, Tensor]:
+    """Places (K, 2, 48, 2) in px of the sectors' middles on ellipses (K, 2, 5), and normals there."""
+    angle = middles(rings.device)
+    around = torch.stack([angle.cos(), angle.sin()], -1)
+    shape = conics.shape_matrix(rings)
+    normal = torch.nn.functional.normalize(around @ torch.linalg.inv(shape), dim=-1)
+    return rings[..., None, :2] + around @ shape, normal
 
 
 def doubtful(sectors: Sectors, clear: Tensor, variance: Tensor, row: Tensor, step_chi2: Tensor, more: Tensor) -> Tensor:

@@ -1,0 +1,245 @@
+"""Poses from several cameras beside their joint Cramer-Rao bound, and whether the covariance explains the errors.
+
+    python scripts/rig_statistics.py --moments 1000 --out rigs.csv
+    python scripts/rig_statistics.py --case three-35 knocked --moments 60
+
+Simulated frames of quad40, as much of 2 megapixels as the target is in, 8 bit, noise 2, blur 0.7 px; cameras of one rig
+look at one place, 160 mm away, from angles that a case names, the first of which is 0. One row a case: moments with a
+pose, RMS error over RMS bound across and along the axis of the first camera and of the rotation, RMS errors, share of
+rows that claim 1.3 times the bound in depth or more, mean NEES (ideal 6), consistency (mean chi-squared between the
+cameras over its freedom, ideal 1).
+
+Cases end in `-places` where the rig states a covariance of its places (20 um, 0.2 mrad a camera) and every moment has
+places of its own from it. `two-markers`: each camera sees two markers of the four, at opposite corners in turns.
+`missing`: one camera has no picture, each in turn. `knocked-N`: the second camera is turned by N deviations of the
+centre of a ring at the noise of the frames, which the rig does not know.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import torchpose as tp
+from torchpose.analysis import pose_errors, rig_crlb
+from torchpose.analysis.errors import rms
+from torchpose.geometry import rotations
+from torchpose.geometry.least_squares import Pose
+from torchpose.io.writers import write_rows
+from torchpose.sim import add_noise, render
+
+F64 = torch.float64
+FOCAL, WIDTH, HEIGHT = 1111.11, 800, 720
+DISTANCE = 160.0
+NOISE, BLUR, DARK, LIGHT = 2.0, 0.7, 30.0, 220.0
+PLACE = (0.02, 2e-4)  # mm and rad, of the places of a rig that states them
+CENTER = 0.0012  # px, deviation of the centre of a ring at this noise (docs/precision.md)
+BATCH = 16
+_WIDE = 1.3  # times the bound: a claimed deviation beyond is that of a row whose cameras hardly agree
+TARGET = tp.Target.load("quad40")
+
+
+@dataclass(frozen=True)
+class Case:
+    """Angles of the cameras; ``places``: uncertain; what is missing; deviations by which one camera is turned."""
+
+    angles_deg: tuple[float, ...]
+    places: bool = False
+    missing: bool = False
+    two_markers: bool = False
+    knocked: float = 0.0
+
+
+CASES = {
+    **{f"two-{a}": Case((0, a)) for a in (5, 20, 35, 60, 90, 120)},
+    "three-35": Case((0, 35, -35)),
+    "three-60": Case((0, 60, -60)),
+    "four-40": Case((0, 40, -40, 80)),
+    **{f"two-{a}-places": Case((0, a), places=True) for a in (5, 35, 90)},
+    "three-35-places": Case((0, 35, -35), places=True),
+    "four-40-places": Case((0, 40, -40, 80), places=True),
+    "three-35-missing": Case((0, 35, -35), missing=True),
+    "three-35-two-markers": Case((0, 35, -35), two_markers=True),
+    **{f"knocked-{n}": Case((0, 35, -35), knocked=float(n)) for n in (1, 2, 5, 20)},
+}
+
+
+def rig_of(case: Case) -> tp.CameraRig:
+    """Cameras about the place where the target is."""
+    turns = torch.tensor([[0.0, math.radians(a), 0.0] for a in case.angles_deg], dtype=F64)
+    R, middle = rotations.exp(turns), torch.tensor([0.0, 0.0, DISTANCE], dtype=F64)
+    t = middle - R @ middle
+    t[0] = 0
+    others = len(case.angles_deg) - 1
+    size = torch.tensor([*[PLACE[0]] * 3, *[PLACE[1]] * 3] * others, dtype=F64)
+    camera = tp.Camera.ideal(WIDTH, HEIGHT, FOCAL)
+    return tp.CameraRig([camera] * (others + 1), R, t, torch.diag(size.square()) if case.places else None)
+
+
+def poses(case: Case, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Turned so that all cameras see it at less than 70 degrees from its normal."""
+    middle = math.radians(0.5 * (max(case.angles_deg) + min(case.angles_deg)))
+    room = 68 - 0.5 * (max(case.angles_deg) - min(case.angles_deg))
+    lean, azimuth, roll, x, y, z = torch.rand(6, count, dtype=F64, generator=generator)
+    lean, azimuth, roll = lean * math.radians(min(room, 25)), azimuth * 2 * math.pi, roll * 2 * math.pi
+    zero = torch.zeros_like(lean)
+    R = rotations.exp(torch.tensor([0.0, -middle, 0.0], dtype=F64)) @ rotations.exp(
+        torch.stack([lean * azimuth.cos(), lean * azimuth.sin(), zero], -1)
+    )
+    R = R @ rotations.exp(torch.stack([zero, zero, roll], -1))
+    return R, torch.stack([(x - 0.5) * 20, (y - 0.5) * 12, DISTANCE + (z - 0.5) * 20], -1)
+
+
+def in_view(rig: tp.CameraRig, camera: int, R: Tensor, t: Tensor, moved: Tensor) -> tuple[Tensor, Tensor]:
+    """Poses as a camera sees them whose place is off by (B, 6)."""
+    own_R, own_t = rig.seen_by(camera, R, t)
+    turn, shift = rotations.exp(moved[:, 3:]), rig.t[camera]
+    return turn @ own_R, (turn @ (own_t - shift)[..., None])[..., 0] + shift + moved[:, :3]
+
+
+def targets_of(case: Case, camera: int) -> list[tp.Target]:
+    """What a camera sees of the target: all, or two markers, turn by turn."""
+    if not case.two_markers:
+        return [TARGET]
+    pairs = ((0, 2), (1, 3), (0, 1), (2, 3))
+    seen = [pairs[(camera + k) % len(pairs)] for k in range(2)]
+    return [part_of(pair) for pair in seen]
+
+
+def part_of(markers: Sequence[int]) -> tp.Target:
+    """The target with some of its markers alone in sight: the others are behind the cameras."""
+    centers = 1e3 * TARGET.centers - torch.tensor([0.0, 0.0, 1e5], dtype=F64)
+    index = torch.tensor(markers)
+    return replace(TARGET, centers=centers.index_copy(0, index, TARGET.centers[index]))
+
+
+def pictures(case: Case, rig: tp.CameraRig, R: Tensor, t: Tensor, moved: Tensor, seed: int) -> list[Tensor]:
+    """Frames (B, H, W) of every camera."""
+    frames = []
+    for camera, lens in enumerate(rig.cameras):
+        off = torch.zeros(len(t), 6, dtype=F64) if camera == 0 else moved[:, 6 * (camera - 1) : 6 * camera]
+        own = in_view(rig, camera, R, t, off)
+        seen, imaging = targets_of(case, camera), {"psf_sigma": BLUR, "dark": DARK, "light": LIGHT}
+        parts = [slice(k, None, len(seen)) for k in range(len(seen))]
+        images = torch.empty(len(t), HEIGHT, WIDTH)
+        for part, target in zip(parts, seen, strict=True):
+            images[part] = render(lens, target, own[0][part], own[1][part], **imaging)
+        frames.append(add_noise(images, NOISE, seed=seed + camera))
+    return frames
+
+
+def bounds(case: Case, rig: tp.CameraRig, R: Tensor, t: Tensor, first: int) -> Tensor:
+    """Joint bounds (B, 6, 6); without those of cameras that have no picture, and of markers that are hidden."""
+    if not (case.missing or case.two_markers):
+        return rig_crlb(rig, TARGET, R, t, psf_sigma=BLUR, dark=DARK, light=LIGHT, noise_sigma=NOISE)
+    out = []
+    for k in range(len(t)):
+        rest = [n for n in range(len(rig)) if not case.missing or n != (first + k) % len(rig)]
+        information = torch.zeros(6, 6, dtype=F64)
+        for n in rest:
+            seen = targets_of(case, n)
+            alone = tp.CameraRig.alone(rig.cameras[n])
+            own = [x[None] for x in rig.seen_by(n, R[k], t[k])]
+            whole = _fisher_of(alone, seen[k % len(seen)], own[0], own[1])
+            turn = torch.block_diag(rig.R[n], rig.R[n])
+            information += turn.T @ whole @ turn
+        out.append(torch.linalg.inv(information))
+    return torch.stack(out)
+
+
+def _fisher_of(rig: tp.CameraRig, target: tp.Target, R: Tensor, t: Tensor) -> Tensor:
+    bound = rig_crlb(rig, target, R, t, psf_sigma=BLUR, dark=DARK, light=LIGHT, noise_sigma=NOISE)
+    return torch.linalg.inv(bound[0])
+
+
+def measure(name: str, case: Case, moments: int, seed: int) -> dict[str, Any]:
+    """The row of a case."""
+    generator = torch.Generator().manual_seed(seed)
+    rig = rig_of(case)
+    estimator = tp.PoseEstimator(rig, TARGET)
+    found, truth, bound = [], [], []
+    for first in range(0, moments, BATCH):
+        count = min(BATCH, moments - first)
+        R, t = poses(case, count, generator)
+        moved = torch.zeros(count, 6 * (len(rig) - 1), dtype=F64)
+        if case.places and rig.covariance is not None:
+            moved = torch.randn(moved.shape, dtype=F64, generator=generator) * rig.covariance.diagonal().sqrt()
+        if case.knocked:
+            moved[:, 4] = case.knocked * CENTER / FOCAL
+        seen = torch.ones(len(rig), count, dtype=torch.bool)
+        if case.missing:
+            seen[(first + torch.arange(count)) % len(rig), torch.arange(count)] = False
+        frames = pictures(case, rig, R, t, moved, seed + 1000 * first)
+        found.append(estimator(frames, seen))
+        truth.append((R, t))
+        bound.append(bounds(case, rig, R, t, first))
+        print(f"\r{name}: {first + count} of {moments}", end="", file=sys.stderr, flush=True)
+    print(file=sys.stderr)
+    return row_of(name, tp.Poses.cat(found), truth, torch.cat(bound))
+
+
+def row_of(name: str, found: tp.Poses, truth: list[tuple[Tensor, Tensor]], bound: Tensor) -> dict[str, Any]:
+    R, t = (torch.cat(parts) for parts in zip(*truth, strict=True))
+    good = found.ok.nonzero()[:, 0]
+    errors = pose_errors(found[good], Pose(R[good], t[good]))
+    variance = bound[good].diagonal(dim1=-2, dim2=-1)
+    least = [variance[:, :2].sum(-1), variance[:, 2], variance[:, 3:].sum(-1)]
+    errs = [rms(errors.lateral), rms(errors.depth), rms(errors.angle)]
+    ratios = [float(e / v.mean().sqrt()) for e, v in zip(errs, least, strict=True)]
+    disagree = int((found.reason == tp.Reason.CAMERAS_DISAGREE).sum())
+    assert found.consistency is not None
+    chi2, freedom = found.consistency[good].sum(0).tolist()
+    return {
+        "case": name,
+        "moments": len(found),
+        "ok": len(good),
+        "disagree": disagree,
+        "lateral": ratios[0],
+        "depth": ratios[1],
+        "rotation": ratios[2],
+        "lateral_um": 1e3 * float(errs[0]),
+        "depth_um": 1e3 * float(errs[1]),
+        "rotation_deg": math.degrees(float(errs[2])),
+        "widened": float((found.std[good, 2] > _WIDE * variance[:, 2].sqrt()).double().mean()),
+        "nees": float(errors.nees.mean()) if len(good) else math.nan,
+        "consistency": chi2 / freedom if freedom else math.nan,
+        "worst": float(errors.nees.max()) if len(good) else math.nan,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--case", nargs="+", choices=[*CASES, "all"], default=["all"])
+    parser.add_argument("--moments", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--out", type=Path, help="Table: .csv, .jsonl or .parquet")
+    parser.add_argument("--markdown", action="store_true", help="print a table for the documentation")
+    args = parser.parse_args()
+    rows = []
+    for name in CASES if "all" in args.case else args.case:
+        rows.append(measure(name, CASES[name], args.moments, args.seed))
+        print(
+            "  ".join(
+                f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}"
+                for key, value in rows[-1].items()
+            ),
+            flush=True,
+        )
+    if args.markdown:
+        print("| " + " | ".join(rows[0]) + " |\n|" + " --- |" * len(rows[0]))
+        for row in rows:
+            print("| " + " | ".join(f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values()) + " |")
+    if args.out is not None:
+        write_rows(args.out, rows, {key: type(value) for key, value in rows[0].items()})
+
+
+if __name__ == "__main__":
+    main()
