@@ -42,7 +42,7 @@ def test_jpeg_files_are_judged_by_their_rings(tmp_path: Path, capsys: pytest.Cap
     CAMERA.save(tmp_path / "camera.yaml")
     judged = ratios(tmp_path)
     said = capsys.readouterr().err
-    assert "0.jpg: JPEG or colour" in said
+    assert "0.jpg: JPEG, film or colour" in said
     assert "taken as srgb" in said or "taken as gamma: 2" in said
     linear, told = ratios(tmp_path, "--tone", "linear"), ratios(tmp_path, "--tone", "gamma:2.2")
     assert capsys.readouterr().err == ""

@@ -7,6 +7,7 @@ import re
 import types
 from collections.abc import Callable, Iterator
 from importlib import import_module
+from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
 import numpy as np
@@ -65,6 +66,8 @@ def good(hint: Any) -> Any:
         return option()
     if get_origin(option) in (list, Callable):
         return [] if get_origin(option) is list else len
+    if option is Path:
+        return Path()
     if option is Tensor:
         return torch.zeros(1)
     if isinstance(option, type) and issubclass(option, tuple):

@@ -46,8 +46,8 @@ def evidence(r: Tensor, t: Tensor) -> Evidence:
         flat,
         torch.ones(count, dtype=F64),
         torch.zeros(*mask.shape, 2, 2, dtype=F64),
-        torch.zeros(*mask.shape, 4, 0, dtype=F64),
-        torch.zeros(*mask.shape, 4, 0, dtype=F64),
+        torch.zeros(*mask.shape, 7, 0, dtype=F64),
+        torch.zeros(*mask.shape, 7, 0, dtype=F64),
         torch.zeros(count, dtype=F64),
         CAMERA.matrix,
     )

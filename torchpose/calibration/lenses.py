@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -12,6 +13,7 @@ from torch.nn.functional import pad
 
 from torchpose.camera import Camera
 from torchpose.camera.derivatives import by_intrinsics
+from torchpose.camera.fold import growing_radius
 
 
 def by_lens(
@@ -61,8 +63,13 @@ def count(cameras: Sequence[Camera]) -> int:
 
 
 def folds(cameras: Sequence[Camera], like: Tensor) -> Float[Tensor, " C"]:
-    """`Camera.fold_radius` of each."""
-    return like.new_tensor([camera.fold_radius for camera in cameras])
+    """Normalised radius up to which the lens of each may be looked through."""
+
+    def fold(camera: Camera) -> float:
+        d = camera.distortion.tolist()
+        return growing_radius(np.array([*d[:2], d[4]]), np.array(d[5:])) if len(d) == 8 else camera.fold_radius
+
+    return like.new_tensor([fold(camera) for camera in cameras])
 
 
 def moved_camera(camera: Camera, step: Tensor) -> Camera | None:

@@ -20,6 +20,16 @@ def polynomial_fold(k: np.ndarray) -> float:
     return math.tan(theta) if theta < math.pi / 2 else math.inf
 
 
+def growing_radius(above: np.ndarray, below: np.ndarray) -> float:
+    """The radius up to which f = r n(r^2) / q(r^2) grows and has no pole, however steep it is; arguments as below.
+
+    On the way to a lens a fit passes others that are less plausible.
+    """
+    n, q, u = Polynomial([1.0, *above]), Polynomial([1.0, *below]), Polynomial([0.0, 1.0])
+    growth = n * q + 2 * u * (n.deriv() * q - n * q.deriv())
+    return math.sqrt(min(first_root(growth), first_root(q)))
+
+
 def rational_fold(above: np.ndarray, below: np.ndarray) -> float:
     """The radius up to which f = r n(r^2) / q(r^2) has one inverse, and a plausible one; inf where it has everywhere.
 

@@ -212,11 +212,11 @@ class _Tables:
 
 
 def _check_engine(overlay: Path | None, device: str, *, on_ray: bool) -> None:
-    check_device(device)
     if overlay is not None and on_ray:
         raise ConfigError("--overlay: is not drawn by --engine ray; run a part of the frames with --engine local")
     if device != "cpu" and on_ray:
         raise ConfigError("--device: is cpu with --engine ray; leave one of them out")
+    check_device(device)
 
 
 def with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -> Camera:

@@ -134,7 +134,7 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
     path = example(path, "plans")
     file = validate(PlanFile, read_yaml(path), path)
     rig = CameraRig.load(beside(path, file.cameras)) if file.cameras else None
-    camera = Camera.load(beside(path, file.camera)) if rig is None else rig.cameras[0]
+    camera = Camera.load(beside(path, file.camera or "")) if rig is None else rig.cameras[0]
     target = Target.load(beside(path, file.target))
     if file.faults:
         with within(f"{path}: "):

@@ -268,8 +268,8 @@ def _small(value: Any) -> bool:
 class PlanFile(_Section):
     """A plan file, see docs/simulation.md; ``camera`` or, with poses in the first of them, ``cameras``."""
 
-    camera: Word = ""
-    cameras: Word = ""
+    camera: Word | None = None
+    cameras: Word | None = None
     target: Word
     seed: Seed = 0
     poses: Poses

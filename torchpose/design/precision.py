@@ -150,6 +150,7 @@ def precision_map(camera: Camera, target: Target, volume: WorkingVolume, imaging
     return PrecisionMap(distance, tilt, by_tilt, x, y, places.view(len(y), len(x), 3))
 
 
+@checked
 def surroundings(volume: WorkingVolume) -> WorkingVolume:
     """The volume, with a range of distance where it has a single one, and tilts where it has none."""
     near, far = volume.distance

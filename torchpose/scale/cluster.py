@@ -45,8 +45,10 @@ def cluster(address: str | None, workers: int) -> Iterator[Workers]:
     if address is not None:
         _check_answers(address)
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR, "include_dashboard": False}
-    own = {"num_cpus": workers} if address is None else {"address": address}
-    if address is not None:
+    own: dict[str, Any] = {"address": address or "local"}  # not one that happens to run here
+    if address is None:
+        own["num_cpus"] = workers
+    else:
         del quiet["include_dashboard"]
     try:
         ray.init(**own, **quiet)

@@ -134,7 +134,7 @@ def _users(place: Place) -> Any:
     from asyncua.crypto.permission_rules import User, UserRole
     from asyncua.server.user_managers import UserManager
 
-    class Users(UserManager):
+    class Users(UserManager):  # type: ignore[misc,unused-ignore]  # where asyncua is not installed
         def get_user(
             self, iserver: Any, username: str | None = None, password: str | None = None, certificate: Any = None
         ) -> User | None:
