@@ -278,7 +278,7 @@ def test_refined_poses_follow_the_intrinsics_as_predicted(method: Literal["photo
     r = rotations.exp(torch.tensor([[0.4, 0.3, 0.5], [0.6, -0.1, 1.0]], dtype=F64))
     t = torch.tensor([[10.0, -20, 160], [-20, 10, 200]], dtype=F64)
     # with noise, beside which a matrix so little off is none that residuals show
-    frames = add_noise(render(camera, target, r, t), 2.0)
+    frames = add_noise(render(camera, target, r, t), 3.0)
 
     def solved(matrix: Tensor, covariance: Tensor | None = None) -> tp.Poses:
         changed = dataclasses.replace(camera, matrix=matrix, covariance=covariance)
