@@ -13,10 +13,10 @@ import statistics
 import time
 from collections.abc import Callable
 
+import rig_statistics as rigs
 import torch
 
 import torchpose as tp
-from scripts import rig_statistics as rigs
 from torchpose.sim import add_noise, render
 
 CASES = {2: (0.0, 35.0), 3: (0.0, 35.0, -35.0), 4: (0.0, 40.0, -40.0, 80.0)}

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -225,6 +226,16 @@ def row_of(cameras: int, moments: int, sets: int, *, rendered: bool = False) -> 
     }
 
 
+def print_rows(rows: Sequence[Mapping[str, float]], *, markdown: bool) -> None:
+    """Prints rows of one set of columns, as a table for the documentation or one a line."""
+    if markdown:
+        print("| " + " | ".join(rows[0]) + " |\n|" + " ---: |" * len(rows[0]))
+        print("\n".join("| " + " | ".join(f"{value:.3g}" for value in row.values()) + " |" for row in rows))
+    else:
+        for row in rows:
+            print("  ".join(f"{name} {value:.3g}" for name, value in row.items()))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cameras", type=int, nargs="+", default=[*RIGS], choices=[*RIGS])
@@ -235,13 +246,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     rows = [row_of(n, options.moments, options.sets, rendered=options.rendered) for n in options.cameras]
-    cells = [[f"{value:.3g}" for value in row.values()] for row in rows]
-    if options.markdown:
-        print("| " + " | ".join(rows[0]) + " |\n|" + " ---: |" * len(rows[0]))
-        print("\n".join("| " + " | ".join(row) + " |" for row in cells))
-    else:
-        for row in rows:
-            print("  ".join(f"{name} {value:.3g}" for name, value in row.items()))
+    print_rows(rows, markdown=options.markdown)
 
 
 if __name__ == "__main__":

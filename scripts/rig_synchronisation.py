@@ -14,9 +14,10 @@ import argparse
 from typing import Any
 
 import torch
+from rig_calibration_statistics import print_rows
+from rig_statistics import BLUR, CASES, DARK, LIGHT, NOISE, TARGET, poses, rig_of
 
 import torchpose as tp
-from scripts.rig_statistics import BLUR, CASES, DARK, LIGHT, NOISE, TARGET, poses, rig_of
 from torchpose.results import Reason
 from torchpose.sim import add_noise, render
 
@@ -61,13 +62,7 @@ def main() -> None:
     torch.set_num_threads(1)
     with torch.inference_mode():
         rows = [row_of(way, options.moments, options.seed) for way in WAYS_UM]
-    cells = [[f"{value:.3g}" for value in row.values()] for row in rows]
-    if options.markdown:
-        print("| " + " | ".join(rows[0]) + " |\n|" + " ---: |" * len(rows[0]))
-        print("\n".join("| " + " | ".join(row) + " |" for row in cells))
-    else:
-        for row in rows:
-            print("  ".join(f"{name} {value:.3g}" for name, value in row.items()))
+    print_rows(rows, markdown=options.markdown)
 
 
 if __name__ == "__main__":

@@ -20,13 +20,18 @@ def polynomial_fold(k: np.ndarray) -> float:
     return math.tan(theta) if theta < math.pi / 2 else math.inf
 
 
+def _ratio(above: np.ndarray, below: np.ndarray) -> tuple[Polynomial, Polynomial, Polynomial]:
+    """n and q of f = r n(r^2) / q(r^2), and the numerator of df / dr, all in u = r^2."""
+    n, q, u = Polynomial([1.0, *above]), Polynomial([1.0, *below]), Polynomial([0.0, 1.0])
+    return n, q, n * q + 2 * u * (n.deriv() * q - n * q.deriv())
+
+
 def growing_radius(above: np.ndarray, below: np.ndarray) -> float:
     """The radius up to which f = r n(r^2) / q(r^2) grows and has no pole, however steep it is; arguments as below.
 
     On the way to a lens a fit passes others that are less plausible.
     """
-    n, q, u = Polynomial([1.0, *above]), Polynomial([1.0, *below]), Polynomial([0.0, 1.0])
-    growth = n * q + 2 * u * (n.deriv() * q - n * q.deriv())
+    _, q, growth = _ratio(above, below)
     return math.sqrt(min(first_root(growth), first_root(q)))
 
 
@@ -43,9 +48,7 @@ def rational_fold(above: np.ndarray, below: np.ndarray) -> float:
         above: the coefficients of n behind its constant 1.
         below: those of q.
     """
-    n, q, u = Polynomial([1.0, *above]), Polynomial([1.0, *below]), Polynomial([0.0, 1.0])
-    # numerator of d f / dr over r
-    growth = n * q + 2 * u * (n.deriv() * q - n * q.deriv())
+    n, q, growth = _ratio(above, below)
     fold, pole = first_root(growth), first_root(q)
     steep = growth - _STEEPEST * n * q
     spike = first_root(steep) if np.any(below) else math.inf
