@@ -88,7 +88,7 @@ def points(camera: tp.Camera) -> list[Point]:
         *sweep("blur, px", "gaussian blur", (0.7, 1.0, 1.5, 2.0, 3.0, 5.0)),
         *sweep("motion, px", "motion", (1.0, 3.0, 6.0, 9.0, 12.0)),
         *sweep("noise, grey levels", "noise", (0.5, 2.0, 5.0, 15.0, 30.0, 45.0)),
-        *sweep("contrast, % of range", "low contrast", (0.75, 0.3, 0.15, 0.06)),
+        *sweep("contrast, share of range", "low contrast", (0.75, 0.3, 0.15, 0.06)),
     ]
 
 

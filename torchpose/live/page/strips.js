@@ -190,10 +190,11 @@ function ticks(low, high, log) {
       for (const digit of [1, 2, 5]) found.push(digit * 10 ** power);
     const inside = found.filter((v) => v > low && v < high);
     const decades = inside.filter((v) => Math.abs(Math.log10(v) % 1) < 1e-9);
-    return inside.length > 4 ? (decades.length ? decades : inside.slice(0, 3)) : inside;
+    if (inside.length > 1) return inside.length > 4 && decades.length > 1 ? decades : inside.slice(0, 4);
   }
-  const rough = (high - low) / 3, power = 10 ** Math.floor(Math.log10(rough));
-  const step = [1, 2, 5, 10].map((n) => n * power).find((n) => n >= rough);
+  // the largest round step of which two numbers are in sight, so that there is a scale
+  const power = 10 ** Math.ceil(Math.log10(high - low));
+  const step = [1, 0.5, 0.2, 0.1, 0.05].map((n) => n * power).find((n) => Math.floor(high / n) - Math.ceil(low / n) >= 1);
   const found = [];
   for (let at = Math.ceil(low / step) * step; at < high; at += step) found.push(Math.abs(at) < step / 1e6 ? 0 : at);
   return found;
