@@ -41,6 +41,7 @@ from peer_boards import DARK, NO_APRILTAG, TAG_MM, Contender, Pose, apriltag_det
 
 import torchpose as tp
 from torchpose.geometry import rotations
+from torchpose.report.figures import PlainLog
 from torchpose.sim import shapes
 
 CAMERA = Path(__file__).parents[1] / "data" / "sample" / "camera.yaml"
@@ -198,6 +199,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
             if part:
                 panel.plot(*zip(*part, strict=True), linestyle="none", **style | {"markerfacecolor": "white"})
         panel.set(xlabel=axis, yscale="log")
+        panel.yaxis.set_major_formatter(PlainLog())
         if axis.startswith(("plate", "contrast")):
             panel.set_xscale("log")
             values = sorted({r["value"] for r in rows if r["axis"] == axis})

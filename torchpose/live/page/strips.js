@@ -129,7 +129,6 @@ class Strips {
     if (wanted) {
       pen.strokeStyle = colour("ink"); pen.setLineDash([4, 3]);
       pen.beginPath(); pen.moveTo(GUTTER, y(wanted)); pen.lineTo(width, y(wanted)); pen.stroke(); pen.setLineDash([]);
-      pen.fillStyle = colour("ink"); pen.fillText("wanted", width - 2, y(wanted) < 14 ? y(wanted) + 8 : y(wanted) - 7);
     }
     for (const line of lines) {
       pen.strokeStyle = pen.fillStyle = colour(line.axis);
@@ -152,7 +151,7 @@ class Strips {
       pen.fillRect(left, height - 3, Math.max(1, x(p[P.time]) - left), 3);
       before = p[P.time];
     }
-    range.textContent = strip.unit;
+    range.textContent = wanted ? `dashes: wanted · ${strip.unit}` : strip.unit;
     const now = points[points.length - 1];
     legend.replaceChildren(...lines.map((line) => {
       const item = document.createElement("li"), name = document.createElement("b"), value = document.createElement("span");
