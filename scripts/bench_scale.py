@@ -1,14 +1,18 @@
-"""What one machine and a Ray cluster on it do: frames a second, lost nodes, a store that fails now and then.
+"""What one machine and a Ray cluster on it do: frames a second, lost nodes, a store that fails; what a day costs.
 
-    python scripts/bench_scale.py throughput [--frames 2000]     # workers of one core, beside the local engine
+    python scripts/bench_scale.py throughput [--frames 2000]     # workers of one core beside local ones: 5 minutes
     python scripts/bench_scale.py loss [--runs 20]               # two of three nodes killed at random moments
     python scripts/bench_scale.py store [--frames 10000]         # an S3 server on the loopback, 2 % of requests fail
+    python scripts/bench_scale.py costs --price 0.05             # of a million to a billion frames, by arithmetic
 
 Figures of docs/scale.md. Needs the extras ray and dev. Commands run as a user types them, in processes of their own.
+`throughput` keeps what it measures in docs/benchmarks/scale.json (--figures), which `costs` reads.
 """
 
 import argparse
+import contextlib
 import json
+import math
 import os
 import random
 import subprocess
@@ -18,40 +22,41 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from torchpose.camera import Camera
 from torchpose.io.rows import POSE_SCHEMA, Row
 from torchpose.io.writers import read_table
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 SAMPLE = ROOT / "data" / "sample"
+FIGURES = ROOT / "docs" / "benchmarks" / "scale.json"
+BATCH = 16  # frames of 2 MP, `torchpose.io.reader.default_batch`
 SMALL = 320, 240  # px, of the frames of the store
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("what", choices=("throughput", "loss", "store"))
+    parser.add_argument("what", choices=("throughput", "loss", "store", "costs"))
     parser.add_argument("--frames", type=int, help="by default 2000, 400 and 10000")
     parser.add_argument("--runs", type=int, default=20, help="of loss")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--figures", type=Path, default=FIGURES, help="what throughput measures, for costs")
+    parser.add_argument("--price", type=float, default=1.0, help="of a core-hour, for costs")
     arguments = parser.parse_args()
+    arguments.load = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as folder:
-        {"throughput": throughput, "loss": loss, "store": store}[arguments.what](Path(folder), arguments)
+        {"throughput": throughput, "loss": loss, "store": store, "costs": costs}[arguments.what](
+            Path(folder), arguments
+        )
 
 
 def command(frames: str | Path, out: str | Path, *options: str, sample: Path = SAMPLE) -> list[str]:
     files = ["--camera", str(sample / "camera.yaml"), "--target", str(sample / "target.yaml")]
     return [sys.executable, "-m", "torchpose", "estimate", str(frames), *files, "--out", str(out), "-q", *options]
-
-
-def timed(arguments: Sequence[str]) -> float:
-    """Seconds of a command that succeeds."""
-    start = time.perf_counter()
-    subprocess.run(arguments, check=True, stderr=subprocess.DEVNULL)
-    return time.perf_counter() - start
 
 
 def linked(folder: Path, count: int) -> Path:
@@ -67,27 +72,128 @@ def rows(path: Path) -> list[Row]:
     return read_table(path, POSE_SCHEMA, ["frame"])
 
 
+def busy_seconds() -> float:
+    """Core seconds that this machine has worked so far, at nice 0 or above; NaN where that is not told."""
+    try:
+        user, _, system = Path("/proc/stat").read_text().split()[1:4]
+    except OSError:
+        return float("nan")
+    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
+
+
+def worker_bytes() -> int:
+    """Resident set of the largest worker of Ray that runs here."""
+    largest = 0
+    for process in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError, IndexError):
+            if (process / "cmdline").read_bytes().startswith(b"ray::MapWorker"):
+                pages = int((process / "statm").read_text().split()[1])
+                largest = max(largest, pages * os.sysconf("SC_PAGE_SIZE"))
+    return largest
+
+
+class Run(NamedTuple):
+    """Of a command: seconds, cores that were busy meanwhile, largest resident set of a worker of Ray in MB."""
+
+    seconds: float
+    cores: float
+    worker_mb: int
+
+
+def timed(arguments: Sequence[str]) -> Run:
+    """A command that succeeds."""
+    start, busy, largest = time.perf_counter(), busy_seconds(), 0
+    with subprocess.Popen(arguments, stderr=subprocess.DEVNULL) as process:
+        while process.poll() is None:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(1.0)
+            largest = max(largest, worker_bytes())
+    if process.returncode:
+        raise SystemExit(f"{' '.join(arguments)}: exit {process.returncode}")
+    taken = time.perf_counter() - start
+    return Run(taken, (busy_seconds() - busy) / taken, largest >> 20)
+
+
+ENGINES = {
+    "local, 1 core": ["--threads", "1"],
+    "local, 2 cores": ["--threads", "2"],
+    "ray, 1 worker": ["--engine", "ray", "--threads", "1"],
+    "ray, 2 workers": ["--engine", "ray", "--threads", "2"],
+}
+
+
 def throughput(folder: Path, arguments: argparse.Namespace) -> None:
-    """Frames a second of one and two workers, start and end of the cluster left out by a run of few frames."""
-    count = arguments.frames or 2000
-    many, few = linked(folder / "many", count), linked(folder / "few", 32)
-    seconds: dict[str, float] = {}
-    for name, options in {
-        "local, 2 threads": ["--threads", "2"],
-        "local, 1 thread": ["--threads", "1"],
-        "ray, 1 worker": ["--engine", "ray", "--threads", "1"],
-        "ray, 2 workers": ["--engine", "ray", "--threads", "2"],
-    }.items():
-        taken = []
-        for number, frames in enumerate((few, many)):
-            taken.append(timed(command(frames, folder / f"{name}{number}.parquet", *options)))
-        seconds[name] = taken[1] - taken[0]
-        print(f"{name}: {(count - 32) / seconds[name]:.1f} frames/s ({taken[1]:.0f} s in all, {taken[0]:.0f} s of 32)")
-    print(f"two workers over one: {seconds['ray, 1 worker'] / seconds['ray, 2 workers']:.2f}")
-    print(f"ray over local, two cores: {seconds['ray, 2 workers'] / seconds['local, 2 threads']:.2f} of its time")
-    own, other = rows(folder / "local, 1 thread1.parquet"), rows(folder / "ray, 2 workers1.parquet")
-    by_name = {row["frame"]: row for row in other}
-    print(f"rows equal to the last digit: {sum(by_name.get(row['frame']) == row for row in own)} of {count}")
+    """Frames a second of one and two cores by both engines: of the whole command, and without its start and end.
+
+    The start is what a run of few frames takes beyond them: two batches, one for each of two workers.
+    """
+    count, few = arguments.frames or 2000, 2 * BATCH
+    many = linked(folder / "many", count)
+    little = linked(folder / "few", few)
+    steady, whole, starts, worker_mb = {}, {}, {}, 0
+    print("engine          frames/s  whole command  start s  busy cores")
+    for name, options in ENGINES.items():
+        short, long = (timed(command(f, folder / f"{name}{f.name}.parquet", *options)) for f in (little, many))
+        steady[name] = (count - few) / (long.seconds - short.seconds)
+        whole[name], starts[name] = count / long.seconds, long.seconds - count / steady[name]
+        worker_mb = max(worker_mb, long.worker_mb)
+        print(
+            f"{name:15} {steady[name]:8.1f} {whole[name]:14.1f} {starts[name]:8.1f} {long.cores:11.2f}",
+            flush=True,
+        )
+    for what, rate in (("without start", steady), ("whole command", whole)):
+        print(
+            f"{what}: two workers over one {rate['ray, 2 workers'] / rate['ray, 1 worker']:.2f} (at least 1.7), "
+            f"time of two workers over that of two local cores {rate['local, 2 cores'] / rate['ray, 2 workers']:.2f} "
+            "(at most 1.15)"
+        )
+    own = rows(folder / f"local, 1 core{many.name}.parquet")
+    same = {row["frame"]: row for row in rows(folder / f"ray, 2 workers{many.name}.parquet")}
+    print(f"rows equal to the last digit: {sum(same.get(row['frame']) == row for row in own)} of {count}")
+    parts = folder / f"ray, 2 workers{many.name}.parquet"
+    pictures = [path.stat().st_size for path in many.iterdir()]
+    camera = Camera.load(SAMPLE / "camera.yaml")
+    figures = {
+        "frames": count,
+        "megapixels": round(camera.width * camera.height / 1e6, 1),
+        "frames/s and core": round(steady["local, 1 core"], 1),
+        "share of it on Ray": round(steady["ray, 2 workers"] / (2 * steady["local, 1 core"]), 3),
+        "start s": round(starts["ray, 2 workers"], 1),
+        "worker MB": worker_mb,
+        "bytes a picture": sum(pictures) // count,
+        "bytes a row": sum(path.stat().st_size for path in parts.iterdir()) // count,
+        "load before": arguments.load,
+    }
+    arguments.figures.write_text(json.dumps(figures, indent=1) + "\n")
+    print(json.dumps(figures))
+
+
+def costs(folder: Path, arguments: argparse.Namespace) -> None:
+    """What a day of so many frames needs, by arithmetic from what `throughput` has measured."""
+    measured = json.loads(arguments.figures.read_text())
+    rate = measured["frames/s and core"] * measured["share of it on Ray"]
+    print(
+        f"{measured['megapixels']} MP, {rate:.1f} frames/s and core on Ray, {measured['worker MB']} MB a core, "
+        f"{measured['bytes a picture'] / 1e6:.2f} MB a picture, {measured['bytes a row']} bytes a row; "
+        f"a core-hour costs {arguments.price:g}\n"
+    )
+    print("| frames a day | cores | memory GB | from the store MB/s | pictures/s | rows GB a day | a day costs |")
+    print("|---|---|---|---|---|---|---|")
+    for frames in (10**6, 10**7, 10**8, 10**9):
+        a_second = frames / 86400
+        cores = math.ceil(a_second / rate)
+        print(
+            f"| {frames:.0e} | {cores} | {cores * measured['worker MB'] / 1e3:.0f} "
+            f"| {a_second * measured['bytes a picture'] / 1e6:.0f} | {a_second:.0f} "
+            f"| {frames * measured['bytes a row'] / 1e9:.1f} | {a_second / rate * 24 * arguments.price:.2f} |"
+        )
+    print("\n| machines of 16 cores | Ray is quicker than one of them from | that is |")
+    print("|---|---|---|")
+    for machines in (2, 4, 16):
+        # n / r = s + n / (m e r): the machine of 16 cores against m of them, which start later
+        alone = 16 * measured["frames/s and core"]
+        frames = measured["start s"] * alone / (1 - 1 / (machines * measured["share of it on Ray"]))
+        print(f"| {machines} | {frames:.0f} frames | {frames / alone:.0f} s of one machine |")
 
 
 def loss(folder: Path, arguments: argparse.Namespace) -> None:
@@ -159,7 +265,6 @@ def small_sample(folder: Path) -> np.ndarray:
     """A small frame, with camera.yaml and target.yaml beside it."""
     import torch
 
-    from torchpose.camera import Camera
     from torchpose.sim import add_noise, render
     from torchpose.target import Target
 

@@ -26,6 +26,7 @@ _NATIVE = ("s3", "gs", "gcs", "hdfs", "abfs", "abfss")  # that Arrow serves itse
 _PIECE = 1 << 16  # bytes (convention)
 _BUCKETS = ("s3", "gs", "gcs")
 _OPTIONS = ("endpoint_override", "region", "scheme")  # of an S3 URL; others could hold secrets
+REQUESTS = 4  # of a process to a store at once (convention): they wait for answers, not for its core
 _TRIES, _CONNECT, _ANSWER = 5, 10.0, 60.0  # of S3 (convention): tries, seconds to connect and to answer
 # what S3 and its kin say, in words; the rest is told as a store that does not answer
 _ANSWERS = {
