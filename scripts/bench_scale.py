@@ -12,6 +12,7 @@ Figures of docs/scale.md. Needs the extras ray and dev. Commands run as a user t
 import argparse
 import contextlib
 import json
+import logging
 import math
 import os
 import random
@@ -21,6 +22,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,6 +30,7 @@ import numpy as np
 
 from torchpose.camera import Camera
 from torchpose.io.rows import POSE_SCHEMA, Row
+from torchpose.io.storage import Place
 from torchpose.io.writers import read_table
 
 ROOT = Path(__file__).parents[1]
@@ -92,26 +95,36 @@ def worker_bytes() -> int:
     return largest
 
 
+def peak_mb(process: int) -> int:
+    """Largest resident set so far of a process that runs, MB; 0 where there is none."""
+    with contextlib.suppress(OSError):
+        for line in Path(f"/proc/{process}/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) >> 10
+    return 0
+
+
 class Run(NamedTuple):
-    """Of a command: seconds, cores that were busy meanwhile, largest resident set of a worker of Ray in MB."""
+    """Of a command: seconds, cores that were busy meanwhile, largest resident sets of it and of a worker of Ray, MB."""
 
     seconds: float
     cores: float
+    mb: int
     worker_mb: int
 
 
 def timed(arguments: Sequence[str]) -> Run:
     """A command that succeeds."""
-    start, busy, largest = time.perf_counter(), busy_seconds(), 0
+    start, busy, own, worker = time.perf_counter(), busy_seconds(), 0, 0
     with subprocess.Popen(arguments, stderr=subprocess.DEVNULL) as process:
         while process.poll() is None:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(1.0)
-            largest = max(largest, worker_bytes())
+            own, worker = max(own, peak_mb(process.pid)), max(worker, worker_bytes() >> 20)
     if process.returncode:
         raise SystemExit(f"{' '.join(arguments)}: exit {process.returncode}")
     taken = time.perf_counter() - start
-    return Run(taken, (busy_seconds() - busy) / taken, largest >> 20)
+    return Run(taken, (busy_seconds() - busy) / taken, own, worker)
 
 
 ENGINES = {
@@ -229,36 +242,45 @@ def loss(folder: Path, arguments: argparse.Namespace) -> None:
 
 
 def store(folder: Path, arguments: argparse.Namespace) -> None:
-    """Small frames from and to a store; memory of the driver with a tenth of them and with all."""
+    """Small frames from and to a store, by both engines; memory of the command with a tenth of them and with all."""
     import cv2
 
     from tests.io.stores import ENVIRONMENT, s3_server
-    from torchpose.io.storage import Place
 
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)
     count, picture = arguments.frames or 10000, cv2.imencode(".png", small_sample(folder))[1].tobytes()
-    with s3_server("cell", every=50) as (url, application):
-        os.environ.update(ENVIRONMENT | {"AWS_ENDPOINT_URL": url})
+    with s3_server("cell", every=0) as (url, application):
+        os.environ.update(ENVIRONMENT | {"AWS_ENDPOINT_URL": url, "XDG_CACHE_HOME": str(folder)})
         for share in (10, 1):
-            for number in range(count // share):
-                (Place(f"s3://cell/{share}") / f"{number:06d}.png").write(picture)
-            before = application.asked, application.failed
-            out = Place(f"s3://cell/out/{share}.parquet")
-            driver = command(f"s3://cell/{share}", str(out), "--engine", "ray", "--threads", "2", sample=folder)
-            start = time.perf_counter()
-            _, status, used = os.wait4(subprocess.Popen(driver).pid, 0)
-            table = folder / f"{share}.parquet"
-            table.mkdir()
-            for one in out.listed():
-                (table / one.name).write_bytes((out / one.name).read(1 << 30))
-            found = Counter(row["frame"] for row in rows(table))
-            print(
-                f"{count // share} frames: exit {os.waitstatus_to_exitcode(status)}, "
-                f"{time.perf_counter() - start:.0f} s, "
-                f"{len(found)} of them have rows, {sum(found.values()) - len(found)} twice, "
-                f"{application.failed - before[1]} of {application.asked - before[0]} requests failed, "
-                f"driver {used.ru_maxrss // 1024} MB",
-                flush=True,
-            )
+            with ThreadPoolExecutor(8) as pool:
+                places = [Place(f"s3://cell/{share}") / f"{number:06d}.png" for number in range(count // share)]
+                list(pool.map(lambda place: place.write(picture), places))
+        application._every = 50
+        for engine in ("local", "ray"):
+            for share in (10, 1):
+                before = application.asked, application.failed
+                out = Place(f"s3://cell/out/{engine}{share}.parquet")
+                options = ["--engine", engine, "--threads", "2"]
+                run = timed(command(f"s3://cell/{share}", str(out), *options, sample=folder))
+                found = Counter(row["frame"] for row in rows(fetched(out, folder / f"{engine}{share}.parquet")))
+                print(
+                    f"{engine}, {count // share} frames: {run.seconds:.0f} s, "
+                    f"{len(found)} of them have rows, {sum(found.values()) - len(found)} twice, "
+                    f"{application.failed - before[1]} of {application.asked - before[0]} requests failed, "
+                    f"command {run.mb} MB",
+                    flush=True,
+                )
+
+
+def fetched(table: Place, copy: Path) -> Path:
+    """A copy of a table, or of one in parts, here."""
+    if table.kind() == "file":
+        copy.write_bytes(table.read(1 << 30))
+        return copy
+    copy.mkdir()
+    for one in table.listed():
+        (copy / one.name).write_bytes((table / one.name).read(1 << 30))
+    return copy
 
 
 def small_sample(folder: Path) -> np.ndarray:

@@ -262,9 +262,9 @@ def _file_system(scheme: str, netloc: str, query: str) -> "fs.FileSystem":
                 given["region"] = fs.resolve_s3_region(netloc)
         retry = fs.AwsStandardS3RetryStrategy(max_attempts=_TRIES)
         named = {name: value for name, value in given.items() if value}
-        return fs.S3FileSystem(
-            **named, retry_strategy=retry, connect_timeout=_CONNECT, request_timeout=_ANSWER, background_writes=False
-        )
+        # a small file is sent in one request rather than in three
+        how = {"background_writes": False, "allow_delayed_open": True}
+        return fs.S3FileSystem(**named, retry_strategy=retry, connect_timeout=_CONNECT, request_timeout=_ANSWER, **how)
     if scheme in _NATIVE:
         with _told():
             return fs.FileSystem.from_uri(f"{scheme}://{netloc}/")[0]
