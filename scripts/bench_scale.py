@@ -221,10 +221,10 @@ def loss(folder: Path, arguments: argparse.Namespace) -> None:
         out = folder / f"{run}.parquet"
         options = ["--engine", "ray", "--batch", "4", "--method", "centers"]
         task = subprocess.Popen(command(frames, out, *options, "--address", cluster.address))
-        moments = sorted(draw.uniform(5, 40) for _ in nodes)
-        start = time.perf_counter()
+        moments = sorted(draw.uniform(0, 0.9) for _ in nodes)  # share of the blocks that is done
         for node, moment in zip(nodes, moments, strict=True):
-            time.sleep(max(0.0, moment - (time.perf_counter() - start)))
+            while task.poll() is None and len(list(out.glob("part-*"))) < moment * count / 4:
+                time.sleep(0.1)
             whole["killed while it ran"] += task.poll() is None
             cluster.remove_node(node, allow_graceful=False)
         code = task.wait()
@@ -236,7 +236,7 @@ def loss(folder: Path, arguments: argparse.Namespace) -> None:
         whole["rows lost"] += count - len(found)
         whole["rows twice"] += sum(found.values()) - len(found)
         print(
-            f"run {run}: killed after {', '.join(f'{m:.0f}' for m in moments)} s, exit {code}: {dict(whole)}",
+            f"run {run}: killed at {', '.join(f'{m:.0%}' for m in moments)}, exit {code}: {dict(whole)}",
             flush=True,
         )
 
