@@ -21,7 +21,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -181,32 +181,62 @@ def throughput(folder: Path, arguments: argparse.Namespace) -> None:
     print(json.dumps(figures))
 
 
+class Needs(NamedTuple):
+    """Of a day of frames: cores, their memory in GB, what a store sends (MB/s, pictures/s) and keeps (GB), its price."""
+
+    cores: int
+    memory: float
+    bandwidth: float
+    pictures: float
+    rows: float
+    price: float
+
+
+def needs(frames: int, measured: Mapping[str, float], price: float) -> Needs:
+    """Of so many frames a day, by arithmetic from what `throughput` has measured and the price of a core-hour."""
+    rate, a_second = measured["frames/s and core"] * measured["share of it on Ray"], frames / 86400
+    cores = math.ceil(a_second / rate)
+    return Needs(
+        cores,
+        cores * measured["worker MB"] / 1e3,
+        a_second * measured["bytes a picture"] / 1e6,
+        a_second,
+        frames * measured["bytes a row"] / 1e9,
+        a_second / rate * 24 * price,
+    )
+
+
+def pays_from(machines: int, cores: int, measured: Mapping[str, float]) -> float:
+    """Frames from which so many machines with Ray are done before one of them is with the local engine; inf: never.
+
+    n / r = s + n / (m e r): frames n, frames/s of a machine r, start of Ray s, m machines, share of their work e.
+    """
+    rate, gain = cores * measured["frames/s and core"], machines * measured["share of it on Ray"]
+    return measured["start s"] * rate / (1 - 1 / gain) if gain > 1 else math.inf
+
+
 def costs(folder: Path, arguments: argparse.Namespace) -> None:
-    """What a day of so many frames needs, by arithmetic from what `throughput` has measured."""
+    """The tables of docs/scale.md."""
     measured = json.loads(arguments.figures.read_text())
-    rate = measured["frames/s and core"] * measured["share of it on Ray"]
     print(
-        f"{measured['megapixels']} MP, {rate:.1f} frames/s and core on Ray, {measured['worker MB']} MB a core, "
+        f"{measured['megapixels']} MP, {measured['frames/s and core']} frames/s and core, "
+        f"{measured['share of it on Ray']:.0%} of that on Ray, {measured['worker MB']} MB a worker, "
         f"{measured['bytes a picture'] / 1e6:.2f} MB a picture, {measured['bytes a row']} bytes a row; "
         f"a core-hour costs {arguments.price:g}\n"
     )
-    print("| frames a day | cores | memory GB | from the store MB/s | pictures/s | rows GB a day | a day costs |")
+    print("| frames a day | cores | memory, GB | from the store, MB/s | pictures/s | rows, GB a day | a day costs |")
     print("|---|---|---|---|---|---|---|")
-    for frames in (10**6, 10**7, 10**8, 10**9):
-        a_second = frames / 86400
-        cores = math.ceil(a_second / rate)
+    for power in (6, 7, 8, 9):
+        need = needs(10**power, measured, arguments.price)
         print(
-            f"| {frames:.0e} | {cores} | {cores * measured['worker MB'] / 1e3:.0f} "
-            f"| {a_second * measured['bytes a picture'] / 1e6:.0f} | {a_second:.0f} "
-            f"| {frames * measured['bytes a row'] / 1e9:.1f} | {a_second / rate * 24 * arguments.price:.2f} |"
+            f"| 10^{power} | {need.cores} | {need.memory:.0f} | {need.bandwidth:.0f} | {need.pictures:.0f} | "
+            f"{need.rows:.1f} | {need.price:.1f} |"
         )
-    print("\n| machines of 16 cores | Ray is quicker than one of them from | that is |")
+    print("\n| machines of 16 cores | quicker on Ray than one of them from | which it does in |")
     print("|---|---|---|")
     for machines in (2, 4, 16):
-        # n / r = s + n / (m e r): the machine of 16 cores against m of them, which start later
-        alone = 16 * measured["frames/s and core"]
-        frames = measured["start s"] * alone / (1 - 1 / (machines * measured["share of it on Ray"]))
-        print(f"| {machines} | {frames:.0f} frames | {frames / alone:.0f} s of one machine |")
+        frames = pays_from(machines, 16, measured)
+        print(f"| {machines} | {frames:.0f} frames | {frames / 16 / measured['frames/s and core']:.0f} s |")
 
 
 def loss(folder: Path, arguments: argparse.Namespace) -> None:

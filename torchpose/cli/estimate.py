@@ -130,7 +130,6 @@ def estimate(
         rest, several = partial(estimation, stated), {**how, "tone": stated["tone"]}
         return estimate_moments(cameras, places, rest, tables.out, several)
     sources = frames_of(places, listed)
-    _check_films(sources, on_ray=on_ray)
     work = estimation(stated, sources)
     check_outputs([*places, *listed], sources, tables.paths, overlay)
     with native_stderr_silenced():
@@ -220,9 +219,10 @@ def _check_engine(overlay: Path | None, device: str, *, on_ray: bool) -> None:
     check_device(device)
 
 
-def _check_films(sources: Sequence[Source], *, on_ray: bool) -> None:
+def _check_shared(sources: Sequence[Source]) -> None:
+    """Raises ConfigError unless workers can share the sources."""
     film = next((source for source in sources if source.film), None)
-    if film is not None and on_ray:
+    if film is not None:
         raise ConfigError(
             f"{film.path}: --engine ray: a film is decoded from its beginning, so workers cannot share it; use "
             "--engine local"
@@ -350,6 +350,7 @@ def _run_on_ray(
     from torchpose.scale.estimate import measured, pending
     from torchpose.scale.parts import Parts
 
+    _check_shared(sources)
     poses, marks = Parts.at(tables.out, work.schema), None
     if tables.detections is not None:
         marks = Parts.at(tables.detections, DETECTION_SCHEMA, "--detections")
