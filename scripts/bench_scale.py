@@ -182,7 +182,7 @@ def throughput(folder: Path, arguments: argparse.Namespace) -> None:
 
 
 class Needs(NamedTuple):
-    """Of a day of frames: cores, their memory in GB, what a store sends (MB/s, pictures/s) and keeps (GB), its price."""
+    """Of a day of frames: cores, their memory in GB, what stores send (MB/s, pictures/s) and keep (GB), price."""
 
     cores: int
     memory: float
