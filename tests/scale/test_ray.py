@@ -17,8 +17,12 @@ from tests.io.stores import ENVIRONMENT, s3_server
 from torchpose.cli.main import main
 from torchpose.io import storage
 from torchpose.io.rows import DETECTION_SCHEMA, POSE_SCHEMA, Row
+from torchpose.io.sources import find_sources
 from torchpose.io.storage import Place
+from torchpose.io.tally import Tally
 from torchpose.io.writers import read_table
+from torchpose.scale.estimate import pending
+from torchpose.scale.parts import Parts
 
 SAMPLE = Path(__file__).parents[2] / "data" / "sample"
 ARGUMENTS = ["--camera", str(SAMPLE / "camera.yaml"), "--target", str(SAMPLE / "target.yaml"), "--method", "centers"]
@@ -84,6 +88,17 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.copy(path, folder)
     (folder / "009.png").write_bytes(b"no picture")
     return folder
+
+
+def test_workers_elsewhere_find_the_frames(frames: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(frames.parent)
+    poses = Parts.at(tmp_path / "p.parquet", POSE_SCHEMA)
+    blocks = pending(find_sources([Path(frames.name)]), 4, poses, Tally())
+    assert [[source.path for source in block.sources] for block in blocks] == [
+        sorted(frames.iterdir())[:4],
+        sorted(frames.iterdir())[4:],
+    ]
+    assert blocks[0].sources[0].name == "000.png"
 
 
 def test_rows_are_those_of_the_local_engine(frames: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import pickle
 import threading
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
@@ -94,10 +94,15 @@ def pending(sources: Sequence[Source], size: int, poses: Parts, tally: Tally) ->
         done.update(part.files)
     blocks = []
     for number, batch in enumerate(in_batches(sources, size)):
-        left = [source for source in batch if source.name not in done]
+        left = [_absolute(source) for source in batch if source.name not in done]
         if left:
             blocks.append(Block(part_name(number * size, left), left))
     return blocks
+
+
+def _absolute(source: Source) -> Source:
+    """The same for a worker that was started elsewhere."""
+    return replace(source, path=source.path.absolute()) if isinstance(source.path, Path) else source
 
 
 def measured(
