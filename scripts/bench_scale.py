@@ -243,6 +243,7 @@ def loss(folder: Path, arguments: argparse.Namespace) -> None:
     """Runs of which two of three nodes are killed, each at a random moment."""
     from ray.cluster_utils import Cluster
 
+    os.environ.setdefault("RAY_worker_niceness", "0")  # as of a cluster that starts with the command
     draw, count = random.Random(arguments.seed), arguments.frames or 400
     frames, whole = linked(folder / "frames", count), Counter[str]()
     for run in range(arguments.runs):

@@ -46,6 +46,7 @@ def cluster(address: str | None, workers: int) -> Iterator[Workers]:
     own: dict[str, Any] = {"address": address or "local"}  # not one that happens to run here
     if address is None:
         own["num_cpus"] = workers
+        os.environ.setdefault("RAY_worker_niceness", "0")  # Ray's own 15 gives way to whatever else runs here
     else:
         del quiet["include_dashboard"]
     try:
