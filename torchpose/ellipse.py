@@ -232,33 +232,6 @@ class _Conics(NamedTuple):
         ellipse = torch.cat([ellipse[:, :2] * scale + self.center, ellipse[:, 2:4] * scale, ellipse[:, 4:]], -1)
         return torch.where(self.sound[:, None], ellipse, torch.nan)
 
-    def form(self) -> Tensor:
-        """(M, 5) as `_form_of` has it, which distances need; axes and angle would cost as much as the fit."""
-        squares, b, linear, f = self.conic[:, :3:2], self.conic[:, 1], self.conic[:, 3:5], self.conic[:, 5]
-        mixed = squares.flip(-1)
-        disc = 4 * squares.prod(-1) - b.square()
-        center = (b[:, None] * linear.flip(-1) - 2 * mixed * linear) / disc[:, None]
-        level = -(f + 0.5 * (linear * center).sum(-1)) * self.scale.square()
-        form = torch.cat([center * self.scale[:, None] + self.center, self.conic[:, :3] / level[:, None]], -1)
-        sound = self.sound & (disc > 0) & (form[:, 2] > 0)
-        return torch.where(sound[:, None], form, torch.nan)
-
-
-def _form_of(ellipses: Tensor) -> Tensor:
-    """(M, 5) of ellipses (M, 5): centre and p, r, q of p x^2 + r x y + q y^2 = 1 about it."""
-    conic = conics.conic_from_ellipse(ellipses)
-    return torch.cat([ellipses[:, :2], conic[:, :3]], -1)
-
-
-def _from_form(xy: Tensor, form: Tensor) -> Tensor:
-    """Signed first-order distances (K, T) of points (K, 2, T) from ellipses given by forms (K, 5), as `distance`."""
-    cx, cy, p, r, q = form[:, :, None].unbind(1)
-    dx, dy = xy[:, 0] - cx, xy[:, 1] - cy
-    half = 0.5 * r
-    u, v = p * dx + half * dy, half * dx + q * dy
-    rho = (u * dx + v * dy).sqrt()  # whose gradient is (u, v) / rho
-    return (rho - 1) * rho / (u * u + v * v).sqrt()
-
 
 def _halir_flusser(moments: Tensor) -> Tensor:
     """Conics (M, 6) of central moments (12, M), as `_moments` orders them, with m20 + m02 = 1.
@@ -394,35 +367,74 @@ def fit_robust(
     if len(start) != count:
         raise ArgumentError(f"start: has {len(start)} ellipses; give one for each of the {count} of count")
     tiles, xy, there = _tiled(points, index, count)
-    there = there[:, 0]
-
-    def refit(weights: Tensor) -> _Conics:
-        return _Conics.of(*_tile_moments(tiles, xy, weights[:, None]))
-
-    def distances(form: Tensor) -> Tensor:
-        return _from_form(xy, form[tiles.group])
+    finite = xy.isfinite().all(1)
+    there, xy = there[:, 0] * finite, torch.where(finite[:, None], xy, 0.0)
+    near = _Near.of(tiles, xy, start.double())
 
     def trust(off: Tensor, scale: float) -> Tensor:
         return there * geman_mcclure(off / scale).nan_to_num(nan=0.0)
 
-    form = _form_of(start.double())
+    conic = near.circle
     for scale in scales:
-        again = refit(trust(distances(form), scale)).form()
-        form = torch.where(again.isfinite().all(-1, keepdim=True), again, form)
-    keep, fitted = there, None
+        conic = near.refit(trust(near.distances(conic), scale), conic)
+    keep = there
     for _ in range(3):
-        r = distances(form)
+        r = near.distances(conic)
         # the weighted RMS under Geman-McClure weights is a scale that outliers hardly move
         w = trust(r, scales[-1])
-        sums = tiles.sums(torch.stack([(w * r.square().nan_to_num(nan=0.0)).sum(-1), w.sum(-1)], -1))
-        sigma = (sums[:, 0] / sums[:, 1]).sqrt()
+        square, total = tiles.sums(torch.stack([w * r.square().nan_to_num(nan=0.0), w], 1).sum(-1)).unbind(-1)
+        sigma = (square / total).sqrt()
         before, keep = keep, there * (r.abs() <= (cut * sigma + 0.02)[tiles.group, None])
-        if fitted is not None and torch.equal(before, keep):  # the same points again
+        if before is not there and torch.equal(before, keep):  # the same points again
             break
-        fitted = refit(keep)
-        form = fitted.form()
-    ellipses = start if fitted is None else fitted.ellipses()
-    return ellipses, tiles.flat(keep) > 0
+        conic = near.refit(keep, conic)
+    return _Conics.of(*_tile_moments(tiles, xy, keep[:, None])).ellipses(), tiles.flat(keep) > 0
+
+
+class _Near(NamedTuple):
+    """Points near M ellipses, in coordinates in which each of these is the unit circle.
+
+    There a conic a . (x^2, xy, y^2, x, y) = 1 near the circle is found by one linear solution, of small residuals about
+    as well as by the direct fit, and the distances from it are two products of matrices.
+
+    Attributes:
+        tiles: the points'.
+        terms: (K, 6, T), x^2, xy, y^2, x, y and 1.
+        inverse: (M, 2, 2), from px to these coordinates.
+        circle: (M, 5), the conics of the ellipses themselves.
+    """
+
+    tiles: Tiles
+    terms: Tensor
+    inverse: Tensor
+    circle: Tensor
+
+    @classmethod
+    def of(cls, tiles: Tiles, xy: Tensor, ellipses: Tensor) -> Self:
+        """Of points (K, 2, T) in tiles."""
+        inverse = torch.linalg.inv_ex(conics.shape_matrix(ellipses)).inverse
+        unit = torch.bmm(inverse[tiles.group], xy - ellipses[tiles.group, :2, None])
+        terms = xy.new_ones(xy.shape[0], 6, xy.shape[2])
+        torch.mul(unit, unit[:, :1], out=terms[:, :2])
+        torch.mul(unit[:, 1], unit[:, 1], out=terms[:, 2])
+        terms[:, 3:5] = unit
+        circle = terms.new_tensor([1.0, 0.0, 1.0, 0.0, 0.0]).expand(len(ellipses), 5)
+        return cls(tiles, terms, inverse, circle)
+
+    def distances(self, conic: Tensor) -> Tensor:
+        """First-order distances (K, T) in px of the points from conics (M, 5), positive outside (Sampson)."""
+        a, b, c, d, e = conic.unbind(-1)
+        slope = torch.stack([2 * a, b, d, b, 2 * c, e], -1).unflatten(-1, (2, 3))
+        both = torch.cat([conic[:, None], -torch.ones_like(conic[:, :1, None])], -1)
+        rise = torch.bmm(torch.bmm(self.inverse, slope)[self.tiles.group], self.terms[:, 3:])
+        value = torch.bmm(both[self.tiles.group], self.terms).squeeze(1)
+        return value / torch.linalg.vector_norm(rise, dim=1)
+
+    def refit(self, weights: Tensor, old: Tensor) -> Tensor:
+        """Conics (M, 5) of the points by their weights (K, T); the ``old`` ones where they define none."""
+        gram = self.tiles.sums(torch.bmm(self.terms * weights[:, None], self.terms.mT))
+        conic = torch.linalg.solve_ex(gram[:, :5, :5], gram[:, :5, 5]).result
+        return torch.where(conic.isfinite().all(-1, keepdim=True), conic, old)
 
 
 @checked

@@ -76,6 +76,7 @@ _LEAST_CANDIDATE = (
     3.0  # px of semi-minor axis: rings below 4 are refused (`rings.measure`); candidates of covered ones err
 )
 _LEGIBLE = 1.8  # px, of blur, up to which the mean profile of a ring tells its code (measured: decisions/0059)
+_FEW_OTHERS = 2  # circles a marker that are measured sooner than they are chosen from (convention: cost alone depends)
 _LAYOUT = ("ids", "centers", "normals", "radii", "valid", "polarity")  # of the table: what makes a target
 Method = Literal["photometric", "edges", "centers", "paper"]
 Near = Poses | tuple[Tensor, Tensor]
@@ -377,6 +378,10 @@ class PoseEstimator(nn.Module):
         some &= _full(rough.frame[some], count, least)[rough.frame]
         # the code of a much blurred ring is not to be read off its profile
         clear = _legible(rough.blur)
+        if self._recipe.on_rims and bool((clear | ~some).all()) and not _choice(rough.frame[some], count, least):
+            rings, of = self._rings(scene, circles[some])  # which of a few are markers is told when they are measured
+            none = _Tried(circles.outer[of[:0]], rings[:0], clear[:0])
+            return rings, torch.zeros(scene.groups, dtype=torch.int64, device=of.device), none
         sharp, blurred, rough = circles[some & clear], circles[some & ~clear], rough[some & clear]
         known, of = self._rings(scene, blurred)
         likely = identify(Rings.cat([rough, known]), scene.table, scene.camera, count, instances=1)
@@ -645,6 +650,11 @@ def _legible(blur: Tensor) -> Tensor:
 def _full(frame: Tensor, frames: int, least: int) -> Tensor:
     """Frames (B,) bool that have at least so many of the items of frames (K,)."""
     return torch.bincount(frame, minlength=frames) >= least
+
+
+def _choice(frame: Tensor, frames: int, markers: int) -> bool:
+    """Whether a frame has so many more of the items of frames (K,) than markers that choosing costs less."""
+    return bool((torch.bincount(frame, minlength=frames) > _FEW_OTHERS * markers).any())
 
 
 def _lacking(scene: Scene, identified: Identified) -> Tensor:
