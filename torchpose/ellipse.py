@@ -366,69 +366,105 @@ def fit_robust(
     expect_positive(cut=cut, **{f"scales[{i}]": scale for i, scale in enumerate(scales)})
     if len(start) != count:
         raise ArgumentError(f"start: has {len(start)} ellipses; give one for each of the {count} of count")
-    tiles, xy, there = _tiled(points, index, count)
-    finite = xy.isfinite().all(1)
-    there, xy = there[:, 0] * finite, torch.where(finite[:, None], xy, 0.0)
-    near = _Near.of(tiles, xy, start.double())
-
-    def trust(off: Tensor, scale: float) -> Tensor:
-        return there * geman_mcclure(off / scale).nan_to_num(nan=0.0)
-
-    conic = near.circle
-    for scale in scales:
-        conic = near.refit(trust(near.distances(conic), scale), conic)
-    keep = there
-    for _ in range(3):
-        r = near.distances(conic)
-        # the weighted RMS under Geman-McClure weights is a scale that outliers hardly move
-        w = trust(r, scales[-1])
-        square, total = tiles.sums(torch.stack([w * r.square().nan_to_num(nan=0.0), w], 1).sum(-1)).unbind(-1)
-        sigma = (square / total).sqrt()
-        before, keep = keep, there * (r.abs() <= (cut * sigma + 0.02)[tiles.group, None])
-        if before is not there and torch.equal(before, keep):  # the same points again
-            break
-        conic = near.refit(keep, conic)
-    return _Conics.of(*_tile_moments(tiles, xy, keep[:, None])).ellipses(), tiles.flat(keep) > 0
+    near = Near.of(points, index, start)
+    _, keep = near.robust(near.circle, scales, cut)
+    ellipses = _Conics.of(*_tile_moments(near.tiles, near.xy, keep[:, None])).ellipses()
+    return ellipses, near.tiles.flat(keep) > 0
 
 
-class _Near(NamedTuple):
+class Near(NamedTuple):
     """Points near M ellipses, in coordinates in which each of these is the unit circle.
 
     There a conic a . (x^2, xy, y^2, x, y) = 1 near the circle is found by one linear solution, of small residuals about
-    as well as by the direct fit, and the distances from it are two products of matrices.
+    as well as by the direct fit, and the distances from it are two products of matrices. Points that are not finite
+    count nothing.
 
     Attributes:
         tiles: the points'.
+        xy: (K, 2, T), px, 0 where there is none.
+        there: (K, T), 1 where there is one, else 0.
         terms: (K, 6, T), x^2, xy, y^2, x, y and 1.
-        inverse: (M, 2, 2), from px to these coordinates.
-        circle: (M, 5), the conics of the ellipses themselves.
+        center: (M, 2), of the ellipses.
+        inverse: (M, 2, 2), from px about them to these coordinates.
     """
 
     tiles: Tiles
+    xy: Tensor
+    there: Tensor
     terms: Tensor
+    center: Tensor
     inverse: Tensor
-    circle: Tensor
 
     @classmethod
-    def of(cls, tiles: Tiles, xy: Tensor, ellipses: Tensor) -> Self:
-        """Of points (K, 2, T) in tiles."""
-        inverse = torch.linalg.inv_ex(conics.shape_matrix(ellipses)).inverse
-        unit = torch.bmm(inverse[tiles.group], xy - ellipses[tiles.group, :2, None])
+    def of(cls, points: Tensor, index: Tensor, ellipses: Tensor) -> Self:
+        """Of points (E, 2) near the ellipses (M, 5) of their index (E,)."""
+        ellipses = ellipses.double()
+        tiles, inverse = Tiles.of(index, len(ellipses)), torch.linalg.inv_ex(conics.shape_matrix(ellipses)).inverse
+        return cls._at(tiles, points, ellipses[:, :2], inverse)
+
+    @classmethod
+    def _at(cls, tiles: Tiles, points: Tensor, center: Tensor, inverse: Tensor) -> Self:
+        u, v = points.double().unbind(-1)
+        planes = tiles.planes(u, v, torch.ones_like(u))
+        finite = planes.isfinite().all(1, keepdim=True)
+        xy, there = torch.where(finite, planes, 0.0).split([2, 1], 1)
+        unit = torch.bmm(inverse[tiles.group], xy - center[tiles.group][..., None])
         terms = xy.new_ones(xy.shape[0], 6, xy.shape[2])
         torch.mul(unit, unit[:, :1], out=terms[:, :2])
         torch.mul(unit[:, 1], unit[:, 1], out=terms[:, 2])
         terms[:, 3:5] = unit
-        circle = terms.new_tensor([1.0, 0.0, 1.0, 0.0, 0.0]).expand(len(ellipses), 5)
-        return cls(tiles, terms, inverse, circle)
+        return cls(tiles, xy, there[:, 0], terms, center, inverse)
 
-    def distances(self, conic: Tensor) -> Tensor:
-        """First-order distances (K, T) in px of the points from conics (M, 5), positive outside (Sampson)."""
+    def moved(self, points: Tensor) -> Self:
+        """The same points at other places (E, 2)."""
+        return self._at(self.tiles, points, self.center, self.inverse)
+
+    @property
+    def circle(self) -> Tensor:
+        """Conics (M, 5) of the ellipses themselves."""
+        return self.terms.new_tensor([1.0, 0.0, 1.0, 0.0, 0.0]).expand(len(self.center), 5)
+
+    def slopes(self, conic: Tensor) -> Tensor:
+        """Gradients (K, 2, T) of conics (M, 5) at the points, per px."""
         a, b, c, d, e = conic.unbind(-1)
         slope = torch.stack([2 * a, b, d, b, 2 * c, e], -1).unflatten(-1, (2, 3))
-        both = torch.cat([conic[:, None], -torch.ones_like(conic[:, :1, None])], -1)
-        rise = torch.bmm(torch.bmm(self.inverse, slope)[self.tiles.group], self.terms[:, 3:])
+        return torch.bmm(torch.bmm(self.inverse, slope)[self.tiles.group], self.terms[:, 3:])
+
+    def distances(self, conic: Tensor, slopes: Tensor | None = None) -> Tensor:
+        """First-order distances (K, T) in px of the points from conics (M, 5), positive outside (Sampson)."""
+        slopes = self.slopes(conic) if slopes is None else slopes
+        both = torch.nn.functional.pad(conic, (0, 1), value=-1.0)[:, None]
         value = torch.bmm(both[self.tiles.group], self.terms).squeeze(1)
-        return value / torch.linalg.vector_norm(rise, dim=1)
+        return value / torch.linalg.vector_norm(slopes, dim=1)
+
+    def curvatures(self, conic: Tensor, slopes: Tensor) -> Tensor:
+        """Curvatures (K, T) in 1/px of the level curves of conics (M, 5) at the points."""
+        second = conic[:, (0, 1, 1, 2)].unflatten(-1, (2, 2)) * conic.new_tensor([[2.0, 1.0], [1.0, 2.0]])
+        second = torch.bmm(torch.bmm(self.inverse, second), self.inverse)[self.tiles.group]
+        steep = torch.linalg.vector_norm(slopes, dim=1)
+        along = torch.stack([slopes[:, 1], -slopes[:, 0]], 1)
+        return (torch.bmm(second, along) * along).sum(1) / steep**3
+
+    def robust(self, conic: Tensor, scales: tuple[float, ...], cut: float = 4.0) -> tuple[Tensor, Tensor]:
+        """Conics (M, 5) from ``conic`` on, see `fit_robust`, and which points were kept (K, T), 1 or 0."""
+
+        def trust(off: Tensor, scale: float) -> Tensor:
+            return self.there * geman_mcclure(off / scale).nan_to_num(nan=0.0)
+
+        for scale in scales:
+            conic = self.refit(trust(self.distances(conic), scale), conic)
+        keep = before = self.there
+        for number in range(3):
+            r = self.distances(conic)
+            # the weighted RMS under Geman-McClure weights is a scale that outliers hardly move
+            w = trust(r, scales[-1])
+            sums = self.tiles.sums(torch.stack([w * r.square().nan_to_num(nan=0.0), w], 1).sum(-1))
+            sigma = (sums[:, 0] / sums[:, 1]).sqrt()
+            before, keep = keep, self.there * (r.abs() <= (cut * sigma + 0.02)[self.tiles.group, None])
+            if number and torch.equal(before, keep):  # the same points again
+                break
+            conic = self.refit(keep, conic)
+        return conic, keep
 
     def refit(self, weights: Tensor, old: Tensor) -> Tensor:
         """Conics (M, 5) of the points by their weights (K, T); the ``old`` ones where they define none."""

@@ -372,16 +372,16 @@ class PoseEstimator(nn.Module):
         Also how many copies (B T,) were seen, and what was measured for that.
         """
         circles, count, least = self._circles(scene, candidates), len(scene.frames), int(scene.table.valid.sum())
-        rough = rough_rings(circles, scene.camera)
         # frames with fewer circles than markers are searched at all scales anyway
+        if self._recipe.on_rims and _few(circles, _FEW_OTHERS * least, count):
+            circles = circles[_full(circles.outer.frame, count, least)[circles.outer.frame]]
+            rings, of = self._rings(scene, circles)  # when they are measured they tell which of them are markers
+            return rings, of.new_zeros(scene.groups), _Tried(circles.outer[of[:0]], rings[:0], rings.clipped[:0])
+        rough = rough_rings(circles, scene.camera)
         some = in_company(rough, scene.table, scene.camera.matrix)
         some &= _full(rough.frame[some], count, least)[rough.frame]
         # the code of a much blurred ring is not to be read off its profile
         clear = _legible(rough.blur)
-        if self._recipe.on_rims and bool((clear | ~some).all()) and not _choice(rough.frame[some], count, least):
-            rings, of = self._rings(scene, circles[some])  # which of a few are markers is told when they are measured
-            none = _Tried(circles.outer[of[:0]], rings[:0], clear[:0])
-            return rings, torch.zeros(scene.groups, dtype=torch.int64, device=of.device), none
         sharp, blurred, rough = circles[some & clear], circles[some & ~clear], rough[some & clear]
         known, of = self._rings(scene, blurred)
         likely = identify(Rings.cat([rough, known]), scene.table, scene.camera, count, instances=1)
@@ -652,9 +652,10 @@ def _full(frame: Tensor, frames: int, least: int) -> Tensor:
     return torch.bincount(frame, minlength=frames) >= least
 
 
-def _choice(frame: Tensor, frames: int, markers: int) -> bool:
-    """Whether a frame has so many more of the items of frames (K,) than markers that choosing costs less."""
-    return bool((torch.bincount(frame, minlength=frames) > _FEW_OTHERS * markers).any())
+def _few(circles: Circles, most: int, frames: int) -> bool:
+    """Whether circles are legible, and no frame has so many of them that choosing costs less than measuring all."""
+    few = bool((torch.bincount(circles.outer.frame, minlength=frames) <= most).all())
+    return few and bool(_legible(circles.inside.blur).all())
 
 
 def _lacking(scene: Scene, identified: Identified) -> Tensor:
