@@ -124,3 +124,51 @@ def _of_quaternion(device: torch.device, dtype: torch.dtype) -> Tensor:
             for i, k, factor in terms:
                 row[i, k] += factor
         return table.view(10, 16).to(device)
+
+
+def ippe_few(
+    points: Tensor, xy: Tensor, weight: Tensor, axes: Tensor, center: Tensor, fixed: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`planar.ippe` of K planes: R (K, 2, 3, 3), t (K, 2, 3), and the points in the camera frame (K, N, 2, 3).
+
+    Args:
+        points: (K, N, 3). xy: (K, N, 2). weight: (K, N), 1 or 0.
+        axes: (K, 3, 3), those of the planes as rows. center: (K, 3).
+    """
+    offset = (points - center[:, None]) * weight[..., None]
+    plane = torch.cat([torch.bmm(offset, axes[:, :2].mT), weight[..., None]], -1)
+    basis, factor = torch.linalg.qr(plane)
+    # Harker, O'Leary: with h3 given, the first two rows of H follow by linear least squares from u (h3 . m)
+    products = (xy[..., None] * plane[:, :, None]).flatten(2)
+    coefficients = torch.bmm(basis.mT, products)
+    residual = (products - torch.bmm(basis, coefficients)).unflatten(2, (2, 3)).flatten(1, 2)
+    gram = torch.bmm(residual.mT, residual)
+    scatter = coefficients[:, :2, 2::3].square().sum((1, 2)) * plane[..., 0].square().sum(1) / weight.sum(1).square()
+    firm = torch.linalg.det(gram[:, :2, :2]) > fixed * scatter * gram.diagonal(dim1=1, dim2=2)[:, :2].sum(1)
+    p = -torch.linalg.solve_ex(gram[:, :2, :2], gram[:, :2, 2]).result
+    h = torch.bmm(coefficients.view(-1, 6, 3), torch.nn.functional.pad(p, (0, 1), value=1.0)[..., None])
+    h = torch.linalg.solve_triangular(factor, h.view(-1, 3, 2), upper=True)
+    q = h[:, 2]  # image of the centroid
+    jacobian = h[:, :2].mT - q[..., None] * p[:, None]
+    # a rotation of the axis towards the centroid, by half a turn about the middle between them
+    aim = torch.nn.functional.normalize(torch.nn.functional.pad(q, (0, 1), value=1.0), dim=-1)
+    eye = torch.eye(3, dtype=xy.dtype, device=xy.device)
+    middle = torch.nn.functional.normalize(aim + eye[2], dim=-1)
+    ray = 2 * middle[..., None] * middle[:, None] - eye
+    both = torch.linalg.solve_ex(ray[:, :2, :2] - q[..., None] * ray[:, 2:, :2], jacobian).result
+    # the largest singular value is the inverse depth
+    half, area = 0.5 * both.square().sum((1, 2)), torch.linalg.det(both)
+    both = both * (half + (half.square() - area.square()).clamp_min(0).sqrt()).rsqrt()[:, None, None]
+    third = (1 - both.square().sum(1)).clamp_min(0).sqrt()
+    third = torch.stack([third[:, 0], torch.where(both.prod(2).sum(1) > 0, -third[:, 1], third[:, 1])], -1)
+    columns = torch.cat([both[:, None].expand(-1, 2, 2, 2), torch.stack([third, -third], 1)[:, :, None]], 2)
+    normal = torch.linalg.cross(columns[..., 0], columns[..., 1])
+    R = ray[:, None] @ torch.cat([columns, normal[..., None]], -1) @ axes[:, None]
+    R = torch.where(firm[:, None, None, None], R, torch.nan)
+    # the translation of least |(x, y) Z - (X, Y)|^2
+    x = torch.bmm(offset, R.flatten(1, 2).mT).unflatten(2, (2, 3))
+    rows = torch.cat([eye[:2, :2].expand(*xy.shape, 2), -xy[..., None]], -1) * weight[..., None, None]
+    right = (xy[:, :, None] * x[..., 2:] - x[..., :2]).mT.flatten(1, 2)
+    rows = rows.flatten(1, 2)
+    t = torch.linalg.solve_ex(torch.bmm(rows.mT, rows), torch.bmm(rows.mT, right)).result.mT
+    return R, t - (R @ center[:, None, :, None]).squeeze(-1), x + t[:, None]
