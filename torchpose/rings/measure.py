@@ -36,6 +36,7 @@ _LARGE = 20.0  # px, of the outer semi-minor axis, from which on a fit of all pi
 # `scripts/corruption_statistics.py --only interlacing`)
 _SOFT_ALL_AROUND = 1.0
 _ROUGH = 0.5  # px, of a candidate's centre and axes
+_SCALES = (2.0, 1.0, 0.5)  # px, see `ellipse.fit_robust`: from a candidate's error down to a few times that of edges
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,16 +284,24 @@ def _by_edges(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
     shown = clear.repeat(2, 1)[edges.ring, sector]
     edges, sector = edges[shown], sector[shown]
 
-    raw, keep = ellipse.fit_robust(edges.points, edges.ring, 2 * count, start=rough)
-    distance = edges.offset - ellipse.distance(edges.points, edges.ring, raw) * outward[edges.ring]
-    blur = zernike.edge_blur(edges.offset[keep], distance[keep], edges.normal[keep], edges.ring[keep] % count, count)
+    near = ellipse.Near.of(edges.points, edges.ring, rough)
+    conic, keep = near.robust(near.circle, _SCALES)
+    slopes, outside = near.slopes(conic), outward[edges.ring]
+    distance = edges.offset - near.tiles.flat(near.distances(conic, slopes)) * outside
+    kept = near.tiles.flat(keep) > 0
+    blur = zernike.edge_blur(edges.offset[kept], distance[kept], edges.normal[kept], edges.ring[kept] % count, count)
     points = edges.points
     if how.correct:
-        points = points + _correction(edges, raw, blur, outward)[:, None] * edges.normal
-    raw, keep = ellipse.fit_robust(points, edges.ring, 2 * count, start=raw, scales=(0.5,))
+        bend = near.tiles.flat(near.curvatures(conic, slopes)) * outside
+        points = points + _correction(edges, blur, bend)[:, None] * edges.normal
+        near = near.moved(points)
+    _, keep = near.robust(conic, _SCALES[-1:])
+    keep = near.tiles.flat(keep) > 0
     ring, points = edges.ring[keep], points[keep]
     ideal_points = ideal_pixels(camera, points)
-    ideal = ellipse.fit(ideal_points, ring, 2 * count)
+    # as the frame shows them, and without the lens
+    each = torch.cat([points, ideal_points]), torch.cat([ring, ring + 2 * count])
+    raw, ideal = ellipse.fit(*each, 4 * count).tensor_split(2)
     fit = ellipse.with_covariance(ideal_points, ring, ideal, correlation=zernike.edge_correlation())
 
     one = torch.ones_like(ring, dtype=torch.float64)
@@ -349,9 +358,11 @@ def _as_a_whole(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> 
     return rings, index
 
 
-def _correction(edges: RingEdges, fitted: Tensor, blur: Tensor, outward: Tensor) -> Tensor:
-    """What each ring's blur (M / 2, 3) and the edges' curvature do to their offsets, taken off: (E,) px."""
+def _correction(edges: RingEdges, blur: Tensor, bend: Tensor) -> Tensor:
+    """What each ring's blur (M / 2, 3) and the edges' curvature do to their offsets, taken off: (E,) px.
+
+    ``bend`` (E,) is the curvature, 1/px, positive where the edge's normal points outwards.
+    """
     blur = blur[edges.ring % len(blur)]
-    pushed = zernike.curvature_shift(blur, edges.normal) * ellipse.curvature(edges.points, edges.ring, fitted)
     slope = zernike.slope_across(blur, edges.normal)
-    return zernike.deblur(edges.offset, slope) - edges.offset - pushed * outward[edges.ring]
+    return zernike.deblur(edges.offset, slope) - edges.offset - zernike.curvature_shift(blur, edges.normal) * bend
