@@ -1,5 +1,6 @@
 """Stage: concentric pairs. From candidate ellipses to rings with both circles measured."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -197,7 +198,7 @@ def _measured(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
     A mask or a band of a fixed size sees little of an edge that is wider; in a frame of half the size it is not.
     """
     candidates, inside = circles.outer, circles.inside
-    by_blur = reduction_for(blurs.axes(inside.blur)[1].sqrt(), zernike.WIDEST)
+    by_blur = reduction_for(_in_common(blurs.axes(inside.blur)[1].sqrt(), candidates.frame), zernike.WIDEST)
     # a ring keeps a pixel more than the least has
     factor = by_blur.minimum(reduction_for(candidates.ellipse[:, 3], 2 * (_LEAST_SEMI_MINOR[0] + 1)))
     rings, which = [], []
@@ -214,6 +215,14 @@ def _measured(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
         return _no_rings(candidates), candidates.frame
     order = torch.argsort(torch.cat(which))
     return Rings.cat(rings)[order], torch.cat(which)[order]
+
+
+def _in_common(blur: Tensor, frame: Tensor) -> Tensor:
+    """Blurs (K,) px of the rings of frames (K,); those of a frame that differ little count as one, and so each frame is
+    reduced in one way."""
+    logarithm = blur.log()
+    usual = segment_mean(logarithm, frame, int(frame.max()) + 1)[frame]
+    return torch.where((logarithm - usual).abs() < 0.5 * math.log(2), usual, logarithm).exp()
 
 
 def _enlarged(rings: Rings, factor: int) -> Rings:
