@@ -318,13 +318,9 @@ def _by_edges(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
     step = segment_mean(edges.step[keep], ring, 2 * count)
     step_ratio = step[count:] / step[:count]
     offset = torch.linalg.vector_norm(raw[count:, :2] - inner[:, :2], dim=-1)
-    # all points lie within reach of the rough ellipse; a fit that does not has followed the stump of a circle cut off
-    shift = torch.linalg.vector_norm(raw[:, :2] - rough[:, :2], dim=-1)
-    growth = (conics.shape_matrix(raw) - conics.shape_matrix(rough)).abs().amax((1, 2))
-    near = torch.maximum(shift, growth) < reach + 1.5
     good = (
         fit.covariance.isfinite().all(-1).all(-1).view(2, count).all(0)
-        & near.view(2, count).all(0)
+        & _within(reach, raw, rough).view(2, count).all(0)
         & (cover[:count] > _LEAST_COVER[0])
         & (cover[count:] > _LEAST_COVER[1])
         & (step_ratio > STEP_RANGE[0])
@@ -339,6 +335,14 @@ def _by_edges(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
     follows = marked((edges.ring * SECTORS + sector)[keep], 2 * count * SECTORS).view(2, count, SECTORS)[0, index]
     known = (blur, inside.clipped[index], clear[index] & follows)
     return Rings(frame, polarity, raw[index], raw[second], fit[index], fit[second], *known), index
+
+
+def _within(reach: Tensor, fitted: Tensor, rough: Tensor) -> Tensor:
+    """Whether ellipses (N, 5) lie along their rough ones, (N,): all points are within reach of those, and a fit that is
+    not has followed the stump of a circle cut off."""
+    shift = torch.linalg.vector_norm(fitted[:, :2] - rough[:, :2], dim=-1)
+    growth = (conics.shape_matrix(fitted) - conics.shape_matrix(rough)).abs().amax((1, 2))
+    return torch.maximum(shift, growth) < reach + 1.5
 
 
 def _as_a_whole(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tuple[Rings, Tensor]:
