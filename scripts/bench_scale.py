@@ -116,14 +116,14 @@ class Run(NamedTuple):
 
 
 def timed(arguments: Sequence[str]) -> Run:
-    """A command that succeeds."""
+    """A command that comes to its end, if with frames that could not be read."""
     start, busy, own, worker = time.perf_counter(), busy_seconds(), 0, 0
-    with subprocess.Popen(arguments, stderr=subprocess.DEVNULL) as process:
+    with subprocess.Popen(arguments) as process:
         while process.poll() is None:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(1.0)
             own, worker = max(own, peak_mb(process.pid)), max(worker, worker_bytes() >> 20)
-    if process.returncode:
+    if process.returncode not in (0, 1):
         raise SystemExit(f"{' '.join(arguments)}: exit {process.returncode}")
     taken = time.perf_counter() - start
     return Run(taken, (busy_seconds() - busy) / taken, own, worker)
@@ -320,10 +320,12 @@ def store(folder: Path, arguments: argparse.Namespace) -> None:
                 out = Place(f"s3://cell/out/{engine}{share}.parquet")
                 options = ["--engine", engine, "--threads", "2"]
                 run = timed(command(f"s3://cell/{share}", str(out), *options, sample=folder))
-                found = Counter(row["frame"] for row in rows(fetched(out, folder / f"{engine}{share}.parquet")))
+                table = rows(fetched(out, folder / f"{engine}{share}.parquet"))
+                found = Counter(row["frame"] for row in table)
+                told = Counter(str(row["reason"] or row["status"]) for row in table)
                 print(
                     f"{engine}, {count // share} frames: {run.seconds:.0f} s, "
-                    f"{len(found)} of them have rows, {sum(found.values()) - len(found)} twice, "
+                    f"{len(found)} of them have rows, {sum(found.values()) - len(found)} twice, {dict(told)}, "
                     f"{application.failed - before[1]} of {application.asked - before[0]} requests failed, "
                     f"command {run.mb} MB",
                     flush=True,
