@@ -266,16 +266,28 @@ def costs(folder: Path, arguments: argparse.Namespace) -> None:
     arguments.into.write_text(text)
 
 
-def loss(folder: Path, arguments: argparse.Namespace) -> None:
-    """Runs of which two of three nodes are killed, each at a random moment."""
+def three_nodes() -> tuple[Any, list[Any]]:
+    """A cluster on this machine, and two of its nodes; anew where one does not start within Ray's 30 s."""
     from ray.cluster_utils import Cluster
 
+    for _ in range(5):
+        cluster: Any = Cluster()
+        try:
+            cluster.add_node(num_cpus=1)
+            return cluster, [cluster.add_node(num_cpus=1) for _ in range(2)]
+        except Exception as error:  # Ray raises no other
+            print(f"a node did not start: {error}", flush=True)
+            cluster.shutdown()
+    raise SystemExit("no cluster starts here")
+
+
+def loss(folder: Path, arguments: argparse.Namespace) -> None:
+    """Runs of which two of three nodes are killed, each at a random moment."""
     os.environ.setdefault("RAY_worker_niceness", "0")  # as of a cluster that starts with the command
     draw, count = random.Random(arguments.seed), arguments.frames or 400
     frames, whole = linked(folder / "frames", count), Counter[str]()
     for run in range(arguments.runs):
-        cluster: Any = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
-        nodes = [cluster.add_node(num_cpus=1) for _ in range(2)]
+        cluster, nodes = three_nodes()
         out = folder / f"{run}.parquet"
         options = ["--engine", "ray", "--batch", "4", "--method", "centers"]
         task = subprocess.Popen(command(frames, out, *options, "--address", cluster.address))
