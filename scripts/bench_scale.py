@@ -326,11 +326,11 @@ def store(folder: Path, arguments: argparse.Namespace) -> None:
                 places = [Place(f"s3://cell/{share}") / f"{number:06d}.png" for number in range(count // share)]
                 list(pool.map(lambda place: place.write(picture), places))
         application._every = 50
-        for engine in ("local", "ray"):
+        for engine in ("ray", "local"):
             for share in (10, 1):
                 before = application.asked, application.failed
                 out = Place(f"s3://cell/out/{engine}{share}.parquet")
-                options = ["--engine", engine, "--threads", "2"]
+                options = ["--engine", engine, "--threads", "2", "--batch", "64", "--method", "centers"]
                 run = timed(command(f"s3://cell/{share}", str(out), *options, sample=folder))
                 table = rows(fetched(out, folder / f"{engine}{share}.parquet"))
                 found = Counter(row["frame"] for row in table)
