@@ -10,6 +10,8 @@ from jaxtyping import Bool, Float32, Float64, Int, Real, Shaped
 from torch import Tensor
 
 _MOST_ROWS = 4096  # of a grid of near points: more would cost more than they save
+# pairs up to which looking at each of them costs less than a grid: a hundred calls, of a microsecond or more
+_FEW_PAIRS = 1 << 14
 
 
 def values_at(frames: Real[Tensor, "B H W"], cell: Int[Tensor, "*S"]) -> Float32[Tensor, "*S"]:
@@ -153,6 +155,10 @@ def near_pairs(
     each: what is near a first point is one run in each of the rows that it reaches. So the work grows with the pairs
     found, not with the square of the points.
     """
+    if len(first) * len(second) <= _FEW_PAIRS:
+        away = (first[:, None] - second).abs().amax(-1)
+        i, j = ((away <= reach[:, None]) & (groups[0][:, None] == groups[1])).nonzero().unbind(-1)
+        return i, j
     sound, known = positions((first.sum(-1) + reach).isfinite()), positions(second.isfinite().all(-1))
     if sound.numel() == 0 or known.numel() == 0:
         return sound[:0], known[:0]
