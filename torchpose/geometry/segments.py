@@ -10,8 +10,6 @@ from jaxtyping import Bool, Float32, Float64, Int, Real, Shaped
 from torch import Tensor
 
 _MOST_ROWS = 4096  # of a grid of near points: more would cost more than they save
-# pairs up to which looking at each of them costs less than a grid: a hundred calls, of a microsecond or more
-_FEW_PAIRS = 1 << 14
 
 
 def values_at(frames: Real[Tensor, "B H W"], cell: Int[Tensor, "*S"]) -> Float32[Tensor, "*S"]:
@@ -155,7 +153,7 @@ def near_pairs(
     each: what is near a first point is one run in each of the rows that it reaches. So the work grows with the pairs
     found, not with the square of the points.
     """
-    if len(first) * len(second) <= _FEW_PAIRS:
+    if not len(first) * len(second) // (4 * _MOST_ROWS):  # each pair is looked at sooner than a hundred calls are made
         away = (first[:, None] - second).abs().amax(-1)
         i, j = ((away <= reach[:, None]) & (groups[0][:, None] == groups[1])).nonzero().unbind(-1)
         return i, j
