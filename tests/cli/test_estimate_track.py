@@ -2,6 +2,7 @@
 
 import csv
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -90,7 +91,7 @@ def test_every_frame_is_in_one_lane_behind_the_one_before() -> None:
     groups = in_lanes(sources, 3)
     assert sorted(source.name for one in groups for source in one) == sorted(source.name for source in sources)
     assert max(len(batch) for one in groups for batch in one.batches) == 3
-    follows = {now.name: before.name for before, now in zip(sources, sources[1:], strict=False)}
+    follows = {now.name: before.name for before, now in pairwise(sources)}
     firsts = 0
     for one in groups:
         last: dict[int, str] = {}
