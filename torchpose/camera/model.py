@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from torchpose.camera.fold import polynomial_fold, rational_fold
 from torchpose.camera.tone import Tone
@@ -329,7 +328,7 @@ class Camera:
 
     def _warp(self, x: Tensor, y: Tensor, *, slopes: bool = True) -> tuple[Tensor, ...]:
         """Distorted normalised x, y; with ``slopes`` the xx, xy, yy of the Jacobian, symmetric in both models."""
-        r2 = x * x + y * y
+        r2 = torch.addcmul(x * x, y, y)
         if self.model == "kannala_brandt":
             k1, k2, k3, k4 = self.distortion.to(x).unbind()
             small = r2 < 1e-6
@@ -345,26 +344,40 @@ class Camera:
             slope = torch.where(small, 2 * (k1 - 1 / 3) + r2 * (4 * k2 - 4 * k1 + 0.8), (growth - s) / r2_safe)
             return s * x, s * y, s + slope * x * x, slope * x * y, s + slope * y * y
         d = self.distortion.to(x)
-        k1, k2, p1, p2, k3, k4, k5, k6 = pad(d, (0, 8 - len(d))).unbind()
-        s = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        if rational := len(d) == 8:
-            denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        if not len(d):
+            one = torch.ones_like(x)
+            return (x, y, one, torch.zeros_like(x), one) if slopes else (x, y)
+        k1, k2, p1, p2, *more = d.unbind()
+        along, below = [k1, k2, *more[:1]], more[1:]
+        twice = [*(2 * (power + 1) * k for power, k in enumerate(along))] if slopes else []
+        s = 1 + r2 * _polynomial(r2, along)
+        if below:
+            denominator = 1 + r2 * _polynomial(r2, below)
             s = s / denominator
         # 2 (p1 y + p2 x) x + p2 r^2 is OpenCV's 2 p1 x y + p2 (r^2 + 2 x^2)
-        shear = 2 * (p2 * x + p1 * y)
-        s_tangential = s + shear
-        bent = s_tangential * x + p2 * r2, s_tangential * y + p1 * r2
+        px, py = 2 * p2 * x, 2 * p1 * y
+        s_tangential = s + (px + py)
+        bent = torch.addcmul(s_tangential * x, r2, p2), torch.addcmul(s_tangential * y, r2, p1)
         if not slopes:
             return bent
-        slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
-        if rational:
-            slope = (slope - 2 * s * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / denominator
+        slope = _polynomial(r2, twice)
+        if below:
+            slope = (slope - s * _polynomial(r2, [2 * (power + 1) * k for power, k in enumerate(below)])) / denominator
+        sx = slope * x
         return (
             *bent,
-            s_tangential + slope * x * x + 4 * p2 * x,
-            slope * x * y + 2 * (p1 * x + p2 * y),
-            s_tangential + slope * y * y + 4 * p1 * y,
+            torch.addcmul(s_tangential + 2 * px, sx, x),
+            torch.addcmul(2 * (p1 * x + p2 * y), sx, y),
+            torch.addcmul(s_tangential + 2 * py, slope * y, y),
         )
+
+
+def _polynomial(at: Tensor, coefficients: Sequence[Tensor]) -> Tensor:
+    """c0 + c1 at + c2 at^2 + ... (Horner)."""
+    value = coefficients[-1]
+    for c in reversed(coefficients[:-1]):
+        value = torch.addcmul(c, at, value)
+    return value
 
 
 def _check_covariance(covariance: Tensor, coefficients: int) -> None:
