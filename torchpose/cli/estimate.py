@@ -124,11 +124,9 @@ def estimate(
     how: _How = {"resume": resume, "batch": batch, "threads": threads or cores(), "quiet": quiet, "told": stated.told}
     if cameras is not None:
         other = {"--device": device != "cpu"}
-        check_several(
-            camera, {"-d": detections, "--overlay": overlay, "--engine ray": on_ray, "-f": files_from, **other}
-        )
+        check_several(camera, {"--engine ray": on_ray, "-f": files_from, **other})
         rest, several = partial(estimation, stated), {**how, "tone": stated["tone"]}
-        return estimate_moments(cameras, places, rest, tables.out, several)
+        return estimate_moments(cameras, places, rest, (tables.out, tables.detections, overlay), several)
     sources = frames_of(places, listed)
     work = estimation(stated, sources)
     check_outputs([*places, *listed], sources, tables.paths, overlay)
