@@ -11,9 +11,10 @@ consistency (mean chi-squared between the cameras over its freedom, ideal 1). A 
 rigs are as they say: of ratios the root mean square over the cases.
 
 Cases end in `-places` where the rig states a covariance of its places (20 um, 0.2 mrad a camera) and every moment has
-places of its own from it. `two-markers`: each camera sees two markers of the four, at opposite corners in turns.
+places of its own from it; in `-fixed` all 16 moments of a call have the same ones. `two-markers`: each camera sees two markers of the four, at opposite corners in turns.
 `missing`: one camera has no picture, each in turn. `knocked-N`: the second camera is turned by N deviations of the
-centre of a ring at the noise of the frames, which the rig does not know.
+centre of a ring at the noise of the frames, which the rig does not know; `-first` the first one, in whose axes the
+poses are. What a call says of a rig depends on how many moments it has: `--batch`.
 """
 
 from __future__ import annotations
@@ -53,13 +54,16 @@ TARGET = tp.Target.load("quad40")
 
 @dataclass(frozen=True)
 class Case:
-    """Angles of the cameras; ``places``: uncertain; what is missing; deviations by which one camera is turned."""
+    """Angles of the cameras; ``places``: uncertain; what is missing; deviations by which one camera is turned, the
+    first or the second; whether all moments of a call have the same places."""
 
     angles_deg: tuple[float, ...]
     places: bool = False
     missing: bool = False
     two_markers: bool = False
     knocked: float = 0.0
+    first: bool = False
+    fixed: bool = False
 
 
 CASES = {
@@ -72,7 +76,9 @@ CASES = {
     "four-40-places": Case((0, 40, -40, 80), places=True),
     "three-35-missing": Case((0, 35, -35), missing=True),
     "three-35-two-markers": Case((0, 35, -35), two_markers=True),
+    "three-35-places-fixed": Case((0, 35, -35), places=True, fixed=True),
     **{f"knocked-{n}": Case((0, 35, -35), knocked=float(n)) for n in (1, 2, 5, 20)},
+    "knocked-5-first": Case((0, 35, -35), knocked=5.0, first=True),
 }
 
 
@@ -129,8 +135,7 @@ def pictures(case: Case, rig: tp.CameraRig, R: Tensor, t: Tensor, moved: Tensor,
     """Frames (B, H, W) of every camera."""
     frames = []
     for camera, lens in enumerate(rig.cameras):
-        off = torch.zeros(len(t), 6, dtype=F64) if camera == 0 else moved[:, 6 * (camera - 1) : 6 * camera]
-        own = in_view(rig, camera, R, t, off)
+        own = in_view(rig, camera, R, t, moved[:, 6 * camera : 6 * camera + 6])
         seen, imaging = targets_of(case, camera), {"psf_sigma": BLUR, "dark": DARK, "light": LIGHT}
         parts = [slice(k, None, len(seen)) for k in range(len(seen))]
         images = torch.empty(len(t), HEIGHT, WIDTH)
@@ -164,27 +169,28 @@ def _fisher_of(rig: tp.CameraRig, target: tp.Target, R: Tensor, t: Tensor) -> Te
     return torch.linalg.inv(bound[0])
 
 
-def measure(name: str, case: Case, moments: int, seed: int) -> dict[str, Any]:
+def measure(name: str, case: Case, moments: int, seed: int, batch: int = BATCH) -> dict[str, Any]:
     """The row of a case."""
     torch.set_num_threads(1)
     generator = torch.Generator().manual_seed(seed)
     rig = rig_of(case)
     estimator = tp.PoseEstimator(rig, TARGET)
     found, truth, bound = [], [], []
-    for first in range(0, moments, BATCH):
-        count = min(BATCH, moments - first)
+    for first in range(0, moments, batch):
+        count = min(batch, moments - first)
         R, t = poses(case, count, generator)
-        moved = torch.zeros(count, 6 * (len(rig) - 1), dtype=F64)
+        moved = torch.zeros(count, 6 * len(rig), dtype=F64)
         if case.places and rig.covariance is not None:
-            moved = torch.randn(moved.shape, dtype=F64, generator=generator) * rig.covariance.diagonal().sqrt()
+            drawn = torch.randn(count, 6 * (len(rig) - 1), dtype=F64, generator=generator)
+            moved[:, 6:] = (drawn[:1] if case.fixed else drawn) * rig.covariance.diagonal().sqrt()
         if case.knocked:
-            moved[:, 4] = case.knocked * CENTER / FOCAL
+            moved[:, 4 if case.first else 10] = case.knocked * CENTER / FOCAL
         seen = torch.ones(len(rig), count, dtype=torch.bool)
         if case.missing:
             seen[(first + torch.arange(count)) % len(rig), torch.arange(count)] = False
         frames = pictures(case, rig, R, t, moved, seed + 1000 * first)
         found.append(estimator(frames, seen))
-        truth.append((R, t))
+        truth.append(in_view(rig, 0, R, t, moved[:, :6]))
         bound.append(bounds(case, rig, R, t, first))
         print(f"{name}: {first + count} of {moments}", file=sys.stderr, flush=True)
     return row_of(name, tp.Poses.cat(found), truth, torch.cat(bound))
@@ -220,8 +226,8 @@ def row_of(name: str, found: tp.Poses, truth: list[tuple[Tensor, Tensor]], bound
     }
 
 
-def _measured(name: str, moments: int, seed: int) -> dict[str, Any]:
-    return measure(name, CASES[name], moments, seed)
+def _measured(name: str, moments: int, seed: int, batch: int) -> dict[str, Any]:
+    return measure(name, CASES[name], moments, seed, batch)
 
 
 def together(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -245,12 +251,13 @@ def main() -> None:
     parser.add_argument("--case", nargs="+", choices=[*CASES, "all"], default=["all"])
     parser.add_argument("--moments", type=int, default=100)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--batch", type=int, default=BATCH, help="moments a call")
     parser.add_argument("--processes", type=int, default=1, help="cases side by side")
     parser.add_argument("--out", type=Path, help="Table: .csv, .jsonl or .parquet")
     parser.add_argument("--markdown", action="store_true", help="print a table for the documentation")
     args = parser.parse_args()
     names = list(CASES) if "all" in args.case else args.case
-    row_of_case = partial(_measured, moments=args.moments, seed=args.seed)
+    row_of_case = partial(_measured, moments=args.moments, seed=args.seed, batch=args.batch)
     rows = []
     if args.processes > 1:
         with ProcessPoolExecutor(args.processes, get_context("spawn")) as pool:
