@@ -129,9 +129,9 @@ def estimate(
     how: _How = {"resume": resume, "batch": batch, "threads": threads or cores(), "quiet": quiet, "told": stated.told}
     if cameras is not None:
         other = {"--device": device != "cpu", "--track": track, "--engine ray": on_ray}
-        check_several(camera, {"-d": detections, "--overlay": overlay, "-f": files_from, **other})
+        check_several(camera, {"-f": files_from, **other})
         rest, several = partial(estimation, stated), {**how, "tone": stated["tone"]}
-        return estimate_moments(cameras, places, rest, tables.out, several)
+        return estimate_moments(cameras, places, rest, (tables.out, tables.detections, overlay), several)
     sources = frames_of(places, listed)
     work = _check_track(replace(estimation(stated, sources), track=track), tables, on_ray=on_ray)
     check_outputs([*places, *listed], sources, tables.paths, overlay)
