@@ -11,8 +11,9 @@ functions outside the model are mixtures of shifted frames: a shift of the princ
 The bound of a covered ring takes the covered part of that marker's information off; that of a foreign point-spread
 function is the bound of a Gaussian of the same variance.
 
-`faults` are what differs from the files, and what cameras do to pictures: `print`, `warp` and `gain` have another print
-in every frame, `k1-off` a camera file that is off. Column `file`: `perfect` where the files claim nothing of it,
+`faults` are what differs from the files, and what cameras do to pictures: `print`, `warp`, `gain`, `raster` and `texture`
+have another print, on another piece of paper, in every frame, for the NEES is that over all prints; of one print alone
+it is the mean square of a few numbers. `k1-off` has a camera file that is off. Column `file`: `perfect` where the files claim nothing of it,
 `stated` where the target file has the right `center_sigma` and `edge_gain_sigma`. The bound is that of the nominal
 target and camera, without the fault.
 """
@@ -188,12 +189,24 @@ Drawn = tp.Target | Prints
 
 
 def picture(
-    case: Case, camera: tp.Camera, target: Drawn, r: Tensor, t: Tensor, twist: tuple[float, ...] | None = None
+    case: Case,
+    camera: tp.Camera,
+    target: Drawn,
+    r: Tensor,
+    t: Tensor,
+    *,
+    index: Tensor | None = None,
+    twist: tuple[float, ...] | None = None,
 ) -> Tensor:
-    """Frames (B, H, W), free of noise; ``twist``: mm and rad by which the target moves during the exposure."""
+    """Frames (B, H, W), free of noise.
+
+    Args:
+        index: numbers of the frames, each of which is of another piece of paper; None for the same one in all.
+        twist: mm and rad by which the target moves during the exposure.
+    """
     if case.psf == "blackman-harris":
         return filtered(case, camera, target, r, t)
-    options = plate_of(case, len(t))
+    options = plate_of(case, len(t), index)
     if twist is not None:
         options |= {"motion": torch.tensor(twist, dtype=F64).expand(len(t), 6)}
     out = torch.zeros(len(t), camera.height, camera.width)
@@ -206,13 +219,13 @@ def picture(
     return out
 
 
-def plate_of(case: Case, frames: int) -> dict[str, Any]:
-    """Options of `render`; the paper has the same texture in all frames, which see it from elsewhere."""
+def plate_of(case: Case, frames: int, index: Tensor | None = None) -> dict[str, Any]:
+    """Options of `render`; ``index``: see `picture`."""
     options: dict[str, Any] = {"plate": PLATE, "dark": DARK, "light": LIGHT}
     if case.texture is None:
         return options
     share, length = case.texture
-    key = keys_of(1, 0, "paper").expand(frames)
+    key = keys_of(1, 0, "paper").expand(frames) if index is None else keys_of(frames, 0, "paper", index)
     return options | {"texture": Texture(key, share, length * MIDDLE / FOCAL)}
 
 
@@ -319,10 +332,11 @@ def run(name: str, case: Case, methods: list[Method], frames: int, seed: int) ->
     for a in range(0, frames, BATCH):
         s = slice(a, a + BATCH)
         drawn = without_first(TARGET) if case.missing else TARGET
-        clean = picture(case, camera, drawn if prints is None else prints[s], r[s], t[s])
+        index = torch.arange(a, min(a + BATCH, frames))
+        clean = picture(case, camera, drawn if prints is None else prints[s], r[s], t[s], index=index)
         if case.cover:
             clean = covered(case, camera, clean, r[s], t[s], g)
-        noisy = photographed(case, clean, seed, torch.arange(a, a + len(clean)))
+        noisy = photographed(case, clean, seed, index)
         bounds.append(bound_of(case, camera, r[s], t[s]))
         for key, estimator in estimators.items():
             poses = estimator(noisy)
