@@ -91,9 +91,7 @@ class Overlay:
         if folder is not None:
             make_folder(folder, "--overlay")
 
-    def write(
-        self, frames: Tensor, poses: Poses, names: Sequence[str], seen: Sequence[bool] | None = None
-    ) -> None:
+    def write(self, frames: Tensor, poses: Poses, names: Sequence[str], seen: Sequence[bool] | None = None) -> None:
         """Writes one picture a frame.
 
         Args:

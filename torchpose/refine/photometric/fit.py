@@ -60,6 +60,7 @@ from torchpose.refine.photometric.sectors import (
     level_scatter,
     of_more,
     overdispersion,
+    shift_scatter,
     sum_sectors,
     trust,
 )
@@ -329,7 +330,8 @@ def _beyond_rims(fit: _Fit, found: Minimum, normals: MarkerNormals, wider: Tenso
     """
     row, pose, rows = fit.blocks.row, found.unknowns.pose, len(wider)
     factor, freedom, alone = in_step(fit.sectors.scaled(fit.factor), fit.variance[row], fit.blocks.rings, row, rows)
-    beyond = torch.where(of_more(factor, freedom), (factor - wider[:, None]).clamp_min(0), 0.0)
+    shifted = shift_scatter(fit.sectors.scaled(fit.factor), fit.variance[row], fit.blocks.rings, row, rows)[:, None]
+    beyond = (torch.where(of_more(factor, freedom), factor, 0.0).maximum(shifted) - wider[:, None]).clamp_min(0)
     away = (pose.R[row] @ fit.blocks.center[..., None])[:, 2] + pose.t[row, 2:]
     mm = (beyond[row] * alone).sqrt() * away / fit.focal
     shifts = torch.nn.functional.pad(torch.diag_embed(mm), (0, 0, 0, POSE - 1))
