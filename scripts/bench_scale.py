@@ -4,6 +4,7 @@
     python scripts/bench_scale.py loss [--runs 20]               # two of three nodes killed at random moments
     python scripts/bench_scale.py store [--frames 10000]         # an S3 server on the loopback, 2 % of requests fail
     python scripts/bench_scale.py costs --price 0.05             # of a million to a billion frames, by arithmetic
+    python scripts/bench_scale.py costs --into docs/scale.md     # the tables of that page
 
 Figures of docs/scale.md. Needs the extras ray and dev. Commands run as a user types them, in processes of their own.
 `throughput` keeps what it measures in docs/benchmarks/scale.json (--figures), which `costs` reads.
@@ -48,7 +49,8 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=20, help="of loss")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--figures", type=Path, default=FIGURES, help="what throughput measures, for costs")
-    parser.add_argument("--price", type=float, default=1.0, help="of a core-hour, for costs")
+    parser.add_argument("--price", type=float, default=0.05, help="of a core-hour, in your currency, for costs")
+    parser.add_argument("--into", type=Path, help="page that costs writes its tables into, by default prints them")
     arguments = parser.parse_args()
     arguments.load = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as folder:
@@ -114,14 +116,14 @@ class Run(NamedTuple):
 
 
 def timed(arguments: Sequence[str]) -> Run:
-    """A command that succeeds."""
+    """A command that comes to its end, if with frames that could not be read."""
     start, busy, own, worker = time.perf_counter(), busy_seconds(), 0, 0
-    with subprocess.Popen(arguments, stderr=subprocess.DEVNULL) as process:
+    with subprocess.Popen(arguments) as process:
         while process.poll() is None:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(1.0)
             own, worker = max(own, peak_mb(process.pid)), max(worker, worker_bytes() >> 20)
-    if process.returncode:
+    if process.returncode not in (0, 1):
         raise SystemExit(f"{' '.join(arguments)}: exit {process.returncode}")
     taken = time.perf_counter() - start
     return Run(taken, (busy_seconds() - busy) / taken, own, worker)
@@ -138,47 +140,59 @@ ENGINES = {
 def throughput(folder: Path, arguments: argparse.Namespace) -> None:
     """Frames a second of one and two cores by both engines: of the whole command, and without its start and end.
 
-    The start is what a run of few frames takes beyond them: two batches, one for each of two workers.
+    Without: by what a run of many frames takes beyond one of few, which are two batches, one for each of two workers.
     """
     count, few = arguments.frames or 2000, 2 * BATCH
-    many = linked(folder / "many", count)
-    little = linked(folder / "few", few)
-    steady, whole, starts, worker_mb = {}, {}, {}, 0
-    print("engine          frames/s  whole command  start s  busy cores")
+    many, little = linked(folder / "many", count), linked(folder / "few", few)
+    engines: dict[str, dict[str, float]] = {}
     for name, options in ENGINES.items():
         short, long = (timed(command(f, folder / f"{name}{f.name}.parquet", *options)) for f in (little, many))
-        steady[name] = (count - few) / (long.seconds - short.seconds)
-        whole[name], starts[name] = count / long.seconds, long.seconds - count / steady[name]
-        worker_mb = max(worker_mb, long.worker_mb)
-        print(
-            f"{name:15} {steady[name]:8.1f} {whole[name]:14.1f} {starts[name]:8.1f} {long.cores:11.2f}",
-            flush=True,
-        )
-    for what, rate in (("without start", steady), ("whole command", whole)):
-        print(
-            f"{what}: two workers over one {rate['ray, 2 workers'] / rate['ray, 1 worker']:.2f} (at least 1.7), "
-            f"time of two workers over that of two local cores {rate['local, 2 cores'] / rate['ray, 2 workers']:.2f} "
-            "(at most 1.15)"
-        )
+        rate = (count - few) / (long.seconds - short.seconds)
+        engines[name] = {
+            "frames/s": round(rate, 1),
+            "of the whole command": round(count / long.seconds, 1),
+            "start and end, s": round(long.seconds - count / rate, 1),
+            "busy cores": round(long.cores, 2),
+            "MB": long.worker_mb or long.mb,
+        }
+        print(f"{name}: {engines[name]}", flush=True)
     own = rows(folder / f"local, 1 core{many.name}.parquet")
-    same = {row["frame"]: row for row in rows(folder / f"ray, 2 workers{many.name}.parquet")}
-    print(f"rows equal to the last digit: {sum(same.get(row['frame']) == row for row in own)} of {count}")
     parts = folder / f"ray, 2 workers{many.name}.parquet"
-    pictures = [path.stat().st_size for path in many.iterdir()]
+    same = {row["frame"]: row for row in rows(parts)}
     camera = Camera.load(SAMPLE / "camera.yaml")
-    figures = {
+    measured = {
         "frames": count,
+        "load before": round(arguments.load, 2),
+        "engines": engines,
+        "rows equal to the last digit": sum(same.get(row["frame"]) == row for row in own),
         "megapixels": round(camera.width * camera.height / 1e6, 1),
-        "frames/s and core": round(steady["local, 1 core"], 1),
-        "share of it on Ray": round(steady["ray, 2 workers"] / (2 * steady["local, 1 core"]), 3),
-        "start s": round(starts["ray, 2 workers"], 1),
-        "worker MB": worker_mb,
-        "bytes a picture": sum(pictures) // count,
+        "bytes a picture": sum(path.stat().st_size for path in many.iterdir()) // count,
         "bytes a row": sum(path.stat().st_size for path in parts.iterdir()) // count,
-        "load before": arguments.load,
     }
-    arguments.figures.write_text(json.dumps(figures, indent=1) + "\n")
-    print(json.dumps(figures))
+    arguments.figures.write_text(json.dumps(measured, indent=1) + "\n")
+    print("\n" + "\n".join(measured_lines(measured)))
+
+
+def measured_lines(measured: Mapping[str, Any]) -> list[str]:
+    """What `throughput` found, as Markdown."""
+    engines, count = measured["engines"], measured["frames"]
+    columns = list(next(iter(engines.values())))
+    lines = [
+        f"| {count} frames of {measured['megapixels']} MP | {' | '.join(columns)} |",
+        "|---" * (len(columns) + 1) + "|",
+    ]
+    lines += [f"| {name} | {' | '.join(str(value) for value in found.values())} |" for name, found in engines.items()]
+    lines.append("")
+    for column in columns[:2]:
+        rate = {name: found[column] for name, found in engines.items()}
+        gain = rate["ray, 2 workers"] / rate["ray, 1 worker"]
+        time_taken = rate["local, 2 cores"] / rate["ray, 2 workers"]
+        lines.append(
+            f"- {column}: two workers over one {gain:.2f} (at least 1.7 wanted), time of two workers over that of two "
+            f"local cores {time_taken:.2f} (at most 1.15 wanted)."
+        )
+    lines.append(f"- Rows equal to the last digit: {measured['rows equal to the last digit']} of {count}.")
+    return [*lines, f"- Load of the machine before: {measured['load before']}."]
 
 
 class Needs(NamedTuple):
@@ -192,13 +206,13 @@ class Needs(NamedTuple):
     price: float
 
 
-def needs(frames: int, measured: Mapping[str, float], price: float) -> Needs:
+def needs(frames: int, measured: Mapping[str, Any], price: float) -> Needs:
     """Of so many frames a day, by arithmetic from what `throughput` has measured and the price of a core-hour."""
-    rate, a_second = measured["frames/s and core"] * measured["share of it on Ray"], frames / 86400
+    rate, a_second = measured["engines"]["ray, 2 workers"]["frames/s"] / 2, frames / 86400
     cores = math.ceil(a_second / rate)
     return Needs(
         cores,
-        cores * measured["worker MB"] / 1e3,
+        cores * measured["engines"]["ray, 2 workers"]["MB"] / 1e3,
         a_second * measured["bytes a picture"] / 1e6,
         a_second,
         frames * measured["bytes a row"] / 1e9,
@@ -206,49 +220,74 @@ def needs(frames: int, measured: Mapping[str, float], price: float) -> Needs:
     )
 
 
-def pays_from(machines: int, cores: int, measured: Mapping[str, float]) -> float:
+def pays_from(machines: int, cores: int, measured: Mapping[str, Any]) -> float:
     """Frames from which so many machines with Ray are done before one of them is with the local engine; inf: never.
 
-    n / r = s + n / (m e r): frames n, frames/s of a machine r, start of Ray s, m machines, share of their work e.
+    n / r + s = n / (m q) + t: frames n, frames/s of a machine r and q, start s and t, locally and on Ray, m machines.
     """
-    rate, gain = cores * measured["frames/s and core"], machines * measured["share of it on Ray"]
-    return measured["start s"] * rate / (1 - 1 / gain) if gain > 1 else math.inf
+    local, ray = measured["engines"]["local, 2 cores"], measured["engines"]["ray, 2 workers"]
+    saved = 2 / (cores * local["frames/s"]) - 2 / (machines * cores * ray["frames/s"])
+    return (ray["start and end, s"] - local["start and end, s"]) / saved if saved > 0 else math.inf
+
+
+def cost_lines(measured: Mapping[str, Any], price: float) -> list[str]:
+    """What days of frames need, and when Ray pays, as Markdown."""
+    lines = [
+        f"| frames of {measured['megapixels']} MP a day | cores | memory, GB | from the store, MB/s | pictures/s "
+        f"| rows, GB a day | a day costs, at {price:g} a core-hour |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for power, name in ((6, "a million"), (7, "ten million"), (8, "a hundred million"), (9, "a billion")):
+        need = needs(10**power, measured, price)
+        lines.append(
+            f"| {name} | {need.cores} | {need.memory:.0f} | {need.bandwidth:.0f} | {need.pictures:.0f} | "
+            f"{need.rows:.1f} | {need.price:.1f} |"
+        )
+    lines += ["", "| machines of 16 cores | on Ray quicker than one of them from | which takes |", "|---|---|---|"]
+    for machines in (2, 4, 16):
+        frames = pays_from(machines, 16, measured)
+        seconds = frames / 8 / measured["engines"]["local, 2 cores"]["frames/s"]
+        lines.append(f"| {machines} | {frames:.0f} frames | {seconds:.0f} s |")
+    return lines
 
 
 def costs(folder: Path, arguments: argparse.Namespace) -> None:
-    """The tables of docs/scale.md."""
+    """Prints what was measured and what follows, or writes it into a page, between the comments that say so."""
     measured = json.loads(arguments.figures.read_text())
-    print(
-        f"{measured['megapixels']} MP, {measured['frames/s and core']} frames/s and core, "
-        f"{measured['share of it on Ray']:.0%} of that on Ray, {measured['worker MB']} MB a worker, "
-        f"{measured['bytes a picture'] / 1e6:.2f} MB a picture, {measured['bytes a row']} bytes a row; "
-        f"a core-hour costs {arguments.price:g}\n"
-    )
-    print("| frames a day | cores | memory, GB | from the store, MB/s | pictures/s | rows, GB a day | a day costs |")
-    print("|---|---|---|---|---|---|---|")
-    for power in (6, 7, 8, 9):
-        need = needs(10**power, measured, arguments.price)
-        print(
-            f"| 10^{power} | {need.cores} | {need.memory:.0f} | {need.bandwidth:.0f} | {need.pictures:.0f} | "
-            f"{need.rows:.1f} | {need.price:.1f} |"
-        )
-    print("\n| machines of 16 cores | quicker on Ray than one of them from | which it does in |")
-    print("|---|---|---|")
-    for machines in (2, 4, 16):
-        frames = pays_from(machines, 16, measured)
-        print(f"| {machines} | {frames:.0f} frames | {frames / 16 / measured['frames/s and core']:.0f} s |")
+    made = {"throughput": measured_lines(measured), "costs": cost_lines(measured, arguments.price)}
+    if arguments.into is None:
+        print("\n".join([*made["throughput"], "", *made["costs"]]))
+        return
+    text = arguments.into.read_text()
+    for name, lines in made.items():
+        begin, end = f"<!-- made by scripts/bench_scale.py: {name} -->\n", "<!-- end -->"
+        head, _, rest = text.partition(begin)
+        text = "".join([head, begin, "\n", "\n".join(lines), "\n\n", end, rest.partition(end)[2]])
+    arguments.into.write_text(text)
+
+
+def three_nodes() -> tuple[Any, list[Any]]:
+    """A cluster on this machine, and two of its nodes; anew where one does not start within Ray's 30 s."""
+    from ray.cluster_utils import Cluster
+
+    for _ in range(5):
+        cluster: Any = Cluster()
+        try:
+            cluster.add_node(num_cpus=1)
+            return cluster, [cluster.add_node(num_cpus=1) for _ in range(2)]
+        except Exception as error:  # Ray raises no other
+            print(f"a node did not start: {error}", flush=True)
+            cluster.shutdown()
+    raise SystemExit("no cluster starts here")
 
 
 def loss(folder: Path, arguments: argparse.Namespace) -> None:
     """Runs of which two of three nodes are killed, each at a random moment."""
-    from ray.cluster_utils import Cluster
-
     os.environ.setdefault("RAY_worker_niceness", "0")  # as of a cluster that starts with the command
     draw, count = random.Random(arguments.seed), arguments.frames or 400
     frames, whole = linked(folder / "frames", count), Counter[str]()
     for run in range(arguments.runs):
-        cluster: Any = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
-        nodes = [cluster.add_node(num_cpus=1) for _ in range(2)]
+        cluster, nodes = three_nodes()
         out = folder / f"{run}.parquet"
         options = ["--engine", "ray", "--batch", "4", "--method", "centers"]
         task = subprocess.Popen(command(frames, out, *options, "--address", cluster.address))
@@ -287,16 +326,18 @@ def store(folder: Path, arguments: argparse.Namespace) -> None:
                 places = [Place(f"s3://cell/{share}") / f"{number:06d}.png" for number in range(count // share)]
                 list(pool.map(lambda place: place.write(picture), places))
         application._every = 50
-        for engine in ("local", "ray"):
+        for engine in ("ray", "local"):
             for share in (10, 1):
                 before = application.asked, application.failed
                 out = Place(f"s3://cell/out/{engine}{share}.parquet")
-                options = ["--engine", engine, "--threads", "2"]
+                options = ["--engine", engine, "--threads", "2", "--batch", "64", "--method", "centers"]
                 run = timed(command(f"s3://cell/{share}", str(out), *options, sample=folder))
-                found = Counter(row["frame"] for row in rows(fetched(out, folder / f"{engine}{share}.parquet")))
+                table = rows(fetched(out, folder / f"{engine}{share}.parquet"))
+                found = Counter(row["frame"] for row in table)
+                told = Counter(str(row["reason"] or row["status"]) for row in table)
                 print(
                     f"{engine}, {count // share} frames: {run.seconds:.0f} s, "
-                    f"{len(found)} of them have rows, {sum(found.values()) - len(found)} twice, "
+                    f"{len(found)} of them have rows, {sum(found.values()) - len(found)} twice, {dict(told)}, "
                     f"{application.failed - before[1]} of {application.asked - before[0]} requests failed, "
                     f"command {run.mb} MB",
                     flush=True,

@@ -66,7 +66,8 @@ def cluster(address: str | None, workers: int) -> Iterator[Workers]:
         with contextlib.redirect_stdout(nowhere):
             yield Workers(int(resources().get("CPU", 1)), alive)
     finally:
-        ray.shutdown()
+        with contextlib.redirect_stdout(nowhere):
+            ray.shutdown()  # which prints what is left of them
         nowhere.close()
 
 
