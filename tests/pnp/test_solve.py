@@ -403,9 +403,7 @@ def test_a_start_is_left_once_its_minimum_is_sure_to_stay_above() -> None:
     towards = torch.nn.functional.normalize(t, dim=-1)
     turned = torch.eye(3, dtype=F64) - 2 * towards[..., :, None] * towards[..., None, :]
     mirror = turned @ r @ torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=F64))
-    both = pnp.solve(
-        SQUARE, image, MATRIX, sigma_px=0.3, initial=(torch.stack([r, mirror], 1), torch.stack([t, t], 1))
-    )
+    both = pnp.solve(SQUARE, image, MATRIX, sigma_px=0.3, initial=(torch.stack([r, mirror], 1), torch.stack([t, t], 1)))
     alone = pnp.solve(SQUARE, image, MATRIX, sigma_px=0.3, initial=(r, t))
     other = pnp.solve(SQUARE, image, MATRIX, sigma_px=0.3, initial=(mirror[:, None], t[:, None]))
     torch.testing.assert_close(both.chi2, torch.minimum(alone.chi2, other.chi2), rtol=1e-6, atol=1e-6)

@@ -27,7 +27,7 @@ from torchpose.refine.decide import decide, decide_on_grey
 from torchpose.refine.edges.fit import refine_edges
 from torchpose.refine.photometric.fit import refine_photometric
 from torchpose.refine.sight import LEAST_KEPT, Refined, Sight
-from torchpose.results import Misfit, Reason, Status
+from torchpose.results import Reason, Status
 
 # of the pixels, where the pose stays near: of wires over half of every ring 0.27 (measured: `wires 3` of
 # `scripts/corruption_statistics.py`)

@@ -60,6 +60,7 @@ from torchpose.refine.photometric.sectors import (
     level_scatter,
     of_more,
     overdispersion,
+    shift_scatter,
     sum_sectors,
     trust,
 )
@@ -246,9 +247,7 @@ class _Fits:
         found = _minimised(fit, result.pose[index], spread, (_COARSELY,), result.look.levels[index][fit.mask])
         unknowns = found.unknowns
         look = fit.look(cast(Spread, unknowns.own["blur"]), unknowns.values("levels"))
-        begun = replace(
-            result, pose=result.pose.replaced(index, unknowns.pose), look=result.look.replaced(index, look)
-        )
+        begun = replace(result, pose=result.pose.replaced(index, unknowns.pose), look=result.look.replaced(index, look))
         return begun, rows.index_copy(0, index, fit.variance.sqrt() > result.noise[index])
 
     def widened(self, result: _Result, rows: Tensor) -> _Result:
@@ -331,7 +330,8 @@ def _beyond_rims(fit: _Fit, found: Minimum, normals: MarkerNormals, wider: Tenso
     """
     row, pose, rows = fit.blocks.row, found.unknowns.pose, len(wider)
     factor, freedom, alone = in_step(fit.sectors.scaled(fit.factor), fit.variance[row], fit.blocks.rings, row, rows)
-    beyond = torch.where(of_more(factor, freedom), (factor - wider[:, None]).clamp_min(0), 0.0)
+    shifted = shift_scatter(fit.sectors.scaled(fit.factor), fit.variance[row], fit.blocks.rings, row, rows)[:, None]
+    beyond = (torch.where(of_more(factor, freedom), factor, 0.0).maximum(shifted) - wider[:, None]).clamp_min(0)
     away = (pose.R[row] @ fit.blocks.center[..., None])[:, 2] + pose.t[row, 2:]
     mm = (beyond[row] * alone).sqrt() * away / fit.focal
     shifts = torch.nn.functional.pad(torch.diag_embed(mm), (0, 0, 0, POSE - 1))
