@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from torchpose.camera.fold import polynomial_fold, rational_fold
 from torchpose.camera.tone import Tone
