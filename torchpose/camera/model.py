@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from copy import copy
@@ -26,6 +27,7 @@ Model = Literal["brown_conrady", "kannala_brandt"]
 # of normalised coordinates: a step of less leaves an error of its own square, about, which one more step squares again
 _LAST_STEP = 1e-6
 _MAX_ITERATIONS = 60
+_NEAR = 1e-2  # of the root of the rounding: a step of Newton's from there is exact to rounding (derived: it squares)
 # the tensors of a camera and what files call them
 _FIELDS = {
     "matrix": "camera_matrix",
@@ -298,7 +300,7 @@ class Camera:
         eps = torch.finfo(u.dtype).eps
         limit = self.fold_radius
         radius = torch.hypot(u, v)
-        scale = 1 + radius
+        near = _NEAR * math.sqrt(eps) * (1 + radius)
         inside = (0.99 * limit / radius.clamp_min(eps)).clamp_max(1)
         x, y = inside * u, inside * v
         x_distorted, y_distorted, *jacobian = self._warp(x, y)
@@ -306,7 +308,7 @@ class Camera:
         error = torch.hypot(ex, ey)
         fraction = torch.ones_like(error)
         for _ in range(_MAX_ITERATIONS):
-            if bool(((error <= 4 * eps * scale) | ~error.isfinite() | (fraction < 1e-6)).all()):
+            if bool(((error <= near) | ~error.isfinite() | (fraction < 1e-6)).all()):
                 break
             dx, dy = _newton_step(ex, ey, *jacobian)
             x_trial, y_trial = x - fraction * dx, y - fraction * dy
@@ -319,7 +321,7 @@ class Camera:
             x, y, ex, ey, error, *jacobian = (torch.where(better, b, a) for a, b in zip(old, new, strict=True))
             fraction = torch.where(better, 1.0, 0.5 * fraction)
         j_xx, j_xy, j_yy = jacobian
-        valid = (error <= 1e4 * eps * scale) & (j_xx * j_yy - j_xy * j_xy > 0)
+        valid = (error <= near.clamp_min(1e4 * eps)) & (j_xx * j_yy - j_xy * j_xy > 0)
         return torch.where(valid, x, torch.nan), torch.where(valid, y, torch.nan)
 
     def _intrinsics(self, like: Tensor) -> tuple[Tensor, Tensor]:

@@ -118,7 +118,7 @@ def estimate(
 
     places = [place_of(name) for name in inputs or []]
     on_ray, tables = engine is Engine.ray, _Tables.of(out, detections)
-    check_address(engine, address)
+    check_address(engine, address, threads)
     _check_engine(overlay, device, on_ray=on_ray)
     tables.check(resume=resume, on_ray=on_ray)
     one_thread_each()
@@ -129,9 +129,9 @@ def estimate(
     how: _How = {"resume": resume, "batch": batch, "threads": threads or cores(), "quiet": quiet, "told": stated.told}
     if cameras is not None:
         other = {"--device": device != "cpu", "--track": track, "--engine ray": on_ray}
-        check_several(camera, {"-d": detections, "--overlay": overlay, "-f": files_from, **other})
+        check_several(camera, {"-f": files_from, **other})
         rest, several = partial(estimation, stated), {**how, "tone": stated["tone"]}
-        return estimate_moments(cameras, places, rest, tables.out, several)
+        return estimate_moments(cameras, places, rest, (tables.out, tables.detections, overlay), several)
     sources = frames_of(places, listed)
     work = _check_track(replace(estimation(stated, sources), track=track), tables, on_ray=on_ray)
     check_outputs([*places, *listed], sources, tables.paths, overlay)
@@ -222,6 +222,16 @@ def _check_engine(overlay: Path | None, device: str, *, on_ray: bool) -> None:
     check_device(device)
 
 
+def _check_shared(sources: Sequence[Source]) -> None:
+    """Raises ConfigError unless workers can share the sources."""
+    film = next((source for source in sources if source.film), None)
+    if film is not None:
+        raise ConfigError(
+            f"{film.path}: --engine ray: a film is decoded from its beginning, so workers cannot share it; use "
+            "--engine local"
+        )
+
+
 def _check_track(work: Estimation, tables: _Tables, *, on_ray: bool) -> Estimation:
     """The same work. ConfigError: it tracks, and has options that do not go with it."""
     from torchpose.io.stream import is_standard
@@ -287,6 +297,7 @@ def _run(
     from torchpose.io.estimates import estimated, tracked
     from torchpose.io.processes import Crew
     from torchpose.io.staged import Staged
+    from torchpose.io.storage import REQUESTS
     from torchpose.io.stream import StreamedRows
     from torchpose.report.overlay import Overlay
 
@@ -296,16 +307,16 @@ def _run(
     store = _opened(work, sources, staged.out, staged.detections, resume)
     # a resumed run works on the same batches as one that was not interrupted, so that rows agree to the last bit
     pending = [one for one in _batches(work, sources, batch) if any(source.name not in store for source in one)]
-    # a single process decodes ahead with all threads, several do so with one each; neither a GPU, nor a connection to a
-    # store, nor an open film, whose decoder has threads of its own, can be shared with processes
-    shared = device == "cpu" and all(isinstance(source.path, Path) and source.film is None for source in sources)
-    processes = threads if shared else 1
-    decoding = threads if min(processes, len(pending)) < 2 else 1
+    # a single process decodes ahead with all threads, several do so with one each, or more that wait for a store;
+    # neither a GPU nor an open film, whose decoder has threads of its own, can be shared with processes
+    stored = any(not isinstance(source.path, Path) for source in sources)
+    processes = threads if device == "cpu" and all(source.film is None for source in sources) else 1
+    decoding = max(threads if min(processes, len(pending)) < 2 else 1, REQUESTS if stored else 1)
     paint = None if painter is None else painter.write
     job = partial(tracked if work.track else estimated, work, estimator, paint, decoding)
     try:
         with (
-            Crew(job, pending, processes, let_go=store.close) as crew,
+            Crew(job, pending, processes, let_go=store.close, fresh=stored) as crew,
             FrameProgress(len(sources), len(store), quiet=quiet) as progress,
         ):
             for records in crew:
@@ -360,6 +371,7 @@ def _run_on_ray(
     from torchpose.scale.estimate import measured, pending
     from torchpose.scale.parts import Parts
 
+    _check_shared(sources)
     poses, marks = Parts.at(tables.out, work.schema), None
     if tables.detections is not None:
         marks = Parts.at(tables.detections, DETECTION_SCHEMA, "--detections")

@@ -7,11 +7,11 @@ for no more than it tells, and the covariance of the pose holds what all of them
 
 What residuals show beyond that (`pose.excess`) is looked for within each camera, with a pose of its own: cameras that
 contradict each other are no misfit of the print. Whether they do is asked then: chi-squared of poses of their own.
+What that leaves possible widens the covariance (`moments.places`).
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -74,6 +74,10 @@ class JointPose(Rows):
         between_freedom: its degrees of freedom.
         odd: the camera alone against which all others agree; -1 where none is.
         torn: whether they contradict each other beyond their covariance.
+        told: information about the numbers that all rows share, and about how far cameras are beside their places
+            (of each three turns, rad, and three shifts, mm), pose and blurs being unknown.
+        pull: its right side.
+        by_place: error of the pose with each of the latter.
     """
 
     R: Float[Tensor, "J 3 3"]
@@ -93,6 +97,9 @@ class JointPose(Rows):
     between_freedom: Int[Tensor, " J"]
     odd: Int[Tensor, " J"]
     torn: Bool[Tensor, " J"]
+    told: Float[Tensor, "J E E"]
+    pull: Float[Tensor, "J E"]
+    by_place: Float[Tensor, "J 6 P"]
 
 
 class _Parts(NamedTuple):
@@ -122,24 +129,28 @@ def joint_pose(rig: CameraRig, views: list[Seen], R: Tensor, t: Tensor, moved: T
     parts = _parts(rig, views, R, t, moved)
     excess, further = _excess(parts, views)
     n = parts.normals.right.shape[-1]
-    beside = parts.numbers
+    odd_ones = parts.numbers[..., :0]
     if further is not None:
-        beside = torch.cat([beside, _among(further * excess.deviation[:, None, None], n)], -1)
+        odd_ones = _among(further * excess.deviation[:, None, None], n)
+    beside = torch.cat([parts.numbers, odd_ones], -1)
     normals = parts.normals.over(excess.factor)
     between, freedom, odd, torn = _between(normals, parts, beside, len(views))
+    off = _off(rig, views, R, t, n)
+    own = torch.cat([parts.own, odd_ones], -1)
+    told, pull = _remaining(normals, own, torch.cat([parts.numbers, off], -1), odd_ones.shape[-1])
     # counted, not estimated: the pose is the one of a rig that is as its file says
-    loose = _loosened(normals, parts, beside, _turns(rig, views, R, t, n))
-    joint = _Joint.of(normals, parts.own, beside, beside[..., :0] if loose is None else loose, True)
+    joint = _Joint.of(normals, parts.own, beside, off, True)
+    covariance = joint.noise + joint.by_print @ joint.by_print.mT
     place = look = _print_places(parts, views, joint, excess.deviation, further)
     other = ((excess.misfit == Misfit.CAMERA) | (excess.misfit == Misfit.SCATTER)).nonzero()[:, 0]
     if other.numel() and further is not None:
         look = place.index_copy(0, other, _if_printed(parts, views, excess, further, other))
-    known = joint.known & (torch.linalg.cholesky_ex(joint.covariance.nan_to_num(nan=-1.0))[1] == 0)
+    known = joint.known & (torch.linalg.cholesky_ex(covariance.nan_to_num(nan=-1.0))[1] == 0)
     step = joint.step.nan_to_num(nan=0.0)
     return JointPose(
         R=rotations.exp(step[:, 3:]) @ R,
         t=t + step[:, :3],
-        covariance=joint.covariance,
+        covariance=covariance,
         noise=joint.noise,
         systematic=joint.by_print[..., : parts.numbers.shape[-1]],
         place=place,
@@ -154,6 +165,9 @@ def joint_pose(rig: CameraRig, views: list[Seen], R: Tensor, t: Tensor, moved: T
         between_freedom=freedom,
         odd=odd,
         torn=torn,
+        told=told,
+        pull=pull,
+        by_place=joint.by_camera - _in_axes_of_first(views, off),
     )
 
 
@@ -280,58 +294,28 @@ def _of_each(blocks: Tensor, own: Tensor) -> tuple[Tensor, Tensor]:
     return found[0].unflatten(0, own.shape[:2]), found[1].unflatten(0, own.shape[:2])
 
 
-def _turns(rig: CameraRig, views: list[Seen], R: Tensor, t: Tensor, n: int) -> Tensor:
-    """How markers move (J, V M, n, 6 V) if a camera is not where the rig has it: turned by 1 rad, or moved by as much
-    as shifts its picture alike."""
+def _off(rig: CameraRig, views: list[Seen], R: Tensor, t: Tensor, n: int) -> Tensor:
+    """How markers move (J, V M, n, 6 V) if a camera is not where the rig has it: turned by 1 rad, or moved by 1 mm."""
     parts = []
     for k, view in enumerate(views):
         at = rig.seen_by(view.camera, R, t)[1]
-        turn = torch.zeros(len(t), n, 2 * 3, dtype=t.dtype, device=t.device)
+        turn = torch.zeros(len(t), n, POSE, dtype=t.dtype, device=t.device)
         eye = torch.eye(3).to(t)
         turn[:, :3, :3] = -rotations.skew(at)
         turn[:, 3:POSE, :3] = eye
-        turn[:, :3, 3:] = eye * torch.linalg.vector_norm(at, dim=-1)[:, None, None]
+        turn[:, :3, 3:] = eye
         turn = torch.nn.functional.pad(turn, (POSE * k, POSE * (len(views) - 1 - k)))
         parts.append(turn[:, None].expand(-1, view.setting.evidence.mask.shape[1], -1, -1))
     return torch.cat(parts, 1)
 
 
-def _loosened(normals: MarkerNormals, parts: _Parts, numbers: Tensor, turns: Tensor) -> Tensor | None:
-    """The columns ``turns`` by as much as cameras seem to be beside their places; None where none does.
-
-    One camera may be turned, or beside its place in all six numbers, or all are. Which it is and how much, nobody
-    knows: it is averaged over by its likelihood, as `pose.excess` does for prints.
-    """
-    known = torch.cat([parts.own, numbers], -1)
-    information, right = _remaining(normals, known, turns, numbers.shape[-1])
-    finite = (information.isfinite().all(-1) & right.isfinite()).all(-1)
-    information = torch.where(finite[:, None, None], information, 0.0)
-    right = torch.where(finite[:, None], right, 0.0)
-    cameras = torch.eye(right.shape[-1] // POSE, dtype=right.dtype, device=right.device)
-    turned = torch.nn.functional.pad(right.new_ones(2), (0, POSE - 2))
-    which = torch.cat(
-        [torch.kron(cameras, turned[None]), cameras.repeat_interleave(POSE, 1), right.new_ones(1, len(right[0]))]
-    )
-    found = [_likelihood(information, right, some > 0) for some in which]
-    likelihood, variance = (torch.stack(part, 1) for part in zip(*found, strict=True))
-    weight = torch.softmax(likelihood.flatten(1), -1).view_as(likelihood)
-    evidence = torch.logsumexp(likelihood.flatten(1), -1) - math.log(likelihood[0].numel())
-    off = torch.where((evidence > math.log(_LIKELIER))[:, None], (weight * variance).sum(-1) @ which, 0.0)
-    return turns * off.sqrt()[:, None, None] if bool((off > 0).any()) else None
-
-
-def _likelihood(information: Tensor, right: Tensor, some: Tensor) -> tuple[Tensor, Tensor]:
-    """Logarithm (J, G) of how much likelier some of the unknowns are off with G variances (J, G) than not at all."""
-    information, right = information[:, some][:, :, some], right[:, some]
-    values, vectors = torch.linalg.eigh(0.5 * (information + information.mT))
-    values = values.clamp_min(0.0)[:, None]
-    known = values[..., -1:].clamp_min(torch.finfo(values.dtype).tiny)
-    variance = torch.logspace(*_OFF, _GRID, dtype=right.dtype, device=right.device)[:, None].square() / known
-    along = (vectors.mT @ right[..., None])[..., 0].square()[:, None]
-    # the right side along a direction has the variance l + v l^2
-    spread = 1 + variance * values
-    likelihood = 0.5 * (torch.where(values > 0, along * variance / spread, 0.0) - spread.log()).sum(-1)
-    return likelihood, variance[..., 0]
+def _in_axes_of_first(views: list[Seen], off: Tensor) -> Tensor:
+    """By how much poses (J, 6, 6 V) in the axes of the rig's first camera differ from those of its place if that one
+    is off."""
+    moved = torch.zeros_like(off[:, 0, :POSE])
+    if views[0].camera == 0:
+        moved[..., :POSE] = off[:, 0, :POSE, :POSE]
+    return moved
 
 
 def _taken(information: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
@@ -345,14 +329,6 @@ def _taken(information: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
     there = values > least * values[..., -1:].clamp_min(least)
     along = (vectors.mT @ (right * scale)[..., None])[..., 0]
     return torch.where(there, along.square() / values.clamp_min(LEAST_DIRECTION), 0.0).sum(-1), there.sum(-1)
-
-
-# deviations of what the pictures tell best, by which a camera may be off: from none that would show to what nobody
-# would call a calibration (convention)
-_OFF, _GRID = (-1.0, 3.0), 24
-# times as likely as not at all: of rows of rigs that are as they say, one in ten is widened (measured:
-# `scripts/rig_statistics.py`); from 1 on knocks of five deviations are not covered
-_LIKELIER = 0.5
 
 
 def _share(normals: MarkerNormals, own: Tensor, views: int) -> Tensor:

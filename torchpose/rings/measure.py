@@ -1,5 +1,6 @@
 """Stage: concentric pairs. From candidate ellipses to rings with both circles measured."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -197,7 +198,7 @@ def _measured(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
     A mask or a band of a fixed size sees little of an edge that is wider; in a frame of half the size it is not.
     """
     candidates, inside = circles.outer, circles.inside
-    by_blur = reduction_for(blurs.axes(inside.blur)[1].sqrt(), zernike.WIDEST)
+    by_blur = reduction_for(_in_common(blurs.axes(inside.blur)[1].sqrt(), candidates.frame), zernike.WIDEST)
     # a ring keeps a pixel more than the least has
     factor = by_blur.minimum(reduction_for(candidates.ellipse[:, 3], 2 * (_LEAST_SEMI_MINOR[0] + 1)))
     rings, which = [], []
@@ -214,6 +215,14 @@ def _measured(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
         return _no_rings(candidates), candidates.frame
     order = torch.argsort(torch.cat(which))
     return Rings.cat(rings)[order], torch.cat(which)[order]
+
+
+def _in_common(blur: Tensor, frame: Tensor) -> Tensor:
+    """Blurs (K,) px of the rings of frames (K,); those of a frame that differ little count as one, and so each frame is
+    reduced in one way."""
+    logarithm = blur.log()
+    usual = segment_mean(logarithm, frame, int(frame.max()) + 1)[frame]
+    return torch.where((logarithm - usual).abs() < 0.5 * math.log(2), usual, logarithm).exp()
 
 
 def _enlarged(rings: Rings, factor: int) -> Rings:
@@ -297,13 +306,9 @@ def _by_edges(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
     step = segment_mean(edges.step[keep], ring, 2 * count)
     step_ratio = step[count:] / step[:count]
     offset = torch.linalg.vector_norm(raw[count:, :2] - inner[:, :2], dim=-1)
-    # all points lie within reach of the rough ellipse; a fit that does not has followed the stump of a circle cut off
-    shift = torch.linalg.vector_norm(raw[:, :2] - rough[:, :2], dim=-1)
-    growth = (conics.shape_matrix(raw) - conics.shape_matrix(rough)).abs().amax((1, 2))
-    near = torch.maximum(shift, growth) < reach + 1.5
     good = (
         fit.covariance.isfinite().all(-1).all(-1).view(2, count).all(0)
-        & near.view(2, count).all(0)
+        & _within(reach, raw, rough).view(2, count).all(0)
         & (cover[:count] > _LEAST_COVER[0])
         & (cover[count:] > _LEAST_COVER[1])
         & (step_ratio > STEP_RANGE[0])
@@ -318,6 +323,14 @@ def _by_edges(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
     follows = marked((edges.ring * SECTORS + sector)[keep], 2 * count * SECTORS).view(2, count, SECTORS)[0, index]
     known = (blur, inside.clipped[index], clear[index] & follows)
     return Rings(frame, polarity, raw[index], raw[second], fit[index], fit[second], *known), index
+
+
+def _within(reach: Tensor, fitted: Tensor, rough: Tensor) -> Tensor:
+    """Whether ellipses (N, 5) lie along their rough ones, (N,): all points are within reach of those, and a fit that is
+    not has followed the stump of a circle cut off."""
+    shift = torch.linalg.vector_norm(fitted[:, :2] - rough[:, :2], dim=-1)
+    growth = (conics.shape_matrix(fitted) - conics.shape_matrix(rough)).abs().amax((1, 2))
+    return torch.maximum(shift, growth) < reach + 1.5
 
 
 def _freed(edges: RingEdges, rough: Tensor, outward: Tensor, correct: bool) -> tuple[Tensor, Tensor, Tensor]:
