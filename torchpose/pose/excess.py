@@ -99,7 +99,9 @@ class _Modes(NamedTuple):
 
     def existing(self) -> Self:
         """Those that exist in any row; they come last."""
-        most = int(self.there.sum(-1).amax()) if len(self.there) else 0
+        if not len(self.there):
+            return self
+        most = int(self.there.sum(-1).amax())
         return type(self)(*(x[:, x.shape[1] - most :] for x in self))
 
 
