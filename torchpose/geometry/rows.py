@@ -25,7 +25,7 @@ class Rows:
     """Base of frozen dataclasses of tensors that share their first dimension; the first field has it for certain."""
 
     def __len__(self) -> int:
-        return len(getattr(self, _fields(type(self))[0][0]))
+        return len(getattr(self, _fields(type(self))[0][0]))  # type: ignore[arg-type]  # classes are hashable
 
     def __getitem__(self, index: Any) -> Self:
         """The rows selected by a mask, a slice or an index tensor."""
@@ -80,7 +80,7 @@ class Rows:
     def _each(self, change: Callable[..., Any], *others: Self, with_shared: bool = False) -> Self:
         """These rows with every field changed, given the same field of the others."""
         changed = {}
-        for name, common in _fields(type(self)):
+        for name, common in _fields(type(self)):  # type: ignore[arg-type]
             values = [getattr(rows, name) for rows in (self, *others)]
             changed[name] = first = values[0]
             if common and not with_shared:
