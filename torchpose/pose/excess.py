@@ -99,9 +99,7 @@ class _Modes(NamedTuple):
 
     def existing(self) -> Self:
         """Those that exist in any row; they come last."""
-        if not len(self.there):
-            return self
-        most = int(self.there.sum(-1).amax())
+        most = max(1, int(self.there.sum(-1).amax())) if len(self.there) else self.there.shape[1]
         return type(self)(*(x[:, x.shape[1] - most :] for x in self))
 
 
