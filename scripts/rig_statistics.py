@@ -243,7 +243,9 @@ def together(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def shown(row: dict[str, Any]) -> str:
-    return "  ".join(f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in row.items())
+    return "  ".join(
+        f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in row.items()
+    )
 
 
 def main() -> None:

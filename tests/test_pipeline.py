@@ -22,7 +22,7 @@ from torchpose.sim import add_noise, render
 
 SAMPLE = Path(__file__).parent.parent / "data" / "sample"
 QUAD = tp.Target.load("quad40")
-MOST_OPERATIONS = 19_400
+MOST_OPERATIONS = 14_500
 
 
 @pytest.fixture(scope="module")

@@ -292,7 +292,7 @@ def fit_arcs(grad: Gradient, arcs: Regions, wanted: Wanted = ANYTHING) -> Candid
     about = describe_arcs(arcs, xy)
     pair = chain_pairs(about, wanted.polarity)
     if len(pair) == 0:
-        return score(grad, about.frame[:0], xy.new_zeros(0, 5), xy.new_zeros(0))
+        return Candidates.unscored(about.frame[:0], xy.new_zeros(0, 5), xy.new_zeros(0))
     params = fit_pairs(arcs, about, xy, pair)
     some = positions(plausible(grad, params) == Verdict.ACCEPTED)
     pair, params = pair[some], params[some]

@@ -208,7 +208,7 @@ class ResultStore:
             self._forget()
             self._places = places
             for record in self._journal.read(list(places.values())):
-                self._note(record)
+                self._note(self._completed(record))
         return True
 
     def _is_fresh(self, record: Row) -> bool:
@@ -236,11 +236,14 @@ class ResultStore:
         return check
 
     def _records(self, frames: Sequence[str]) -> Iterator[Row]:
-        for record in self._journal.read([self._places[frame] for frame in frames]):
-            for part, schema in (("rows", self._schema), ("detections", self.marks)):
-                newer = {column: cell for column, cell in NEWER.items() if column in schema}
-                record[part] = [newer | row for row in record[part]]
-            yield record
+        yield from map(self._completed, self._journal.read([self._places[frame] for frame in frames]))
+
+    def _completed(self, record: Row) -> Row:
+        """A record of the journal with all columns: one that a row lacks is empty, as its check has it."""
+        for part, schema in (("rows", self._schema), ("detections", self.marks)):
+            empty: Row = {column: NEWER.get(column) for column in schema}
+            record[part] = [empty | row for row in record[part]]
+        return record
 
     def _finished(self) -> Iterator[Row]:
         """Records of the tables of a run that was completed."""

@@ -111,7 +111,9 @@ _POINT = ("tx", "ty", "tz", "sx", "sy", "sz", "srx", "sry", "srz", "nx", "ny", "
 
 
 class Observer:
-    """Looks at single frames: pose, row, and what there is to turn.
+    """Looks at frames, one after the other: pose, row, and what there is to turn.
+
+    Where the last frame had a pose, the next one is looked for near it, and everywhere where that fails.
 
     Args:
         camera: of the frames.
@@ -123,6 +125,7 @@ class Observer:
         self.camera, self.target = camera, target
         self.estimator = PoseEstimator(camera, target, **options)
         self._overlay = Overlay(camera, [target])
+        self._last: Poses | None = None
 
     def look(self, shot: Shot) -> Sight:
         """What is seen in a frame."""
@@ -131,7 +134,7 @@ class Observer:
             row = fault_row(shot.name, self.target.name, shot.fault.status, shot.fault.reason)
             return Sight(shot, row, [], None, self.target.ids.tolist(), [], None, None, None)
         frame = torch.from_numpy(shot.image)
-        poses = self.estimator(frame[None])
+        poses = self._last = self.estimator(frame[None], near=self._last)
         part = self.target.part_from_target
         (row,) = pose_rows(poses if part is None else poses.moved(*part), [shot.name], [self.target.name])
         outlines = _outlines(poses.detections)

@@ -59,9 +59,7 @@ def _second_moment(information: Tensor, right: Tensor) -> Tensor:
     size = len(right)
     cameras = torch.eye(size // POSE, dtype=right.dtype, device=right.device)
     turned = torch.nn.functional.pad(right.new_ones(2), (0, POSE - 2))  # about the axes across the line of sight
-    which = torch.cat(
-        [torch.kron(cameras, turned[None]), cameras.repeat_interleave(POSE, 1), right.new_ones(1, size)]
-    )
+    which = torch.cat([torch.kron(cameras, turned[None]), cameras.repeat_interleave(POSE, 1), right.new_ones(1, size)])
     likelihood, moment = zip(*(_if_off(information, right, some > 0) for some in which), strict=True)
     every = torch.stack(likelihood)
     # as likely beforehand as none of it

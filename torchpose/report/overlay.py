@@ -91,9 +91,7 @@ class Overlay:
         if folder is not None:
             make_folder(folder, "--overlay")
 
-    def write(
-        self, frames: Tensor, poses: Poses, names: Sequence[str], seen: Sequence[bool] | None = None
-    ) -> None:
+    def write(self, frames: Tensor, poses: Poses, names: Sequence[str], seen: Sequence[bool] | None = None) -> None:
         """Writes one picture a frame.
 
         Args:
@@ -216,8 +214,11 @@ def draw_polyline(picture: np.ndarray, points: np.ndarray, colour: Colour, width
 
 def draw_text(picture: np.ndarray, text: str, place: tuple[float, float], size: float, colour: Colour) -> None:
     """Text with a dark rim, readable on any ground."""
-    x, y = round(place[0]), round(place[1])
     rim = max(1, round(1.5 * size))
+    (wide, high), below = cv2.getTextSize(text, _FONT, size, rim)
+    # whole within the picture, whatever it belongs to
+    x = max(min(round(place[0]), picture.shape[1] - wide - rim), rim)
+    y = max(min(round(place[1]), picture.shape[0] - below - rim), high + rim)
     for dx, dy in ((-rim, -rim), (-rim, rim), (rim, -rim), (rim, rim)):
         cv2.putText(picture, text, (x + dx, y + dy), _FONT, size, (0, 0, 0), rim, cv2.LINE_AA)
     cv2.putText(picture, text, (x, y), _FONT, size, colour, rim, cv2.LINE_AA)

@@ -207,7 +207,6 @@ def plot(rows: list[Row], seconds: dict[str, float]) -> Figure:
         curves(orientation, rows, group, "orientation_median_deg", "orientation error, median [deg]")
         position.set_yscale("log")
         orientation.set_yscale("log")
-    axes[1, 0].legend(fontsize=9)
     bars, ratio = axes[:, 2]
     bars.barh(names, [1e3 * seconds[name] for name in names], color=[colours[name] for name in names])
     bars.axvline(300, color="k", linestyle=":")
@@ -220,5 +219,5 @@ def plot(rows: list[Row], seconds: dict[str, float]) -> Figure:
     over = [row | {"ratio": row["orientation_rms_deg"] / base[row["noise_px"]]} for row in rows]
     curves(ratio, over, names, "ratio", "orientation error, RMS, over that of\ntorchpose iterative")
     ratio.set_yscale("log")
-    legend_below(figure, axes[0, :1], 6)
+    legend_below(figure, axes[:, 0], 6)
     return figure
