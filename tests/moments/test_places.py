@@ -65,7 +65,7 @@ def pose_of(information: Tensor, right: Tensor, rows: int) -> JointPose:
         "known": torch.ones(rows, dtype=torch.bool),
     }
     shapes = {"noise": (6, 6), "systematic": (6, 1), "place": (4, 5), "look": (4, 5), "share": (2,)}
-    kinds = {name: torch.int64 for name in ("misfit", "freedom", "between_freedom", "odd")}
+    kinds = dict.fromkeys(("misfit", "freedom", "between_freedom", "odd"), torch.int64)
     kinds |= {"explained": torch.bool, "torn": torch.bool}
     for field in fields(JointPose):
         empty = torch.zeros(rows, *shapes.get(field.name, ()), dtype=kinds.get(field.name, F64))

@@ -8,7 +8,6 @@ from torchpose.io.misfits import Misfits
 from torchpose.io.rows import Row
 from torchpose.io.whole_run import WholeRun
 
-
 _LEAST_CHANCE = 1e-300  # of a row whose cameras contradict each other (derived: the smallest of float64)
 
 
