@@ -166,11 +166,11 @@ def _explanations(modes: _Modes, none: Excess, even: Tensor | None) -> tuple[Ten
     One thing that is off, as k1, may stand in one direction of the residuals, where their sum says little. So a camera,
     which costs little to try, is held against rows whose sum is no surprise, too.
     """
-    row = (none.chi2 > quantile(none.freedom.clamp_min(1), _LOOKED_AT)).nonzero()[:, 0]
+    row = (none.chi2 > _usual(none.freedom)).nonzero()[:, 0]
     some, silent = _Modes(*(x[row] for x in modes)), torch.zeros_like(none.chi2)
-    # where noise is known to be more than that of independent pixels, still more is no surprise
+    # beforehand as likely as all three; where noise is known to be more than that of independent pixels, as each
     expected = torch.ones_like(none.explained) if even is None else even > 0
-    nothing = _NOTHING * expected[row] - 0.5 * some.residual.square().sum(-1)
+    nothing = math.log(_SCATTER + 1) * expected[row] - 0.5 * some.residual.square().sum(-1)
     camera = _beside_scatter(_camera, some)
     kept = (none.chi2[row] > quantile(none.freedom[row].clamp_min(1), SURE)) | (camera.evidence > nothing)
     row, some, nothing = row[kept], _Modes(*(x[kept] for x in some)), nothing[kept]
@@ -200,9 +200,14 @@ def no_excess(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) 
 def _none(right: Tensor, modes: _Modes) -> Excess:
     chi2, freedom = modes.residual.square().sum(-1), modes.there.sum(-1)
     zero, one = torch.zeros_like(right), torch.ones_like(chi2)
-    by_chance = chi2 < quantile(freedom.clamp_min(1), _LOOKED_AT)
+    by_chance = chi2 < _usual(freedom)
     nothing = torch.zeros_like(freedom)
     return Excess(zero, zero, one, one, zero[:, 0], zero[:, 0], nothing, by_chance, chi2, freedom)
+
+
+def _usual(freedom: Tensor) -> Tensor:
+    """What chi-squared (N,) of noise stays below by one of its deviations: five times in six."""
+    return freedom + (2 * freedom).sqrt()
 
 
 def _most(freedom: Tensor) -> Tensor:
