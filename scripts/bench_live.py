@@ -1,6 +1,6 @@
 """What the live page costs: from a frame to the page, frames a second with viewers, and memory over many frames.
 
-    python scripts/bench_live.py [--seconds 20] [--soak 100000]
+    python scripts/bench_live.py [--seconds 20] [--soak 100000] [--looks 15]
 
 Frames of the simulated target are played as fast as the estimator takes them, at 2 and 20 MP, and looked at by 0, 1 and
 10 viewers over loopback. A viewer does what the page does: it reads the events, and asks for the newest picture when it
@@ -9,6 +9,9 @@ at which a viewer has its numbers, and its picture.
 
 The soak plays small frames as fast as they can be looked at, with one viewer, and tells the memory as it goes;
 `--remembered` looks at each of the three pictures once and plays what was seen, so that all but the estimator works.
+
+`--looks` tells what tracking saves: CPU of looking at a frame near the last pose, and all over it, in turn, of frames
+with the target alone and with 200 other things.
 """
 
 from __future__ import annotations
@@ -29,6 +32,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 
@@ -44,6 +48,7 @@ from torchpose.target import Target
 ROOT = Path(__file__).parents[1]
 VIEWERS = str(Path(__file__).with_name("live_viewers.py"))
 CAMERAS = {"2 MP": "acA5472_8mm_third.yaml", "20 MP": "acA5472_8mm.yaml"}
+THINGS = 200  # beside the target, where there are others
 FRAMES = 3  # different ones, so that nothing can be kept from one to the next
 PAGE_KB = 1024
 
@@ -54,7 +59,6 @@ class Played:
 
     images: list[np.ndarray]
     kind: str = "folder"
-    encoded: bool = False
     number: int = 0
     times: list[float] = field(default_factory=list)
 
@@ -74,6 +78,53 @@ def frames_of(camera: Camera, target: Target, distance: float) -> list[np.ndarra
     R, t = torch.eye(3, dtype=torch.float64)[None], torch.tensor([[0.0, 0.0, distance]], dtype=torch.float64)
     ideal = render(camera, target, R, t, plate=(70.0, 70.0), surround=110.0)
     return [np.asarray(add_noise(ideal, 1.0, seed)[0]) for seed in range(FRAMES)]
+
+
+def cluttered(image: np.ndarray) -> np.ndarray:
+    """The frame with rings, discs and squares beside the plate, which is left as it is."""
+    generator, height, width = np.random.default_rng(1), *image.shape
+    found, size, third = image.copy(), height // 40, height // 3
+    plate = np.s_[height // 2 - third : height // 2 + third, width // 2 - third : width // 2 + third]
+    for number in range(THINGS):
+        at = tuple(int(v) for v in generator.integers(size, (width - size, height - size)))
+        if number % 2:
+            line = -1 if number % 4 == 1 else size // 4
+            cv2.circle(found, at, int(generator.integers(size // 2, size)), 40, line, cv2.LINE_AA)
+        else:
+            cv2.rectangle(found, at, (at[0] + size, at[1] + size // 2), 180, -1)
+    found[plate] = image[plate]
+    return found
+
+
+def looks(count: int) -> None:
+    """Prints CPU of a frame near the last pose and all over, in one run."""
+    target = Target.load("quad40")
+    print("| frames | all over, CPU ms | near, CPU ms | near / all over |\n| --- | ---: | ---: | ---: |")
+    for size, name in CAMERAS.items():
+        camera = Camera.load(ROOT / "configs/cameras" / name)
+        alone = frames_of(camera, target, 150.0)
+        for what, images in (("target alone", alone), (f"{THINGS} other things", [cluttered(one) for one in alone])):
+            near, everywhere = Observer(camera, target), Everywhere(camera, target)
+            times: dict[str, list[float]] = {"near": [], "everywhere": []}
+            with torch.inference_mode():
+                for number in range(count + 2):
+                    shot = Shot(f"{number}", time.time(), images[number % FRAMES])
+                    for key, observer in (("near", near), ("everywhere", everywhere)):
+                        began = time.process_time()
+                        sight = observer.look(shot)
+                        times[key].append(time.process_time() - began)
+                        assert sight.row["status"] == "ok", sight.row
+            all_over, tracked = (1e3 * statistics.median(times[key][2:]) for key in ("everywhere", "near"))
+            ratio = statistics.median(a / b for a, b in zip(times["near"][2:], times["everywhere"][2:], strict=True))
+            print(f"| {size}, {what} | {all_over:.0f} | {tracked:.0f} | {ratio:.2f} |", flush=True)
+
+
+class Everywhere(Observer):
+    """Looks for the target all over every frame."""
+
+    def look(self, shot: Shot) -> Sight:
+        self._tracker.forget()
+        return super().look(shot)
 
 
 class Remembering(Observer):
@@ -188,7 +239,7 @@ def soak(count: int, kind: type[Observer]) -> None:
                             f"{live.snapshot.number:7d} frames  {resident_mb():7.1f} MB  {rate:.1f} frames/s",
                             flush=True,
                         )
-                        told += max(1, count // 20)
+                        told += max(1, count // 50)
             finally:
                 viewer.kill()
                 viewer.wait()
@@ -207,9 +258,13 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=20.0, help="of each row of the table")
     parser.add_argument("--soak", type=int, metavar="FRAMES", help="only play so many small frames")
     parser.add_argument("--remembered", action="store_true", help="without the estimator")
+    parser.add_argument("--looks", type=int, metavar="FRAMES", help="only tell what tracking saves")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    if given.soak:
+    cv2.setNumThreads(1)
+    if given.looks:
+        looks(given.looks)
+    elif given.soak:
         soak(given.soak, Remembering if given.remembered else Observer)
     else:
         latencies(given.seconds)

@@ -41,6 +41,7 @@ from peer_boards import DARK, NO_APRILTAG, TAG_MM, Contender, Pose, apriltag_det
 
 import torchpose as tp
 from torchpose.geometry import rotations
+from torchpose.report.figures import PlainLog
 from torchpose.sim import shapes
 
 CAMERA = Path(__file__).parents[1] / "data" / "sample" / "camera.yaml"
@@ -88,7 +89,7 @@ def points(camera: tp.Camera) -> list[Point]:
         *sweep("blur, px", "gaussian blur", (0.7, 1.0, 1.5, 2.0, 3.0, 5.0)),
         *sweep("motion, px", "motion", (1.0, 3.0, 6.0, 9.0, 12.0)),
         *sweep("noise, grey levels", "noise", (0.5, 2.0, 5.0, 15.0, 30.0, 45.0)),
-        *sweep("contrast, % of range", "low contrast", (0.75, 0.3, 0.15, 0.06)),
+        *sweep("contrast, share of range", "low contrast", (0.75, 0.3, 0.15, 0.06)),
     ]
 
 
@@ -198,6 +199,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
             if part:
                 panel.plot(*zip(*part, strict=True), linestyle="none", **style | {"markerfacecolor": "white"})
         panel.set(xlabel=axis, yscale="log")
+        panel.yaxis.set_major_formatter(PlainLog())
         if axis.startswith(("plate", "contrast")):
             panel.set_xscale("log")
             values = sorted({r["value"] for r in rows if r["axis"] == axis})

@@ -8,6 +8,12 @@ and OpenCV one after the other, and the ratios are medians over the rounds. `tor
 its own, start and all, on few and on many frames: the difference is what a frame costs, decoding, tables and all, and
 what is left of the few is its start. Memory is the largest resident set of any of its processes. The load of the
 machine stands beside: frames/s say nothing where others work.
+
+    python scripts/bench_pipeline.py --operations [1 8]
+
+counts dispatched tensor operations instead, of a batch of each size, by the functions of the package in which they are
+made and those that called these: counts do not depend on the load. `syncs` are those after which a GPU would be waited
+for: numbers read, sizes that depend on values.
 """
 
 from __future__ import annotations
@@ -20,16 +26,17 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
+from types import CodeType, ModuleType
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import torchpose as tp
 from torchpose import pipeline
@@ -41,6 +48,7 @@ from torchpose.sim import add_noise, render
 
 SIZES = {"2 MP": (1824, 1216, 1111.11), "20 MP": (5472, 3648, 3333.33)}
 FRAMES = 8
+_LISTED = 500  # operations of a function that the whole report lists
 COUNTS = {"2 MP": (16, 144), "20 MP": (4, 28)}  # frames of a short and a long run of the command, whole batches
 REFINEMENT = "refine_photometric"
 STAGES = (
@@ -292,6 +300,74 @@ def python_cpu(code: str) -> float:
     return usage.ru_utime + usage.ru_stime
 
 
+class Operations(TorchDispatchMode):
+    """Counts dispatched operations by the functions of torchpose on the stack, outermost first."""
+
+    def __init__(self) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]  # of torch
+        self.by_chain: Counter[tuple[str, ...]] = Counter()
+        self.kinds: Counter[str] = Counter()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        chain, frame = [], sys._getframe(1)
+        while frame is not None:
+            if (name := _function(frame.f_code)) is not None:
+                chain.append(name)
+            frame = frame.f_back  # type: ignore[assignment]
+        self.by_chain[tuple(reversed(chain))] += 1
+        self.kinds[func.overloadpacket.__name__] += 1
+        return func(*args, **(kwargs or {}))
+
+    @property
+    def total(self) -> int:
+        return self.by_chain.total()
+
+    def tree(self, least: int) -> list[str]:
+        """Lines of an indented list: all operations under a function that make up ``least`` or more."""
+        under: Counter[tuple[str, ...]] = Counter()
+        for chain, count in self.by_chain.items():
+            for end in range(1, len(chain) + 1):
+                under[chain[:end]] += count
+        first = {chain: number for number, chain in enumerate(under)}  # in the order of the calls
+
+        def below(chain: tuple[str, ...]) -> list[str]:
+            inner = [c for c in under if c[:-1] == chain and under[c] >= least]
+            lines = []
+            for c in sorted(inner, key=first.__getitem__):
+                lines += [f"{'    ' * len(chain)}- {c[-1]}: {under[c]}", *below(c)]
+            return lines
+
+        return below(())
+
+
+SYNCS = ("_local_scalar_dense", "nonzero", "equal", "_unique2", "unique_dim", "repeat_interleave")
+
+
+def _function(code: CodeType) -> str | None:
+    """Module and name of a function of the package; None of what only checks or selects."""
+    _, package, path = code.co_filename.rpartition("/torchpose/")
+    plumbing = path in ("geometry/arguments.py", "geometry/rows.py")
+    if not package or plumbing or code.co_name.startswith("<"):
+        return None
+    return f"{path.removesuffix('.py').replace('/', '.')}.{code.co_qualname}"
+
+
+def bench_operations(batches: list[int], least: int, report: list[str]) -> None:
+    camera, target = camera_of(*SIZES["2 MP"]), tp.Target.load("quad40")
+    frames, _, _ = make_frames(camera, target)
+    estimator = tp.PoseEstimator(camera, target)
+    for batch in batches:
+        some = frames[torch.arange(batch) % FRAMES].contiguous()
+        estimator(some)
+        with Operations() as operations:
+            estimator(some)
+        syncs = sum(operations.kinds[kind] for kind in SYNCS)
+        report += [f"## Operations of a batch of {batch}: {operations.total}, {syncs} of them syncs", ""]
+        report += [*operations.tree(least), ""]
+        kinds = ", ".join(f"{name} {count}" for name, count in operations.kinds.most_common(24))
+        report += [f"Most: {kinds}.", ""]
+
+
 def loaded() -> str:
     return f"Load of the machine (1 minute): {os.getloadavg()[0]:.1f}."
 
@@ -300,9 +376,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--out", type=Path, help="also write the report to this Markdown file")
+    parser.add_argument("--operations", type=int, nargs="*", metavar="BATCH", help="count operations of such batches")
+    parser.add_argument("--least", type=int, default=100, help="operations of a function that is listed")
     options = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
+    if options.operations is not None:
+        lines: list[str] = []
+        bench_operations(options.operations or [1], options.least, lines)
+        print("\n".join(lines))
+        return
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
     report = [
         "# Pipeline benchmark",
@@ -318,6 +401,7 @@ def main() -> None:
             bench_size(label, options.rounds, folder, report)
             bench_decoders(folder, options.rounds, report)
             bench_command(label, min(3, options.rounds), folder, report)
+    bench_operations([1, FRAMES], _LISTED, report)
     bench_start(min(3, options.rounds), report)
     bench_reduction(options.rounds, report)
     text = "\n".join(report)

@@ -15,6 +15,7 @@ import typer
 
 import torchpose as tp
 from torchpose.cli.main import app
+from torchpose.results import Misfit
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -78,8 +79,14 @@ def unique(table: str) -> list[str]:
 def test_statuses_and_reasons_are_all_explained() -> None:
     table = TASKS["statuses"]
     assert set(re.findall(r"`(\w+)`", table)) >= {status.name.lower() for status in tp.Status}
-    reasons = {reason.name.lower() for reason in tp.Reason} - {"none", "two_solutions"}  # the latter is `ambiguous`
-    assert set(re.findall(r"`(\w+)`", table)) >= reasons
+    reasons = {reason.name.lower() for reason in tp.Reason} - {"none"}
+    misfits = {misfit.name.lower() for misfit in Misfit} - {"none"}
+    assert set(re.findall(r"`(\w+)`", table)) >= reasons | misfits
+    # of files: every word that the readers of pictures have
+    sources = [path.read_text(encoding="utf-8") for path in (ROOT / "torchpose" / "io").rglob("*.py")]
+    words = {word for text in sources for word in re.findall(r'UnreadableImageError\("(\w+)"\)', text)}
+    assert words >= {"corrupt", "truncated", "missing"}
+    assert set(re.findall(r"`(\w+)`", page("pictures.md"))) >= words
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

@@ -25,6 +25,7 @@ FLOW = [
     ["refine"],
     ["moments"],
     ["pipeline"],
+    ["tracking"],
     ["io", "sim"],
     ["analysis"],
     ["datasets"],

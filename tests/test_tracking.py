@@ -10,12 +10,13 @@ from torch import Tensor
 from torchpose import pipeline
 from torchpose.camera import Camera
 from torchpose.detect.candidates import find_coarse
-from torchpose.errors import ConfigError
+from torchpose.errors import ArgumentError, ConfigError
 from torchpose.geometry import rotations
 from torchpose.pipeline import PoseEstimator
 from torchpose.results import Poses, Status
 from torchpose.sim import add_noise, render
 from torchpose.target import Target
+from torchpose.tracking import Tracker
 
 F64 = torch.float64
 MATRIX = torch.tensor([[800.0, 0, 399.5], [0, 800, 299.5], [0, 0, 1]], dtype=F64)
@@ -95,3 +96,29 @@ def test_poses_of_other_targets_are_refused(estimator: PoseEstimator, sequence: 
     both = PoseEstimator(CAMERA, ["quad40", "hexa50"])(sequence[:1])
     with pytest.raises(ConfigError, match=r"^near: poses of 2 targets"):
         estimator(sequence[:1], near=both)
+
+
+def test_a_tracker_keeps_the_last_pose_of_every_sequence(
+    estimator: PoseEstimator, sequence: Tensor, searched: list[int]
+) -> None:
+    """Two sequences, of which one pauses, and their order changes; each goes on where it was."""
+    tracker = Tracker(estimator)
+    assert same(tracker(sequence[[0, 5]], ["left", "right"]), estimator(sequence[[0, 5]]))
+    tracker(sequence[[1]], ["left"])
+    searched.clear()
+    now = tracker(sequence[[6, 2]], ["right", "left"])
+    assert not searched
+    assert same(now, estimator(sequence[[6, 2]]))
+    tracker.forget("left")
+    searched.clear()
+    tracker(sequence[[7, 3]], ["right", "left"])
+    assert searched == [1]
+    with pytest.raises(ArgumentError, match=r"^sequences: 1 names for 2 frames"):
+        tracker(sequence[:2], ["left"])
+
+
+def test_poses_given_as_matrices_are_those_of_all_targets(estimator: PoseEstimator, sequence: Tensor) -> None:
+    last = estimator(sequence[:1])
+    assert same(estimator(sequence[1:2], near=(last.R[None], last.t[None])), estimator(sequence[1:2]))
+    with pytest.raises(ArgumentError, match=r"^near: has shapes \(1, 3, 3\)"):
+        estimator(sequence[1:2], near=(last.R, last.t))

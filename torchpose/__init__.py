@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from torchpose.results import Detections, Misfit, Motions, Poses, Reason, Status
     from torchpose.rings import zernike
     from torchpose.target import Target
+    from torchpose.tracking import Tracker
 
 __all__ = [
     "ArgumentError",
@@ -32,6 +33,7 @@ __all__ = [
     "Status",
     "Target",
     "TorchposeError",
+    "Tracker",
     "analysis",
     "calibration",
     "centers",
@@ -60,6 +62,7 @@ _HOME = {
     "Status": "results",
     "Target": "target",
     "TorchposeError": "errors",
+    "Tracker": "tracking",
 }
 _MODULES = {"centers": "pose.centers", "zernike": "rings.zernike"}
 

@@ -232,33 +232,6 @@ class _Conics(NamedTuple):
         ellipse = torch.cat([ellipse[:, :2] * scale + self.center, ellipse[:, 2:4] * scale, ellipse[:, 4:]], -1)
         return torch.where(self.sound[:, None], ellipse, torch.nan)
 
-    def form(self) -> Tensor:
-        """(M, 5) as `_form_of` has it, which distances need; axes and angle would cost as much as the fit."""
-        squares, b, linear, f = self.conic[:, :3:2], self.conic[:, 1], self.conic[:, 3:5], self.conic[:, 5]
-        mixed = squares.flip(-1)
-        disc = 4 * squares.prod(-1) - b.square()
-        center = (b[:, None] * linear.flip(-1) - 2 * mixed * linear) / disc[:, None]
-        level = -(f + 0.5 * (linear * center).sum(-1)) * self.scale.square()
-        form = torch.cat([center * self.scale[:, None] + self.center, self.conic[:, :3] / level[:, None]], -1)
-        sound = self.sound & (disc > 0) & (form[:, 2] > 0)
-        return torch.where(sound[:, None], form, torch.nan)
-
-
-def _form_of(ellipses: Tensor) -> Tensor:
-    """(M, 5) of ellipses (M, 5): centre and p, r, q of p x^2 + r x y + q y^2 = 1 about it."""
-    conic = conics.conic_from_ellipse(ellipses)
-    return torch.cat([ellipses[:, :2], conic[:, :3]], -1)
-
-
-def _from_form(xy: Tensor, form: Tensor) -> Tensor:
-    """Signed first-order distances (K, T) of points (K, 2, T) from ellipses given by forms (K, 5), as `distance`."""
-    cx, cy, p, r, q = form[:, :, None].unbind(1)
-    dx, dy = xy[:, 0] - cx, xy[:, 1] - cy
-    half = 0.5 * r
-    u, v = p * dx + half * dy, half * dx + q * dy
-    rho = (u * dx + v * dy).sqrt()  # whose gradient is (u, v) / rho
-    return (rho - 1) * rho / (u * u + v * v).sqrt()
-
 
 def _halir_flusser(moments: Tensor) -> Tensor:
     """Conics (M, 6) of central moments (12, M), as `_moments` orders them, with m20 + m02 = 1.
@@ -393,36 +366,117 @@ def fit_robust(
     expect_positive(cut=cut, **{f"scales[{i}]": scale for i, scale in enumerate(scales)})
     if len(start) != count:
         raise ArgumentError(f"start: has {len(start)} ellipses; give one for each of the {count} of count")
-    tiles, xy, there = _tiled(points, index, count)
-    there = there[:, 0]
+    near = Near.of(points, index, start)
+    _, keep = near.robust(near.circle, scales, cut)
+    ellipses = _Conics.of(*_tile_moments(near.tiles, near.xy, keep[:, None])).ellipses()
+    return ellipses, near.tiles.flat(keep) > 0
 
-    def refit(weights: Tensor) -> _Conics:
-        return _Conics.of(*_tile_moments(tiles, xy, weights[:, None]))
 
-    def distances(form: Tensor) -> Tensor:
-        return _from_form(xy, form[tiles.group])
+class Near(NamedTuple):
+    """Points near M ellipses, in coordinates in which each of these is the unit circle.
 
-    def trust(off: Tensor, scale: float) -> Tensor:
-        return there * geman_mcclure(off / scale).nan_to_num(nan=0.0)
+    There a conic a . (x^2, xy, y^2, x, y) = 1 near the circle is found by one linear solution, of small residuals about
+    as well as by the direct fit, and the distances from it are two products of matrices. Points that are not finite
+    count nothing.
 
-    form = _form_of(start.double())
-    for scale in scales:
-        again = refit(trust(distances(form), scale)).form()
-        form = torch.where(again.isfinite().all(-1, keepdim=True), again, form)
-    keep, fitted = there, None
-    for _ in range(3):
-        r = distances(form)
-        # the weighted RMS under Geman-McClure weights is a scale that outliers hardly move
-        w = trust(r, scales[-1])
-        sums = tiles.sums(torch.stack([(w * r.square().nan_to_num(nan=0.0)).sum(-1), w.sum(-1)], -1))
-        sigma = (sums[:, 0] / sums[:, 1]).sqrt()
-        before, keep = keep, there * (r.abs() <= (cut * sigma + 0.02)[tiles.group, None])
-        if fitted is not None and torch.equal(before, keep):  # the same points again
-            break
-        fitted = refit(keep)
-        form = fitted.form()
-    ellipses = start if fitted is None else fitted.ellipses()
-    return ellipses, tiles.flat(keep) > 0
+    Attributes:
+        tiles: the points'.
+        xy: (K, 2, T), px, 0 where there is none.
+        there: (K, T), 1 where there is one, else 0.
+        terms: (K, 6, T), x^2, xy, y^2, x, y and 1.
+        center: (M, 2), of the ellipses.
+        inverse: (M, 2, 2), from px about them to these coordinates.
+    """
+
+    tiles: Tiles
+    xy: Tensor
+    there: Tensor
+    terms: Tensor
+    center: Tensor
+    inverse: Tensor
+
+    @classmethod
+    def of(cls, points: Tensor, index: Tensor, ellipses: Tensor) -> Self:
+        """Of points (E, 2) near the ellipses (M, 5) of their index (E,)."""
+        ellipses = ellipses.double()
+        tiles, inverse = Tiles.of(index, len(ellipses)), torch.linalg.inv_ex(conics.shape_matrix(ellipses)).inverse
+        return cls._at(tiles, points, ellipses[:, :2], inverse)
+
+    @classmethod
+    def _at(cls, tiles: Tiles, points: Tensor, center: Tensor, inverse: Tensor) -> Self:
+        u, v = points.double().unbind(-1)
+        planes = tiles.planes(u, v, torch.ones_like(u))
+        finite = planes.isfinite().all(1, keepdim=True)
+        xy, there = torch.where(finite, planes, 0.0).split([2, 1], 1)
+        unit = torch.bmm(inverse[tiles.group], xy - center[tiles.group][..., None])
+        terms = xy.new_ones(xy.shape[0], 6, xy.shape[2])
+        torch.mul(unit, unit[:, :1], out=terms[:, :2])
+        torch.mul(unit[:, 1], unit[:, 1], out=terms[:, 2])
+        terms[:, 3:5] = unit
+        return cls(tiles, xy, there[:, 0], terms, center, inverse)
+
+    def moved(self, points: Tensor) -> Self:
+        """The same points at other places (E, 2)."""
+        return self._at(self.tiles, points, self.center, self.inverse)
+
+    @property
+    def circle(self) -> Tensor:
+        """Conics (M, 5) of the ellipses themselves."""
+        return self.terms.new_tensor([1.0, 0.0, 1.0, 0.0, 0.0]).expand(len(self.center), 5)
+
+    def slopes(self, conic: Tensor) -> Tensor:
+        """Gradients (K, 2, T) of conics (M, 5) at the points, per px."""
+        a, b, c, d, e = conic.unbind(-1)
+        slope = torch.stack([2 * a, b, d, b, 2 * c, e], -1).unflatten(-1, (2, 3))
+        return torch.bmm(torch.bmm(self.inverse, slope)[self.tiles.group], self.terms[:, 3:])
+
+    def distances(self, conic: Tensor, slopes: Tensor | None = None) -> Tensor:
+        """First-order distances (K, T) in px of the points from conics (M, 5), positive outside (Sampson)."""
+        slopes = self.slopes(conic) if slopes is None else slopes
+        both = torch.nn.functional.pad(conic, (0, 1), value=-1.0)[:, None]
+        value = torch.bmm(both[self.tiles.group], self.terms).squeeze(1)
+        return value / _length(slopes)
+
+    def curvatures(self, conic: Tensor, slopes: Tensor) -> Tensor:
+        """Curvatures (K, T) in 1/px of the level curves of conics (M, 5) at the points."""
+        second = conic[:, (0, 1, 1, 2)].unflatten(-1, (2, 2)) * conic.new_tensor([[2.0, 1.0], [1.0, 2.0]])
+        second = torch.bmm(torch.bmm(self.inverse, second), self.inverse)[self.tiles.group]
+        steep = _length(slopes)
+        along = torch.stack([slopes[:, 1], -slopes[:, 0]], 1)
+        return (torch.bmm(second, along) * along).sum(1) / steep**3
+
+    def robust(self, conic: Tensor, scales: tuple[float, ...], cut: float = 4.0) -> tuple[Tensor, Tensor]:
+        """Conics (M, 5) from ``conic`` on, see `fit_robust`, and which points were kept (K, T), 1 or 0."""
+
+        def trust(off: Tensor, scale: float) -> Tensor:
+            return self.there * geman_mcclure(off / scale).nan_to_num(nan=0.0)
+
+        for scale in scales:
+            conic = self.refit(trust(self.distances(conic), scale), conic)
+        keep = before = self.there
+        for number in range(3):
+            r = self.distances(conic)
+            # the weighted RMS under Geman-McClure weights is a scale that outliers hardly move
+            w = trust(r, scales[-1])
+            sums = self.tiles.sums(torch.stack([w * r.square().nan_to_num(nan=0.0), w], 1).sum(-1))
+            sigma = (sums[:, 0] / sums[:, 1]).sqrt()
+            before, keep = keep, self.there * (r.abs() <= (cut * sigma + 0.02)[self.tiles.group, None])
+            if number and torch.equal(before, keep):  # the same points again
+                break
+            conic = self.refit(keep, conic)
+        return conic, keep
+
+    def refit(self, weights: Tensor, old: Tensor) -> Tensor:
+        """Conics (M, 5) of the points by their weights (K, T); the ``old`` ones where they define none."""
+        gram = self.tiles.sums(torch.bmm(self.terms * weights[:, None], self.terms.mT))
+        conic = torch.linalg.solve_ex(gram[:, :5, :5], gram[:, :5, 5]).result
+        return torch.where(conic.isfinite().all(-1, keepdim=True), conic, old)
+
+
+def _length(planes: Tensor) -> Tensor:
+    """Lengths (K, T) of vectors (K, 2, T), in a tenth of the time of a norm along an axis that is not the last."""
+    x, y = planes.unbind(1)
+    return torch.addcmul(x * x, y, y).sqrt_()
 
 
 @checked
@@ -445,27 +499,27 @@ def with_covariance(
     _expect(index, count, weights)
     expect_positive(correlation=correlation)
     w = torch.ones_like(points[:, 0], dtype=torch.float64) if weights is None else weights.double()
-    value, gx, gy = _radial(points, index, ellipses)
-    norm = torch.sqrt(gx * gx + gy * gy)
-    r = (value / norm).nan_to_num(nan=0.0)
-    nx, ny = (gx / norm).nan_to_num(nan=0.0), (gy / norm).nan_to_num(nan=0.0)
-    theta = ellipses[:, 4]
-    each = theta.cos().nan_to_num(nan=1.0), theta.sin().nan_to_num(nan=0.0), ellipses[:, 2], ellipses[:, 3]
-    cos, sin, a, b = (v.index_select(0, index) for v in each)
-    n1, n2 = nx * cos + ny * sin, ny * cos - nx * sin
-    # unit circle coordinates (s1, s2) of the point: the boundary moves by n . (dc + E s)
-    s1, s2 = a * n1, b * n2
-    s = torch.sqrt(s1 * s1 + s2 * s2)
-    s1, s2 = (s1 / s).nan_to_num(nan=0.0), (s2 / s).nan_to_num(nan=0.0)
-    # times b, so that it is 1 where the ellipse is steepest
-    algebraic = (w * (b * norm).square()).nan_to_num(nan=0.0)
     tiles = Tiles.of(index, count)
-    planes = tiles.planes(nx, ny, n1 * s1, n1 * s2 + n2 * s1, n2 * s2, algebraic, w * r.square(), w)
-    jac, algebraic = planes[:, :5], planes[:, 5:6]
+    planes, of = tiles.planes(*points.double().unbind(-1), w), ellipses[tiles.group]
+    cos, sin = of[:, 4].cos(), of[:, 4].sin()
+    turn = torch.stack([cos, sin, -sin, cos], -1).view(-1, 2, 2)  # from the frame's axes to the ellipse's own
+    axes, w = of[:, 2:4, None], planes[:, 2:]
+    unit = torch.bmm(turn, planes[:, :2] - of[:, :2, None]) / axes
+    rho = _length(unit)[:, None]
+    slope = unit / (axes * rho)
+    norm = _length(slope)[:, None]
+    r, normal = ((rho - 1) / norm).nan_to_num(nan=0.0), slope / norm
+    # unit circle coordinates s of the point with that normal: the boundary moves by n . (dc + E s)
+    s = axes * normal
+    s = s / _length(s)[:, None]
+    own, mixed = normal * s, (normal * s.flip(1)).sum(1, keepdim=True)
+    jac = torch.cat([torch.bmm(turn.mT, normal), own[:, :1], mixed, own[:, 1:]], 1).nan_to_num(nan=0.0)
+    # times b, so that it is 1 where the ellipse is steepest
+    algebraic = (w * (axes[:, 1:] * norm).square()).nan_to_num(nan=0.0)
     weighted = jac * algebraic
     normal_matrix = tiles.sums(weighted @ jac.mT)
     scatter = tiles.sums((weighted * algebraic) @ jac.mT)
-    chi2, n = tiles.sums(planes[:, 6:].sum(-1)).unbind(-1)
+    chi2, n = tiles.sums(torch.cat([w * r.square(), w], 1).sum(-1)).unbind(-1)
     sigma = (chi2 / (n - 5).clamp_min(1)).sqrt()
     solvable = (n >= _SOLVABLE_POINTS) & ellipses.isfinite().all(-1)
     eye = torch.eye(5, dtype=torch.float64, device=points.device)

@@ -25,7 +25,7 @@ from torchpose.detect import (
     reduction_factor,
     same_ellipses,
 )
-from torchpose.errors import ConfigError, FrameError
+from torchpose.errors import ArgumentError, ConfigError, FrameError
 from torchpose.geometry import blur as blurs
 from torchpose.geometry.grey import FRAME_TYPES, as_frames
 from torchpose.geometry.segments import marked
@@ -68,6 +68,7 @@ from torchpose.rings import (
     mapped,
     measure_circles,
     measure_exactly,
+    measure_predicted,
     rough_rings,
 )
 from torchpose.target import Target
@@ -78,6 +79,7 @@ _LEAST_CANDIDATE = (
 _LEGIBLE = 1.8  # px, of blur, up to which the mean profile of a ring tells its code (measured: decisions/0059)
 _LAYOUT = ("ids", "centers", "normals", "radii", "valid", "polarity")  # of the table: what makes a target
 Method = Literal["photometric", "edges", "centers", "paper"]
+Near = Poses | tuple[Tensor, Tensor]
 
 
 class _Tried(NamedTuple):
@@ -206,17 +208,18 @@ class PoseEstimator(nn.Module):
         return f"camera={self.camera.width}x{self.camera.height}, targets=[{names}]"
 
     @torch.no_grad()
-    def forward(self, frames: Tensor | NDArray[Any], near: Poses | None = None) -> Poses:
+    def forward(self, frames: Tensor | NDArray[Any], near: Near | None = None) -> Poses:
         """Poses of every target in every frame.
 
         Args:
             frames: (H, W), (B, H, W) or (B, 1, H, W) grey, or (B, 3, H, W) RGB, of which the luma counts; tensors or
                 NumPy arrays of uint8, uint16, or floating point with white at ``float_range``.
             near: poses not long before, row by row of the frame of the batch that they are near to: of a sequence, what
-                the last call gave. The rings are looked for where these put them, up to `identify.near.MOST_MOVE` px
-                away, and all over the frame only where a target is not found whole there; so one that was lost is found
-                again. The result is the same to a fraction of its deviation, but for `Poses.copies`, which then counts
-                what is near. Boards, and several instances, are looked for everywhere.
+                the last call gave (`tracking.Tracker`); or R (B, T, 3, 3) and t (B, T, 3), NaN where unknown. The rings
+                are looked for where these put them, up to `identify.near.MOST_MOVE` px away, and all over the frame
+                only where a target is not found whole there; so one that was lost is found again. The result is the
+                same to a fraction of its deviation, but for `Poses.copies`, which then counts what is near. Boards, and
+                several instances, are looked for everywhere.
 
         Returns:
             Rows sorted by frame, target and instance, on the device of the frames: B * T of them with
@@ -255,7 +258,7 @@ class PoseEstimator(nn.Module):
             frames = frames.float() * (255.0 / self.float_range)
         return frames.contiguous()
 
-    def _found(self, scene: Scene, near: Poses | None = None) -> tuple[Scene, Found, Rings]:
+    def _found(self, scene: Scene, near: Near | None = None) -> tuple[Scene, Found, Rings]:
         """What is found in all frames: at the coarse scale alone where that shows every target whole.
 
         Also the rings that were measured for that.
@@ -268,17 +271,20 @@ class PoseEstimator(nn.Module):
             circles, others = self._useful(scene, find_candidates(frames, wanted=wanted, float_range=255.0))
             scene, found = self._read(scene, Rings.cat([self._measured(scene, circles), others]))
             return scene, found, found.rings
-        coarse = None if near is None else find_near(scene, *_placed(scene, near), wanted)
-        tracked = coarse is not None
-        if coarse is None:
-            coarse = find_coarse(frames, wanted=wanted, float_range=255.0)
+        there = None if near is None else find_near(scene, *_placed(scene, near))
+        if there is not None:
+            rings, _ = measure_predicted(frames, *there, scene.camera, correct=self._recipe.correct)
+            first = self._read(scene, rings)
+            settled = self._settled(*first)
+            if bool(settled.all()):
+                return *first, rings
+            return self._found_elsewhere(scene, first, settled, rings)
+        coarse = find_coarse(frames, wanted=wanted, float_range=255.0)
         rings, copies, tried = self._likely(scene, coarse)
         first = self._read(scene, rings, copies)
         settled = self._settled(*first)
         if bool(settled.all()):
             return *first, tried.rings
-        if tracked:
-            return self._found_elsewhere(scene, first, settled, tried.rings)
         rest, number = (~settled).nonzero()[:, 0], (~settled).cumsum(0) - 1
         known = coarse[~settled[coarse.frame]]
         known = replace(known, frame=number[known.frame])
@@ -370,8 +376,13 @@ class PoseEstimator(nn.Module):
         Also how many copies (B T,) were seen, and what was measured for that.
         """
         circles, count, least = self._circles(scene, candidates), len(scene.frames), int(scene.table.valid.sum())
+        # frames with fewer circles than markers are searched at all scales anyway; up to twice as many are measured
+        # sooner than they are chosen from
+        if self._recipe.on_rims and _few(circles, 2 * least, count):
+            circles = circles[_full(circles.outer.frame, count, least)[circles.outer.frame]]
+            rings, of = self._rings(scene, circles)  # when they are measured they tell which of them are markers
+            return rings, of.new_zeros(scene.groups), _Tried(circles.outer[of[:0]], rings[:0], rings.clipped[:0])
         rough = rough_rings(circles, scene.camera)
-        # frames with fewer circles than markers are searched at all scales anyway
         some = in_company(rough, scene.table, scene.camera.matrix)
         some &= _full(rough.frame[some], count, least)[rough.frame]
         # the code of a much blurred ring is not to be read off its profile
@@ -452,12 +463,19 @@ def _hopeful(scene: Scene, frames: int, found: Candidates) -> Tensor:
     return marked(found.frame[together], frames)
 
 
-def _placed(scene: Scene, near: Poses) -> tuple[Tensor, Tensor]:
+def _placed(scene: Scene, near: Near) -> tuple[Tensor, Tensor]:
     """The poses as those of the rows (N, 3, 3), (N, 3) of a scene with one for every frame and target; NaN elsewhere.
 
     Raises:
-        ConfigError: they are of other targets.
+        ConfigError: they are of other targets. ArgumentError: they are tensors of another shape.
     """
+    if isinstance(near, tuple):
+        R, t = near
+        each = (len(scene.frames), len(scene.table))
+        if R.shape != (*each, 3, 3) or t.shape != (*each, 3):
+            shapes = f"{tuple(R.shape)} and {tuple(t.shape)}"
+            raise ArgumentError(f"near: has shapes {shapes}; give R {(*each, 3, 3)} and t {(*each, 3)}")
+        return R.flatten(0, 1), t.flatten(0, 1)
     if len(near) and int(near.target.max()) >= len(scene.table):
         raise ConfigError(f"near: poses of {int(near.target.max()) + 1} targets, but there are {len(scene.table)}")
     some = near[(near.instance == 0) & (near.frame < len(scene.frames))]
@@ -637,6 +655,12 @@ def _legible(blur: Tensor) -> Tensor:
 def _full(frame: Tensor, frames: int, least: int) -> Tensor:
     """Frames (B,) bool that have at least so many of the items of frames (K,)."""
     return torch.bincount(frame, minlength=frames) >= least
+
+
+def _few(circles: Circles, most: int, frames: int) -> bool:
+    """Whether circles are legible, and no frame has so many of them that choosing costs less than measuring all."""
+    few = bool((torch.bincount(circles.outer.frame, minlength=frames) <= most).all())
+    return few and bool(_legible(circles.inside.blur).all())
 
 
 def _lacking(scene: Scene, identified: Identified) -> Tensor:

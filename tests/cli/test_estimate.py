@@ -8,7 +8,6 @@ import resource
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -505,8 +504,33 @@ COMMAND = [sys.executable, "-m", "torchpose"]
 OPTIONS = ["--camera", "camera.yaml", "--target", "quad40", "--threads", "1"]
 
 
-def start(*words: str) -> subprocess.Popen[str]:
-    command = [*COMMAND, "estimate", "f", *OPTIONS, "--batch", "1", *words]
+# a run that is ended at a moment of its own: a process that watched it from outside would be late on a busy machine
+ENDED = """
+import os, signal, sys
+from torchpose.cli.main import main
+from torchpose.io.journal import Journal
+
+lines, seconds, append = int(sys.argv.pop(1)), sys.argv.pop(1), Journal.append
+
+def counted(journal, records):
+    global lines
+    places = append(journal, records)
+    lines -= len(records)
+    if lines <= 0 and seconds == "interrupt":
+        os.kill(os.getpid(), signal.SIGINT)
+    elif lines <= 0 and not signal.getitimer(signal.ITIMER_REAL)[0]:
+        signal.setitimer(signal.ITIMER_REAL, float(seconds))  # its signal is not caught: the process is gone
+    return places
+
+Journal.append = counted
+main()
+"""
+
+
+def start(*words: str, ended: tuple[str, str] | None = None) -> subprocess.Popen[str]:
+    """A run; ended once it has written so many lines, by the terminal's ``interrupt`` or killed after some seconds."""
+    begin = COMMAND if ended is None else [sys.executable, "-c", ENDED, *ended]
+    command = [*begin, "estimate", "f", *OPTIONS, "--batch", "1", *words]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
@@ -514,19 +538,6 @@ def finish(process: subprocess.Popen[str]) -> tuple[int, str]:
     out, error = process.communicate(timeout=120)
     assert out == ""
     return process.returncode, error
-
-
-def wait_for_rows(process: subprocess.Popen[str], journal: Path, lines: int) -> bool:
-    """Waits until the journal has grown by some lines; False if the process ended before."""
-    begin = None
-    while process.poll() is None:
-        if journal.exists():
-            count = journal.read_bytes().count(b"\n")
-            begin = count if begin is None else begin
-            if count >= begin + lines:
-                return True
-        time.sleep(0.001)
-    return False
 
 
 @pytest.fixture
@@ -550,11 +561,9 @@ def test_a_run_killed_again_and_again_and_resumed_gives_the_rows_of_an_undisturb
     kills: list[Any] = []
     for _ in range(3):
         # two processes may be some rows ahead of the one that writes: once, so that rows are left for the others
-        process = start(*words, *(["--resume"] if kills else ["--threads", "2"]))
-        assert wait_for_rows(process, journal, chance.randint(1, 5))
-        time.sleep(chance.random() * 0.01)
-        process.kill()
-        process.communicate()
+        moment = str(chance.randint(2, 5)), str(chance.uniform(1e-6, 0.002))
+        process = start(*words, *(["--resume"] if kills else ["--threads", "2"]), ended=moment)
+        assert finish(process) == (-signal.SIGALRM, "")
         kills.append(journal.read_bytes().count(b"\n") - 1)
         assert not Path("poses.csv").exists()
     assert kills == sorted(kills)
@@ -570,10 +579,7 @@ def test_a_run_killed_again_and_again_and_resumed_gives_the_rows_of_an_undisturb
 
 @pytest.mark.usefixtures("many")
 def test_an_interrupted_run_says_how_to_go_on_and_prints_nothing_else() -> None:
-    process = start("--out", "poses.csv", "--threads", "2")
-    assert wait_for_rows(process, Path("poses.csv.partial"), 2)
-    process.send_signal(signal.SIGINT)
-    code, error = finish(process)
+    code, error = finish(start("--out", "poses.csv", "--threads", "2", ended=("3", "interrupt")))
     assert code == 130
     assert error.startswith("torchpose: error: interrupted: ")
     assert "--resume" in error

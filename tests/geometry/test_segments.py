@@ -87,9 +87,9 @@ def test_rank_in_group(members: list[int]) -> None:
     assert rank.tolist() == [members[:i].count(g) for i, g in enumerate(members)]
 
 
-@pytest.mark.parametrize("reach", [0.5, 8.0, 300.0])
+@pytest.mark.parametrize(("reach", "size"), [(0.5, 300), (8.0, 300), (300.0, 300), (300.0, 60)])
 @pytest.mark.parametrize("seed", range(5))
-def test_near_pairs_are_all_that_are_near(seed: int, reach: float) -> None:
+def test_near_pairs_are_all_that_are_near(seed: int, reach: float, size: int) -> None:
     generator = torch.Generator().manual_seed(seed)
 
     def points(count: int) -> torch.Tensor:
@@ -101,10 +101,10 @@ def test_near_pairs_are_all_that_are_near(seed: int, reach: float) -> None:
         some[2::11, 1] = torch.nan
         return some
 
-    first, second = points(300), points(400)
-    second[::5] = first[:80] + 0.1
-    group, other = (torch.randint(0, 3, (n,), generator=generator) for n in (300, 400))
-    span = reach * torch.rand(300, generator=generator, dtype=torch.float64).pow(3)
+    first, second = points(size), points(size + 100)
+    second[: size // 4] = first[: size // 4] + 0.1
+    group, other = (torch.randint(0, 3, (n,), generator=generator) for n in (size, size + 100))
+    span = reach * torch.rand(size, generator=generator, dtype=torch.float64).pow(3)
     i, j = near_pairs(first, second, span, (group, other))
     near = (first[:, None] - second).abs().amax(-1) <= span[:, None]
     near &= group[:, None] == other

@@ -14,7 +14,6 @@ from torchpose.geometry import rotations
 from torchpose.identify import Identified, MarkerTable, identify
 from torchpose.identify.assignments import propose
 from torchpose.identify.hypotheses import hypotheses
-from torchpose.identify.nearby import Nearby
 from torchpose.rings import Rings
 from torchpose.target import Target
 
@@ -139,21 +138,3 @@ def test_poses_grow_with_the_rings_and_not_with_their_square() -> None:
     for few, many in itertools.pairwise(counts):
         assert many[0] < 5.5 * few[0]  # of four times the rings
         assert many[1] < 5.5 * few[1]
-
-
-def test_boxes_hold_what_brute_force_finds() -> None:
-    g = torch.Generator().manual_seed(0)
-    points = torch.rand(400, 2, dtype=F64, generator=g) * torch.tensor([1800.0, 1200.0])
-    group = torch.randint(0, 5, (400,), generator=g)
-    center = torch.rand(200, 2, dtype=F64, generator=g) * torch.tensor([2400.0, 1600.0]) - 300
-    reach = torch.rand(200, dtype=F64, generator=g).pow(3) * 900
-    of = torch.randint(0, 5, (200,), generator=g)
-    box, point = Nearby.of(group, points).within(of, center, reach)
-    inside = ((points - center[:, None]).abs() <= reach[:, None, None]).all(-1) & (group == of[:, None])
-    pairs = set(zip(box.tolist(), point.tolist(), strict=True))
-    assert len(pairs) == len(box)
-    assert pairs >= set(map(tuple, inside.nonzero().tolist()))
-    # and beyond it no more than the rest of two strips of 64 px
-    off = (points[point] - center[box]).abs() - reach[box, None]
-    assert (off[:, 0] <= 0).all()
-    assert (off[:, 1] < 64).all()

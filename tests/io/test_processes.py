@@ -4,6 +4,7 @@ import os
 import signal
 import time
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -36,6 +37,20 @@ def test_results_come_in_the_order_of_the_items_from_every_process(count: int) -
         assert processes == [processes[i % count] for i in range(len(items))]
         assert {threads for _, _, threads in found} == {1}
         assert not any(alive(process) for process in processes)
+
+
+def test_fresh_processes_share_the_work_as_forked_ones_do() -> None:
+    """As in stores, and on systems that do not fork."""
+    items = [torch.tensor(number) for number in range(5)]
+    with Crew(partial(scaled, 3), items, 2, fresh=True, let_go=lambda: None) as crew:  # which no pickle takes
+        found = list(crew)
+    assert [value for value, _, _ in found] == [0, 3, 6, 9, 12]
+    assert len({process for _, process, _ in found} | {os.getpid()}) == 3
+    assert {threads for _, _, threads in found} == {1}
+
+
+def scaled(factor: int, numbers: Sequence[torch.Tensor]) -> Iterator[tuple[int, int, int]]:
+    yield from ((factor * int(number), os.getpid(), torch.get_num_threads()) for number in numbers)
 
 
 def tensors(numbers: Sequence[int]) -> Iterator[torch.Tensor]:

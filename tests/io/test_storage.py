@@ -6,8 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from tests.io.stores import ENVIRONMENT, Unsteady, s3_server
+from torchpose.camera import Camera
 from torchpose.cli.main import main
 from torchpose.errors import ConfigError
 from torchpose.io import storage
@@ -122,6 +124,72 @@ def test_a_run_from_and_to_a_store_has_the_rows_of_one_on_a_disk(
     assert "secret-word" not in "".join(capfd.readouterr())
     assert estimate(place, "--out", "s3://other/poses.csv") == 2
     assert "s3://other/poses.csv: --out: the bucket does not exist" in capfd.readouterr().err
+
+
+def test_simulate_fills_a_store_and_goes_on(bucket: Place, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    plan, out = tmp_path / "plan.yaml", bucket / "set"
+    matrix = torch.tensor([[250.0, 0, 79.5], [0, 250.0, 59.5], [0, 0, 1]], dtype=torch.float64)
+    Camera(160, 120, matrix, torch.zeros(4, dtype=torch.float64)).save(tmp_path / "camera.yaml")
+    text = (
+        "camera: camera.yaml\ntarget: quad40\nseed: {seed}\nbounds: false\n"
+        "print: {{seed: 4, center_sigma: 0.1, gain: [0.1, 0.2]}}\n"
+        "poses: {{grid: {{distance: 160, angles_deg: [0], positions: [[0, 0, 0], [5, 0, 0]]}}}}\n"
+    )
+    plan.write_text(text.format(seed=3))
+
+    def simulate(*arguments: str) -> int:
+        with pytest.raises(SystemExit) as ended:
+            main(["simulate", str(plan), "--threads", "1", *arguments])
+        assert isinstance(ended.value.code, int)
+        return ended.value.code
+
+    def stored() -> dict[str, bytes]:
+        return {one.name: (out / one.name).read(1 << 30) for one in out.listed()}
+
+    assert simulate("--out", str(tmp_path / "own")) == 0
+    assert simulate("--out", str(out)) == 0
+    whole = stored()
+    own = {path.relative_to(tmp_path / "own").as_posix(): path.read_bytes() for path in (tmp_path / "own").rglob("*.*")}
+    assert whole == own
+    assert {"frames/0001.png", "truth.csv", "prints.csv", "print.yaml", "plan.json"} < set(whole)
+    assert simulate("--out", str(out)) == 2
+    assert "s3://cell/set: --out: holds frames; add --resume" in capfd.readouterr().err
+    for name in ("frames/0001.png", "truth.csv"):  # as a run that was killed leaves it
+        (out / name).remove()
+    assert simulate("--out", str(out), "--resume") == 0
+    assert stored() == whole
+    plan.write_text(text.format(seed=5))
+    assert simulate("--out", str(out), "--resume") == 2
+    assert "s3://cell/set: --resume: the frames there were made with another plan" in capfd.readouterr().err
+    assert simulate("--out", "s3://other/set") == 2
+    assert "the bucket does not exist" in capfd.readouterr().err
+    assert simulate("--out", str(out), "--bop") == 2
+    assert "--bop: links the frames, which a store cannot" in capfd.readouterr().err
+
+
+def test_films_of_a_store_are_named(bucket: Place) -> None:
+    (bucket / "films" / "a.mp4").write(b"film")
+    (bucket / "films" / "b.png").write((SAMPLE / "frames" / "011.png").read_bytes())
+    lines: list[str] = []
+    assert [source.name for source in find_sources([bucket / "films"], lines.append)] == ["b.png"]
+    (line,) = lines
+    assert line.startswith("s3://cell/films: passed over 1 films, which are read from a disk alone; what is read ends")
+    assert ".mp4" not in line
+    with pytest.raises(
+        ConfigError, match=r"s3://cell/films/a.mp4: INPUT: a film, which is read from a disk alone; cop"
+    ):
+        find_sources([bucket / "films" / "a.mp4"])
+
+
+@pytest.mark.slow
+def test_processes_that_read_a_store_give_the_same_rows(bucket: Place, tmp_path: Path) -> None:
+    """Fresh ones: a connection cannot be forked."""
+    for number in range(6):
+        name = f"{number:03d}.png"
+        (bucket / "run 2" / name).write((SAMPLE / "frames" / name).read_bytes())
+    for threads, out in (("1", tmp_path / "one.csv"), ("2", bucket / "two.csv")):
+        assert estimate("s3://cell/run%202", "--out", str(out), "--batch", "2", "--threads", threads) == 0
+    assert (bucket / "two.csv").read(1 << 20) == (tmp_path / "one.csv").read_bytes()
 
 
 def test_manifests_and_stacks_of_a_store(bucket: Place) -> None:

@@ -49,7 +49,6 @@ class Scene:
     images: list[np.ndarray] = field(default_factory=lambda: [picture()])
     gap_s: float = 0.05
     kind: str = "folder"
-    encoded: bool = False
     number: int = 0
 
     def __enter__(self) -> Scene:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ import pytest
 from tests.live.cell import Page, Scene, picture, served
 from torchpose.live import server
 from torchpose.live.app import MOST_VIEWERS
-from torchpose.live.guard import Guard, is_loopback
+from torchpose.live.guard import COOKIE, Guard, _cookies, is_loopback
 
 TOKEN = "a token of some length"
 
@@ -94,6 +95,12 @@ FOREIGN: list[tuple[dict[str, str], int]] = [
     ({"host": "127.0.0.1.evil.example"}, 421),
     ({"host": "127.0.0.1@evil.example"}, 421),
     ({"host": "192.0.2.7:8765"}, 421),  # not where it listens
+    ({"host": "0.0.0.0:8765"}, 421),  # what some browsers let a page ask as this machine
+    ({"host": "2130706433"}, 421),  # 127.0.0.1 as one number, as a resolver may read it
+    ({"host": "127.1:8765"}, 421),
+    ({"host": "[::ffff:127.0.0.1]:8765"}, 421),
+    ({"host": "localhost.evil.example"}, 421),
+    ({"host": "localhost:8765, evil.example"}, 421),
     ({"sec-fetch-site": "cross-site", "sec-fetch-mode": "no-cors"}, 403),
     ({"sec-fetch-site": "same-site"}, 403),
     ({"sec-fetch-site": "cross-site", "sec-fetch-mode": "navigate"}, 403),  # to anything but the page itself
@@ -146,6 +153,8 @@ def test_the_page_asks_nobody_else() -> None:
         assert "//" not in text.replace("// ", ""), path
         assert "style=" not in text, path  # the policy has no place for it
         assert "onclick" not in text, path
+        assert "innerHTML" not in text, path  # a frame may be called anything: names are shown as text
+        assert "insertAdjacentHTML" not in text, path
 
 
 MALFORMED: list[tuple[str, bytes, str, int]] = [
@@ -182,6 +191,8 @@ def test_methods_and_doubled_headers(open_page: Client) -> None:
     assert open_page.http.get("/api/state", headers=twice).status_code == 400
     assert open_page.http.request("GET", "/api/state", content=b"x").status_code == 400
     assert open_page.http.get("/api/recording").status_code == 405
+    assert open_page.http.head("/api/events").status_code == 405  # would be a viewer who is told nothing
+    assert open_page.http.head("/api/state").status_code == 200
 
 
 def test_no_token_no_answer(closed_page: Client) -> None:
@@ -197,6 +208,7 @@ def test_no_token_no_answer(closed_page: Client) -> None:
             {"cookie": f"torchpose_live={TOKEN}"},
             {"cookie": "torchpose_live="},
             {"cookie": 'a=;;;=;"torchpose_live'},
+            {"cookie": "torchpose_live=a;" * 800},
         ):
             before = len(closed_page.lines)
             answer = known.get(path, headers=headers)
@@ -264,6 +276,15 @@ def test_what_is_no_http_is_refused(tmp_path: Path) -> None:
     with served(Scene(), tmp_path) as page:
         for request in (
             b"\x16\x03\x01\x02\x00" + bytes(200),
+            b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n" + b"X: a\r\n" * 12_000 + b"\r\n",
+            b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: a\0b\r\n\r\n",
+            b"GET / HTTP/1.1\r\nHost : 127.0.0.1\r\n\r\n",
+            b"GET / HTTP/1.0\r\n\r\n",
+            b"POST /api/still HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: " + b"9" * 5000 + b"\r\n\r\n",
+            CHUNKED + b"Content-Length: 2\r\n\r\n2\r\n{}\r\n0\r\n\r\n",  # two lengths: who splits them is fooled
+            CHUNKED + b"\r\nfffffffffffffffffffffff\r\n{}",
+            CHUNKED + b"\r\n" + b"100\r\n" + bytes(256) + b"\r\n" + b"400\r\n" + bytes(1024) + b"\r\n0\r\n\r\n",
+            CHUNKED + b"\r\n2;" + b"x" * 70_000,  # an extension without end
             b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: " + b"a" * 70_000 + b"\r\n\r\n",
             b"GET / HTTP/1.1\r\n\r\n",
             b"GET / HTTP/1.1\r\nHost: a\r\nHost: b\r\n\r\n",
@@ -271,11 +292,72 @@ def test_what_is_no_http_is_refused(tmp_path: Path) -> None:
             b"GET / NONSENSE\r\n\r\n",
         ):
             before = len(page.lines)
-            assert raw(page, request).split(b" ")[1] in (b"400", b"421", b"431"), request[:40]
+            assert raw(page, request).split(b" ")[1] in (b"400", b"413", b"421", b"431"), request[100:180]
             page.until(lambda before=before: len(page.lines) == before + 1)  # type: ignore[misc]
+        absolute = b"GET http://evil.example/api/state HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: close\r\n\r\n"
+        assert b" 404 " in raw(page, absolute)
         upgrade = b"GET /api/state HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\r\n"
         assert b" 101 " not in raw(page, upgrade)
         assert httpx.get(f"{page.url}/api/about").status_code == 200
+
+
+CHUNKED = (
+    b"POST /api/still HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\nTransfer-Encoding: chunked\r\n"
+)
+
+
+def test_a_flood_of_websockets_gets_none_and_the_estimator_goes_on(tmp_path: Path) -> None:
+    upgrade = (
+        b"GET /api/events HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+        b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+    )
+    with served(Scene(), tmp_path) as page, contextlib.ExitStack() as stack:
+        page.until(lambda: page.live.snapshot.sight is not None, 30)
+        before, answers = page.live.snapshot.number, []
+        for _ in range(60):
+            connection = stack.enter_context(socket.create_connection(("127.0.0.1", page.port), timeout=10))
+            with contextlib.suppress(ConnectionError):
+                connection.sendall(upgrade + b"\x81\xff" * 8000)  # frames that nobody reads
+            answers.append(connection)
+        for connection in answers:
+            with contextlib.suppress(ConnectionError):
+                assert b" 101 " not in connection.recv(200)
+        assert httpx.get(f"{page.url}/api/state", timeout=10).json()["status"] == "ok"
+        page.until(lambda: page.live.snapshot.number > before + 2, 20)
+
+
+def test_a_flood_of_refusals_fills_no_disk(tmp_path: Path) -> None:
+    many = server.MOST_LINES + 60
+    with served(Scene(), tmp_path, token=TOKEN) as page:
+        page.until(lambda: page.live.snapshot.sight is not None, 30)
+        before = page.live.snapshot.number
+        with httpx.Client(base_url=page.url, timeout=30) as http:
+            found = {http.get("/", params={"token": f"guess {number}"}).status_code for number in range(many)}
+            assert found == {401}
+            known = {"authorization": f"Bearer {TOKEN}"}
+            assert http.get("/api/state", headers=known).json()["status"] == "ok"
+        assert len(page.lines) == server.MOST_LINES
+        page.until(lambda: page.live.snapshot.number > before + 2, 20)
+    assert page.lines[-1] == "60 more such lines were left out"
+
+
+def test_lines_come_again_when_a_minute_has_passed() -> None:
+    lines: list[str] = []
+    now = [0.0]
+    tell = server.Bounded(lines.append, lambda: now[0])
+    for number in range(server.MOST_LINES + 5):
+        tell(str(number))
+    now[0] = 60.0
+    tell("next")
+    assert lines[-3:] == [str(server.MOST_LINES - 1), "5 more such lines were left out", "next"]
+
+
+def test_a_cookie_costs_no_time() -> None:
+    """A quote full of backslashes is half a second's work for `http.cookies` of Python 3.11.2 (CVE-2024-7592)."""
+    headers = {"cookie": [f'{COOKIE}="' + "\\" * 15_000 + '"']}
+    began = time.process_time()
+    assert _cookies(headers) == [headers["cookie"][0].partition("=")[2]]
+    assert time.process_time() - began < 0.02
 
 
 def test_slow_clients_are_dropped_and_the_estimator_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,7 +24,7 @@ from torchpose.cli.main import main
 from torchpose.live.sources import camera_of_rig
 from torchpose.rig.twin.scene import Scene
 
-sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
+sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install '.[browser]'")
 pytest.importorskip("pypylon.pylon", reason="needs pypylon: pip install '.[rig]'")
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), ""

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from torchpose.errors import ConfigError
-from torchpose.live.sources import Clock, Film, Player, camera_of_rig, folder_or_film
+from torchpose.io.films import Film
+from torchpose.io.sources import Source
+from torchpose.live.sources import Clock, camera_of_rig, player
 from torchpose.results import Status
 
 SIZE = (64, 48)
@@ -51,11 +53,10 @@ def folder(tmp_path: Path) -> Path:
 
 def test_folder_is_played_in_order_over_and_over(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     time = Time()
-    player = folder_or_film(folder, SIZE, 10.0, lambda line: None)
-    assert isinstance(player, Player)
-    assert not player.encoded
-    player._clock = Clock(10.0, time)
-    shots = [player.newest(time.wait) for _ in range(5)]
+    played = player(folder, SIZE, 10.0, lambda line: None)
+    assert played.kind == "folder"
+    played._clock = Clock(10.0, time)
+    shots = [played.newest(time.wait) for _ in range(5)]
     assert [shot.name for shot in shots] == ["8.png", "9.png", "10.png", "11.png", "8.png"]
     assert shots[1].image is not None
     assert shots[1].image[0, 0] == 10
@@ -67,7 +68,7 @@ def test_folder_is_played_in_order_over_and_over(folder: Path, monkeypatch: pyte
         None,
     ]
     time.now += 0.65  # the estimator was busy: what has passed is dropped, not queued
-    late = player.newest(time.wait)
+    late = played.newest(time.wait)
     assert (late.name, late.passed_over) == ("10.png", 5)
 
 
@@ -84,40 +85,80 @@ def film(tmp_path: Path) -> Path:
 
 def test_film_is_played_by_the_clock(film: Path) -> None:
     time = Time()
-    found = folder_or_film(film, SIZE, None, lambda line: None)
-    assert isinstance(found, Film)
-    assert found.encoded
+    found = player(film, SIZE, None, lambda line: None)
+    assert found.kind == "video"
+    assert found._rate == 20.0  # the film's own
     found._clock = Clock(20.0, time)
     with found:
         shots = [found.newest(time.wait) for _ in range(3)]
-        assert [shot.name for shot in shots] == ["clip.avi#0", "clip.avi#1", "clip.avi#2"]
+        assert [shot.name for shot in shots] == ["clip.avi#1", "clip.avi#2", "clip.avi#3"]
         assert [float(shot.image.mean()) for shot in shots if shot.image is not None] == pytest.approx(
             [10, 30, 50], abs=3
         )
         time.now += 0.22  # three frames go by
         late = found.newest(time.wait)
-        assert (late.name, late.passed_over) == ("clip.avi#6", 3)
+        assert (late.name, late.passed_over) == ("clip.avi#7", 3)
         assert late.image is not None
         assert float(late.image.mean()) == pytest.approx(130, abs=3)
         names = [found.newest(time.wait).name for _ in range(5)]
-        assert names == ["clip.avi#7", "clip.avi#8", "clip.avi#9", "clip.avi#0", "clip.avi#1"]  # over again
+        assert names == ["clip.avi#8", "clip.avi#9", "clip.avi#10", "clip.avi#1", "clip.avi#2"]  # over again
         time.now += 100.0  # after a pause it does not decode all that it missed
         assert found.newest(time.wait).passed_over <= 20
 
 
 def test_film_of_another_size_has_a_fault(film: Path) -> None:
-    with Film(film, (640, 480)) as found:
-        shot = found.newest(Time().wait)
+    shot = player(film, (640, 480), None, lambda line: None).newest(Time().wait)
     assert shot.fault is not None
     assert (shot.fault.status, shot.fault.reason) == (Status.WRONG_SIZE, "64x48")
 
 
-@pytest.mark.parametrize("name", ["missing.mp4", "text.mp4", "missing", "empty"])
-def test_what_is_no_source_is_named(tmp_path: Path, name: str) -> None:
-    (tmp_path / "text.mp4").write_text("no film")
+def test_a_film_that_ends_early_shows_so_and_goes_on(film: Path) -> None:
+    whole = film.read_bytes()
+    film.write_bytes(whole[: 8 * len(whole) // 10])
+    time = Time()
+    found = player(film, SIZE, 20.0, lambda line: None)
+    found._clock = Clock(20.0, time)
+    shots = [found.newest(time.wait) for _ in range(12)]
+    some = len(found.sources)  # frames, and one that says that there were to be more
+    assert 2 <= some < 10
+    assert [shot.name for shot in shots] == [f"clip.avi#{k % some + 1}" for k in range(12)]
+    ends = [shot.fault.reason if shot.fault else "" for shot in shots]
+    assert ends == ["truncated" if k % some == some - 1 else "" for k in range(12)]
+
+
+def test_frames_that_a_film_lacks_are_asked_for_once(film: Path, tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "z.png"), np.full((48, 64), 200, np.uint8))
+    found = player(tmp_path, SIZE, 20.0, lambda line: None)
+    of = found.sources[0].film
+    assert of is not None
+    longer = Film(film, 13)  # as where packets do not decode
+    found.sources = [Source(f"clip.avi#{k + 1}", film, tmp_path, directory=k, film=longer) for k in range(13)]
+    found.sources.append(Source("z.png", tmp_path / "z.png", tmp_path))
+    time = Time()
+    found._clock = Clock(20.0, time)
+    names = [found.newest(time.wait).name for _ in range(14)]
+    shown = [f"clip.avi#{k}" for k in range(1, 12)]  # the eleventh says that it is not there
+    assert names == [*shown, "z.png", *shown[:2]]
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("missing", "does not exist"),
+        ("missing.mp4", "does not exist"),
+        ("list.avi", r"holds no .* \(not_an_image\)"),
+        ("none.mp4", r"holds no .* \(empty\)"),
+        ("empty", "holds no image"),
+        ("v.mpg", "of a kind that is not read"),
+    ],
+)
+def test_what_is_no_source_is_named(tmp_path: Path, name: str, why: str) -> None:
+    (tmp_path / "list.avi").write_text("#EXTM3U\nhttp://127.0.0.1/secret\n")  # FFmpeg alone would fetch that
+    (tmp_path / "none.mp4").touch()
+    (tmp_path / "v.mpg").touch()
     (tmp_path / "empty").mkdir()
-    with pytest.raises(ConfigError, match=f"{name}: SOURCE: .*; give "):
-        folder_or_film(tmp_path / name, SIZE, None, lambda line: None)
+    with pytest.raises(ConfigError, match=f"{name}: SOURCE: {why}.*; give "):
+        player(tmp_path / name, SIZE, None, lambda line: None)
 
 
 def test_rigs_are_checked() -> None:

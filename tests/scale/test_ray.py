@@ -9,11 +9,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
+from tests.io.stores import ENVIRONMENT, s3_server
 from torchpose.cli.main import main
+from torchpose.io import storage
 from torchpose.io.rows import DETECTION_SCHEMA, POSE_SCHEMA, Row
+from torchpose.io.sources import find_sources
+from torchpose.io.storage import Place
+from torchpose.io.tally import Tally
 from torchpose.io.writers import read_table
+from torchpose.scale.estimate import pending
+from torchpose.scale.parts import Parts
 
 SAMPLE = Path(__file__).parents[2] / "data" / "sample"
 ARGUMENTS = ["--camera", str(SAMPLE / "camera.yaml"), "--target", str(SAMPLE / "target.yaml"), "--method", "centers"]
@@ -41,6 +50,7 @@ def test_mistakes_are_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]
         (["--address", "auto"], "--address: is of --engine ray alone"),
         (["--engine", "ray", "--overlay", tmp_path], "--overlay: is not drawn by --engine ray"),
         (["--engine", "ray", "--device", "cuda"], "--device: is cpu with --engine ray"),
+        (["--engine", "ray", "--address", "127.0.0.1:9", "--threads", "2"], "--threads: is of a cluster that starts"),
         (["--engine", "ray", "--address", "here"], "here: --address: is none; give HOST:PORT"),
         (["--engine", "ray", "--address", "127.0.0.1:9"], "127.0.0.1:9: --address: no Ray cluster answers"),
     ]
@@ -52,6 +62,15 @@ def test_mistakes_are_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]
         shutil.rmtree(tmp_path / "a.parquet", ignore_errors=True)
     assert estimate(SAMPLE / "frames", *ARGUMENTS, "--out", tmp_path / "a.csv", "--engine", "ray") == 2
     assert "writes a folder that ends in .parquet" in capfd.readouterr().err
+    film = tmp_path / "film.avi"
+    writer = cv2.VideoWriter(str(film), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
+    writer.write(np.zeros((48, 64, 3), np.uint8))
+    writer.release()
+    assert estimate(film, *ARGUMENTS, "--out", tmp_path / "a.parquet", "--engine", "ray") == 2
+    assert "film.avi: --engine ray: a film is decoded from its beginning" in capfd.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["simulate", "plan.yaml", "--out", str(tmp_path), "--engine", "ray", "--backend", "blender"])
+    assert "--backend: blender renders on this machine alone" in capfd.readouterr().err
 
 
 def test_without_ray_there_is_one_line(
@@ -69,6 +88,17 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.copy(path, folder)
     (folder / "009.png").write_bytes(b"no picture")
     return folder
+
+
+def test_workers_elsewhere_find_the_frames(frames: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(frames.parent)
+    poses = Parts.at(tmp_path / "p.parquet", POSE_SCHEMA)
+    blocks = pending(find_sources([Path(frames.name)]), 4, poses, Tally())
+    assert [[source.path for source in block.sources] for block in blocks] == [
+        sorted(frames.iterdir())[:4],
+        sorted(frames.iterdir())[4:],
+    ]
+    assert blocks[0].sources[0].name == "000.png"
 
 
 def test_rows_are_those_of_the_local_engine(frames: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -104,21 +134,35 @@ def test_rows_are_those_of_the_local_engine(frames: Path, tmp_path: Path, capfd:
     assert "were made with another --instances" in capfd.readouterr().err
 
 
-def test_simulated_frames_are_those_of_the_local_engine(tmp_path: Path) -> None:
+def test_simulated_frames_are_those_of_the_local_engine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a store too, of which every fifth request fails."""
     pytest.importorskip("ray")
+    pytest.importorskip("moto")
     plan = tmp_path / "plan.yaml"
     plan.write_text(
         f"camera: {SAMPLE / 'camera.yaml'}\ntarget: quad40\nseed: 3\n"
         "poses: {grid: {distance: 160, angles_deg: [0], positions: [[0, 0, 0], [5, 0, 0], [0, 0, 9]]}}\n"
     )
-    for name, options in (("own", ["--threads", "1"]), ("ray", ["--engine", "ray", "--threads", "2", "--batch", "1"])):
-        with pytest.raises(SystemExit) as ended:
-            main(["simulate", str(plan), "--out", str(tmp_path / name), *options])
-        assert ended.value.code == 0
-    files = sorted(path.relative_to(tmp_path / "own") for path in (tmp_path / "own").rglob("*.*"))
-    assert len(files) >= 7
-    for file in files:
-        assert (tmp_path / "ray" / file).read_bytes() == (tmp_path / "own" / file).read_bytes(), file
+    own = tmp_path / "own"
+    with s3_server("cell", every=5) as (url, application):
+        for name, value in (ENVIRONMENT | {"AWS_ENDPOINT_URL": url}).items():
+            monkeypatch.setenv(name, value)
+        storage._file_system.cache_clear()
+        for out, options in (
+            (str(own), ["--threads", "1"]),
+            ("s3://cell/set", ["--engine", "ray", "--threads", "2", "--batch", "1"]),
+        ):
+            with pytest.raises(SystemExit) as ended:
+                main(["simulate", str(plan), "--out", out, *options])
+            assert ended.value.code == 0
+        files = sorted(path.relative_to(own).as_posix() for path in own.rglob("*.*"))
+        assert len(files) >= 7
+        stored = Place("s3://cell/set")
+        assert sorted(one.name for one in stored.listed()) == files
+        for file in files:
+            assert (stored / file).read(1 << 30) == (own / file).read_bytes(), file
+        assert application.failed > 3
+    storage._file_system.cache_clear()
 
 
 def copies(folder: Path, count: int) -> None:

@@ -73,12 +73,9 @@ def one_thread_each() -> None:
 
     Results then do not depend on the number of cores, and a process that has no threads can be forked.
     """
-    import cv2
-    import torch
+    from torchpose.io.processes import one_thread
 
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    one_thread()
 
 
 def check_device(name: str) -> None:

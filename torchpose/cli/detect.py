@@ -117,17 +117,13 @@ def _decoded(
     from concurrent.futures import ThreadPoolExecutor
 
     from torchpose.camera import LINEAR
-    from torchpose.io.films import NoFrameError
-    from torchpose.io.images import UnreadableImageError
-    from torchpose.io.reader import linear_image
+    from torchpose.io.reader import Fault, decoded, linear_image
 
     def load(source: Source) -> np.ndarray | str:
-        try:
-            return linear_image(source.decode(threads=threads), tone or LINEAR)
-        except NoFrameError:
-            return ""
-        except UnreadableImageError as error:
-            return error.reason
+        image = decoded(source, threads=threads)
+        if image is None or isinstance(image, Fault):
+            return "" if image is None else image.reason
+        return linear_image(image, tone or LINEAR)
 
     with ThreadPoolExecutor(threads, thread_name_prefix="decode") as pool:
         ahead = [pool.submit(load, source) for source in sources[: 2 * threads]]

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from torchpose.live.sources import Frames
     from torchpose.target import Target
 
-_SOURCE = "Folder or manifest played as a camera, over and over, or a video file. Or give --rig."
+_SOURCE = "Folder, manifest or film played as a camera, over and over. Or give --rig."
 _CAMERA = "Camera file, as for `estimate`."
 _TARGET = "Target file or name of a built-in target."
 _RIG = "Rig file (YAML): show its Basler camera; RIG#NAME picks one of several. Its robot is left alone."
@@ -61,7 +61,7 @@ def live(
     _check_access(host, token)
     lens, plate = with_tone(Camera.load(camera), tone), Target.load(target)
     plate = plate.upright() if assume_upright else plate
-    frames = _frames(source, rig, twin, lens, rate)
+    frames, lens = _frames(source, rig, twin, (lens, plate), rate)
     use_threads(threads)  # threads of torch gain little on one frame, and the page needs a core too
     options: dict[str, Any] = {"method": method}
     return _serve(frames, lens, plate, options, record=record, wanted_um=wanted_um, at=(host, port, token))
@@ -86,22 +86,20 @@ def _check_access(host: str, token: str | None) -> None:
     say(f"torchpose: warning: --host {host}: the network can ask for this page, unencrypted{guess}", err=True)
 
 
-def _frames(source: Path | None, rig: Path | None, twin: Path | None, lens: Camera, rate: float | None) -> Frames:
-    """What is shown; says what is taken for granted."""
-    from torchpose.live.sources import camera_of_rig, folder_or_film
+def _frames(
+    source: Path | None, rig: Path | None, twin: Path | None, seen: tuple[Camera, Target], rate: float | None
+) -> tuple[Frames, Camera]:
+    """What is shown, and the camera with the tone that files tell, as `estimate` judges it."""
+    from torchpose.cli.estimate import with_judged_tone
+    from torchpose.live.sources import camera_of_rig, player
 
+    lens, plate = seen
     size = (lens.width, lens.height)
     if rig is not None:
-        return camera_of_rig(rig, twin, size, rate)
+        return camera_of_rig(rig, twin, size, rate), lens
     assert source is not None
-    frames = folder_or_film(source, size, rate, lambda line: say(f"torchpose: {line}", err=True))
-    if lens.tone is None and frames.encoded:
-        say(
-            f"torchpose: {source.name}: JPEG, colour or video, taken as linear: give --tone, as `estimate` would "
-            "judge it",
-            err=True,
-        )
-    return frames
+    frames = player(source, size, rate, lambda line: say(f"torchpose: {line}", err=True))
+    return frames, lens if lens.tone is not None else with_judged_tone(lens, plate, frames.sources)
 
 
 def _serve(

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from torchpose.cli.common import built_in_targets
+from torchpose.cli.common import built_in_targets, cores
 from torchpose.errors import ConfigError
 
 _CAMERA = (
@@ -51,9 +51,10 @@ class Engine(StrEnum):
 
 
 @contextmanager
-def crew_of(engine: Engine, address: str | None, threads: int) -> Iterator[Any]:
+def crew_of(engine: Engine, address: str | None, threads: int | None) -> Iterator[Any]:
     """Who shares out the work: `Crew` or what is like it, of so many. ConfigError: nobody answers."""
-    check_address(engine, address)
+    check_address(engine, address, threads)
+    threads = threads or cores()
     if engine is Engine.local:
         from torchpose.io.processes import Crew
 
@@ -66,10 +67,12 @@ def crew_of(engine: Engine, address: str | None, threads: int) -> Iterator[Any]:
         yield partial(RayCrew, count=workers.count)
 
 
-def check_address(engine: Engine, address: str | None) -> None:
-    """Raises ConfigError for an address that nothing would use."""
+def check_address(engine: Engine, address: str | None, threads: int | None) -> None:
+    """Raises ConfigError for an address that nothing would use, and for threads that it leaves without use."""
     if address is not None and engine is not Engine.ray:
         raise ConfigError("--address: is of --engine ray alone; add it or leave --address out")
+    if address is not None and threads is not None:
+        raise ConfigError("--threads: is of a cluster that starts here, --address names another; leave one of them out")
 
 
 def camera_option(text: str) -> Any:

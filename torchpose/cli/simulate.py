@@ -6,10 +6,11 @@ from typing import Annotated, Any
 
 import typer
 
-from torchpose.cli.common import Batch, Quiet, Resume, Threads, cores, importing, interrupted, one_thread_each, say
+from torchpose.cli.common import Batch, Quiet, Resume, Threads, importing, interrupted, one_thread_each, say
 from torchpose.cli.options import ADDRESS, ENGINE, Engine, crew_of
 from torchpose.errors import ConfigError
 
+_OUT = "Folder of the data set, on a disk or in a store (s3://BUCKET/FOLDER)."
 _BACKEND = "Who renders: the analytic renderer, or Blender Cycles (extra: blender)."
 
 
@@ -20,7 +21,7 @@ class Backend(StrEnum):
 
 def simulate(
     plan: Annotated[Path, typer.Argument(metavar="PLAN", help="Plan file (YAML): poses, imaging, sensor.")],
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder of the data set.")],
+    out: Annotated[str, typer.Option("--out", "-o", metavar="DIR", help=_OUT)],
     backend: Annotated[Backend, typer.Option(help=_BACKEND)] = Backend.analytic,
     resume: Resume = False,
     bop: Annotated[bool, typer.Option("--bop", help="Export the layout of the BOP challenge besides.")] = False,
@@ -40,7 +41,13 @@ def simulate(
         from torchpose.cli.terminal import FrameProgress
         from torchpose.datasets.dataset import write_bop, write_dataset, write_rig_dataset
         from torchpose.datasets.plan import load_plan
+        from torchpose.io.storage import place_of
 
+    place = place_of(out)
+    if bop and not isinstance(place, Path):
+        raise ConfigError("--bop: links the frames, which a store cannot; give a folder of a disk or leave it out")
+    if backend is Backend.blender and engine is Engine.ray:
+        raise ConfigError("--backend: blender renders on this machine alone; leave --engine ray out")
     one_thread_each()
     read = load_plan(plan)
     if bop and read.rig is not None:
@@ -51,16 +58,16 @@ def simulate(
     with FrameProgress(cameras * len(read), 0, quiet=quiet) as progress:
         how["progress"] = lambda done: progress.advance(done, Counter())
         try:
-            with crew_of(engine, address, threads or cores()) as crew:
-                write(read, out, **how, crew=crew)
-            if bop:
-                write_bop(out)
+            with crew_of(engine, address, threads) as crew:
+                write(read, place, **how, crew=crew)
+            if bop and isinstance(place, Path):
+                write_bop(place)
         except KeyboardInterrupt:
-            return interrupted(f"{out} keeps its frames; add --resume to go on")
+            return interrupted(f"{place} keeps its frames; add --resume to go on")
     if not quiet:
         marked = int((read.seen < len(read.target)).sum())
-        where = out / "frames" if read.rig is None else f"each of {', '.join(str(out / n) for n in read.rig.names)}"
-        say(f"{len(read)} frames in {where}, truth in {out / 'truth.csv'}", err=True)
+        several = None if read.rig is None else f"each of {', '.join(str(place / name) for name in read.rig.names)}"
+        say(f"{len(read)} frames in {several or place / 'frames'}, truth in {place / 'truth.csv'}", err=True)
         if marked:
             say(f"{marked} of them without the whole target in view, marked in the truth", err=True)
     return 0

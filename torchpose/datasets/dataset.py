@@ -28,18 +28,22 @@ from torch import Tensor
 
 from torchpose.analysis.crlb import pose_crlb, rig_crlb
 from torchpose.camera import Camera
-from torchpose.config import parse_json, read_text, write_text
+from torchpose.config import parse_json, write_text
 from torchpose.datasets.plan import Plan
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
+from torchpose.io.folders import Folder
 from torchpose.io.images import UnreadableImageError, decode
 from torchpose.io.processes import Crew
+from torchpose.io.rows import Schema
+from torchpose.io.storage import Place
 from torchpose.io.truth import Truth, read_truth, write_truth
-from torchpose.io.writers import atomic_path, write_rows
+from torchpose.io.writers import write_rows
 from torchpose.sim import Processing, SensorPattern, disturbed, faults_of, processed, read_out, with_faults
 from torchpose.sim.clutter import random_clutter, random_covers
 from torchpose.sim.renderer import Defocus, render
 from torchpose.sim.sensor import Lighting, add_noise
+from torchpose.target import Target
 
 Backend = Literal["analytic", "blender"]
 Renderer = Callable[[Int[Tensor, " B"]], Float[Tensor, "B H W"]]
@@ -158,7 +162,7 @@ def simulated_frames(plan: Plan, renderer: Renderer, which: Int[Tensor, " B"]) -
 
 def write_dataset(
     plan: Plan,
-    out: Path,
+    out: Path | Place,
     *,
     backend: Backend = "analytic",
     resume: bool = False,
@@ -170,7 +174,7 @@ def write_dataset(
 
     Args:
         plan: what to render.
-        out: folder, made where it is missing.
+        out: folder, made where it is missing; on a disk or in a store. ``truth.csv`` is its last file.
         backend: who renders.
         resume: keep the frames of an earlier run of the same plan.
         batch: frames at a time.
@@ -183,14 +187,16 @@ def write_dataset(
     Raises:
         ConfigError: the folder holds another data set, or holds one and ``resume`` is false, or cannot be written.
     """
-    folder = _prepare(plan, out, backend, resume)
-    done = {path.name for path in folder.iterdir()}
+    folder = Folder(out)
+    frames = _prepare(plan, folder, backend, resume)
+    done = frames.names()
     pending = torch.tensor([i for i, name in enumerate(plan.names) if name not in done], dtype=torch.int64)
     progress(len(plan) - len(pending))
     size = max(1, min(16, _BATCH_PIXELS // (plan.camera.width * plan.camera.height))) if backend == "analytic" else 1
     batches = torch.split(pending, batch or size) if len(pending) else ()
+    stored = isinstance(out, Place)  # then each process has a connection of its own
     renderers = crew if backend == "analytic" else _ALONE  # Blender has threads of its own
-    with renderers(partial(_write_frames, plan, backend, folder), batches) as rendered:
+    with renderers(partial(_write_frames, plan, backend, frames.absolute()), batches, fresh=stored) as rendered:
         for finished in rendered:
             progress(finished)
     truth = plan_truth(plan)
@@ -198,30 +204,36 @@ def write_dataset(
         with crew(partial(_bounds_of, plan), torch.split(torch.arange(len(plan)), _BOUNDS_AT_ONCE)) as parts:
             std = torch.cat(list(parts))
         truth.extra.update(zip(BOUND, std.unbind(1), strict=True))
-    write_truth(out / "truth.csv", truth)
-    _write_prints(plan, out)
+    _write_prints(plan, folder)
+    folder.save("truth.csv", partial(write_truth, truth=truth))
     return len(pending)
 
 
-def write_rig_dataset(plan: Plan, out: Path, **options: Any) -> int:
+def write_rig_dataset(plan: Plan, out: Path | Place, **options: Any) -> int:
     """Writes a data set of several cameras: one of each in a folder of its name, the rig, and the truth of all.
 
     ``truth.csv`` has the poses in the first camera, and the joint bounds. Arguments and result as of `write_dataset`.
     """
-    rig = plan.rig
+    rig, folder = plan.rig, Folder(out)
     assert rig is not None
     count = sum(write_dataset(plan.of_camera(k), out / name, **options) for k, name in enumerate(rig.names))
-    rig.save(out / "rig.yaml")
-    replace(plan.target, part_rotation=None, part_translation=None).save(out / "target.yaml")
+    folder.save("rig.yaml", rig.save)
+    folder.save("target.yaml", _alone(plan.target).save)
     truth = plan_truth(plan)
     if plan.file.bounds:
         std = torch.cat([bounds(plan, which) for which in torch.split(torch.arange(len(plan)), 64)])
         truth.extra.update(zip(BOUND, std.unbind(1), strict=True))
-    write_truth(out / "truth.csv", replace(truth, frame=[f"frames/{name}" for name in plan.names]))
+    truth = replace(truth, frame=[f"frames/{name}" for name in plan.names])
+    folder.save("truth.csv", partial(write_truth, truth=truth))
     return count
 
 
-def _write_prints(plan: Plan, out: Path) -> None:
+def _alone(target: Target) -> Target:
+    """Without a part: the truth is the pose of the target itself."""
+    return replace(target, part_rotation=None, part_translation=None)
+
+
+def _write_prints(plan: Plan, folder: Folder) -> None:
     """What was printed, where that differs from the target."""
     if (prints := plan.prints) is None:
         return
@@ -232,9 +244,10 @@ def _write_prints(plan: Plan, out: Path) -> None:
         for frame, markers in zip(plan.names, values, strict=True)
         for marker, row in zip(plan.target.ids.tolist(), markers, strict=True)
     ]
-    write_rows(out / "prints.csv", rows, {"frame": str, "id": int} | dict.fromkeys(names, float))
+    schema: Schema = {"frame": str, "id": int} | dict.fromkeys(names, float)
+    folder.save("prints.csv", partial(write_rows, rows=rows, schema=schema))
     if plan.file.print is not None and plan.file.print.each == "set":
-        replace(prints.as_target(), part_rotation=None, part_translation=None).save(out / "print.yaml")
+        folder.save("print.yaml", _alone(prints.as_target()).save)
 
 
 def write_bop(out: Path) -> None:
@@ -265,7 +278,7 @@ def write_bop(out: Path) -> None:
         os.link(out / "frames" / name, link)
 
 
-def _write_frames(plan: Plan, backend: Backend, folder: Path, batches: Sequence[Tensor]) -> Iterator[int]:
+def _write_frames(plan: Plan, backend: Backend, folder: Folder, batches: Sequence[Tensor]) -> Iterator[int]:
     """Renders and writes the frames of each batch of numbers; how many they are."""
     if backend == "blender":
         from torchpose.datasets.blender import blender
@@ -275,7 +288,7 @@ def _write_frames(plan: Plan, backend: Backend, folder: Path, batches: Sequence[
         renderer = analytic(plan)
     for which in batches:
         for i, frame in zip(which.tolist(), simulated_frames(plan, renderer, which), strict=True):
-            _write_png(folder / plan.names[i], frame.numpy())
+            folder.write(plan.names[i], cv2.imencode(".png", frame.numpy())[1].tobytes())
         yield len(which)
 
 
@@ -283,39 +296,30 @@ def _bounds_of(plan: Plan, batches: Sequence[Tensor]) -> Iterator[Tensor]:
     yield from (bounds(plan, which) for which in batches)
 
 
-def _write_png(path: Path, frame: np.ndarray) -> None:
-    """Writes a frame that is there as a whole or not at all."""
-    with atomic_path(path, option="--out: ", fix="free some space and go on with --resume", sync=False) as temporary:
-        temporary.write_bytes(cv2.imencode(".png", frame)[1].tobytes())
-
-
-def _prepare(plan: Plan, out: Path, backend: Backend, resume: bool) -> Path:
+def _prepare(plan: Plan, out: Folder, backend: Backend, resume: bool) -> Folder:
     """Writes all but frames and truth into the data set's folder; returns the folder of the frames."""
     origin, frames = _origin(plan, backend), out / "frames"
-    if os.path.exists(out) and not os.path.isdir(out):
+    if isinstance(out.where, Path) and os.path.exists(out.where) and not os.path.isdir(out.where):
         raise ConfigError(f"{out}: --out: is a file; give a folder")
-    if os.path.exists(frames) and any(frames.iterdir()):
+    frames.make()
+    if frames.names():
         _check_origin(out, origin, resume)
-    try:
-        frames.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"{out}: --out: cannot be made ({error.strerror}); choose another folder") from None
-    write_text(out / "plan.json", json.dumps(origin, indent=2) + "\n")
-    plan.camera.save(out / "camera.yaml")
-    # without a part: the truth is the pose of the target itself
-    replace(plan.target, part_rotation=None, part_translation=None).save(out / "target.yaml")
+    text = json.dumps(origin, indent=2) + "\n"
+    out.save("plan.json", partial(write_text, text=text))
+    out.save("camera.yaml", plan.camera.save)
+    out.save("target.yaml", _alone(plan.target).save)
     return frames
 
 
-def _check_origin(out: Path, origin: dict[str, object], resume: bool) -> None:
+def _check_origin(out: Folder, origin: dict[str, object], resume: bool) -> None:
     """Raises ConfigError unless the frames in a folder are to be gone on with and were made from the same."""
     if not resume:
         raise ConfigError(f"{out}: --out: holds frames; add --resume to go on with them or choose another folder")
     try:
-        before = parse_json(read_text(out / "plan.json"))
+        before = parse_json(out.text("plan.json"))
         changed = [name for name in origin if before.get(name) != origin[name]]
     except (ConfigError, ValueError, AttributeError):
-        raise ConfigError(f"{out / 'plan.json'}: --resume: missing or damaged; choose another folder") from None
+        raise ConfigError(f"{out.where / 'plan.json'}: --resume: missing or damaged; choose another folder") from None
     if changed:
         raise ConfigError(
             f"{out}: --resume: the frames there were made with another {' and '.join(changed)}; choose another folder"

@@ -348,4 +348,4 @@ def _floats(values: Any) -> Tensor:
 
 def _backgrounds(path: Path, name: str | None) -> list[Path]:
     sources = [] if name is None else find_sources([Path(beside(path, name))])
-    return [Path(str(source.path)) for source in sources if source.film is None]
+    return [Path(str(source.path)).absolute() for source in sources if source.film is None]

@@ -2,8 +2,8 @@
 
 Each ring's ellipse gives two poses of its plane. In such a plane another marker lies on a circle about the ring, and
 only rings of its code near the image of that circle, of the size and in the place that the layout predicts, are paired
-with it. Both searches look into a small part of the image (`nearby.Nearby`), and a ring keeps the best few partners of
-each code: the cost grows with the number of rings, not with its square.
+with it. Both searches look into a small part of the image (`segments.near_pairs`), and a ring keeps the best few
+partners of each code: the cost grows with the number of rings, not with its square.
 """
 
 from typing import NamedTuple, Self
@@ -11,9 +11,8 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor
 
-from torchpose.geometry.segments import rank_in_group
+from torchpose.geometry.segments import near_pairs, rank_in_group
 from torchpose.identify.assignments import Assignments
-from torchpose.identify.nearby import Nearby
 from torchpose.identify.scene import MarkerTable
 
 # px, of the ring's semi-major axis, of the distance to the ring the pose comes from
@@ -60,16 +59,13 @@ def hypotheses(one: Assignments, table: MarkerTable, matrix: Tensor, side: float
         matrix: of the camera.
         side: 1 for targets seen from their printed side, -1 for the same planes seen from behind.
     """
-    near = Nearby.of(one.row * table.ids.shape[1] + one.marker, one.ellipse[:, :2])
-    R, t, origin = _poses(one, table, near, matrix, side)
-    return Hypotheses(R, t, origin, *_support((R, t, origin), one, table, near, matrix))
+    R, t, origin = _poses(one, table, matrix, side)
+    return Hypotheses(R, t, origin, *_support((R, t, origin), one, table, matrix))
 
 
-def _poses(
-    one: Assignments, table: MarkerTable, near: Nearby, matrix: Tensor, side: float
-) -> tuple[Tensor, Tensor, Tensor]:
+def _poses(one: Assignments, table: MarkerTable, matrix: Tensor, side: float) -> tuple[Tensor, Tensor, Tensor]:
     """Poses R (H, 3, 3), t (H, 3) of every pair that agrees with the layout, and the first assignment of each."""
-    a, plane, b, height, flat = _pairs(one, table, near, matrix, side)
+    a, plane, b, height, flat = _pairs(one, table, matrix, side)
     place, normal = one.place[a, plane], side * one.axis[a, plane]
     seen = _frame(normal, one.place[b].mean(1) - place)
     # the pose puts the second marker at its distance in the plane, straight towards the second ring
@@ -88,7 +84,7 @@ def _poses(
 
 
 def _pairs(
-    one: Assignments, table: MarkerTable, near: Nearby, matrix: Tensor, side: float
+    one: Assignments, table: MarkerTable, matrix: Tensor, side: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Pairs whose second ring may lie on the image of its circle about the first.
 
@@ -113,14 +109,16 @@ def _pairs(
     px, of_size, of_way = PLACE_TOLERANCE
     reach = px + scale * ((1 + of_way) * flat + of_size * SIZE_TOLERANCE * radius)
     center = (middle @ matrix.T)[:, :2] / depth[:, None]
-    query, b = near.within(one.row[a] * table.ids.shape[1] + marker, center, reach)
+    markers = table.ids.shape[1]
+    slots = one.row[a] * markers + marker, one.row * markers + one.marker
+    query, b = near_pairs(center, one.ellipse[:, :2], reach, slots)
     other = one.ring[a[query]] != one.ring[b]
     query, b = query[other], b[other]
     return a[query], plane[query], b, height[query], flat[query]
 
 
 def _support(
-    poses: tuple[Tensor, Tensor, Tensor], one: Assignments, table: MarkerTable, near: Nearby, matrix: Tensor
+    poses: tuple[Tensor, Tensor, Tensor], one: Assignments, table: MarkerTable, matrix: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Assignments near the places that each pose predicts: pose (S,), assignment (S,) and miss (S,), flat."""
     R, t, origin = poses
@@ -133,7 +131,9 @@ def _support(
     px, of_size, of_way = PLACE_TOLERANCE
     way = torch.linalg.vector_norm(uv - start, dim=-1)
     reach = SAME_PLACE * (px + of_size * SIZE_TOLERANCE * most + of_way * way) / (1 - SAME_PLACE * of_way)
-    query, member = near.within(one.row[origin[pose]] * table.ids.shape[1] + marker, uv, reach)
+    markers = table.ids.shape[1]
+    slots = one.row[origin[pose]] * markers + marker, one.row * markers + one.marker
+    query, member = near_pairs(uv, one.ellipse[:, :2], reach, slots)
     away = torch.linalg.vector_norm(one.ellipse[member, :2] - start[query], dim=-1)
     miss = _miss(x[query], one.radius[member], one.ellipse[member], away, matrix)
     agrees = miss < SAME_PLACE

@@ -5,6 +5,7 @@ Few codecs have checksums, and FFmpeg fills what it cannot decode: damage within
 says of their number may be wrong either way.
 """
 
+import math
 import os
 import threading
 from collections.abc import Sequence
@@ -17,7 +18,7 @@ import numpy as np
 from torchpose.io.images import UnreadableImageError
 from torchpose.io.images.header import Header, check_size
 
-FILM_SUFFIXES = (".avi", ".mkv", ".mov", ".mp4", ".webm")
+FILM_SUFFIXES = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm")
 _HEAD = 1 << 16  # bytes in which the boxes of a fragmented file say so
 # by FFmpeg's own guess a text file would be a play list, whose entries are fetched from anywhere
 _BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot")
@@ -122,6 +123,15 @@ def frames_of_film(path: Path) -> tuple[int, bool]:
     while capture.grab():
         count += 1
     return count, count == 0 or (_counts_frames(path) and capture.get(cv2.CAP_PROP_FRAME_COUNT) > count)
+
+
+def rate_of_film(path: Path) -> float | None:
+    """Frames/s by the film's header, where it has one and says so."""
+    try:
+        rate = _opened(path, []).get(cv2.CAP_PROP_FPS)
+    except UnreadableImageError:
+        return None
+    return float(rate) if math.isfinite(rate) and rate > 0 else None
 
 
 def _counts_frames(path: Path) -> bool:

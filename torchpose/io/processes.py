@@ -2,7 +2,8 @@
 
 Threads share one interpreter, which eager torch keeps busy between its operations, and which kornia_rs holds while it
 decodes. Processes share nothing. They are forked where the system does that safely (Linux), after all imports: that
-takes milliseconds, where a fresh interpreter needs a second of CPU before its first frame.
+takes milliseconds, where a fresh interpreter needs a second of CPU before its first frame. Work that speaks to a store
+has fresh ones everywhere: a connection cannot be forked.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from multiprocessing.context import BaseContext
 from types import TracebackType
 from typing import Any, Generic, Self, TypeVar
 
+import cv2
 import torch
 
 from torchpose.errors import ConfigError
@@ -44,7 +46,9 @@ class Crew(Generic[Item, Result]):
             crew is made, a copy for every process. Its errors are raised here, behind the results before them.
         items: all of them.
         count: of processes, at most.
-        let_go: called in every process at first: closes what is this process's alone, such as a locked file.
+        let_go: called in every process that is forked, at first: closes what is this process's alone, such as a
+            locked file.
+        fresh: whether none may be forked, see above; ``work`` is pickled then.
     """
 
     def __init__(
@@ -53,6 +57,8 @@ class Crew(Generic[Item, Result]):
         items: Sequence[Item],
         count: int,
         let_go: Callable[[], None] = _nothing,
+        *,
+        fresh: bool = False,
     ) -> None:
         self._work, self._items = work, items
         count = min(count, len(items))
@@ -60,13 +66,14 @@ class Crew(Generic[Item, Result]):
         self._processes: list[Any] = []
         if count < 2:
             return
-        context = _context()
+        context = _context(fresh)
+        forked = context.get_start_method() == "fork"
         for number in range(count):
             end, theirs = context.Pipe(duplex=False)
             self._ends.append(end)
             # forked, a process has the ends of all before it: unless it closes them, none notices that this one is gone
-            inherited = self._ends if context.get_start_method() == "fork" else []
-            arguments = (work, items[number::count], theirs, inherited, let_go)
+            what: _Share = (work, items[number::count])
+            arguments = (what, theirs, self._ends, let_go) if forked else (pickle.dumps(what), theirs, [], _nothing)
             process: Any = context.Process(target=_serve, args=arguments, daemon=True)  # type: ignore[attr-defined]
             process.start()
             self._processes.append(process)
@@ -123,26 +130,39 @@ class Crew(Generic[Item, Result]):
         )
 
 
-def _context() -> BaseContext:
+def one_thread() -> None:
+    """Has torch and OpenCV use one thread in this process, and OpenCV print nothing."""
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+
+
+def _context(fresh: bool) -> BaseContext:
     """Forking is safe on Linux, where the libraries of the system start no threads of their own."""
-    return multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
+    return multiprocessing.get_context("spawn" if fresh or sys.platform != "linux" else "fork")
+
+
+_Share = tuple[Callable[[Sequence[Any]], Iterator[Any]], Sequence[Any]]  # work and its items
 
 
 def _serve(
-    work: Callable[[Sequence[Item]], Iterator[Result]],
-    share: Sequence[Item],
+    what: _Share | bytes,
     end: Connection,
     inherited: Sequence[Connection],
     let_go: Callable[[], None],
 ) -> None:
-    """Sends ``(True, result)`` for each item of a share, or ``(False, error)`` and no more."""
+    """Sends ``(True, result)`` for each item of a share, or ``(False, error)`` and no more.
+
+    A fresh process is given its share as bytes: tensors that are handed over otherwise have an open file each.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal interrupts all processes; the first one ends the others
     for other in inherited:
         other.close()
     let_go()
-    torch.set_num_threads(1)
+    one_thread()
     with contextlib.suppress(BrokenPipeError):  # nobody waits for the results any more
         try:
+            work, share = pickle.loads(what) if isinstance(what, bytes) else what
             for result in work(share):
                 _send(end, (True, result))
         except BrokenPipeError:

@@ -100,6 +100,24 @@ class FrameReader:
             pool.shutdown(wait=True, cancel_futures=True)
 
 
+def decoded(source: Source, *, threads: int = 1, size: tuple[int, int] | None = None) -> np.ndarray | Fault | None:
+    """Grey values (H, W) of a frame, what is wrong with it, or None where its film has ended before.
+
+    Args:
+        source: of the frame.
+        threads: that decode side by side.
+        size: width and height that it has to have, if known.
+    """
+    try:
+        return source.decode(threads=threads, size=size)
+    except NoFrameError:
+        return None
+    except UnreadableImageError as error:
+        return Fault(Status.UNREADABLE, error.reason)
+    except WrongSizeError as error:
+        return Fault(Status.WRONG_SIZE, str(error))
+
+
 def linear_image(image: np.ndarray, tone: Tone) -> np.ndarray:
     """A decoded frame by its light: as it is where it is linear, else uint16."""
     return image if tone == LINEAR else _table(tone, image.dtype.itemsize)[image]
@@ -123,14 +141,9 @@ class _Buffer:
 
     def load(self, slot: int, source: Source) -> Fault | np.dtype | None:
         """Decodes a source into a slot; returns its pixel type, what is wrong with it, or None if there is no frame."""
-        try:
-            image = source.decode(threads=self._threads, size=(self._size[2], self._size[1]))
-        except NoFrameError:
-            return None
-        except UnreadableImageError as error:
-            return Fault(Status.UNREADABLE, error.reason)
-        except WrongSizeError as error:
-            return Fault(Status.WRONG_SIZE, str(error))
+        image = decoded(source, threads=self._threads, size=(self._size[2], self._size[1]))
+        if image is None or isinstance(image, Fault):
+            return image
         image = linear_image(image, self._tone)
         with self._lock:
             if image.dtype not in self._planes:

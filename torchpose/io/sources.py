@@ -30,6 +30,7 @@ _OTHERS = frozenset(
         ".pgx .pic .pnm .ppm .psd .raf .ras .raw .rw2 .sr .svg .tga .webp .wmv"
     ).split()
 )
+_STORED_FILMS = "films, which are read from a disk alone"
 _PIPE = "is a pipe or a device, no file"
 _DIGITS = re.compile(r"(\d+)", re.ASCII)
 
@@ -118,15 +119,12 @@ def find_sources(
     for given, root in [*((one, None) for one in inputs), *((one, below) for one in more)]:
         passed: Counter[str] = Counter()  # what, and how many of it
         found = list(_sources_of(given, passed, root))
+        read = ", ".join(FRAME_SUFFIXES if isinstance(given, Path) else IMAGE_SUFFIXES)
         if not found:
             also = f" but {_summary(passed)}" if passed.total() else ""
-            raise ConfigError(
-                f"{given}: INPUT: holds no image{also}; give files that end in {', '.join(FRAME_SUFFIXES)}"
-            )
+            raise ConfigError(f"{given}: INPUT: holds no image{also}; give files that end in {read}")
         if passed.total():
-            tell(
-                f"{_text(str(given))}: passed over {_summary(passed)}; what is read ends in {', '.join(FRAME_SUFFIXES)}"
-            )
+            tell(f"{_text(str(given))}: passed over {_summary(passed)}; what is read ends in {read}")
         for source in found:
             twin = seen.setdefault(source.name, source)
             if twin is not source:
@@ -176,13 +174,15 @@ def _stored(given: Place, passed: Counter[str]) -> Iterator[Source]:
             yield from _recorded_in_store(given.parent / given.name, given.fragment or None, passed)
         elif given.suffix.lower() in IMAGE_SUFFIXES and given.kind() == "file":
             yield from sources_of_file(given.name, given, given.parent, _stamp(given.stat()))
+        elif given.suffix.lower() in FILM_SUFFIXES and given.kind() == "file":
+            raise ConfigError(f"{given}: INPUT: a film, which is read from a disk alone; copy it to this machine")
         else:
             for one in sorted(given.listed(), key=lambda one: natural_key(one.name)):
                 suffix = Path(one.name).suffix.lower()
                 if suffix not in _OTHERS.union(FRAME_SUFFIXES) or any(p.startswith(".") for p in one.name.split("/")):
                     continue
-                if suffix in _OTHERS or suffix in FILM_SUFFIXES:  # films are read from a disk alone
-                    passed[suffix] += 1
+                if suffix in _OTHERS or suffix in FILM_SUFFIXES:
+                    passed[suffix if suffix in _OTHERS else _STORED_FILMS] += 1
                 else:
                     yield from sources_of_file(one.name, given / one.name, given, _stamp(one))
     except StorageError as error:

@@ -26,6 +26,7 @@ _NATIVE = ("s3", "gs", "gcs", "hdfs", "abfs", "abfss")  # that Arrow serves itse
 _PIECE = 1 << 16  # bytes (convention)
 _BUCKETS = ("s3", "gs", "gcs")
 _OPTIONS = ("endpoint_override", "region", "scheme")  # of an S3 URL; others could hold secrets
+REQUESTS = 4  # of a process to a store at once (convention): they wait for answers, not for its core
 _TRIES, _CONNECT, _ANSWER = 5, 10.0, 60.0  # of S3 (convention): tries, seconds to connect and to answer
 # what S3 and its kin say, in words; the rest is told as a store that does not answer
 _ANSWERS = {
@@ -261,9 +262,9 @@ def _file_system(scheme: str, netloc: str, query: str) -> "fs.FileSystem":
                 given["region"] = fs.resolve_s3_region(netloc)
         retry = fs.AwsStandardS3RetryStrategy(max_attempts=_TRIES)
         named = {name: value for name, value in given.items() if value}
-        return fs.S3FileSystem(
-            **named, retry_strategy=retry, connect_timeout=_CONNECT, request_timeout=_ANSWER, background_writes=False
-        )
+        # a small file is sent in one request rather than in three
+        how = {"background_writes": False, "allow_delayed_open": True}
+        return fs.S3FileSystem(**named, retry_strategy=retry, connect_timeout=_CONNECT, request_timeout=_ANSWER, **how)
     if scheme in _NATIVE:
         with _told():
             return fs.FileSystem.from_uri(f"{scheme}://{netloc}/")[0]

@@ -146,7 +146,9 @@ class Answers:
             return JSONResponse({"status": None, "age_s": None, "fault": text}, 503, {"retry-after": "1"})
         return JSONResponse(row)
 
-    async def events(self, _request: Request) -> Response:
+    async def events(self, request: Request) -> Response:
+        if request.method != "GET":  # a HEAD would be a viewer who is told nothing
+            raise Refused(405, "method not allowed")
         if self.viewers.count >= MOST_VIEWERS:
             raise Refused(503, f"{MOST_VIEWERS} viewers are there already")
         return _Stream(self.viewers.stream(), media_type="text/event-stream")

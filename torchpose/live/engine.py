@@ -37,6 +37,7 @@ from torchpose.report.overlay import Overlay
 from torchpose.results import Detections, Poses
 from torchpose.rig.faults import RigFault
 from torchpose.target import Target
+from torchpose.tracking import Tracker
 
 AGAIN_S = 2.0  # after which a camera that failed is opened anew
 _KEPT = 600  # points of the strips (convention): two minutes at five frames a second
@@ -111,7 +112,9 @@ _POINT = ("tx", "ty", "tz", "sx", "sy", "sz", "srx", "sry", "srz", "nx", "ny", "
 
 
 class Observer:
-    """Looks at single frames: pose, row, and what there is to turn.
+    """Looks at frames, one after the other: pose, row, and what there is to turn.
+
+    Where the last frame had a pose, the next one is looked for near it, and everywhere where that fails.
 
     Args:
         camera: of the frames.
@@ -122,6 +125,7 @@ class Observer:
     def __init__(self, camera: Camera, target: Target, **options: Any) -> None:
         self.camera, self.target = camera, target
         self.estimator = PoseEstimator(camera, target, **options)
+        self._tracker = Tracker(self.estimator)
         self._overlay = Overlay(camera, [target])
 
     def look(self, shot: Shot) -> Sight:
@@ -131,7 +135,7 @@ class Observer:
             row = fault_row(shot.name, self.target.name, shot.fault.status, shot.fault.reason)
             return Sight(shot, row, [], None, self.target.ids.tolist(), [], None, None, None)
         frame = torch.from_numpy(shot.image)
-        poses = self.estimator(frame[None])
+        poses = self._tracker(frame)
         part = self.target.part_from_target
         (row,) = pose_rows(poses if part is None else poses.moved(*part), [shot.name], [self.target.name])
         outlines = _outlines(poses.detections)

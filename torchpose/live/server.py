@@ -7,6 +7,7 @@ import contextlib
 import logging
 import signal
 import socket
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -20,6 +21,8 @@ from torchpose.live.guard import MOST_HEAD
 MOST_CONNECTIONS = 96  # at a time (convention): three for each of as many viewers as there may be
 SILENT_S = 5.0  # that a connection may take to send a whole request (convention)
 STALLED_S = 5.0  # that a client may leave sent bytes untaken (convention)
+MOST_LINES = 300  # a minute (convention): what a terminal can hold and somebody may still read
+_MINUTE = 60.0  # s
 _WATCH_S = 0.5  # between two looks at the connections
 _UNSENT = 1 << 17  # bytes that wait for a client, a picture or so
 _UNSENT_BY_SYSTEM = 1 << 18  # bytes of a socket's own buffer: what waits there is old when it comes
@@ -93,6 +96,32 @@ def watched(tell: Callable[[str], None]) -> type[H11Protocol]:
     return Told
 
 
+class Bounded:
+    """Hands lines on, so many a minute at most: who asks again and again fills no disk.
+
+    Args:
+        tell: is given the lines, and how many were left out.
+        clock: s.
+    """
+
+    def __init__(self, tell: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> None:
+        self._tell, self._clock = tell, clock
+        self._since, self._count = clock(), 0
+
+    def __call__(self, line: str) -> None:
+        if self._clock() - self._since >= _MINUTE:
+            self.end()
+        self._count += 1
+        if self._count <= MOST_LINES:
+            self._tell(line)
+
+    def end(self) -> None:
+        """Tells how many lines of the last minute were left out; a new one begins."""
+        if self._count > MOST_LINES:
+            self._tell(f"{self._count - MOST_LINES} more such lines were left out")
+        self._since, self._count = self._clock(), 0
+
+
 class _Lines(logging.Handler):
     """Hands what a library has to say on, a line each."""
 
@@ -136,6 +165,7 @@ class Server:
 
     def __init__(self, answers: Answers, host: str, token: str | None, tell: Callable[[str], None]) -> None:
         self._answers = answers
+        self._told = tell = Bounded(tell)
         app = application(answers, host, token, tell)
         self._server = uvicorn.Server(
             uvicorn.Config(
@@ -165,6 +195,7 @@ class Server:
             with _quiet_signals():
                 asyncio.run(self._serve(listening))
         finally:
+            self._told.end()
             log.removeHandler(self._lines)
             log.propagate = propagated
 

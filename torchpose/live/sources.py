@@ -13,19 +13,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from torchpose.errors import ConfigError
-from torchpose.io.images import UnreadableImageError, WrongSizeError
-from torchpose.io.reader import Fault
+from torchpose.io.films import rate_of_film
+from torchpose.io.reader import Fault, decoded
 from torchpose.io.sources import Source, find_sources
-from torchpose.results import Status
 from torchpose.rig.cameras import Cameras
 from torchpose.rig.settings import Rig, load_rig
 
-FILMS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpg", ".mpeg", ".webm")
 FOLDER_RATE = 5.0  # frames/s (convention): what a camera of 20 MP gives
 _PAUSE_S = 0.05  # at most between two looks at whether to end
 _FILM_RATE = 25.0  # frames/s, of a film that does not say
@@ -58,8 +55,6 @@ class Frames(Protocol):
 
     kind: str
     """What a page says of it: folder, video, camera, twin."""
-    encoded: bool
-    """Whether its grey values are likely bent by a tone curve."""
 
     def __enter__(self) -> Frames: ...
 
@@ -99,20 +94,21 @@ class Clock:
 
 
 class Player:
-    """A folder, or a manifest, played as a camera, over and over.
+    """Frames of files played as a camera, over and over: a folder, a manifest, or a film.
 
     Args:
         sources: the frames, in order.
         size: width and height of the camera, px.
-        rate: frames/s.
+        rate: frames/s; None: a film's own, or `FOLDER_RATE`.
     """
 
-    kind = "folder"
-
-    def __init__(self, sources: Sequence[Source], size: tuple[int, int], rate: float = FOLDER_RATE) -> None:
-        self._sources, self._size = sources, size
-        self.encoded = sources[0].likely_encoded()
-        self._clock, self._number = Clock(rate), -1
+    def __init__(self, sources: Sequence[Source], size: tuple[int, int], rate: float | None = None) -> None:
+        film = sources[0].film
+        self.kind = "folder" if film is None else "video"
+        self.sources, self._size = list(sources), size
+        own = FOLDER_RATE if film is None else rate_of_film(film.path) or _FILM_RATE
+        self._rate = rate or own
+        self._clock, self._number, self._at = Clock(self._rate), -1, -1
 
     def __enter__(self) -> Player:
         return self
@@ -121,73 +117,27 @@ class Player:
         pass
 
     def newest(self, wait: Callable[[float], object]) -> Shot:
-        number = self._clock.due(wait)
-        passed, self._number = number - self._number - 1, number
-        source, now = self._sources[number % len(self._sources)], time.time()
-        try:
-            return Shot(source.name, now, source.decode(size=self._size), passed_over=passed)
-        except UnreadableImageError as error:
-            return Shot(source.name, now, None, Fault(Status.UNREADABLE, error.reason), passed)
-        except WrongSizeError as error:
-            return Shot(source.name, now, None, Fault(Status.WRONG_SIZE, str(error)), passed)
-
-
-class Film:
-    """A video file played as a camera, over and over; frames are called by their number.
-
-    Args:
-        path: of the file.
-        size: width and height of the camera, px.
-        rate: frames/s; None: the file's own.
-
-    Raises:
-        ConfigError: there is no frame in it.
-    """
-
-    kind, encoded = "video", True
-
-    def __init__(self, path: Path, size: tuple[int, int], rate: float | None = None) -> None:
-        self._path, self._size = path, size
-        self._film = cv2.VideoCapture(str(path))
-        if not self._film.isOpened() or not self._film.grab():
-            self._film.release()
-            raise ConfigError(f"{path}: SOURCE: holds no frame that OpenCV reads; give a folder of images or a video")
-        own = self._film.get(cv2.CAP_PROP_FPS)
-        self._rate = rate or (own if math.isfinite(own) and own > 0 else _FILM_RATE)
-        self._clock, self._number, self._at = Clock(self._rate), -1, 0  # the first frame is at hand
-
-    def __enter__(self) -> Film:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._film.release()
-
-    def newest(self, wait: Callable[[float], object]) -> Shot:
-        number = self._clock.due(wait)
-        late = number - self._number - 1 - int(_CATCH_UP_S * self._rate)
-        if late > 0:
+        step = self._clock.due(wait) - self._number
+        late = step - 1 - int(_CATCH_UP_S * self._rate)
+        if late > 0 and self.kind == "video":  # decodes what it passes over
             self._clock.set_back(late)
-            number -= late
-        for _ in range(number - self._number - (self._number < 0)):
-            self._forward()
-        passed, self._number = number - self._number - 1, number
-        there, picture = self._film.retrieve()
-        name, now = f"{self._path.name}#{self._at}", time.time()
-        if not there:
-            return Shot(name, now, None, Fault(Status.UNREADABLE, "corrupt"), passed)
-        image: Any = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
-        if image.shape[::-1] != self._size:
-            return Shot(name, now, None, Fault(Status.WRONG_SIZE, f"{image.shape[1]}x{image.shape[0]}"), passed)
-        return Shot(name, now, image, passed_over=passed)
+            step -= late
+        self._number, self._at = self._number + step, (self._at + step) % len(self.sources)
+        now, found = time.time(), decoded(self.sources[self._at], size=self._size)
+        while found is None:
+            self._leave_out(self.sources[self._at])
+            found = decoded(self.sources[self._at], size=self._size)
+        name, passed = self.sources[self._at].name, step - 1
+        if isinstance(found, Fault):
+            return Shot(name, now, None, found, passed)
+        return Shot(name, now, found, passed_over=passed)
 
-    def _forward(self) -> None:
-        """To the next frame, or to the first one again."""
-        self._at += 1
-        if not self._film.grab():
-            self._film.release()
-            self._film = cv2.VideoCapture(str(self._path))
-            self._film.grab()
-            self._at = 0
+    def _leave_out(self, missing: Source) -> None:
+        """Of a film that has ended, leaves out what would follow, and goes on behind it."""
+        first = next(k for k, one in enumerate(self.sources) if one.film is missing.film)
+        kept = [one for one in self.sources if one.film is not missing.film or one.directory < missing.directory]
+        self._at = (first + missing.directory) % len(kept)
+        self.sources = kept
 
 
 class RigCamera:
@@ -199,8 +149,6 @@ class RigCamera:
         twin: twin file, or None for what is there.
         rate: most frames/s; None: as many as there is time for.
     """
-
-    encoded = False
 
     def __init__(self, rig: Rig, name: str, twin: Path | None, rate: float | None = None) -> None:
         self.kind = "camera" if twin is None else "twin"
@@ -233,16 +181,21 @@ class RigCamera:
         return Shot(name, frame.trigger_time_s, frame.image, white=float((1 << self._settings.bits) - 1))
 
 
-def folder_or_film(path: Path, size: tuple[int, int], rate: float | None, tell: Callable[[str], None]) -> Frames:
-    """The player of a SOURCE. ConfigError: it is none."""
-    if path.suffix.lower() in FILMS and not path.is_dir():
-        if not path.is_file():
-            raise ConfigError(f"{path}: SOURCE: does not exist; give a folder of images or a video file")
-        return Film(path, size, rate)
+def player(path: Path, size: tuple[int, int], rate: float | None, tell: Callable[[str], None]) -> Player:
+    """The player of a SOURCE: folder, manifest or film, as INPUTs of `estimate` are read.
+
+    Raises:
+        ConfigError: it is none, or a film without a frame.
+    """
     try:
-        return Player(find_sources([path], tell), size, rate or FOLDER_RATE)
+        sources = find_sources([path], tell)
     except ConfigError as error:
         raise ConfigError(str(error).replace(": INPUT: ", ": SOURCE: ", 1)) from None
+    if sources[0].film is not None and sources[0].film.frames == 0 and len(sources) == 1:
+        fault = decoded(sources[0])
+        why = fault.reason if isinstance(fault, Fault) else "empty"
+        raise ConfigError(f"{path}: SOURCE: holds no frame that can be read ({why}); give a folder of images or a film")
+    return Player(sources, size, rate)
 
 
 def camera_of_rig(given: Path, twin: Path | None, size: tuple[int, int], rate: float | None) -> RigCamera:

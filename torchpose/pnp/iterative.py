@@ -150,6 +150,7 @@ def minimise(
     state = _State(pose, unknown, lam, pose, lam, none, none, torch.zeros_like(none, dtype=torch.int64))
     if compile:
         return _ended(repeated(_advance)(max_iterations, state, obs, rtol, floor, enough))
+    obs = obs.dense(pose.shape[-1])
     result, index = None, torch.arange(pose.shape[-1], device=pose.device)  # of the poses still under way
     for iteration in range(1, max_iterations + 1):
         state, going = _advance(state, obs, rtol, floor, enough)

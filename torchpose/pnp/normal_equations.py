@@ -20,6 +20,7 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.geometry.small_linalg import cayley, cross, matmul3, solve_rows
 from torchpose.kernels import tracing
+from torchpose.pnp.few import MOST, Few, moved_few
 
 # upper triangle of the 6 x 7 matrix [J^T J | J^T r] row by row, and the cost, packed in 28 numbers
 STARTS = (0, 7, 13, 18, 22, 25, 27)
@@ -28,8 +29,6 @@ COST = 27
 _PRODUCTS = 10
 _BB = ((0, 1, 2), (1, 4, 5), (2, 5, 7))
 _BR = (3, 6, 8)
-# poses up to which LAPACK, one matrix after the other, costs less than the calls of an elimination
-_FEW = 64
 
 
 class Sums(NamedTuple):
@@ -56,6 +55,7 @@ class Observations(NamedTuple):
         camera: distorted camera through which the poses are projected; None: the pinhole of normalised coordinates.
         huber: residual in standard deviations above which the cost grows linearly; None: least squares.
         sums: `Sums` of the points where all poses share them, None otherwise.
+        few: the same as matrices, of a few poses through a pinhole; None otherwise.
     """
 
     points: Tensor
@@ -64,6 +64,7 @@ class Observations(NamedTuple):
     camera: Camera | None = None
     huber: float | Tensor | None = None
     sums: Sums | None = None
+    few: Few | None = None
 
     def select(self, index: Tensor) -> Observations:
         """The poses ``index``."""
@@ -73,13 +74,18 @@ class Observations(NamedTuple):
         """With a dimension of one before the batch, for several poses of the same points."""
         return self._each(lambda x: x.unsqueeze(-2))
 
+    def dense(self, poses: int) -> Observations:
+        """With matrices where so many poses are few, for `normal_equations` of one each."""
+        many = poses > MOST or self.camera is not None or self.huber is not None or tracing()
+        return self if many else self._replace(few=Few.of(poses, *self[:3]))
+
     def to(self, dtype: torch.dtype) -> Observations:
         sums = None if self.sums is None else Sums(*(v.to(dtype) for v in self.sums))
         return self._each(lambda x: x.to(dtype))._replace(sums=sums)
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> Observations:
         points, xy, whitening = map(change, self[:3])
-        return self._replace(points=points, xy=xy, whitening=whitening)
+        return self._replace(points=points, xy=xy, whitening=whitening, few=None)
 
 
 class Derivatives(NamedTuple):
@@ -170,6 +176,8 @@ def normal_equations(obs: Observations, pose: Tensor, newton: bool = False, fine
     the point is -(du dz' + du' dz) / z; the distortion of a camera is taken as linear.
     ``fine`` as in `differentiate`: a step has then the accuracy of its dtype, but for an error in proportion to itself.
     """
+    if obs.few is not None and pose.ndim == 3:
+        return obs.few.normal(pose, newton=newton)
     z, rows, cost = differentiate(obs, pose, fine)
     u, v = rows.unbind(1)
     products = torch.empty((_PRODUCTS, *cost.shape), dtype=cost.dtype, device=cost.device)
@@ -189,6 +197,14 @@ def normal_equations(obs: Observations, pose: Tensor, newton: bool = False, fine
         normal = assemble(obs.points, products, newton)
     normal[COST] = torch.where(z.amin(0) > 0, normal[COST], torch.inf)
     return normal
+
+
+def costs(obs: Observations, pose: Tensor) -> Tensor:
+    """The cost (...) alone at the poses (3, 4, ...), as `normal_equations` has it."""
+    p = camera_points(obs, pose)
+    square = residuals(obs, p[:2] / p[2]).square().sum(0)
+    cost = square if obs.huber is None else robust(square, obs.huber)[0]
+    return torch.where(p[2].amin(0) > 0, cost.sum(0), torch.inf)
 
 
 def assemble(points: Tensor, products: Tensor, newton: bool = False) -> Tensor:
@@ -217,8 +233,20 @@ def rows_of(normal: Tensor) -> list[Tensor]:
     return [normal[a:b] for a, b in pairwise(STARTS)]
 
 
+def few(value: Tensor) -> bool:
+    """Whether ``value`` (k, B) is of so few poses that calls cost more than what they compute."""
+    return not tracing() and value.ndim == 2 and value.shape[-1] <= MOST
+
+
+def information(normal: Tensor) -> Tensor:
+    """J^T J (6, 6, B) of packed numbers (28, B)."""
+    return normal.index_select(0, _full(normal.device)[:36]).unflatten(0, (6, 6))
+
+
 def distance(normal: Tensor, step: Tensor) -> Tensor:
     """Squared Mahalanobis length (...) of steps (6, ...), translation first, by the information J^T J."""
+    if few(step):
+        return (information(normal) * step * step[:, None]).sum((0, 1))
     twice = [(row[:-1] * step[i:]).sum(0) - 0.5 * row[0] * step[i] for i, row in enumerate(rows_of(normal))]
     return 2 * (torch.stack(twice) * step).sum(0)
 
@@ -229,7 +257,7 @@ def damped_step(normal: Tensor, damping: Tensor | None = None) -> tuple[Tensor, 
     Where the matrix is not positive definite, the first two mean nothing.
     """
     batch = normal.shape[1:]
-    if not tracing() and normal.device.type == "cpu" and batch.numel() <= _FEW:
+    if not tracing() and normal.device.type == "cpu" and batch.numel() <= MOST:
         numbers = normal.index_select(0, _full(normal.device)).flatten(1)
         gradient = numbers[36:]
         if damping is not None:
@@ -257,6 +285,8 @@ def _full(device: torch.device) -> Tensor:
 
 def moved(pose: Tensor, step: Tensor) -> Tensor:
     """Poses [R C(w) | R d + t] (3, 4, ...) of steps (d, w) (6, ...), with Cayley's rotation C(w)."""
+    if not tracing() and pose.ndim == 3 and pose.shape[-1] <= MOST:
+        return moved_few(pose, step)
     result = matmul3(pose[:, :3], torch.cat([cayley(step[3:]), step[:3, None]], 1))
     result[:, 3] += pose[:, 3]
     return result

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from torchpose.geometry.small_linalg import cross, matmul3
-from torchpose.pnp.candidates import Candidates, batch_last, rank, weighted_mean
+from torchpose.pnp.candidates import Candidates, batch_last, is_rotation, rank, weighted_mean
+from torchpose.pnp.few import MOST, ippe_few
 
 # thickness over extent (standard deviations) above which points are no plane
 _FLATNESS = 1e-2
@@ -84,8 +85,29 @@ def planar(object_points: Tensor, image_points: Tensor, mask: Tensor | None = No
     """
     points, xy, weight = batch_last(object_points, image_points, mask)
     frame = plane_frame(points, weight)
+    if xy.shape[2] <= MOST:
+        return _planar_few(points, xy, weight, frame)
     r, t = ippe(points, xy, weight, frame.axes, frame.center)
     return rank(torch.where(frame.flat & frame.wide, r, torch.nan), t, points, xy, weight)
+
+
+def _planar_few(points: Tensor, xy: Tensor, weight: Tensor | None, frame: Frame) -> Candidates:
+    """The same for a few sets of points, pose first."""
+    poses, count = xy.shape[2], xy.shape[1]
+    x, uv = points.permute(2, 1, 0).expand(poses, count, 3), xy.permute(2, 1, 0)
+    one = torch.ones_like(uv[..., 0]) if weight is None else weight.mT
+    axes, center = frame.axes.permute(2, 0, 1).expand(poses, 3, 3), frame.center.mT.expand(poses, 3)
+    flat = (frame.flat & frame.wide).expand(poses)
+    R, t, camera = ippe_few(x, uv, one, axes, center, _FIXED)
+    square = (camera[..., :2] / camera[..., 2:] - uv[:, :, None]).square().sum(-1)
+    rms = ((square * one[..., None]).sum(1) / one.sum(1)[:, None]).sqrt()
+    ahead = ((camera[..., 2] > 0) | (one[..., None] == 0)).all(1)
+    rms = torch.where(ahead & flat[:, None] & rms.isfinite() & is_rotation(R), rms, torch.inf)
+    rms, order = rms.sort(1)
+    row = torch.arange(poses, device=order.device)[:, None]
+    valid = rms.isfinite()
+    R = torch.where(valid[..., None, None], R[row, order], torch.nan)
+    return Candidates(R, torch.where(valid[..., None], t[row, order], torch.nan), torch.where(valid, rms, torch.nan))
 
 
 def plane_frame(points: Tensor, weight: Tensor | None) -> Frame:
@@ -101,7 +123,7 @@ def plane_frame(points: Tensor, weight: Tensor | None) -> Frame:
     scatter = torch.where(finite, scatter, torch.eye(3, dtype=wide.dtype, device=wide.device)[..., None])
     values, vectors = torch.linalg.eigh(scatter.permute(2, 0, 1))
     x, y = vectors[..., 2].T, vectors[..., 1].T
-    frame = torch.stack([x, y, cross(x, y)]).to(points)
+    frame = torch.stack([x, y, torch.linalg.cross(x, y, dim=0)]).to(points)
     extent = torch.where(finite, values.T.clamp_min(0).sqrt(), torch.nan).to(points)
     return Frame(frame, center, extent)
 

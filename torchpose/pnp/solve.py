@@ -20,7 +20,7 @@ from torchpose.pnp.epnp import epnp
 from torchpose.pnp.first_pass import EVALUATIONS, Rest, first_pass, upright
 from torchpose.pnp.implicit import attach_gradient
 from torchpose.pnp.iterative import minimise
-from torchpose.pnp.normal_equations import COST, normal_equations
+from torchpose.pnp.normal_equations import COST, costs
 from torchpose.pnp.p3p import p3p
 from torchpose.pnp.planar import planar
 from torchpose.pnp.posit import posit
@@ -291,7 +291,7 @@ def _solve_chunk(
     if method != "iterative":
         found = _CLOSED_FORMS[method](*batch_first(problem.observed, problem.weight))
         closed = as_poses([found])
-        cost = normal_equations(problem.final.each(), closed)[COST]
+        cost = costs(problem.final.each(), closed)
         solutions = Found(closed, cost, torch.zeros_like(cost, dtype=torch.int64), cost.isfinite())
         write(problem, choose(problem.final, solutions), _bad(problem, closed, least), table)
         return none, None
@@ -307,7 +307,7 @@ def _solve_chunk(
         poses = starts(problem) if poses is None else poses
         options, batch = poses.shape[2:]
         every = problem.final.select(torch.arange(batch, device=poses.device).repeat(options))
-        cost = normal_equations(problem.final.each(), poses.double())[COST].nan_to_num(nan=torch.inf)
+        cost = costs(problem.final.each(), poses.double()).nan_to_num(nan=torch.inf)
         flat = minimise(
             every,
             upright(poses.double()).flatten(2),

@@ -18,6 +18,8 @@ from torchpose.pnp.normal_equations import (
     camera_points,
     differentiate,
     distance,
+    few,
+    information,
     normal_equations,
     residuals,
     rows_of,
@@ -129,7 +131,7 @@ def choose(obs: Observations, found: Found, compile: bool = False) -> Minima:
         return Found(*(v.gather(-2, order[rank].expand(*v.shape[:-2], 1, batch)).squeeze(-2) for v in found))
 
     pose, cost, iterations, converged = pick(0)
-    normal = (compiled(normal_equations) if compile else normal_equations)(obs, pose)
+    normal = compiled(normal_equations)(obs, pose) if compile else normal_equations(obs.dense(batch), pose)
     # a minimum is known by the cost that its last step promised; one behind the camera from the start by none
     normal[COST] = cost
     best = Estimate(pose, normal, iterations, converged)
@@ -218,6 +220,8 @@ def covariance(best: Estimate, center: Tensor, unit: Tensor, mixed: Tensor | Non
     of D^-1/2 L^-1 T^T. ``mixed`` (6, 4, B) adds what uncertain intrinsics do, see `_mixed`.
     """
     columns = best.pose[:, :3].transpose(0, 1)
+    if few(unit[None]) and mixed is None:
+        return _covariance_of_few(best, columns, center, unit, out)
     rows = rows_of(best.normal)
     to_t = [*(columns * unit), *cross(columns, center[:, None])]
     if mixed is not None:
@@ -243,6 +247,19 @@ def covariance(best: Estimate, center: Tensor, unit: Tensor, mixed: Tensor | Non
             _sum_of_products([v[i] for v in r], [v[3:] for v in t[3:]], shift[3 + i])
         out += (shift[:, None] * shift).sum(2)
     return (pivots / torch.stack([row[0] for row in rows])).amin(0)
+
+
+def _covariance_of_few(best: Estimate, columns: Tensor, center: Tensor, unit: Tensor, out: Tensor) -> Tensor:
+    """The same by Cholesky's factor of each matrix."""
+    matrix = information(best.normal).permute(2, 0, 1)
+    factor, failed = torch.linalg.cholesky_ex(matrix)
+    # derivative of (t, R) by a step, transposed: (6, 6, B)
+    turned = torch.linalg.cross(columns, center[:, None].expand_as(columns), dim=0)
+    by_step = torch.cat([torch.cat([columns * unit, turned]), torch.nn.functional.pad(columns, (0, 0, 0, 0, 3, 0))], 1)
+    root = torch.linalg.solve_triangular(factor, by_step.permute(2, 0, 1), upper=False)
+    out.copy_(torch.bmm(root.mT, root).permute(1, 2, 0))
+    independence = (factor.diagonal(dim1=1, dim2=2).square() / matrix.diagonal(dim1=1, dim2=2)).amin(1)
+    return torch.where(failed == 0, independence, 0.0)
 
 
 def _sum_of_products(left: Sequence[Tensor], right: Sequence[Tensor], out: Tensor) -> None:

@@ -15,7 +15,7 @@ may yet be a print whose residuals are small by chance, and the pose's covarianc
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -110,6 +110,11 @@ class _Modes(NamedTuple):
     by: Tensor
     there: Tensor
 
+    def existing(self) -> Self:
+        """Those that exist in any row; they come last."""
+        most = max(1, int(self.there.sum(-1).amax())) if len(self.there) else self.there.shape[1]
+        return type(self)(*(x[:, x.shape[1] - most :] for x in self))
+
 
 class _Family(NamedTuple):
     """One explanation: its log evidence (N,), deviations (N, E), factor (N,), and chi-squared (N,) under it."""
@@ -177,7 +182,7 @@ def _explanations(modes: _Modes, none: Excess, even: Tensor | None) -> tuple[Ten
     which costs little to try, is held against rows whose sum is no surprise, too.
     """
     row = ((none.chi2 > _usual(none.freedom)) | ~none.explained).nonzero()[:, 0]
-    some, silent = _Modes(*(x[row] for x in modes)), torch.zeros_like(none.chi2)
+    some, silent = _Modes(*(x[row] for x in modes)).existing(), torch.zeros_like(none.chi2)
     # beforehand as likely as all three; where noise is known to be more than that of independent pixels, as each
     expected = torch.ones_like(none.explained) if even is None else even > 0
     nothing = math.log(_SCATTER + 1) * expected[row] - 0.5 * some.residual.square().sum(-1)
@@ -248,8 +253,10 @@ def _beside_scatter(explain: Callable[[_Modes], _Family], modes: _Modes) -> _Fam
     The more of it, the less likely beforehand: nothing tells small errors and scatter from scatter alone.
     """
     factors = _values(_SCALE, modes, _FEW_FACTORS)
-    each = [explain(_Modes(modes.residual / f.sqrt(), modes.by / f.sqrt(), modes.there)) for f in factors]
-    evidence, deviation, _, chi2 = (torch.stack(part, 1) for part in zip(*each, strict=True))
+    root, rows = factors.sqrt().repeat(len(modes.residual))[:, None], modes.residual.repeat_interleave(_FEW_FACTORS, 0)
+    by, there = (x.repeat_interleave(_FEW_FACTORS, 0) for x in (modes.by, modes.there))
+    found = explain(_Modes(rows / root, by / root[..., None], there))
+    evidence, deviation, _, chi2 = (part.unflatten(0, (-1, _FEW_FACTORS)) for part in found)
     evidence = evidence - (0.5 * modes.there.sum(-1, keepdim=True) + 1) * factors.log()
     weight = torch.softmax(evidence, -1)
     deviation = (weight[..., None] * deviation.square()).sum(1).sqrt()
@@ -263,8 +270,9 @@ def _print(modes: _Modes) -> _Family:
     values = _values(_PRINT, modes, _COARSE).square()
     places = torch.cartesian_prod(values, values)  # along, across
     parts = tuple(zip((markers[..., :3].flatten(-2), markers[..., 2:].flatten(-2)), places.T, strict=True))
-    of_edges = (values.new_tensor(_EDGES_OFF)[:, None] * values[:, None]).flatten(0, 1)
-    evidence, weight, chi2 = _weighed(modes, edges, of_edges, parts)
+    off = values.new_tensor(_EDGES_OFF)
+    of_edges = (off[:, None] * values[:, None]).flatten(0, 1)
+    evidence, weight, chi2 = _weighed(modes, edges, off, values, parts)
     every, bent = (weight.sum(-1) @ places).split(1, -1)
     of_marker = torch.cat([every, every, every + bent, bent, bent], -1).repeat(1, markers.shape[-2])
     none = torch.zeros_like(camera[:, 0])
@@ -286,8 +294,9 @@ def _between(chi2: Tensor, freedom: Tensor, values: Tensor) -> Tensor:
 def _camera(modes: _Modes) -> _Family:
     """One thing may be off, or all: of another focal length alone the mean over all tells too little."""
     variance = _values(_CAMERA, modes).square()
-    every = (variance.new_tensor(_OFF)[:, None] * variance[:, None]).flatten(0, 1)  # (S G, OF_CAMERA)
-    evidence, weight, chi2 = _weighed(modes, by_kind(modes.by)[2], every)
+    off = variance.new_tensor(_OFF)
+    every = (off[:, None] * variance[:, None]).flatten(0, 1)  # (S G, OF_CAMERA)
+    evidence, weight, chi2 = _weighed(modes, by_kind(modes.by)[2], off, variance)
     markers, edges, _ = by_kind(torch.zeros_like(modes.by[:, 0]))
     deviation = torch.cat([markers, edges, (weight[:, 0] @ every).sqrt()], -1)
     return _Family(evidence, deviation, torch.ones_like(evidence), chi2)
@@ -328,29 +337,30 @@ _Part = tuple[Tensor, Tensor]
 
 
 def _weighed(
-    modes: _Modes, few: Tensor, of_few: Tensor, parts: tuple[_Part, ...] = ()
+    modes: _Modes, few: Tensor, off: Tensor, values: Tensor, parts: tuple[_Part, ...] = ()
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Log evidence (N,) of unknowns, weights (N, G, V) of their variances, and the mean chi-squared (N,).
+    """Log evidence (N,) of unknowns, weights (N, G, S V) of their variances, and the mean chi-squared (N,).
 
     Args:
         modes: the residuals.
-        few: derivatives (N, r, e) by some unknowns, whose variances cost little to try (Woodbury 1950).
-        of_few: (V, e) variances of these.
-        parts: further unknowns; each of the G is combined with each of the V.
+        few: derivatives (N, r, e) by some unknowns.
+        off: (S, e) 1 or 0, which of these may be off together, by each of the variances ``values`` (V,), which cost
+            little to try (Woodbury 1950).
+        parts: further unknowns; each of the G is combined with each of the S V.
     """
     rows, r = modes.residual.shape
     grid = len(parts[0][1]) if parts else 1
-    some = max(1, _AT_ONCE // (grid * max(r * r, of_few.numel() * of_few.shape[1])))
-    found = [_likelihood(modes, few, of_few, parts, slice(k, k + some)) for k in range(0, max(rows, 1), some)]
+    some = max(1, _AT_ONCE // (grid * max(r * r, off.numel() * len(values))))
+    found = [_likelihood(modes, few, off, values, parts, slice(k, k + some)) for k in range(0, max(rows, 1), some)]
     likelihood, square = (torch.cat(x) for x in zip(*found, strict=True))
     weight = torch.softmax(likelihood.flatten(1), -1).view_as(likelihood)
     return _mean(likelihood.flatten(1)), weight, (weight * square).sum((1, 2))
 
 
 def _likelihood(
-    modes: _Modes, few: Tensor, of_few: Tensor, parts: tuple[_Part, ...], rows: slice
+    modes: _Modes, few: Tensor, off: Tensor, values: Tensor, parts: tuple[_Part, ...], rows: slice
 ) -> tuple[Tensor, Tensor]:
-    """Logarithm (n, G, V) under each of the variances, and chi-squared (n, G, V), of some rows."""
+    """Logarithm (n, G, S V) under each of the variances, and chi-squared (n, G, S V), of some rows."""
     columns = torch.cat([modes.residual[..., None], few], -1)[rows, None]
     spread = torch.eye(columns.shape[-2], dtype=modes.by.dtype, device=modes.by.device)
     for by, variance in parts:
@@ -358,14 +368,14 @@ def _likelihood(
     factor = torch.linalg.cholesky(spread).expand(len(columns), -1, -1, -1) if parts else None
     whitened = columns if factor is None else torch.linalg.solve_triangular(factor, columns, upper=False)
     alone = 0.0 if factor is None else factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)[..., None]
-    products = whitened.mT @ whitened  # (n, G, 1 + e, 1 + e)
-    scale = of_few.sqrt()
-    pull = scale * products[..., None, 1:, 0]
-    held = scale[:, :, None] * products[..., None, 1:, 1:] * scale[:, None]
-    held = torch.linalg.cholesky(held + torch.eye(scale.shape[1], dtype=held.dtype, device=held.device))
-    taken = torch.linalg.solve_triangular(held, pull[..., None], upper=False).square().sum((-1, -2))
-    square = products[..., :1, 0] - taken
-    return -0.5 * square - alone - held.diagonal(dim1=-2, dim2=-1).log().sum(-1), square
+    products = (whitened.mT @ whitened)[:, :, None]  # (n, G, 1, 1 + e, 1 + e)
+    # one variance for all that is off together: along the axes of what is told of them a sum of single ones
+    told, vectors = torch.linalg.eigh(off[:, :, None] * products[..., 1:, 1:] * off[:, None])
+    pull = (vectors.mT @ (off * products[..., 1:, 0])[..., None]).mT  # (n, G, S, 1, e)
+    gain = 1 + values[:, None] * told[..., None, :].clamp_min(0.0)  # (n, G, S, V, e)
+    taken = (values[:, None] * pull.square() / gain).sum(-1).flatten(2)
+    square = products[..., 0, 0] - taken
+    return -0.5 * (square + gain.log().sum(-1).flatten(2)) - alone, square
 
 
 def _values(ends: tuple[float, float], modes: _Modes, count: int = _GRID) -> Tensor:

@@ -159,13 +159,13 @@ def on_print(
     """
     R, n = setting.R, normals.right.shape[-1]
     aside = (R[:, None] @ moved[..., :3, None])[..., 0]
-    back = torch.cat([aside, torch.zeros_like(aside), moved[..., 3:4]], -1) + moved[..., 4:] * _by_size(setting)
-    right = normals.right + (normals.information @ _among(back[..., None], n))[..., 0]
+    back = torch.cat([aside, torch.zeros_like(aside), moved[..., 3:4]], -1) + moved[..., 4:] * motions_by_size(setting)
+    right = normals.right + (normals.information @ among(back[..., None], n))[..., 0]
     normals = MarkerNormals(normals.information, right)
     own = torch.eye(n, dtype=right.dtype, device=right.device)[:, :-1].expand(*right.shape[:2], n, n - 1)
-    by_camera, by_target = _by_camera(setting), _by_target(setting)
+    by_camera, by_target = motions_by_camera(setting), motions_by_target(setting)
     stated = torch.cat([by_camera, by_target], -1)
-    known = torch.cat([own, _among(stated, n)], -1)
+    known = torch.cat([own, among(stated, n)], -1)
     excess, further = _excess(normals, known, stated.shape[-1], setting, even)
     printed, lens = by_target, by_camera
     if further is not None:
@@ -176,19 +176,19 @@ def on_print(
     moving = (excess.field > 0).any(-1).nonzero()[:, 0]
     if moving.numel():
         fields = excess.field[moving].sqrt()[:, :, None, None, None] * _fields(setting.of_rows(moving))
-        shifts = _among(fields.movedim(1, -2).flatten(-2), n)
+        shifts = among(fields.movedim(1, -2).flatten(-2), n)
         some = noisy[moving]
         noisy = noisy.replaced(moving, some.scattered(some.by_motions(shifts)))
-    joint = _Joint.of(noisy, own, _among(printed, n), _among(lens, n), estimate)
-    place = look = _places(printed, joint, setting, excess.deviation)
+    joint = JointSolution.of(noisy, own, among(printed, n), among(lens, n), estimate)
+    place = look = places_of(printed, joint, setting, excess.deviation)
     other = ((excess.misfit == Misfit.CAMERA) | (excess.misfit == Misfit.SCATTER)).nonzero()[:, 0]
     if other.numel() and further is not None:
         # a fit that looks for the markers where they are not may only seem to scatter
         if_printed = torch.cat([by_target, (further * excess.printed[:, None, None])[..., :-OF_CAMERA]], -1)[other]
-        alone = _Joint.of(normals[other], own[other], _among(if_printed, n), _among(lens[other], n), True)
-        look = place.index_copy(0, other, _places(if_printed, alone, setting.of_rows(other), excess.printed[other]))
+        alone = JointSolution.of(normals[other], own[other], among(if_printed, n), among(lens[other], n), True)
+        look = place.index_copy(0, other, places_of(if_printed, alone, setting.of_rows(other), excess.printed[other]))
         noisy = normals[other].over(excess.printed_factor[other])
-        alone = _Joint.of(noisy, own[other], _among(if_printed, n), _among(lens[other], n), estimate)
+        alone = JointSolution.of(noisy, own[other], among(if_printed, n), among(lens[other], n), estimate)
         joint = joint.perhaps(other, alone, excess.maybe[other])
     sure = joint.known & (torch.linalg.cholesky_ex(joint.covariance)[1] == 0)
     parts = (joint.by_camera[..., : by_camera.shape[-1]], joint.by_print[..., : by_target.shape[-1]])
@@ -197,7 +197,7 @@ def on_print(
     return OnPrint(*found, excess.misfit, excess.explained, excess.chi2, excess.freedom, sure)
 
 
-def _places(printed: Tensor, joint: _Joint, setting: Setting, deviation: Tensor) -> Tensor:
+def places_of(printed: Tensor, joint: JointSolution, setting: Setting, deviation: Tensor) -> Tensor:
     """Places (N, M, 5) of markers moved by the numbers of a solution, by their motions (N, M, 7, L).
 
     Where these go beyond what is stated, the last ones are those of edges, see `excess.OF_EDGES`.
@@ -215,7 +215,7 @@ def _places(printed: Tensor, joint: _Joint, setting: Setting, deviation: Tensor)
     return (by @ joint.numbers[:, None, :, None])[..., 0]
 
 
-class _Joint(NamedTuple):
+class JointSolution(NamedTuple):
     """Solution of N problems of own unknowns, and numbers of unit variance of the print and of the camera.
 
     The print's are unknowns, too. The camera's are not: a frame tells next to nothing of them, and poses that followed
@@ -241,7 +241,7 @@ class _Joint(NamedTuple):
         the covariance (I + S)^-1, and every part of the pose's covariance is a sum of squares, whatever is large.
         """
         columns = torch.cat([own, by_print], -1)
-        matrix, right = _assembled(normals, columns)
+        matrix, right = assembled(normals, columns)
         by_lens = columns.flatten(1, 2).mT @ (normals.information @ by_camera).flatten(1, 2)
         k = own.shape[-1]
         alone, known = scaled_inverse(matrix[:, :k, :k])
@@ -280,14 +280,14 @@ def _excess(
     """
     rows, markers, n = known.shape[:3]
     alone = torch.eye(markers * (POSE + 1), dtype=known.dtype, device=known.device).unflatten(0, (markers, -1))
-    together = _remaining(normals, known, _among(alone.expand(rows, -1, -1, -1), n), count)
+    together = remaining_of(normals, known, among(alone.expand(rows, -1, -1, -1), n), count)
     excess = no_excess(*together)
     odd = (~excess.explained).nonzero()[:, 0]
     if odd.numel() == 0:
         return excess, None
     some = setting.of_rows(odd)
-    shifts = torch.cat([_print_shifts(some), _camera_shifts(some)], -1)
-    remaining = _remaining(normals[odd], known[odd], _among(shifts, n), count)
+    shifts = torch.cat([print_shifts(some), _camera_shifts(some)], -1)
+    remaining = remaining_of(normals[odd], known[odd], among(shifts, n), count)
     refuted = beyond_chance(excess)[odd]
 
     def picture(which: Tensor) -> Picture:
@@ -301,7 +301,7 @@ def _excess(
     return excess.replaced(odd, replace(again, chi2=excess.chi2[odd], freedom=excess.freedom[odd])), every
 
 
-def _by_target(setting: Setting) -> Tensor:
+def motions_by_target(setting: Setting) -> Tensor:
     """How markers seem moved (N, M, 7, L), each alone, by the numbers of unit variance of the target.
 
     A target that is larger as a whole looks like the same one that is nearer: all markers move towards the camera.
@@ -332,7 +332,7 @@ def displaced(
     return torch.cat([aside, turn, by[..., 6:, :].expand(*turn.shape[:2], 1, -1)], -2)
 
 
-def _by_camera(setting: Setting) -> Tensor:
+def motions_by_camera(setting: Setting) -> Tensor:
     """The same (N, M, 7, C) by those of the camera.
 
     A camera's error moves the image of a ring; the motion of the marker that does the same, by its own information, is
@@ -366,7 +366,7 @@ def _camera_shifts(setting: Setting) -> Tensor:
     return _as_motions(setting, by)
 
 
-def _print_shifts(setting: Setting) -> Tensor:
+def print_shifts(setting: Setting) -> Tensor:
     """The same (N, M, 7, E) of the numbers of a print in `excess`, by 1 mm each."""
     evidence, R = setting.evidence, setting.R
     rows, markers = evidence.mask.shape
@@ -384,7 +384,7 @@ def _print_shifts(setting: Setting) -> Tensor:
     columns[:, :, :POSE, :-OF_EDGES] = own
     columns[:, :, -1, -3] = 1
     columns[..., -2] = _by_bloom(setting)
-    columns[..., -1] = _by_size(setting)
+    columns[..., -1] = motions_by_size(setting)
     return columns
 
 
@@ -399,6 +399,7 @@ def _fields(setting: Setting) -> Tensor:
     weighted = (jacobian.mT @ weight).unflatten(1, (markers, -1))  # (N, M, P, 7, 2)
     held = (weighted @ jacobian.unflatten(1, (markers, -1))).sum(2)
     moved = solve_scaled(held, weighted.movedim(2, -1).flatten(-2)).unflatten(-1, (2, -1))  # (N, M, 7, 2, P)
+    moved = torch.where(evidence.mask[..., None, None, None], moved, 0.0)
     at = (xy * evidence.matrix.diagonal()[:2]).unflatten(1, (markers, -1))
     across = evidence.radii[..., 0] * evidence.matrix.diagonal()[:2].mean() / setting.t[:, 2:]
     length = across.new_tensor(_LENGTHS)[:, None, None, None] * across[:, None, :, None, None]
@@ -406,7 +407,7 @@ def _fields(setting: Setting) -> Tensor:
     alike = (-(apart / length).square()).exp()
     both = torch.einsum("nmacp,nfmpq,nmbcq->nfmab", moved, alike, moved)
     values, vectors = torch.linalg.eigh(0.5 * (both + both.mT))
-    return vectors * values.clamp_min(0.0).sqrt()[..., None, :] * evidence.mask[:, None, :, None, None]
+    return vectors * values.clamp_min(0.0).sqrt()[..., None, :]
 
 
 def _by_bloom(setting: Setting) -> Tensor:
@@ -419,7 +420,7 @@ def _by_bloom(setting: Setting) -> Tensor:
     return _least_squares(setting, jacobian, weight, across)[..., 0] * mm[:, None, None]
 
 
-def _by_size(setting: Setting) -> Tensor:
+def motions_by_size(setting: Setting) -> Tensor:
     """Motions (N, M, 7) that do to a ring what both its edges do 1 mm further out: it is nearer, with less gain.
 
     A disc has one edge, and nothing but gain.
@@ -451,12 +452,12 @@ def _least_squares(setting: Setting, jacobian: Tensor, weight: Tensor, pixels: T
     return torch.where(mask[..., None, None], solve_scaled(*both), 0.0)
 
 
-def _remaining(normals: MarkerNormals, known: Tensor, excess: Tensor, count: int) -> tuple[Tensor, Tensor]:
+def remaining_of(normals: MarkerNormals, known: Tensor, excess: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Information (N, E, E) about the ``excess`` columns and their right side (N, E), with the ``known`` unknowns.
 
     The last ``count`` of these are numbers with a prior of unit variance about 0.
     """
-    matrix, right = _assembled(normals, torch.cat([known, excess], -1))
+    matrix, right = assembled(normals, torch.cat([known, excess], -1))
     k = known.shape[-1]
     matrix.diagonal(dim1=-2, dim2=-1)[:, k - count : k] += 1
     both = torch.cat([matrix[:, :k, k:], right[:, :k, None]], -1)
@@ -464,7 +465,7 @@ def _remaining(normals: MarkerNormals, known: Tensor, excess: Tensor, count: int
     return matrix[:, k:, k:] - taken[..., :-1], right[:, k:] - taken[..., -1]
 
 
-def _assembled(normals: MarkerNormals, columns: Tensor) -> tuple[Tensor, Tensor]:
+def assembled(normals: MarkerNormals, columns: Tensor) -> tuple[Tensor, Tensor]:
     """Normal equations (N, k, k), (N, k) of unknowns with these columns (N, M, n, k)."""
     # all markers in one product: with many of them single ones are large together
     every = columns.flatten(1, 2).mT
@@ -472,7 +473,7 @@ def _assembled(normals: MarkerNormals, columns: Tensor) -> tuple[Tensor, Tensor]
     return matrix, (every @ normals.right.flatten(1)[..., None])[..., 0]
 
 
-def _among(by: Tensor, n: int) -> Tensor:
+def among(by: Tensor, n: int) -> Tensor:
     """Columns (N, M, n, L) of pose and gain (N, M, 7, L), with 0 for what stands between."""
     between = by.new_zeros(*by.shape[:2], n - POSE - 1, by.shape[-1])
     return torch.cat([by[:, :, :POSE], between, by[:, :, POSE:]], 2)

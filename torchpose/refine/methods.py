@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.geometry.least_squares import Pose
+from torchpose.geometry.robust import of_chance
 from torchpose.pose import (
     CENTER_RMS,
     PLACE,
@@ -26,7 +27,7 @@ from torchpose.refine.decide import decide, decide_on_grey
 from torchpose.refine.edges.fit import refine_edges
 from torchpose.refine.photometric.fit import refine_photometric
 from torchpose.refine.sight import LEAST_KEPT, Refined, Sight
-from torchpose.results import Misfit, Reason, Status
+from torchpose.results import Reason, Status
 
 # of the pixels, where the pose stays near: of wires over half of every ring 0.27 (measured: `wires 3` of
 # `scripts/corruption_statistics.py`)
@@ -65,6 +66,8 @@ def _on_solved(change: Step) -> Step:
         index = solutions.solved.nonzero()[:, 0]
         if index.numel() == 0:
             return solutions
+        if len(index) == len(solutions):
+            return change(solutions, replace(evidence, mask=solutions.mask), replace(sight, mask=solutions.mask))
         rows = solutions[index]
         seen, shown = replace(evidence[index], mask=rows.mask), replace(sight[index], mask=rows.mask)
         return solutions.replaced(index, change(rows, seen, shown))
@@ -84,21 +87,22 @@ def on_frames(refine: Callable[..., Refined]) -> Step:
         found, good = rows, torch.zeros_like(rows.status, dtype=torch.bool)
         active = torch.arange(len(rows), device=good.device)
         for number in range(ROUNDS):
-            some = rows[active], seen[active], sight[active].displaced(beyond(place[active], seen[active]))
+            some = (rows, seen, sight) if number == 0 else (rows[active], seen[active], sight[active])
+            some = (*some[:2], some[2].displaced(beyond(place[active], some[1])))
             # what seems to contradict the model may be a marker beside its place
             refined = refine(some[2], start.R[active], start.t[active], thorough=number > 0)
             now, joint, held = _on_print(refined, *some, place[active])
-            if number == 0:
-                sight = replace(sight, look=refined.look)
-            else:
+            if number > 0:
                 # markers looked for where they are leave less to noise: if not, they are elsewhere
                 held &= torch.logdet(now.noise) < torch.logdet(found.noise[active])
             better = held.nonzero()[:, 0]
             found, good = found.replaced(active[better], now[better]), good.index_fill(0, active[better], True)
             beside = (joint.look - place[active]).abs().amax((-1, -2)) * seen.matrix[0, 0] / now.t[:, 2]
+            if number == 0 and refined.look is not None:
+                sight = replace(sight, look=replace(refined.look, doubt=refined.doubt & (beside <= BESIDE)))
             start, place = start.replaced(active, Pose(now.R, now.t)), place.index_copy(0, active, joint.look)
-            # at first, whatever is amiss is looked at once more with the markers where the print would have them
-            amiss = (refined.doubt | (held & (joint.misfit != Misfit.NONE))) & (number == 0)
+            # rows in doubt are looked at once more, without what contradicts the model
+            amiss = refined.doubt & (number == 0)
             active = active[(held & (beside > BESIDE)) | amiss]
             if active.numel() == 0:
                 break
@@ -112,7 +116,9 @@ def _start(rows: Solutions, seen: Evidence, camera: Camera) -> tuple[Pose, Tenso
     """Poses, and places (N, M, 5) of markers beside those of the file, as `OnPrint.look`, by the ellipses."""
     start, place = Pose(rows.R, rows.t), -beyond(rows.t.new_zeros(*seen.mask.shape, PLACE), seen)
     place = torch.cat([place[..., :4], rows.larger[:, None, None].expand_as(place[..., 4:])], -1)
-    off = (rows.rms > BESIDE).nonzero()[:, 0]
+    freedom = (2 * seen.mask.sum(-1) - start.size).clamp_min(1)
+    # what noise explains is found on the grey values, if it is there
+    off = ((rows.rms > BESIDE) & (rows.chi2 > freedom * of_chance(freedom))).nonzero()[:, 0]
     if off.numel() == 0:
         return start, place
     found, joint = _by_centers(rows[off], seen[off], camera)

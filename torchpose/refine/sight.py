@@ -35,6 +35,7 @@ class Look(Rows):
         levels: grey levels of the markers, as `refine.photometric.light` has them.
         band: on either side of the edges.
         reduction: of the frames, by block means.
+        doubt: what contradicts the model there does so still, since no marker was moved.
     """
 
     kind: Int[Tensor, " N"]
@@ -42,6 +43,7 @@ class Look(Rows):
     levels: Float[Tensor, "N M 6"]
     band: Float[Tensor, " N"]
     reduction: Int[Tensor, " N"]
+    doubt: Bool[Tensor, " N"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,23 +154,30 @@ def refined_by_blur(
     prior: Tensor | None,
     factor: Int[Tensor, " N"],
 ) -> Refined:
-    """N rows refined in parts, by the kind of their blur, in frames reduced by their ``factor``; blurs in px of the
-    frames themselves.
+    """N rows refined in parts, by the kind of their blur and whether they are in doubt, in frames reduced by their
+    ``factor``; blurs in px of the frames themselves.
 
     Args:
         prior: (N, 6, 6), information about the pose where it starts, or (N, 7, 7) with an edge gain of zero.
         factor: for rows without a look.
     """
     known = None if prior is None else PosePrior(prior, start)
-    kind = torch.zeros_like(factor)
+    kind = doubt = torch.zeros_like(factor)
     if sight.look is not None:
-        factor, kind = sight.look.reduction, sight.look.kind
-    each = torch.stack([factor, kind], -1)
+        factor, kind, doubt = sight.look.reduction, sight.look.kind, sight.look.doubt.long()
+    each = torch.stack([factor, kind, doubt], -1)
+    groups = each.unique(dim=0).tolist() or [[1, 0, 0]]
+
+    def part(by: int, sight: Sight, start: Pose, known: PosePrior | None) -> Refined:
+        some = refine(sight.reduced(by), start, known)
+        return some if by == 1 else replace(some, spread=blurs.enlarged(some.spread, by))
+
+    if len(groups) == 1:
+        return part(groups[0][0], sight, start, known)
     order, parts = [], []
-    for both in each.unique(dim=0).tolist() or [[1, 0]]:
-        index, by = (each == each.new_tensor(both)).all(-1).nonzero()[:, 0], both[0]
-        some = refine(sight[index].reduced(by), start[index], None if known is None else known[index])
-        parts.append(some if by == 1 else replace(some, spread=blurs.enlarged(some.spread, by)))
+    for one in groups:
+        index = (each == each.new_tensor(one)).all(-1).nonzero()[:, 0]
+        parts.append(part(one[0], sight[index], start[index], None if known is None else known[index]))
         order.append(index)
     return Refined.cat(parts)[torch.argsort(torch.cat(order))]
 

@@ -11,7 +11,7 @@ from torchpose.calibration import Calibration, HandEyeFit
 from torchpose.calibration.session import Measurement
 from torchpose.geometry.segments import segment_mean
 from torchpose.io.writers import write_rows
-from torchpose.report.figures import COLOURS, GREY, subplots
+from torchpose.report.figures import COLOURS, GREY, legend_below, subplots
 from torchpose.report.files import make_folder, save_figures
 from torchpose.report.measured import plot_target, save_places
 
@@ -77,10 +77,10 @@ def plot_hand_eye(fit: HandEyeFit) -> Figure:
         (rotation, fit.residual[:, 3:].rad2deg() * 1e3, "rotation, mdeg"),
     ):
         for k, axis in enumerate("xyz"):
-            panel.plot(values[:, k], "o-", ms=3, lw=0.8, color=COLOURS[k], label=axis)
+            panel.plot(values[:, k], "o-", ms=3, lw=0.8, color=COLOURS[k], label=f"{axis} of the camera")
         panel.axhline(0, color=GREY, lw=0.6)
         panel.set_ylabel(label)
-    position.legend(title="camera axis", ncols=3, fontsize=8)
+    legend_below(figure, [position], 3)
     rotation.set_xlabel("pose")
     figure.suptitle(
         f"target seen - predicted from the robot; robot noise {fit.robot_sigma_mm * 1e3:.3g} um, "

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
 from torchpose.design import PrecisionMap, WorkingVolume, surroundings
@@ -13,6 +14,7 @@ from torchpose.report.files import save_figures
 
 _PANELS = ("across the optical axis [um]", "along the optical axis [um]", "rotation [mdeg]")
 _MARK = {"color": "white", "mec": "black", "ms": 11}  # of what was asked for
+_LEAST_RANGE = 0.05  # of the largest value (convention), that the colours of a map cover
 _Axis = tuple[str, Tensor]  # label and values
 
 
@@ -50,13 +52,18 @@ def _plot(panel: Any, across: _Axis, up: _Axis, values: Tensor, name: str) -> No
         panel.plot(along.tolist(), values.flatten().tolist(), "o-", color=COLOURS[0], ms=4)
         panel.set(xlabel=f"{label} ({other} {float(at[0]):g})", ylabel=name, ylim=(0, 1.15 * float(values.max())))
         return
-    filled = panel.contourf(x.tolist(), y.tolist(), values.tolist(), 12, cmap="viridis")
-    lines = panel.contour(x.tolist(), y.tolist(), values.tolist(), 5, colors="white", linewidths=0.6)
-    panel.clabel(lines, fontsize=8)
+    filled = panel.contourf(x.tolist(), y.tolist(), values.tolist(), _levels(values), cmap="viridis")
     panel.figure.colorbar(filled, ax=panel, label=name)
     panel.grid(False)
     panel.spines[["top", "right"]].set_visible(True)
     panel.set(xlabel=label_x, ylabel=label_y)
+
+
+def _levels(values: Tensor) -> list[float]:
+    """Steps of a map, round numbers: what hardly varies is of one colour."""
+    low, high = float(values.min()), float(values.max())
+    more = max(0.0, 0.5 * (_LEAST_RANGE * high - (high - low)))
+    return [float(level) for level in MaxNLocator(12).tick_values(low - more, high + more)]
 
 
 def save_plot(found: PrecisionMap, title: str, path: Path, volume: WorkingVolume | None = None) -> None:

@@ -19,6 +19,7 @@ def draw_shapes(frame: np.ndarray, rows: list[Row]) -> np.ndarray:
     """
     picture = cv2.cvtColor(eight_bit(frame), cv2.COLOR_GRAY2BGR)
     unit = max(picture.shape[:2]) / 1000
+    notes: list[tuple[str, tuple[float, float], Colour]] = []
     width = max(1, round(unit))  # that large frames still show it when they are shrunk to a screen
     for row in rows:
         if row["kind"] != "ellipse":
@@ -38,5 +39,20 @@ def draw_shapes(frame: np.ndarray, rows: list[Row]) -> np.ndarray:
             note = f"{row['ring_ratio']:.2f}"
         if note:
             across = math.hypot(params[2] * math.cos(params[4]), params[3] * math.sin(params[4]))
-            draw_text(picture, note, (params[0] + across, params[1]), 0.4 * unit, colour)
+            notes.append((note, (params[0] + across, params[1]), colour))
+    for (note, _, colour), place in zip(
+        notes, _apart([place for _, place, _ in notes], 90 * unit, 16 * unit), strict=True
+    ):
+        draw_text(picture, note, place, 0.4 * unit, colour)
     return picture
+
+
+def _apart(places: list[tuple[float, float]], wide: float, high: float) -> list[tuple[float, float]]:
+    """The places of notes, each moved down until it is as far as that from those before it."""
+    found: list[tuple[float, float]] = []
+    for x, y in places:
+        near = sorted(other for at, other in found if abs(at - x) < wide)
+        for other in near:
+            y = other + high if abs(other - y) < high else y
+        found.append((x, y))
+    return found

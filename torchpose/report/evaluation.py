@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from torchpose.analysis.evaluation import AXES, UNITS, Evaluation
 from torchpose.io.truth import Truth
-from torchpose.report.figures import COLOURS, GREY, band, subplots
+from torchpose.report.figures import COLOURS, GREY, band, legend_below, subplots
 from torchpose.report.files import make_folder, save_figures
 
 _MOST_NEES = 25.0  # shown; larger ones in the last bin
@@ -52,8 +52,8 @@ def plot_consistency(evaluation: Evaluation, title: str) -> Figure:
             panel.stairs(*_density(values, bins, -5, 5), lw=1.5, color=COLOURS[i % 3], label=AXES[i])
         panel.plot(x, (-0.5 * x.square()).exp() / math.sqrt(2 * math.pi), color=GREY, lw=1, label="ideal")
         panel.set_xlabel(f"{name} error / claimed sigma")
-        panel.legend(frameon=False, fontsize=9)
     axes[0].set_ylabel("density")
+    legend_below(figure, axes[:2], 7)
     nees = evaluation.errors.nees[evaluation.error[:, 0].isfinite()].nan_to_num(_MOST_NEES).clamp(max=_MOST_NEES)
     axes[2].stairs(*_density(nees, bins, 0, _MOST_NEES), fill=True, color="#b3cde3")
     x = torch.linspace(0.01, _MOST_NEES, 300, dtype=torch.float64)

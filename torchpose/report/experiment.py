@@ -34,9 +34,9 @@ def _plot_static(panel: Any, static: Static, axis: int) -> None:
     number = torch.arange(len(static.deviation))
     band(panel, number, 2 * scale * static.sigma[:, axis])
     panel.plot(number, scale * static.deviation[:, axis], "o-", ms=3, lw=0.7, color=COLOURS[axis % 3])
-    words = f"{'rotation about ' if axis > 2 else ''}{'xyz'[axis % 3]}"
+    words = f"{'about ' if axis > 2 else ''}{'xyz'[axis % 3]}"
     spread, claimed = scale * float(static.spread[axis]), scale * float(static.claimed[axis])
-    panel.set_title(f"static, {words}: {spread:.3g} {name}, claimed {claimed:.3g}", fontsize=10)
+    panel.set_title(f"at rest, {words}: {spread:.3g} {name}, claimed {claimed:.3g}", fontsize=9)
 
 
 def _plot_moves(panel: Any, moves: Moves, colour: str) -> None:
@@ -46,4 +46,4 @@ def _plot_moves(panel: Any, moves: Moves, colour: str) -> None:
     error, sigma = scale * moves.error[order], scale * moves.sigma[order]
     band(panel, at, 2 * sigma)
     panel.plot(at, error.tolist(), "o-", ms=3, lw=0.7, color=colour)
-    panel.set_title(f"{moves.axis}: RMS {rms(error):.3g} {name}, claimed {rms(sigma):.3g}", fontsize=10)
+    panel.set_title(f"{moves.axis}: RMS {rms(error):.3g} {name}, claimed {rms(sigma):.3g}", fontsize=9)

@@ -68,6 +68,7 @@ def subplots(rows: int, columns: int, size: tuple[float, float], **options: Any)
     for panel in axes.flat:
         panel.spines[["top", "right"]].set_visible(False)
         panel.grid(alpha=0.25, lw=0.5)
+        panel.set_axisbelow(True)
     return figure, axes
 
 

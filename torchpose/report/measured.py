@@ -11,7 +11,7 @@ from torch import Tensor
 from torchpose.calibration.session import Measurement
 from torchpose.geometry.segments import segment_mean
 from torchpose.io.writers import write_rows
-from torchpose.report.figures import COLOURS, GREY, subplots
+from torchpose.report.figures import COLOURS, GREY, legend_below, subplots
 
 _BLUE, _RED = COLOURS[:2]
 _LONGEST = 0.15  # of the plate: the longest arrow
@@ -23,6 +23,7 @@ def plot_target(found: Measurement) -> Figure:
     _plot_places(places, found)
     _plot_residuals(residuals, found)
     _plot_correlation(correlation, found)
+    legend_below(figure, [residuals], 2)
     gain, sigma = found.target.edge_gain, _deviations(found)[-1]
     figure.suptitle(
         f"{found.target.name}: edge gain {1e3 * gain:.3g} +- {1e3 * float(sigma):.2g} um, "
@@ -77,12 +78,12 @@ def _plot_residuals(panel: Any, found: Measurement) -> None:
     for k, axis in enumerate("uv"):
         shift = [p + 0.2 * (k - 0.5) for p in places]
         panel.errorbar(
-            shift, mean[:, k].tolist(), deviation[:, k].tolist(), fmt="o", ms=3, lw=0.8, color=COLOURS[k], label=axis
+            *(shift, mean[:, k].tolist(), deviation[:, k].tolist()),
+            **{"fmt": "o", "ms": 3, "lw": 0.8, "color": COLOURS[k], "label": f"mean residual along {axis}"},
         )
     panel.axhline(0, color=GREY, lw=0.6)
     panel.set_xticks(places, [str(i) for i in found.target.ids.tolist()])
     panel.set(xlabel="marker", ylabel="mean residual, px")
-    panel.legend(fontsize=8)
     panel.set_title("left over all views; bars: three deviations", fontsize=10)
 
 

@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchpose.analysis.evaluation import AXES, SCALE
-from torchpose.report.figures import COLOURS, GREY, subplots
+from torchpose.report.figures import COLOURS, GREY, legend_below, subplots
 
 _PANELS = (("x, y [um]", (0, 1)), ("z, depth [um]", (2,)), ("orientation [mdeg]", (3, 4, 5)))
 
@@ -22,7 +22,7 @@ def plot_angles(degrees: Tensor, bound: Tensor, alone: Tensor, distance: float) 
             panel.axhline(float(single[i]), color=colour, ls="--", lw=0.9, label=f"{AXES[i]}, the first alone")
         panel.set(xlabel="angle between the cameras [degrees]", ylabel=f"standard deviation of {title}")
         panel.set_ylim(bottom=0)
-        panel.legend(fontsize=7)
+    legend_below(figure, panels, 6)
     figure.suptitle(f"a second camera like the first, turned about the target at {distance:g} mm", fontsize=11)
     return figure
 
@@ -36,5 +36,5 @@ def plot_distances(distance: Tensor, bounds: Mapping[str, Tensor]) -> Figure:
             style = {"color": GREY, "lw": 2.5} if name == "all" else {"color": COLOURS[(k - 1) % len(COLOURS)]}
             panel.semilogy(distance, sigma, label=name, **style)
         panel.set(xlabel="distance from the first camera [mm]", ylabel=f"standard deviation of {title}")
-        panel.legend(fontsize=7)
+    legend_below(figure, panels[:1], 6)
     return figure

@@ -1,5 +1,6 @@
 """Stage: concentric pairs. From candidate ellipses to rings with both circles measured."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -36,6 +37,7 @@ _LARGE = 20.0  # px, of the outer semi-minor axis, from which on a fit of all pi
 # `scripts/corruption_statistics.py --only interlacing`)
 _SOFT_ALL_AROUND = 1.0
 _ROUGH = 0.5  # px, of a candidate's centre and axes
+_SCALES = (2.0, 1.0, 0.5)  # px, see `ellipse.fit_robust`: from a candidate's error down to a few times that of edges
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +198,7 @@ def _measured(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
     A mask or a band of a fixed size sees little of an edge that is wider; in a frame of half the size it is not.
     """
     candidates, inside = circles.outer, circles.inside
-    by_blur = reduction_for(blurs.axes(inside.blur)[1].sqrt(), zernike.WIDEST)
+    by_blur = reduction_for(_in_common(blurs.axes(inside.blur)[1].sqrt(), candidates.frame), zernike.WIDEST)
     # a ring keeps a pixel more than the least has
     factor = by_blur.minimum(reduction_for(candidates.ellipse[:, 3], 2 * (_LEAST_SEMI_MINOR[0] + 1)))
     rings, which = [], []
@@ -213,6 +215,14 @@ def _measured(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
         return _no_rings(candidates), candidates.frame
     order = torch.argsort(torch.cat(which))
     return Rings.cat(rings)[order], torch.cat(which)[order]
+
+
+def _in_common(blur: Tensor, frame: Tensor) -> Tensor:
+    """Blurs (K,) px of the rings of frames (K,); those of a frame that differ little count as one, and so each frame is
+    reduced in one way."""
+    logarithm = blur.log()
+    usual = segment_mean(logarithm, frame, int(frame.max()) + 1)[frame]
+    return torch.where((logarithm - usual).abs() < 0.5 * math.log(2), usual, logarithm).exp()
 
 
 def _enlarged(rings: Rings, factor: int) -> Rings:
@@ -283,16 +293,12 @@ def _by_edges(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
     shown = clear.repeat(2, 1)[edges.ring, sector]
     edges, sector = edges[shown], sector[shown]
 
-    raw, keep = ellipse.fit_robust(edges.points, edges.ring, 2 * count, start=rough)
-    distance = edges.offset - ellipse.distance(edges.points, edges.ring, raw) * outward[edges.ring]
-    blur = zernike.edge_blur(edges.offset[keep], distance[keep], edges.normal[keep], edges.ring[keep] % count, count)
-    points = edges.points
-    if how.correct:
-        points = points + _correction(edges, raw, blur, outward)[:, None] * edges.normal
-    raw, keep = ellipse.fit_robust(points, edges.ring, 2 * count, start=raw, scales=(0.5,))
+    points, blur, keep = _freed(edges, rough, outward, how.correct)
     ring, points = edges.ring[keep], points[keep]
     ideal_points = ideal_pixels(camera, points)
-    ideal = ellipse.fit(ideal_points, ring, 2 * count)
+    # as the frame shows them, and without the lens
+    each = torch.cat([points, ideal_points]), torch.cat([ring, ring + 2 * count])
+    raw, ideal = ellipse.fit(*each, 4 * count).tensor_split(2)
     fit = ellipse.with_covariance(ideal_points, ring, ideal, correlation=zernike.edge_correlation())
 
     one = torch.ones_like(ring, dtype=torch.float64)
@@ -300,13 +306,9 @@ def _by_edges(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
     step = segment_mean(edges.step[keep], ring, 2 * count)
     step_ratio = step[count:] / step[:count]
     offset = torch.linalg.vector_norm(raw[count:, :2] - inner[:, :2], dim=-1)
-    # all points lie within reach of the rough ellipse; a fit that does not has followed the stump of a circle cut off
-    shift = torch.linalg.vector_norm(raw[:, :2] - rough[:, :2], dim=-1)
-    growth = (conics.shape_matrix(raw) - conics.shape_matrix(rough)).abs().amax((1, 2))
-    near = torch.maximum(shift, growth) < reach + 1.5
     good = (
         fit.covariance.isfinite().all(-1).all(-1).view(2, count).all(0)
-        & near.view(2, count).all(0)
+        & _within(reach, raw, rough).view(2, count).all(0)
         & (cover[:count] > _LEAST_COVER[0])
         & (cover[count:] > _LEAST_COVER[1])
         & (step_ratio > STEP_RANGE[0])
@@ -321,6 +323,37 @@ def _by_edges(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
     follows = marked((edges.ring * SECTORS + sector)[keep], 2 * count * SECTORS).view(2, count, SECTORS)[0, index]
     known = (blur, inside.clipped[index], clear[index] & follows)
     return Rings(frame, polarity, raw[index], raw[second], fit[index], fit[second], *known), index
+
+
+def _within(reach: Tensor, fitted: Tensor, rough: Tensor) -> Tensor:
+    """Whether ellipses (N, 5) lie along their rough ones, (N,): all points are within reach of those, and a fit that is
+    not has followed the stump of a circle cut off."""
+    shift = torch.linalg.vector_norm(fitted[:, :2] - rough[:, :2], dim=-1)
+    growth = (conics.shape_matrix(fitted) - conics.shape_matrix(rough)).abs().amax((1, 2))
+    return torch.maximum(shift, growth) < reach + 1.5
+
+
+def _freed(edges: RingEdges, rough: Tensor, outward: Tensor, correct: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """Edge points (E, 2) freed of what blur and curvature do to them, the blur (M / 2, 3), and which are of a circle.
+
+    Args:
+        edges: of M circles, the outer ones first.
+        rough: their ellipses (M, 5). outward: (M,), as for `ring_edges`.
+        correct: free them; else they stay as the moments read them.
+    """
+    count, outside = len(rough) // 2, outward[edges.ring]
+    near = ellipse.Near.of(edges.points, edges.ring, rough)
+    conic, keep = near.robust(near.circle, _SCALES)
+    slopes, kept = near.slopes(conic), near.tiles.flat(keep) > 0
+    distance = edges.offset - near.tiles.flat(near.distances(conic, slopes)) * outside
+    blur = zernike.edge_blur(edges.offset[kept], distance[kept], edges.normal[kept], edges.ring[kept] % count, count)
+    points = edges.points
+    if correct:
+        bend = near.tiles.flat(near.curvatures(conic, slopes)) * outside
+        points = points + _correction(edges, blur, bend)[:, None] * edges.normal
+        near = near.moved(points)
+    _, keep = near.robust(conic, _SCALES[-1:])
+    return points, blur, near.tiles.flat(keep) > 0
 
 
 def _as_a_whole(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tuple[Rings, Tensor]:
@@ -349,9 +382,11 @@ def _as_a_whole(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> 
     return rings, index
 
 
-def _correction(edges: RingEdges, fitted: Tensor, blur: Tensor, outward: Tensor) -> Tensor:
-    """What each ring's blur (M / 2, 3) and the edges' curvature do to their offsets, taken off: (E,) px."""
+def _correction(edges: RingEdges, blur: Tensor, bend: Tensor) -> Tensor:
+    """What each ring's blur (M / 2, 3) and the edges' curvature do to their offsets, taken off: (E,) px.
+
+    ``bend`` (E,) is the curvature, 1/px, positive where the edge's normal points outwards.
+    """
     blur = blur[edges.ring % len(blur)]
-    pushed = zernike.curvature_shift(blur, edges.normal) * ellipse.curvature(edges.points, edges.ring, fitted)
     slope = zernike.slope_across(blur, edges.normal)
-    return zernike.deblur(edges.offset, slope) - edges.offset - pushed * outward[edges.ring]
+    return zernike.deblur(edges.offset, slope) - edges.offset - zernike.curvature_shift(blur, edges.normal) * bend

@@ -13,8 +13,6 @@ from typing import Any, cast
 
 from torchpose.errors import ConfigError
 
-# shares of a core of the two stages, one in all: with whole ones the workers would leave no core to decode
-MEASURING, DECODING = 0.75, 0.25
 _CONNECT = 5.0  # seconds (convention)
 
 
@@ -48,6 +46,7 @@ def cluster(address: str | None, workers: int) -> Iterator[Workers]:
     own: dict[str, Any] = {"address": address or "local"}  # not one that happens to run here
     if address is None:
         own["num_cpus"] = workers
+        os.environ.setdefault("RAY_worker_niceness", "0")  # Ray's own 15 gives way to whatever else runs here
     else:
         del quiet["include_dashboard"]
     try:
@@ -60,13 +59,15 @@ def cluster(address: str | None, workers: int) -> Iterator[Workers]:
     nowhere = open(os.devnull, "w")  # noqa: SIM115  # open for as long as Ray's threads may print
     try:
         _silence()
-        _check_nodes()
+        if address is not None:
+            _check_nodes()
         resources: Any = ray.cluster_resources  # without types
         alive = frozenset(node["NodeID"] for node in _nodes() if node["Alive"])
         with contextlib.redirect_stdout(nowhere):
             yield Workers(int(resources().get("CPU", 1)), alive)
     finally:
-        ray.shutdown()
+        with contextlib.redirect_stdout(nowhere):
+            ray.shutdown()  # which prints what is left of them
         nowhere.close()
 
 

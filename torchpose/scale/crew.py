@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
-import torch
 
+from torchpose.io.processes import one_thread
 from torchpose.scale.cluster import blocks_done
 
 Item = TypeVar("Item")
@@ -23,9 +23,17 @@ class RayCrew(Generic[Item, Result]):
             time: another does them again, so doing one twice must leave what doing it once leaves.
         items: all of them.
         count: of workers, at most.
+        fresh: as of `Crew`; these workers always are.
     """
 
-    def __init__(self, work: Callable[[Sequence[Item]], Iterator[Result]], items: Sequence[Item], count: int) -> None:
+    def __init__(
+        self,
+        work: Callable[[Sequence[Item]], Iterator[Result]],
+        items: Sequence[Item],
+        count: int,
+        *,
+        fresh: bool = True,
+    ) -> None:
         self._work, self._items, self._count = work, items, count
 
     def __enter__(self) -> Self:
@@ -43,6 +51,7 @@ class RayCrew(Generic[Item, Result]):
             return
         import ray.data
 
+        count = min(self._count, len(self._items))
         rows = [{"number": number, "item": pickle.dumps(item)} for number, item in enumerate(self._items)]
         data: ray.data.Dataset = ray.data.from_items(rows, override_num_blocks=len(rows))
         data = data.map_batches(
@@ -50,7 +59,7 @@ class RayCrew(Generic[Item, Result]):
             fn_constructor_args=(self._work,),
             batch_size=1,
             num_cpus=1,
-            compute=ray.data.ActorPoolStrategy(min_size=1, max_size=self._count),
+            compute=ray.data.ActorPoolStrategy(min_size=1, max_size=count, initial_size=count),
         )
         early: dict[int, Any] = {}
         following = 0
@@ -65,7 +74,7 @@ class _Worker:
     """Holds what the work needs, and does one item at a time."""
 
     def __init__(self, work: Callable[[Sequence[Any]], Iterator[Any]]) -> None:
-        torch.set_num_threads(1)
+        one_thread()
         self._work = work
 
     def __call__(self, batch: dict[str, np.ndarray]) -> dict[str, Any]:

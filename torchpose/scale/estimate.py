@@ -1,31 +1,36 @@
 """`torchpose estimate --engine ray`: blocks of frames decoded and measured by the workers of a Ray cluster.
 
-Two stages of Ray Data: tasks decode blocks, actors that hold an estimator each measure them and write a part of the
-table. Ray places the work, holds decoding back where it runs ahead, and does again what a lost worker had.
+A worker is an actor of Ray Data with an estimator and one core. Paths travel to it and rows come back; pictures stay
+where they are decoded. Ray places the work, gives no worker more blocks than it has room for, and does again what a
+lost worker had.
 """
 
 from __future__ import annotations
 
 import pickle
+import threading
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import itemgetter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from torchpose.camera import LINEAR
+from torchpose.camera import LINEAR, Camera
 from torchpose.io.estimates import Estimation
+from torchpose.io.processes import one_thread
 from torchpose.io.reader import Batch, FrameReader, in_batches
 from torchpose.io.rows import Row
 from torchpose.io.sources import Source
+from torchpose.io.storage import REQUESTS
 from torchpose.io.tally import Tally
-from torchpose.scale.cluster import DECODING, MEASURING, blocks_done
+from torchpose.scale.cluster import blocks_done
 from torchpose.scale.parts import Parts, part_name
 
-_KINDS = {"frames_8": np.uint8, "frames_16": np.uint16}  # columns of a decoded block, one a pixel type
+_CALLS = 2  # of a worker side by side: one decodes while the other measures
 
 
 @dataclass(frozen=True)
@@ -36,27 +41,8 @@ class Block:
     sources: Sequence[Source]
 
 
-@dataclass(frozen=True)
-class Decode:
-    """The stage that reads: a block in, its frames out."""
-
-    camera: Any
-
-    def __call__(self, batch: dict[str, np.ndarray]) -> dict[str, Any]:
-        block: Block = pickle.loads(batch["block"][0])
-        size = self.camera.width, self.camera.height
-        read = next(iter(FrameReader([block.sources], *size, threads=1, tone=self.camera.tone or LINEAR)))
-        columns: dict[str, Any] = {name: np.zeros((1, 0, *size[::-1]), kind) for name, kind in _KINDS.items()}
-        places: dict[str, list[int]] = {name: [] for name in _KINDS}
-        for positions, frames in read.groups:
-            name = "frames_8" if frames.dtype == torch.uint8 else "frames_16"
-            columns[name], places[name] = frames.numpy()[None], positions
-        about = pickle.dumps((block, read.faults, places))
-        return {"about": np.array([about], dtype=object), **columns}
-
-
 class Measure:
-    """The stage that measures and writes: one estimator a worker.
+    """A worker: decodes blocks, measures them with its estimator and writes their parts.
 
     Args:
         work: what the rows depend on.
@@ -65,24 +51,31 @@ class Measure:
     """
 
     def __init__(self, work: Estimation, poses: Parts, detections: Parts | None) -> None:
-        torch.set_num_threads(1)
+        one_thread()
         self._work, self._poses, self._detections = work, poses, detections
         self._estimator = work.estimator()
+        self._measuring = threading.Lock()
 
     @torch.inference_mode()
     def __call__(self, batch: dict[str, np.ndarray]) -> dict[str, Any]:
-        block, faults, places = pickle.loads(batch["about"][0])
-        groups = [
-            (positions, torch.from_numpy(np.array(batch[name][0]))) for name, positions in places.items() if positions
-        ]
-        records = self._work.records(Batch(block.sources, faults, groups), self._estimator)
-        stamps = {source.name: source.stamp() for source in block.sources}
+        block: Block = pickle.loads(batch["block"][0])
+        stamps = {source.name: source.stamp() for source in block.sources}  # before they are read
+        read = decoded(block, self._work.camera)
+        with self._measuring:
+            records = self._work.records(read, self._estimator)
         if self._detections is not None:
             self._detections.write(block.name, (row for r in records for row in r["detections"]), stamps)
         # the last: where it is there, the block is done
         self._poses.write(block.name, (row for r in records for row in r["rows"]), stamps)
         rows = pickle.dumps([(record["frame"], record["rows"]) for record in records])
         return {"rows": np.array([rows], dtype=object)}
+
+
+def decoded(block: Block, camera: Camera) -> Batch:
+    """The frames of a block."""
+    threads = 1 if all(isinstance(source.path, Path) for source in block.sources) else REQUESTS
+    tone = camera.tone or LINEAR
+    return next(iter(FrameReader([block.sources], camera.width, camera.height, threads=threads, tone=tone)))
 
 
 def pending(sources: Sequence[Source], size: int, poses: Parts, tally: Tally) -> list[Block]:
@@ -101,10 +94,15 @@ def pending(sources: Sequence[Source], size: int, poses: Parts, tally: Tally) ->
         done.update(part.files)
     blocks = []
     for number, batch in enumerate(in_batches(sources, size)):
-        left = [source for source in batch if source.name not in done]
+        left = [_absolute(source) for source in batch if source.name not in done]
         if left:
             blocks.append(Block(part_name(number * size, left), left))
     return blocks
+
+
+def _absolute(source: Source) -> Source:
+    """The same for a worker that was started elsewhere."""
+    return replace(source, path=source.path.absolute()) if isinstance(source.path, Path) else source
 
 
 def measured(
@@ -121,13 +119,19 @@ def measured(
 
     items = [{"block": pickle.dumps(block)} for block in blocks]
     data: ray.data.Dataset = ray.data.from_items(items, override_num_blocks=len(items))
-    data = data.map_batches(Decode(work.camera), batch_size=1, num_cpus=DECODING)
     data = data.map_batches(
         Measure,
         fn_constructor_args=(work, poses, detections),
         batch_size=1,
-        num_cpus=MEASURING,
-        compute=ray.data.ActorPoolStrategy(min_size=1, max_size=workers),
+        num_cpus=1,
+        compute=ray.data.ActorPoolStrategy(
+            # all from the beginning; one must do, as nodes may be lost
+            min_size=1,
+            max_size=min(workers, len(blocks)),
+            initial_size=min(workers, len(blocks)),
+            max_concurrent_calls_per_actor=_CALLS,
+            enable_true_multi_threading=True,
+        ),
     )
     for row in blocks_done(data):
         yield pickle.loads(row["rows"])

@@ -21,7 +21,7 @@ from torchpose import pnp
 from torchpose.geometry import rotations
 from torchpose.io.rows import Row
 from torchpose.kernels import has_compiler
-from torchpose.report.figures import curve, legend_below, subplots
+from torchpose.report.figures import GREY, curve, legend_below, subplots
 from torchpose.studies.study import Comparison, Picture, Progress, StudyResult, Table, ignore_progress
 from torchpose.studies.views import turned
 
@@ -192,13 +192,14 @@ def plot(rows: list[Row], seconds: dict[str, float]) -> Figure:
     """Errors against noise for all methods and for lines against points, and the times."""
     figure, axes = subplots(2, 3, (15, 8.5))
     names = list(seconds)
-    colours = {name: colormaps["tab20"](i) for i, name in enumerate(names)}
+    colours: dict[str, Any] = {name: colormaps["tab20"](i) for i, name in enumerate(names)}
+    colours |= {BY_POINTS: "black", BY_LINES: GREY}  # in one legend with the methods
 
     def curves(panel: Any, some: Sequence[Row], group: Sequence[str], key: str, label: str) -> None:
         for name in group:
-            style = "--" if name in colours and not name.startswith("torchpose") else "-"
+            style = "--" if name in names and not name.startswith("torchpose") else "-"
             part = [row for row in some if row["method"] == name]
-            curve(panel, part, "noise_px", key, f"{style}o", ms=3, color=colours.get(name), label=name)
+            curve(panel, part, "noise_px", key, f"{style}o", ms=3, color=colours[name], label=name)
         panel.set(xlabel="noise of the image points [px]", ylabel=label, xscale="log")
         panel.grid(True, which="both", alpha=0.3)
 
@@ -207,7 +208,6 @@ def plot(rows: list[Row], seconds: dict[str, float]) -> Figure:
         curves(orientation, rows, group, "orientation_median_deg", "orientation error, median [deg]")
         position.set_yscale("log")
         orientation.set_yscale("log")
-    axes[1, 0].legend(fontsize=9)
     bars, ratio = axes[:, 2]
     bars.barh(names, [1e3 * seconds[name] for name in names], color=[colours[name] for name in names])
     bars.axvline(300, color="k", linestyle=":")
@@ -220,5 +220,5 @@ def plot(rows: list[Row], seconds: dict[str, float]) -> Figure:
     over = [row | {"ratio": row["orientation_rms_deg"] / base[row["noise_px"]]} for row in rows]
     curves(ratio, over, names, "ratio", "orientation error, RMS, over that of\ntorchpose iterative")
     ratio.set_yscale("log")
-    legend_below(figure, axes[0, :1], 6)
+    legend_below(figure, axes[:, 0], 6)
     return figure

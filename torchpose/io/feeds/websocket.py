@@ -24,6 +24,7 @@ from torchpose.io.writers import json_line
 _MOST_WAITING = 256  # rows of a client (convention): some batches
 _MOST_CLIENTS = 64  # (convention)
 _UNSUPPORTED, _LATER = 1003, 1013  # codes of RFC 6455 and of its registry: data that is not wanted; try again later
+_GREETING_S = 5.0  # that a client may take for its first request (convention)
 _MOST_BYTES = 1024  # of a message from a client, which nobody reads
 _SILENT = logging.getLogger("torchpose.feeds")
 _SILENT.addHandler(logging.NullHandler())
@@ -56,7 +57,8 @@ class WebSocketFeed(Feed):
 
         # the buffer towards a client is short, so that what waits is counted here; no compression: no memory for it
         options: dict[str, Any] = {"max_size": _MOST_BYTES, "compression": None, "origins": [None], "logger": _SILENT}
-        options |= {"write_limit": 1 << 15, "close_timeout": 1.0, "process_request": self._admit}
+        options |= {"write_limit": 1 << 15, "close_timeout": 1.0, "open_timeout": _GREETING_S}
+        options |= {"process_request": self._admit}
         async with serve(self._attend, self._place.host, self._place.port, **options):
             self._ready()
             await self._stopped.wait()

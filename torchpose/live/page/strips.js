@@ -129,7 +129,6 @@ class Strips {
     if (wanted) {
       pen.strokeStyle = colour("ink"); pen.setLineDash([4, 3]);
       pen.beginPath(); pen.moveTo(GUTTER, y(wanted)); pen.lineTo(width, y(wanted)); pen.stroke(); pen.setLineDash([]);
-      pen.fillStyle = colour("ink"); pen.fillText("wanted", width - 2, y(wanted) < 14 ? y(wanted) + 8 : y(wanted) - 7);
     }
     for (const line of lines) {
       pen.strokeStyle = pen.fillStyle = colour(line.axis);
@@ -152,7 +151,7 @@ class Strips {
       pen.fillRect(left, height - 3, Math.max(1, x(p[P.time]) - left), 3);
       before = p[P.time];
     }
-    range.textContent = strip.unit;
+    range.textContent = wanted ? `dashes: wanted · ${strip.unit}` : strip.unit;
     const now = points[points.length - 1];
     legend.replaceChildren(...lines.map((line) => {
       const item = document.createElement("li"), name = document.createElement("b"), value = document.createElement("span");
@@ -190,10 +189,11 @@ function ticks(low, high, log) {
       for (const digit of [1, 2, 5]) found.push(digit * 10 ** power);
     const inside = found.filter((v) => v > low && v < high);
     const decades = inside.filter((v) => Math.abs(Math.log10(v) % 1) < 1e-9);
-    return inside.length > 4 ? (decades.length ? decades : inside.slice(0, 3)) : inside;
+    if (inside.length > 1) return inside.length > 4 && decades.length > 1 ? decades : inside.slice(0, 4);
   }
-  const rough = (high - low) / 3, power = 10 ** Math.floor(Math.log10(rough));
-  const step = [1, 2, 5, 10].map((n) => n * power).find((n) => n >= rough);
+  // the largest round step of which two numbers are in sight, so that there is a scale
+  const power = 10 ** Math.ceil(Math.log10(high - low));
+  const step = [1, 0.5, 0.2, 0.1, 0.05].map((n) => n * power).find((n) => Math.floor(high / n) - Math.ceil(low / n) >= 1);
   const found = [];
   for (let at = Math.ceil(low / step) * step; at < high; at += step) found.push(Math.abs(at) < step / 1e6 ? 0 : at);
   return found;

@@ -17,6 +17,7 @@ from functools import partial
 from typing import NamedTuple, cast
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.detect.reduce import reduction_for
@@ -49,7 +50,7 @@ from torchpose.refine.photometric.grey_levels import (
     sum_products,
 )
 from torchpose.refine.photometric.light import LEVELS, POSE, normal_equations, of_markers, pulled_by_levels
-from torchpose.refine.photometric.ring_model import gather_pixels, ring_model
+from torchpose.refine.photometric.ring_model import RingModel, gather_pixels, ring_model
 from torchpose.refine.photometric.sectors import (
     Sectors,
     away_from_unclear,
@@ -95,7 +96,7 @@ _FEWER = 0.02
 _MOST_GAIN = 0.5
 _COARSELY = _Stage(2, coarse=True)
 _QUICK = (_Stage(1),)  # after the coarse steps
-_AGAIN = (_Stage(2),)  # from where a fit of the same rows ended
+_AGAIN = (_Stage(1),)  # from where a fit of the same rows ended
 _THOROUGH = (_Stage(1, wary=True), _Stage(2, wary=True, tempered=True))
 
 
@@ -129,33 +130,55 @@ def refine_photometric(
 
 @dataclass(frozen=True, eq=False)
 class _Result(Rows):
-    """Refined rows, how they were seen, and whether their residuals stand out at the edges."""
+    """N refined rows as far as their fit goes on from there, and where it is to be finished.
 
-    refined: Refined
+    Attributes:
+        pose: after the last step.
+        spread: blur, px^2, see `geometry.blur`.
+        look: how the rows were seen.
+        noise, kept, good, doubt: as in `Refined`.
+        misshapen: whether the residuals stand out at the edges.
+        end: which of the fits of `_Fits.ends` this is.
+        at: row of that fit.
+    """
+
+    pose: Pose
+    spread: Float[Tensor, "N 3"]
     look: Look
-    misshapen: Tensor
+    noise: Float[Tensor, " N"]
+    kept: Float[Tensor, " N"]
+    good: Bool[Tensor, " N"]
+    doubt: Bool[Tensor, " N"]
+    misshapen: Bool[Tensor, " N"]
+    end: Int[Tensor, " N"]
+    at: Int[Tensor, " N"]
 
 
 def _refined_in(sight: Sight, start: Pose, known: PosePrior | None, thorough: bool, alike: bool) -> Refined:
     """Rows of one kind of blur refined in the frames as they are."""
     fits, look = _Fits(sight, start, known), sight.look
+    if look is not None and bool(look.doubt.any()):
+        return fits.finished(fits.refined(fits.fit, start, fits.spread, _THOROUGH, look.levels))
     result = fits.first()
     if look is None:
         result = fits.shaped(result, torch.ones_like(result.misshapen))
-        later = result.refined.doubt & thorough  # a wider band is theirs then
+        later = result.doubt & thorough  # a wider band is theirs then
         result = fits.widened(result, ~later)
-    doubt = result.refined.doubt
+    doubt = result.doubt
     if alike and len(doubt):
         doubt = doubt | doubt.int().median().bool()
     for kind in range(len(KINDS) if thorough else 0):
         some = doubt & (result.look.kind == kind)
         if bool(some.any()):
             result = result.replaced(*fits.again(result, some, kind, _THOROUGH))
-    return replace(result.refined, look=result.look)
+    return fits.finished(result)
 
 
 class _Fits:
-    """The fits of N rows: the first one, and those with a band or a kind of blur that suits some rows better."""
+    """The fits of N rows: the first one, and those with a band or a kind of blur that suits some rows better.
+
+    ends: every fit and where it ended; what a row's last one tells is formed once.
+    """
 
     def __init__(self, sight: Sight, start: Pose, known: PosePrior | None) -> None:
         self.sight, self.start, self.known = sight, start, known
@@ -163,19 +186,19 @@ class _Fits:
         self.spread = Spread(blur) if look is None else Spread(look.blur, KINDS[int(look.kind[:1].sum())])
         self.band = band_width(self.spread) if look is None else look.band
         self.fit = _Fit(sight, self.band, known, _MOST_COARSE)
+        self.ends: list[tuple[_Fit, Minimum]] = []
 
     def first(self) -> _Result:
         look = self.sight.look
         if look is None:
-            return _refined(self.fit, self.start, self.spread, (_COARSELY, *_QUICK))
-        return _refined(self.fit, self.start, self.spread, _AGAIN, look.levels)
+            return self.refined(self.fit, self.start, self.spread, (_COARSELY, *_QUICK))
+        return self.refined(self.fit, self.start, self.spread, _AGAIN, look.levels)
 
     def again(self, result: _Result, rows: Tensor, kind: int, stages: tuple[_Stage, ...]) -> tuple[Tensor, _Result]:
         """Those of the rows (N,) bool that could be refined once more from where they are, and what came out."""
-        look, refined = result.look, result.refined
-        fresh = self.sight.look is None
-        band = band_width(Spread.of(refined.spread, KINDS[kind])) if fresh else self.band
-        begun = (look.kind == kind) & (look.band == band) & refined.good
+        look, fresh = result.look, self.sight.look is None
+        band = self._band_for(Spread.of(result.spread, KINDS[kind])) if fresh else self.band
+        begun = (look.kind == kind) & (look.band == band) & result.good
         cases, parts = 2 * (band == self.band) + begun, [(rows.nonzero()[:0, 0], result[:0])]
         for case in cases[rows].unique().tolist():
             some = (rows & (cases == case)).nonzero()[:, 0]
@@ -183,26 +206,31 @@ class _Fits:
             if case % 2:
                 spread, levels, steps = Spread(look.blur[some], KINDS[kind]), look.levels[some], stages
             else:
-                spread, levels, steps = Spread.of(refined.spread[some], KINDS[kind]), None, (_COARSELY, *stages)
-            begin = self.start[some].where(~refined.good[some], Pose(refined.R[some], refined.t[some]))
-            parts.append((some, _refined(fit, begin, spread, steps, levels)))
+                spread, levels, steps = Spread.of(result.spread[some], KINDS[kind]), None, (_COARSELY, *stages)
+            begin = self.start[some].where(~result.good[some], result.pose[some])
+            parts.append((some, self.refined(fit, begin, spread, steps, levels)))
         index, other = torch.cat([some for some, _ in parts]), _Result.cat([part for _, part in parts])
-        return index[other.refined.good], other[other.refined.good]
+        return index[other.good], other[other.good]
+
+    def _band_for(self, spread: Spread) -> Tensor:
+        """Bands (N,) px for these blurs: those that are there where they are as wide, but for a pixel."""
+        wanted = band_width(spread)
+        return torch.where(wanted > self.band + 1, wanted, self.band)
 
     def _fit(self, rows: Tensor, band: Tensor) -> _Fit:
         return _Fit(self.sight[rows], band[rows], None if self.known is None else self.known[rows])
 
     def shaped(self, result: _Result, rows: Tensor) -> _Result:
         """With the kind of blur that explains misshapen ones of the rows (N,) bool better, where there is one."""
-        least, most = blurs.axes(result.refined.spread)
+        least, most = blurs.axes(result.spread)
         long, rows = most > _LONG * least, rows & result.misshapen & (result.look.kind == 0)
         for kind, some in ((1, rows & long), (2, rows & ~long)):
             if not bool(some.any()):
                 continue
-            begun, worse = self._tried(result, some & result.refined.doubt, kind)
+            begun, worse = self._tried(result, some & result.doubt, kind)
             index, other = self.again(begun, some & ~worse, kind, _QUICK)
-            better = other.refined.noise < result.refined.noise[index]
-            better &= other.refined.kept > result.refined.kept[index] - _FEWER
+            better = other.noise < result.noise[index]
+            better &= other.kept > result.kept[index] - _FEWER
             result = result.replaced(index[better], other[better])
         return result
 
@@ -215,36 +243,75 @@ class _Fits:
         index = rows.nonzero()[:, 0]
         if index.numel() == 0:
             return result, rows
-        refined, fit = result.refined, self.fit.of(index)
-        pose, spread = Pose(refined.R[index], refined.t[index]), Spread.of(refined.spread[index], KINDS[kind])
-        unknowns = _minimised(fit, pose, spread, (_COARSELY,), result.look.levels[index][fit.mask]).unknowns
-        R, t = (x.index_copy(0, index, y) for x, y in ((refined.R, unknowns.pose.R), (refined.t, unknowns.pose.t)))
+        fit, spread = self.fit.of(index), Spread.of(result.spread[index], KINDS[kind])
+        found = _minimised(fit, result.pose[index], spread, (_COARSELY,), result.look.levels[index][fit.mask])
+        unknowns = found.unknowns
         look = fit.look(cast(Spread, unknowns.own["blur"]), unknowns.values("levels"))
-        begun = replace(result, refined=replace(refined, R=R, t=t), look=result.look.replaced(index, look))
-        return begun, rows.index_copy(0, index, fit.variance.sqrt() > refined.noise[index])
+        begun = replace(result, pose=result.pose.replaced(index, unknowns.pose), look=result.look.replaced(index, look))
+        return begun, rows.index_copy(0, index, fit.variance.sqrt() > result.noise[index])
 
     def widened(self, result: _Result, rows: Tensor) -> _Result:
         """With a wider band for the rows (N,) bool whose blur takes the levels beside the edge for its own."""
-        wide = rows & (result.look.kind == 0) & (band_width(Spread(result.refined.spread)) > self.band + 1)
+        wide = rows & (result.look.kind == 0) & (self._band_for(Spread(result.spread)) > self.band)
         if not bool(wide.any()):
             return result
         index, other = self.again(result, wide, 0, _QUICK)
         return self.shaped(result.replaced(index, other), marked(index, len(wide)))
 
+    def refined(
+        self, fit: _Fit, start: Pose, spread: Spread, stages: tuple[_Stage, ...], levels: Tensor | None = None
+    ) -> _Result:
+        """Rows refined in stages from poses and blurs, and from levels (N, M, 6) where there are any."""
+        found = _minimised(fit, start, spread, stages, None if levels is None else levels[fit.mask])
+        owner, rows = fit.blocks.row, len(spread)
+        covariance, determined = found.covariance()
+        good = determined & covariance.isfinite().all(-1).all(-1)
+        of_rows = [(x > 0).sum(-1, dtype=torch.float64) for x in (fit.weight, fit.usable, fit.blocks.valid)]
+        of_rows.append((fit.coarse.valid > 0).sum(-1, dtype=torch.float64))
+        kept, usable, seen, of_them = segment_sum(torch.stack(of_rows, -1), owner, rows).unbind(-1)
+        more = (seen / of_them.clamp_min(1)).clamp_min(1)
+        doubt = doubtful(fit.sectors, fit.clear, fit.variance[owner], owner, found.step.own_chi2, more)
+        spread = cast(Spread, found.unknowns.own["blur"])
+        look = fit.look(spread, found.unknowns.values("levels"))
+        at = torch.arange(rows, device=doubt.device)
+        end = torch.full_like(at, len(self.ends))
+        self.ends.append((fit, found))
+        fresh = spread.kind == "gauss" and self.sight.look is None
+        misshapen = fit.stands_out(look.levels[fit.mask]) if fresh else torch.zeros_like(good)
+        known = (spread.covariance, look, fit.variance.sqrt(), kept / usable, good, doubt, misshapen)
+        return _Result(found.unknowns.pose, *known, end, at)
 
-def _refined(
-    fit: _Fit, start: Pose, spread: Spread, stages: tuple[_Stage, ...], levels: Tensor | None = None
-) -> _Result:
-    """Rows refined in stages from poses and blurs, and from levels (N, M, 6) where there are any."""
-    found = _minimised(fit, start, spread, stages, None if levels is None else levels[fit.mask])
-    pose, owner, rows = found.unknowns.pose, fit.blocks.row, len(spread)
+    def finished(self, result: _Result) -> Refined:
+        """What the rows tell at the end of their fits."""
+        ends = result.end.unique().tolist() if len(self.ends) > 1 else [0]
+        order = [(result.end == end).nonzero()[:, 0] for end in ends]
+        parts = [_told(*self.ends[end]) for end in ends]
+        if len(self.ends) > 1:
+            parts = [part[result.at[index]] for part, index in zip(parts, order, strict=True)]
+        told = parts[0] if len(parts) == 1 else _Told.cat(parts)[torch.argsort(torch.cat(order))]
+        good = result.good & told.covariance.isfinite().all(-1).all(-1)
+        of_fit = (result.spread, result.noise, result.kept, good, result.doubt)
+        return Refined(
+            result.pose.R, result.pose.t, told.covariance, *of_fit, told.normals, told.gain, told.even, result.look
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Told(Rows):
+    """What N rows of a fit tell in the end: fields of `Refined`."""
+
+    covariance: Float[Tensor, "N 6 6"]
+    normals: MarkerNormals
+    even: Float[Tensor, " N"]
+    gain: Float[Tensor, " N"] | None
+
+
+def _told(fit: _Fit, found: Minimum) -> _Told:
+    owner, rows = fit.blocks.row, len(fit.band)
     wider, even = overdispersion(fit.sectors.scaled(fit.factor), fit.variance[owner], owner, rows)
-    if stages[-1].tempered:  # its weights have what the rims scatter by
+    if fit.stage.tempered:  # its weights have what the rims scatter by
         even = overdispersion(fit.sectors.scaled(fit.clear.to(fit.factor)), fit.variance[owner], owner, rows)[1]
-    covariance, determined = found.covariance()
-    covariance = wider[:, None, None] * covariance
-    kept, usable = (segment_sum((x > 0).sum(-1), owner, rows) for x in (fit.weight, fit.usable))
-    spread = cast(Spread, found.unknowns.own["blur"])
+    covariance = wider[:, None, None] * found.covariance()[0]
     part = cast(Eliminated, found.normal.eliminated)
     normals = of_markers(fit.sums, fit.variance, part, fit.mask, found.step.own).over(wider)
     rough = even == 0
@@ -253,15 +320,8 @@ def _refined(
         n = covariance.shape[-1]
         covariance = covariance + covariance @ more.sum(1)[:, :n, :n] @ covariance
         normals = normals.scattered(more)
-    covariance = covariance[:, :6, :6]
-    good = determined & covariance.isfinite().all(-1).all(-1)
-    seen, of_them = (segment_sum(b.valid.sum(-1).double(), owner, rows) for b in (fit.blocks, fit.coarse))
-    more = (seen / of_them.clamp_min(1)).clamp_min(1)
-    doubt = doubtful(fit.sectors, fit.clear, fit.variance[owner], owner, found.step.own_chi2, more)
-    noise, kept = fit.variance.sqrt(), kept / usable
     gain = found.unknowns.values("gain")[:, 0] if fit.gain else None
-    refined = Refined(pose.R, pose.t, covariance, spread.covariance, noise, kept, good, doubt, normals, gain, even)
-    return _Result(refined, fit.look(spread, found.unknowns.values("levels")), fit.misshapen)
+    return _Told(covariance[:, :6, :6], normals, even, gain)
 
 
 def _beyond_rims(fit: _Fit, found: Minimum, normals: MarkerNormals, wider: Tensor) -> Tensor:
@@ -290,7 +350,7 @@ def _minimised(fit: _Fit, start: Pose, spread: Spread, stages: tuple[_Stage, ...
         hole = torch.where(inner > 0, inner, outer)
         most = _MOST_GAIN * torch.minimum(hole, 0.5 * (outer - inner)).amin().reshape(1)
         own["gain"] = Vector(torch.zeros_like(start.t[:, :1]), low=-most, high=most)
-    levels = first_levels(fit.coarse, start.R, start.t, spread) if levels is None else levels
+    levels = fit.first_levels(start, spread) if levels is None else levels
     unknowns = Unknowns(own, {"levels": Vector(levels)}, fit.blocks.row)
     for stage in stages:
         if stage.tempered:
@@ -312,7 +372,9 @@ class _Fit:
     sectors: Sectors
     clear: Tensor
     factor: Tensor
-    misshapen: Tensor
+    residual: Tensor
+    slope: Tensor
+    inlying: Tensor
 
     def __init__(self, sight: Sight, band: Tensor, prior: PosePrior | None, most_coarse: int | None = None) -> None:
         self.mask, self.band, self.by = sight.mask, band, sight.reduction
@@ -325,6 +387,12 @@ class _Fit:
         self.variance = torch.ones_like(band)
         self.least = torch.full_like(band, sight.quantisation)
         self.usable = self.weight = self.blocks.valid
+        self.model: RingModel | None = None  # of the coarse pixels where a fit begins
+
+    def first_levels(self, start: Pose, spread: Spread) -> Tensor:
+        """Grey levels (K, 6) where a fit begins."""
+        self.model = ring_model(self.coarse, start.R, start.t, spread, check=True)
+        return first_levels(self.coarse, self.model)
 
     def of(self, rows: Tensor) -> _Fit:
         """Of these rows (K,) alone, on the same pixels."""
@@ -347,7 +415,7 @@ class _Fit:
         spread = cast(Spread, unknowns.own["blur"])
         if self.gain:
             part = part.wider(unknowns.values("gain")[:, 0])
-        model = ring_model(part, pose.R, pose.t, spread, check=True)
+        model, self.model = self.model or ring_model(part, pose.R, pose.t, spread, check=True), None
         columns, slope = columns_of(part, model, levels)
         residual = columns[:, :, -2].flatten(1)
         self.residual, self.of_ring = residual, columns[:, :, POSE].flatten(1)
@@ -356,7 +424,7 @@ class _Fit:
         if stage.coarse:  # the first steps begin with what was seen so far, the others see for themselves
             self.weight = self.weight * part.seen
         else:
-            self.misshapen = self._stands_out(residual, slope, levels)
+            self.slope, self.inlying = slope, self.weight
             self.sectors = sum_sectors(residual, slope, self.usable, self.weight, part, model)
             factor = self._trusted(*noise)
             self.factor = factor.to(self.weight.dtype)
@@ -370,7 +438,7 @@ class _Fit:
         """With the blurs of rows and the levels (K, L) of their markers."""
         kind, by = (torch.full_like(self.mask[:, 0], v, dtype=torch.int64) for v in (KINDS.index(spread.kind), self.by))
         laid = levels.new_zeros(*self.mask.shape, LEVELS).masked_scatter(self.mask[..., None], levels[:, :LEVELS])
-        return Look(kind, spread.values, laid, self.band, by)
+        return Look(kind, spread.values, laid, self.band, by, torch.zeros_like(kind, dtype=torch.bool))
 
     def _known(self, unknowns: Unknowns) -> tuple[Tensor, Tensor] | None:
         """The prior's information (N, n, n) about the frames' unknowns, and how far these moved from it (N, n)."""
@@ -383,21 +451,21 @@ class _Fit:
         information[:, place[:, None], place] = both
         return information, torch.cat([moved, unknowns.values("gain")], -1)
 
-    def _stands_out(self, residual: Tensor, slope: Tensor, levels: Tensor) -> Tensor:
+    def stands_out(self, levels: Tensor) -> Tensor:
         """Rows (N,) bool whose mean square residual is larger at the edges than elsewhere, beyond chance and by so much
-        of the contrast that it matters.
+        of the contrast, of ``levels`` (K, L), that it matters.
 
         A wrong blur leaves residuals where grey values change, on both sides alike: they pull at no edge.
         """
-        contrast = segment_mean((levels[:, 3] - levels[:, 0]).abs(), self.blocks.row, len(self.least))
-        steep = self.weight * slope.square()
-        square = residual.square()
-        planes = (steep * square, steep, steep * slope.square(), self.weight * square, self.weight)
-        sums = [segment_sum(plane.double().sum(-1), self.blocks.row, len(self.least)) for plane in planes]
-        at_edges, everywhere = sums[0] / sums[1], sums[3] / sums[4]
-        pixels = sums[1].square() / sums[2]
+        rows = len(self.least)
+        contrast = segment_mean((levels[:, 3] - levels[:, 0]).abs(), self.blocks.row, rows)
+        steep, square = self.slope.square(), self.residual.square()
+        planes = (steep * square, steep, steep.square(), square, torch.ones_like(square))
+        each = [(self.inlying * plane).sum(-1, dtype=torch.float64) for plane in planes]
+        pulled, one, two, all_of, count = segment_sum(torch.stack(each, -1), self.blocks.row, rows).unbind(-1)
+        at_edges, everywhere = pulled / one, all_of / count
         matters = at_edges - everywhere > (_MATTERS * contrast).square()
-        return matters & (at_edges > everywhere * of_chance(pixels))
+        return matters & (at_edges > everywhere * of_chance(one.square() / two))
 
     def _trusted(self, spread: Tensor, misfit: Tensor) -> Tensor:
         """Weights (K, 96) of the sectors."""

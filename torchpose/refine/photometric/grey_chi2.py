@@ -42,7 +42,7 @@ def grey_chi2(sight: Sight, one: Refined, two: Refined) -> tuple[Tensor, Tensor,
     squares, weights, variances, misfits, there, explained = [], [], [], [], [], []
     for pose, spread in zip((one, two), spreads, strict=True):
         model = ring_model(blocks, pose.R, pose.t, spread, check=True)
-        levels = first_levels(blocks, pose.R, pose.t, spread)
+        levels = first_levels(blocks, model)
         for _ in range(_LEVEL_STEPS):
             columns, slope = columns_of(blocks, model, levels)
             residual = columns[:, :, -2].flatten(1)

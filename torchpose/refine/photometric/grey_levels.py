@@ -9,11 +9,10 @@ import math
 import torch
 from torch import Tensor
 
-from torchpose.geometry.blurred_edge import Spread
 from torchpose.geometry.least_squares import geman_mcclure, solve_scaled
 from torchpose.geometry.robust import CUT
 from torchpose.refine.photometric.light import LEVELS
-from torchpose.refine.photometric.ring_model import PixelBlocks, RingModel, ring_model
+from torchpose.refine.photometric.ring_model import PixelBlocks, RingModel
 
 TILE = 256  # pixels summed in float32 at a time; sums of tiles are float64, so padding changes no digit that counts
 _CLEAR_OF_LIMITS = 3.0  # deviations from where noise is clipped: its mean is off by 0.0004 of one there (derived)
@@ -23,18 +22,17 @@ _NEAR_PURE = 0.05  # of paper in a pixel, beside the most and the least of its m
 _FIRST_STEPS = 3  # reweighted fits of the levels before the pose is moved
 
 
-def first_levels(blocks: PixelBlocks, R: Tensor, t: Tensor, spread: Spread) -> Tensor:
-    """Grey levels (K, 6) for the poses and blurs that come in: medians, then reweighted linear fits.
+def first_levels(blocks: PixelBlocks, model: RingModel) -> Tensor:
+    """Grey levels (K, 6) under a model: medians, then reweighted linear fits.
 
     A third of a ring may be covered: a least-squares fit of gradients would bend towards the cover and stay there.
     """
-    model = ring_model(blocks, R, t, spread)
     columns = _tiled((*_basis(model), blocks.grey))
     none = torch.zeros_like(model.fraction[:, 0])
     ring, paper = _pure_levels(blocks, model.fraction)
     levels = torch.stack([ring, none, none, paper, none, none], -1).nan_to_num(0.0, 0.0, 0.0).double()
     for _ in range(_FIRST_STEPS):
-        predicted = (levels.float()[:, None, None] @ columns[:, :, :LEVELS]).flatten(1)
+        predicted = (levels.float()[:, None, :, None] * columns[:, :, :LEVELS]).sum(2).flatten(1)
         residual = blocks.grey - predicted
         weight = blocks.valid * blocks.seen * geman_mcclure(residual / (2 * noise_spread(residual, blocks)[:, None]))
         sums = sum_products(columns, weight)
@@ -97,7 +95,8 @@ def _tiled(planes: tuple[Tensor, ...]) -> Tensor:
 def sum_products(columns: Tensor, weight: Tensor) -> Tensor:
     """Sums over all pixels of weight times the products of every two columns: (K, n, n) float64."""
     weighted = columns * weight.unflatten(1, (-1, 1, TILE))
-    return (weighted @ columns.mT).double().sum(1)
+    products = torch.bmm(weighted.flatten(0, 1), columns.flatten(0, 1).mT)
+    return products.unflatten(0, columns.shape[:2]).sum(1, dtype=torch.float64)
 
 
 def inliers(
