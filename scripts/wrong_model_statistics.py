@@ -198,7 +198,7 @@ MODELS = {
     "aspect-1%": WrongModel("camera", camera=matrix_off(fy=11.11)),
     "principal-3px": WrongModel("camera", "run", matrix_off(cx=3.0, cy=-2.0)),
     "principal-10px": WrongModel("camera", "run", matrix_off(cx=10.0)),
-    "k1-0.002": WrongModel("camera", camera=lens(distortion=(0.002, 0.0, 0.0, 0.0))),
+    "k1-0.002": WrongModel("camera", "run", camera=lens(distortion=(0.002, 0.0, 0.0, 0.0))),
     "k1-0.02": WrongModel("camera", camera=lens(distortion=(0.02, 0.0, 0.0, 0.0))),
     "tangential": WrongModel("camera", camera=lens(distortion=(0.0, 0.0, 0.001, 0.0))),
     "no-distortion": WrongModel("camera", camera=lens(distortion=(0.1, 0.0, 0.0, 0.0)), case=_with(k1=-0.1)),

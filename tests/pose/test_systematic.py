@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 
 import pytest
 import torch
@@ -23,7 +24,7 @@ from torchpose.pose import (
     on_print,
     solve_poses,
 )
-from torchpose.pose.excess import OF_CAMERA, OF_EDGES, OF_MARKER, SURE, excess_of
+from torchpose.pose.excess import OF_CAMERA, OF_EDGES, OF_MARKER, SURE, Picture, excess_of
 from torchpose.results import Misfit
 from torchpose.target import Target
 
@@ -211,21 +212,29 @@ def test_normals_of_noise_that_is_correlated_are_those_of_the_whole_covariance()
 
 
 def test_rings_that_shift_more_than_they_scatter() -> None:
-    """Shifts of 20 um beside noise are found, beside its factor, where scatter is the likeliest; noise has none."""
+    """A picture displaced by 0.3 px so that rings shift and do no more is told from one that moves them anyhow."""
     g = torch.Generator().manual_seed(12)
-    across = torch.eye(3, 2, dtype=F64).expand(100, MARKERS, 3, 2)
-    information, right = problem(100, 13, of_places(0.0), 20.0)
-    places = torch.zeros(100, information.shape[-1], dtype=F64)
-    moved = 0.02 * torch.randn(100, MARKERS, 2, dtype=F64, generator=g)
-    places[:, : OF_MARKER * MARKERS].view(100, MARKERS, OF_MARKER)[..., :2] = moved
-    shifted = excess_of(information, right + (information @ places[..., None])[..., 0], across=across)
-    still = excess_of(information, right, across=across)
-    scatters = still.misfit == Misfit.SCATTER
-    assert scatters.double().mean() > 0.9
-    assert still.shift[scatters].median() < 0.003
-    assert (still.shift[~scatters] == 0).all()
-    scatters = shifted.misfit == Misfit.SCATTER
-    assert (shifted.shift[scatters] > 0.01).all()
+    by = 20 * torch.randn(100, 40, 7 * MARKERS, dtype=F64, generator=g)
+    noise, shift = (torch.randn(100, n, 1, dtype=F64, generator=g) for n in (40, 2 * MARKERS))
+    moved = torch.nn.functional.pad(0.3 * shift.view(100, MARKERS, 2), (0, 5)).view(100, -1, 1)
+    shifts, anyhow = torch.diag(torch.tensor([1.0, 1.0] + 5 * [0.0], dtype=F64)), 0.5 * torch.eye(7, dtype=F64)
+    fields = torch.stack([shifts, anyhow])[:, None].expand(100, 2, MARKERS, 7, 7)
+
+    def picture(measured: Tensor, which: Tensor) -> Picture:
+        return Picture(*(x[which] for x in (by.mT @ by, (by.mT @ measured)[..., 0], fields)))
+
+    def found(measured: Tensor) -> Tensor:
+        excess = excess_of(*problem(100, 13, of_places(0.0), 20.0), picture=partial(picture, measured))
+        scatters = excess.misfit == Misfit.SCATTER
+        assert scatters.double().mean() > 0.9
+        assert (excess.factor[scatters] == 1).all()
+        assert (excess.field[~scatters] == 0).all()
+        return excess.field[scatters].sqrt().median(0).values
+
+    shifted, still = found(noise + by @ moved), found(noise)
+    assert 0.2 < shifted[0] < 0.45
+    assert shifted[1] < 0.3 * shifted[0]
+    assert (still < 0.02).all()
 
 
 def test_one_thing_of_a_camera_is_seen_where_the_sum_is_no_surprise() -> None:

@@ -43,6 +43,7 @@ _OFF = (  # what may be off of a camera's numbers, in the order of `OF_CAMERA`: 
 # how large each may be, from below any noise: mm, places and edges of an office print (50 to 100 um);
 # px at the corner of the frame, where a file without distortion may be off by a hundred; of variances, as a factor
 _PRINT, _CAMERA, _SCALE = (1e-4, 0.15), (1e-3, 300.0), (1.0, 1e3)
+_FIELD = (1e-3, 1.0)  # px, of displacements of the picture: more would be no ring's shape
 SURE = 2.33  # deviations: one row in 100 that is as its files say is looked at as closely as can be (derived)
 _LOOKED_AT = (
     1.0  # deviations, beyond which a row's residuals are held against a camera, which costs little (convention)
@@ -57,6 +58,18 @@ _SCATTER = int(Misfit.SCATTER) - 1  # among the explanations
 _AT_ONCE = 10_000_000  # numbers: 80 MB
 
 
+class Picture(NamedTuple):
+    """What residuals say when every marker may move by itself, and how it moves if the picture is displaced at random.
+
+    information (N, 7 M, 7 M) and right (N, 7 M). fields (N, F, M, 7, 7): factors of the covariance of the motions by
+    displacements of 1 px, correlated over each of F lengths.
+    """
+
+    information: Tensor
+    right: Tensor
+    fields: Tensor
+
+
 @dataclass(frozen=True, eq=False)
 class Excess(Rows):
     """What N rows show beyond noise and stated uncertainties.
@@ -65,9 +78,9 @@ class Excess(Rows):
         deviation: standard deviations of the further unknowns: places (by marker `OF_MARKER`, mm), edges
             (`OF_EDGES`, mm), camera (px); 0 where they need not be off.
         printed: the same if the print is behind it; 0 where nothing is.
-        factor: of the variance of all noise, 1 where it suffices.
+        factor: of the variance of all noise, 1 where it suffices, or where ``field`` stands for it.
         printed_factor: the same if the print is behind it.
-        shift: standard deviation of the shifts of rings across the line of sight beside that factor, mm.
+        field: variance of displacements of the picture, px^2, by the lengths of `Picture`, where it scatters.
         maybe: how likely it is the print where scatter is likelier, of these two; 0 elsewhere.
         misfit: `Misfit`, what is behind it.
         explained: whether the residuals then agree with all that.
@@ -79,7 +92,7 @@ class Excess(Rows):
     printed: Float[Tensor, "N E"]
     factor: Float[Tensor, " N"]
     printed_factor: Float[Tensor, " N"]
-    shift: Float[Tensor, " N"]
+    field: Float[Tensor, "N F"]
     maybe: Float[Tensor, " N"]
     misfit: Int[Tensor, " N"]
     explained: Bool[Tensor, " N"]
@@ -116,7 +129,7 @@ def excess_of(
     information: Float[Tensor, "N E E"],
     right: Float[Tensor, "N E"],
     even: Float[Tensor, " N"] | None = None,
-    across: Float[Tensor, "N M 3 2"] | None = None,
+    picture: Callable[[Tensor], Picture] | None = None,
     refuted: Bool[Tensor, " N"] | None = None,
 ) -> Excess:
     """What speaks from the information about the further unknowns, and their right side, all else being unknown.
@@ -124,7 +137,7 @@ def excess_of(
     Args:
         even: degrees of freedom of other residuals that are those of noise: what makes all noise larger would have made
             them larger, too.
-        across: two directions across the line of sight as places of the markers.
+        picture: of some rows (K,), to tell displacements of the picture by; without, scatter is one factor.
         refuted: rows in which residuals that the further unknowns do not reach are beyond chance; something is amiss.
     """
     modes = _modes(information, right)
@@ -133,33 +146,27 @@ def excess_of(
     row, families = _explanations(modes, none, even)
     if row.numel() == 0:
         return none
-    some = _Modes(*(x[row] for x in modes))
     evidence = torch.stack([f.evidence for f in families], -1)
     best = evidence.argmax(-1)
     at = torch.arange(len(row), device=row.device)
     deviation, factor, chi2 = (torch.stack([f[k] for f in families], 1)[at, best] for k in (1, 2, 3))
     explained = chi2 < _most(none.freedom[row])
-    shift = torch.zeros_like(factor)
-    scatters = (best == _SCATTER).nonzero()[:, 0]
-    if across is not None and scatters.numel():
-        factor, shift = (
-            x.index_copy(0, scatters, y)
-            for x, y in zip(
-                (factor, shift),
-                _shifted(_Modes(*(x[scatters] for x in some)), across[row[scatters]]),
-                strict=True,
-            )
-        )
+    field, scatters = factor.new_zeros(len(row), 1), (best == _SCATTER).nonzero()[:, 0]
+    if picture is not None and scatters.numel():
+        found = _displaced(picture(row[scatters]))
+        field = field.new_zeros(len(row), found.shape[1]).index_copy(0, scatters, found)
+        factor = factor.index_fill(0, scatters, 1.0)
     misfit = torch.where((best == 0) & _is_tone(deviation), int(Misfit.TONE), best + 1)
-    return none.replaced(
+    every = replace(none, field=field.new_zeros(len(none.chi2), field.shape[1]))
+    return every.replaced(
         row,
         replace(
-            none[row],
+            every[row],
             deviation=deviation,
             printed=families[0].deviation,
             factor=factor,
             printed_factor=families[0].factor,
-            shift=shift,
+            field=field,
             maybe=torch.where(best == _SCATTER, torch.sigmoid(evidence[:, 0] - evidence[:, _SCATTER]), 0.0),
             misfit=misfit,
             explained=explained,
@@ -216,7 +223,7 @@ def _none(right: Tensor, modes: _Modes) -> Excess:
     zero, one = torch.zeros_like(right), torch.ones_like(chi2)
     by_chance = chi2 < _usual(freedom)
     nothing = torch.zeros_like(freedom)
-    return Excess(zero, zero, one, one, zero[:, 0], zero[:, 0], nothing, by_chance, chi2, freedom)
+    return Excess(zero, zero, one, one, zero[:, :1], zero[:, 0], nothing, by_chance, chi2, freedom)
 
 
 def _usual(freedom: Tensor) -> Tensor:
@@ -305,22 +312,24 @@ def _scatter(modes: _Modes, even: Tensor) -> _Family:
     return _Family(_mean(likelihood - against), torch.zeros_like(modes.by[:, 0]), mean, square[:, 0] / mean)
 
 
-def _shifted(modes: _Modes, across: Tensor) -> tuple[Tensor, Tensor]:
-    """Factor (N,) of the scatter, and deviation (N,) in mm of shifts of the rings across the line of sight beside it.
+def _displaced(picture: Picture) -> Tensor:
+    """Variances (N, F) in px^2 of displacements of the picture that are alike over each of the lengths.
 
     What scatters displaces a ring as a whole more than it changes its size or turns it: air, and lines that shake. The
-    pose stands on the shifts, of which few residuals remain: one factor for all would be that of sizes and turns.
+    pose stands on these shifts, of which few residuals remain. How much larger they are than sizes and turns is told by
+    the length over which displacements are alike, and sizes and turns tell how large they are. One factor for all noise
+    would be that of the shortest length.
     """
-    markers = by_kind(modes.by)[0].unflatten(-1, (-1, OF_MARKER))[..., :3]
-    by = torch.einsum("nrmp,nmpa->nrma", markers, across).flatten(-2)
+    modes, fields = _modes(picture.information, picture.right), picture.fields
+    by = modes.by.unflatten(-1, fields.shape[2:4])
+    by = torch.einsum("nrma,nfmab->nfrmb", by, fields).flatten(-2)
     values, vectors = torch.linalg.eigh(by @ by.mT)
-    square = (vectors.mT @ modes.residual[..., None])[..., 0].square()[:, None]
-    factors, shifts = _values(_SCALE, modes), _values(_PRINT, modes).square()
-    missing = (~modes.there).sum(-1, keepdim=True) * factors.log()  # these have no residual
-    held = [factors[:, None] + shift * values.clamp_min(0.0)[:, None] for shift in shifts]
-    likelihood = torch.stack([-0.5 * ((square / v + v.log()).sum(-1) - missing) for v in held], -1)
+    square = (vectors.mT @ modes.residual[:, None, :, None]).square()  # (N, F, r, 1)
+    sizes = _values(_FIELD, modes).square()
+    held = 1 + values.clamp_min(0.0)[..., None] * sizes
+    likelihood = -0.5 * (square / held + held.log()).sum(2)
     weight = torch.softmax(likelihood.flatten(1), -1).view_as(likelihood)
-    return weight.sum(2) @ factors, (weight.sum(1) @ shifts).sqrt()
+    return weight @ sizes
 
 
 _Part = tuple[Tensor, Tensor]

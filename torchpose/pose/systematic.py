@@ -28,10 +28,22 @@ from torchpose.geometry.rotations import plane_axes
 from torchpose.geometry.rows import Rows
 from torchpose.pose.covariance import center_jacobian, derivative
 from torchpose.pose.evidence import Evidence
-from torchpose.pose.excess import OF_CAMERA, OF_EDGES, OF_MARKER, Excess, beyond_chance, by_kind, excess_of, no_excess
+from torchpose.pose.excess import (
+    OF_CAMERA,
+    OF_EDGES,
+    OF_MARKER,
+    Excess,
+    Picture,
+    beyond_chance,
+    by_kind,
+    excess_of,
+    no_excess,
+)
 from torchpose.results import Misfit
 
 POSE = 6
+# of outer radii: from what differs along a rim to what moves a ring as a whole (convention)
+_LENGTHS = (0.25, 0.5, 1.0, 2.0, 4.0)
 _RIM_POINTS = 24  # of a circle: sums over it are exact up to the perspective's high orders
 
 
@@ -161,9 +173,12 @@ def on_print(
         printed = torch.cat([by_target, beside[..., :-OF_CAMERA]], -1)
         lens = torch.cat([by_camera, beside[..., -OF_CAMERA:]], -1)
     noisy = normals.over(excess.factor)
-    if bool((excess.shift > 0).any()):
-        shifts = excess.shift[:, None, None, None] * _across(setting, n)
-        noisy = noisy.scattered(noisy.by_motions(shifts))
+    moving = (excess.field > 0).any(-1).nonzero()[:, 0]
+    if moving.numel():
+        fields = excess.field[moving].sqrt()[:, :, None, None, None] * _fields(setting.of_rows(moving))
+        shifts = among(fields.movedim(1, -2).flatten(-2), n)
+        some = noisy[moving]
+        noisy = noisy.replaced(moving, some.scattered(some.by_motions(shifts)))
     joint = JointSolution.of(noisy, own, among(printed, n), among(lens, n), estimate)
     place = look = places_of(printed, joint, setting, excess.deviation)
     other = ((excess.misfit == Misfit.CAMERA) | (excess.misfit == Misfit.SCATTER)).nonzero()[:, 0]
@@ -265,7 +280,8 @@ def _excess(
     """
     rows, markers, n = known.shape[:3]
     alone = torch.eye(markers * (POSE + 1), dtype=known.dtype, device=known.device).unflatten(0, (markers, -1))
-    excess = no_excess(*remaining_of(normals, known, among(alone.expand(rows, -1, -1, -1), n), count))
+    together = remaining_of(normals, known, among(alone.expand(rows, -1, -1, -1), n), count)
+    excess = no_excess(*together)
     odd = (~excess.explained).nonzero()[:, 0]
     if odd.numel() == 0:
         return excess, None
@@ -273,10 +289,15 @@ def _excess(
     shifts = torch.cat([print_shifts(some), _camera_shifts(some)], -1)
     remaining = remaining_of(normals[odd], known[odd], among(shifts, n), count)
     refuted = beyond_chance(excess)[odd]
-    again = excess_of(*remaining, None if even is None else even[odd], _in_places(some), refuted)
+
+    def picture(which: Tensor) -> Picture:
+        information, right = (x[odd[which]] for x in together)
+        return Picture(information, right, _fields(some.of_rows(which)))
+
+    again = excess_of(*remaining, None if even is None else even[odd], picture, refuted)
     every = shifts.new_zeros(rows, *shifts.shape[1:]).index_copy(0, odd, shifts)
     nothing = shifts.new_zeros(rows, shifts.shape[-1])
-    excess = replace(excess, deviation=nothing, printed=nothing)
+    excess = replace(excess, deviation=nothing, printed=nothing, field=shifts.new_zeros(rows, again.field.shape[1]))
     return excess.replaced(odd, replace(again, chi2=excess.chi2[odd], freedom=excess.freedom[odd])), every
 
 
@@ -367,17 +388,26 @@ def print_shifts(setting: Setting) -> Tensor:
     return columns
 
 
-def _in_places(setting: Setting) -> Tensor:
-    """Two directions across the line of sight as places (N, M, 3, 2) of the markers in `print_shifts`."""
-    normal = setting.evidence.normals
-    axes = torch.stack([*plane_axes(normal), normal], -1)
-    return (setting.R[:, None] @ axes).mT[..., :2]
+def _fields(setting: Setting) -> Tensor:
+    """Factors (N, F, M, 7, 7) of the covariance of motions of single markers where the picture is displaced at random.
 
-
-def _across(setting: Setting, n: int) -> Tensor:
-    """Columns (N, M, n, 2) of single markers moved in these directions, by 1 mm."""
-    eye = torch.eye(n, 2, dtype=setting.t.dtype, device=setting.t.device)
-    return eye.expand(*setting.evidence.mask.shape, n, 2)
+    By 1 px along u and along v, alike over each of F lengths. Rings are so far apart that each is displaced by itself.
+    """
+    evidence = setting.evidence
+    jacobian, xy, weight = (_rim_jacobian if setting.on_rims else _center_jacobian)(evidence, setting.R, setting.t)
+    markers = evidence.mask.shape[1]
+    weighted = (jacobian.mT @ weight).unflatten(1, (markers, -1))  # (N, M, P, 7, 2)
+    held = (weighted @ jacobian.unflatten(1, (markers, -1))).sum(2)
+    moved = solve_scaled(held, weighted.movedim(2, -1).flatten(-2)).unflatten(-1, (2, -1))  # (N, M, 7, 2, P)
+    moved = torch.where(evidence.mask[..., None, None, None], moved, 0.0)
+    at = (xy * evidence.matrix.diagonal()[:2]).unflatten(1, (markers, -1))
+    across = evidence.radii[..., 0] * evidence.matrix.diagonal()[:2].mean() / setting.t[:, 2:]
+    length = across.new_tensor(_LENGTHS)[:, None, None, None] * across[:, None, :, None, None]
+    apart = torch.cdist(at, at)[:, None]  # (N, 1, M, P, P)
+    alike = (-(apart / length).square()).exp()
+    both = torch.einsum("nmacp,nfmpq,nmbcq->nfmab", moved, alike, moved)
+    values, vectors = torch.linalg.eigh(0.5 * (both + both.mT))
+    return vectors * values.clamp_min(0.0).sqrt()[..., None, :]
 
 
 def _by_bloom(setting: Setting) -> Tensor:
