@@ -435,13 +435,13 @@ class Near(NamedTuple):
         slopes = self.slopes(conic) if slopes is None else slopes
         both = torch.nn.functional.pad(conic, (0, 1), value=-1.0)[:, None]
         value = torch.bmm(both[self.tiles.group], self.terms).squeeze(1)
-        return value / torch.linalg.vector_norm(slopes, dim=1)
+        return value / _length(slopes)
 
     def curvatures(self, conic: Tensor, slopes: Tensor) -> Tensor:
         """Curvatures (K, T) in 1/px of the level curves of conics (M, 5) at the points."""
         second = conic[:, (0, 1, 1, 2)].unflatten(-1, (2, 2)) * conic.new_tensor([[2.0, 1.0], [1.0, 2.0]])
         second = torch.bmm(torch.bmm(self.inverse, second), self.inverse)[self.tiles.group]
-        steep = torch.linalg.vector_norm(slopes, dim=1)
+        steep = _length(slopes)
         along = torch.stack([slopes[:, 1], -slopes[:, 0]], 1)
         return (torch.bmm(second, along) * along).sum(1) / steep**3
 
@@ -473,6 +473,12 @@ class Near(NamedTuple):
         return torch.where(conic.isfinite().all(-1, keepdim=True), conic, old)
 
 
+def _length(planes: Tensor) -> Tensor:
+    """Lengths (K, T) of vectors (K, 2, T), in a tenth of the time of a norm along an axis that is not the last."""
+    x, y = planes.unbind(1)
+    return torch.addcmul(x * x, y, y).sqrt_()
+
+
 @checked
 def with_covariance(
     points: Points, index: Index, ellipses: Ellipses, weights: Weights = None, *, correlation: float = 1.0
@@ -499,12 +505,13 @@ def with_covariance(
     turn = torch.stack([cos, sin, -sin, cos], -1).view(-1, 2, 2)  # from the frame's axes to the ellipse's own
     axes, w = of[:, 2:4, None], planes[:, 2:]
     unit = torch.bmm(turn, planes[:, :2] - of[:, :2, None]) / axes
-    rho = torch.linalg.vector_norm(unit, dim=1, keepdim=True)
+    rho = _length(unit)[:, None]
     slope = unit / (axes * rho)
-    norm = torch.linalg.vector_norm(slope, dim=1, keepdim=True)
+    norm = _length(slope)[:, None]
     r, normal = ((rho - 1) / norm).nan_to_num(nan=0.0), slope / norm
     # unit circle coordinates s of the point with that normal: the boundary moves by n . (dc + E s)
-    s = torch.nn.functional.normalize(axes * normal, dim=1)
+    s = axes * normal
+    s = s / _length(s)[:, None]
     own, mixed = normal * s, (normal * s.flip(1)).sum(1, keepdim=True)
     jac = torch.cat([torch.bmm(turn.mT, normal), own[:, :1], mixed, own[:, 1:]], 1).nan_to_num(nan=0.0)
     # times b, so that it is 1 where the ellipse is steepest

@@ -68,6 +68,7 @@ from torchpose.rings import (
     mapped,
     measure_circles,
     measure_exactly,
+    measure_predicted,
     rough_rings,
 )
 from torchpose.target import Target
@@ -270,17 +271,20 @@ class PoseEstimator(nn.Module):
             circles, others = self._useful(scene, find_candidates(frames, wanted=wanted, float_range=255.0))
             scene, found = self._read(scene, Rings.cat([self._measured(scene, circles), others]))
             return scene, found, found.rings
-        coarse = None if near is None else find_near(scene, *_placed(scene, near), wanted)
-        tracked = coarse is not None
-        if coarse is None:
-            coarse = find_coarse(frames, wanted=wanted, float_range=255.0)
+        there = None if near is None else find_near(scene, *_placed(scene, near))
+        if there is not None:
+            rings, _ = measure_predicted(frames, *there, scene.camera, correct=self._recipe.correct)
+            first = self._read(scene, rings)
+            settled = self._settled(*first)
+            if bool(settled.all()):
+                return *first, rings
+            return self._found_elsewhere(scene, first, settled, rings)
+        coarse = find_coarse(frames, wanted=wanted, float_range=255.0)
         rings, copies, tried = self._likely(scene, coarse)
         first = self._read(scene, rings, copies)
         settled = self._settled(*first)
         if bool(settled.all()):
             return *first, tried.rings
-        if tracked:
-            return self._found_elsewhere(scene, first, settled, tried.rings)
         rest, number = (~settled).nonzero()[:, 0], (~settled).cumsum(0) - 1
         known = coarse[~settled[coarse.frame]]
         known = replace(known, frame=number[known.frame])

@@ -26,7 +26,7 @@ from torchpose.geometry.robust import CUT, quantile
 from torchpose.geometry.rows import Rows
 from torchpose.moments.views import motion_in_view, motion_of_place
 from torchpose.pose import MarkerNormals, Setting
-from torchpose.pose.excess import OF_CAMERA, SURE, Excess, excess_of, no_excess
+from torchpose.pose.excess import OF_CAMERA, SURE, Excess, beyond_chance, excess_of, no_excess
 from torchpose.pose.systematic import (
     POSE,
     JointSolution,
@@ -234,7 +234,8 @@ def _excess(parts: _Parts, views: list[Seen]) -> tuple[Excess, Tensor | None]:
     # what one camera's lens does is scatter here: of which one it is would be one more question
     shifts = torch.cat([print_shifts(view.setting.of_rows(odd)) for view in views], 1)
     shifts = torch.nn.functional.pad(shifts, (0, OF_CAMERA))
-    again = excess_of(*remaining_of(normals[odd], known[odd], among(shifts, n), count))
+    refuted = beyond_chance(excess)[odd]
+    again = excess_of(*remaining_of(normals[odd], known[odd], among(shifts, n), count), refuted=refuted)
     every = shifts.new_zeros(rows, *shifts.shape[1:]).index_copy(0, odd, shifts)
     nothing = shifts.new_zeros(rows, shifts.shape[-1])
     excess = replace(excess, deviation=nothing, printed=nothing)

@@ -28,7 +28,7 @@ from torchpose.geometry.rotations import plane_axes
 from torchpose.geometry.rows import Rows
 from torchpose.pose.covariance import center_jacobian, derivative
 from torchpose.pose.evidence import Evidence
-from torchpose.pose.excess import OF_CAMERA, OF_EDGES, OF_MARKER, Excess, by_kind, excess_of, no_excess
+from torchpose.pose.excess import OF_CAMERA, OF_EDGES, OF_MARKER, Excess, beyond_chance, by_kind, excess_of, no_excess
 from torchpose.results import Misfit
 
 POSE = 6
@@ -272,7 +272,8 @@ def _excess(
     some = setting.of_rows(odd)
     shifts = torch.cat([print_shifts(some), _camera_shifts(some)], -1)
     remaining = remaining_of(normals[odd], known[odd], among(shifts, n), count)
-    again = excess_of(*remaining, None if even is None else even[odd], _in_places(some))
+    refuted = beyond_chance(excess)[odd]
+    again = excess_of(*remaining, None if even is None else even[odd], _in_places(some), refuted)
     every = shifts.new_zeros(rows, *shifts.shape[1:]).index_copy(0, odd, shifts)
     nothing = shifts.new_zeros(rows, shifts.shape[-1])
     excess = replace(excess, deviation=nothing, printed=nothing)
