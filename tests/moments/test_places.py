@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchpose.moments.joint import JointPose
-from torchpose.moments.places import _second_moment, widened
+from torchpose.moments.places import _KNOCKED, _second_moment, widened
 
 F64 = torch.float64
 STEPS = 2000
@@ -43,7 +43,7 @@ def test_mean_squares_are_those_of_all_that_may_be(strength: float) -> None:
             "g,gij->ij", weight, spread + mean[:, :, None] * mean[:, None]
         )
         total += full
-    expected = total / (1 + weights)
+    expected = total / ((1 - _KNOCKED) / _KNOCKED + weights)
     found = _second_moment(information, right)
     scale = expected.diagonal().sqrt()
     # steps of 1.5 against many small ones

@@ -4,8 +4,7 @@ Contradictions that are no more than chance allows may yet be a camera that was 
 wrong by more than the contradiction shows. A camera that is off is so at all moments: what their pictures say of its
 place adds up, with lenses and target as numbers that all rows share. The camera may be turned, or off in all six
 numbers (by as much as shifts its picture alike), or every camera may be, by an amount that nobody knows: all that is
-averaged over by its likelihood, with the rig as its file says being as likely beforehand as all of that. What remains
-possible is counted in the covariance.
+averaged over by its likelihood. What remains possible is counted in the covariance.
 """
 
 from __future__ import annotations
@@ -24,6 +23,7 @@ from torchpose.pose.systematic import POSE
 # deviations of what the pictures tell best, by which a camera may be off: from none that would show to what nobody
 # would call a calibration (convention)
 _OFF, _GRID = (-1.0, 3.0), 24
+_KNOCKED = 0.1  # of rigs, that are not as their files say (convention)
 
 
 def widened(pose: JointPose, counted: Bool[Tensor, " J"]) -> JointPose:
@@ -62,8 +62,7 @@ def _second_moment(information: Tensor, right: Tensor) -> Tensor:
     which = torch.cat([torch.kron(cameras, turned[None]), cameras.repeat_interleave(POSE, 1), right.new_ones(1, size)])
     likelihood, moment = zip(*(_if_off(information, right, some > 0) for some in which), strict=True)
     every = torch.stack(likelihood)
-    # as likely beforehand as none of it
-    none = every.new_full((1,), math.log(every.numel()))
+    none = every.new_full((1,), math.log(every.numel() * (1 - _KNOCKED) / _KNOCKED))
     weight = torch.softmax(torch.cat([none, every.flatten()]), 0)[1:].view_as(every)
     return (weight[..., None, None] * torch.stack(moment)).sum((0, 1))
 
