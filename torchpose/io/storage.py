@@ -44,8 +44,11 @@ class StorageError(Exception):
     """A store refuses or does not answer; `problem` and `fix` as error messages say them."""
 
     def __init__(self, problem: str, fix: str) -> None:
-        super().__init__(f"{problem}; {fix}")
+        super().__init__(problem, fix)  # so it can be pickled
         self.problem, self.fix = problem, fix
+
+    def __str__(self) -> str:
+        return f"{self.problem}; {self.fix}"
 
 
 @dataclass(frozen=True)

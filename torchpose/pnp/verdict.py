@@ -255,9 +255,7 @@ def _covariance_of_few(best: Estimate, columns: Tensor, center: Tensor, unit: Te
     factor, failed = torch.linalg.cholesky_ex(matrix)
     # derivative of (t, R) by a step, transposed: (6, 6, B)
     turned = torch.linalg.cross(columns, center[:, None].expand_as(columns), dim=0)
-    by_step = torch.cat(
-        [torch.cat([columns * unit, turned]), torch.nn.functional.pad(columns, (0, 0, 0, 0, 3, 0))], 1
-    )
+    by_step = torch.cat([torch.cat([columns * unit, turned]), torch.nn.functional.pad(columns, (0, 0, 0, 0, 3, 0))], 1)
     root = torch.linalg.solve_triangular(factor, by_step.permute(2, 0, 1), upper=False)
     out.copy_(torch.bmm(root.mT, root).permute(1, 2, 0))
     independence = (factor.diagonal(dim1=1, dim2=2).square() / matrix.diagonal(dim1=1, dim2=2)).amin(1)

@@ -241,9 +241,7 @@ class _Fits:
         found = _minimised(fit, result.pose[index], spread, (_COARSELY,), result.look.levels[index][fit.mask])
         unknowns = found.unknowns
         look = fit.look(cast(Spread, unknowns.own["blur"]), unknowns.values("levels"))
-        begun = replace(
-            result, pose=result.pose.replaced(index, unknowns.pose), look=result.look.replaced(index, look)
-        )
+        begun = replace(result, pose=result.pose.replaced(index, unknowns.pose), look=result.look.replaced(index, look))
         return begun, rows.index_copy(0, index, fit.variance.sqrt() > result.noise[index])
 
     def widened(self, result: _Result, rows: Tensor) -> _Result:
