@@ -48,6 +48,7 @@ from torchpose.sim import add_noise, render
 
 SIZES = {"2 MP": (1824, 1216, 1111.11), "20 MP": (5472, 3648, 3333.33)}
 FRAMES = 8
+_LISTED = 500  # operations of a function that the whole report lists
 COUNTS = {"2 MP": (16, 144), "20 MP": (4, 28)}  # frames of a short and a long run of the command, whole batches
 REFINEMENT = "refine_photometric"
 STAGES = (
@@ -400,6 +401,7 @@ def main() -> None:
             bench_size(label, options.rounds, folder, report)
             bench_decoders(folder, options.rounds, report)
             bench_command(label, min(3, options.rounds), folder, report)
+    bench_operations([1, FRAMES], _LISTED, report)
     bench_start(min(3, options.rounds), report)
     bench_reduction(options.rounds, report)
     text = "\n".join(report)

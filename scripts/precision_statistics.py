@@ -11,10 +11,12 @@ functions outside the model are mixtures of shifted frames: a shift of the princ
 The bound of a covered ring takes the covered part of that marker's information off; that of a foreign point-spread
 function is the bound of a Gaussian of the same variance.
 
-`faults` are what differs from the files, and what cameras do to pictures: `print`, `warp` and `gain` have another print
-in every frame, `k1-off` a camera file that is off. Column `file`: `perfect` where the files claim nothing of it,
-`stated` where the target file has the right `center_sigma` and `edge_gain_sigma`. The bound is that of the nominal
-target and camera, without the fault.
+`faults` are what differs from the files, and what cameras do to pictures: `print`, `warp`, `gain`, `raster` and
+`texture` have another print, on another piece of paper, in every frame, for the NEES is that over all prints; of one
+print alone it is the mean square of a few numbers. `k1-off` has a camera file that is off. Column `file`: `perfect`
+where the files claim nothing of it, `stated` where they say what they can: the target file the covariance of places (of
+a bent plate that of saddles, of a raster how far its rims lie off) and `edge_gain_sigma`, the camera file the variance
+of k1, or its tone. The bound is that of the nominal target and camera, without the fault.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, get_args
 
@@ -33,6 +36,7 @@ from torch import Tensor
 
 import torchpose as tp
 from torchpose.analysis import pose_crlb, pose_errors
+from torchpose.camera import Tone
 from torchpose.geometry import rotations
 from torchpose.geometry.least_squares import Pose
 from torchpose.io.writers import write_rows
@@ -52,6 +56,7 @@ from torchpose.sim import (
     render,
 )
 from torchpose.sim.fields import keys_of
+from torchpose.sim.raster import raster_sides
 from torchpose.sim.sensor import toned
 
 F64 = torch.float64
@@ -164,6 +169,7 @@ FAULTS = {
     "sharpen": Case(tilted(40), processing=Processing(sharpen=1.0)),
     "jpeg-80": Case(tilted(40), processing=Processing(jpeg=80)),
 }
+INCH = 25.4  # mm
 MIDDLE = 165.0  # mm, the distance at which a texture's length in mm is that in px
 
 
@@ -188,12 +194,24 @@ Drawn = tp.Target | Prints
 
 
 def picture(
-    case: Case, camera: tp.Camera, target: Drawn, r: Tensor, t: Tensor, twist: tuple[float, ...] | None = None
+    case: Case,
+    camera: tp.Camera,
+    target: Drawn,
+    r: Tensor,
+    t: Tensor,
+    *,
+    index: Tensor | None = None,
+    twist: tuple[float, ...] | None = None,
 ) -> Tensor:
-    """Frames (B, H, W), free of noise; ``twist``: mm and rad by which the target moves during the exposure."""
+    """Frames (B, H, W), free of noise.
+
+    Args:
+        index: numbers of the frames, each of which is of another piece of paper; None for the same one in all.
+        twist: mm and rad by which the target moves during the exposure.
+    """
     if case.psf == "blackman-harris":
         return filtered(case, camera, target, r, t)
-    options = plate_of(case, len(t))
+    options = plate_of(case, len(t), index)
     if twist is not None:
         options |= {"motion": torch.tensor(twist, dtype=F64).expand(len(t), 6)}
     out = torch.zeros(len(t), camera.height, camera.width)
@@ -206,13 +224,13 @@ def picture(
     return out
 
 
-def plate_of(case: Case, frames: int) -> dict[str, Any]:
-    """Options of `render`; the paper has the same texture in all frames, which see it from elsewhere."""
+def plate_of(case: Case, frames: int, index: Tensor | None = None) -> dict[str, Any]:
+    """Options of `render`; ``index``: see `picture`."""
     options: dict[str, Any] = {"plate": PLATE, "dark": DARK, "light": LIGHT}
     if case.texture is None:
         return options
     share, length = case.texture
-    key = keys_of(1, 0, "paper").expand(frames)
+    key = keys_of(1, 0, "paper").expand(frames) if index is None else keys_of(frames, 0, "paper", index)
     return options | {"texture": Texture(key, share, length * MIDDLE / FOCAL)}
 
 
@@ -278,14 +296,56 @@ def printed_anew(case: Case, frames: int, g: torch.Generator) -> Prints | None:
 
 
 def stated(errors: PrintErrors) -> tp.Target:
-    """The target with what its file may say of such prints; it has no word for a raster."""
-    sigma = torch.as_tensor(errors.center_sigma, dtype=F64).expand(3).clone()
-    reach = TARGET.centers[:, :2].norm(dim=1)
-    # a saddle of any direction: its height over the markers, RMS
-    saddle = float(errors.warp) * (reach / (reach + TARGET.radii[:, 0]).max()).square().mean() / math.sqrt(2)
-    sigma[2] = torch.hypot(sigma[2], saddle)
-    deviations = torch.cat([sigma.repeat(len(TARGET)), torch.tensor([float(errors.gain)], dtype=F64)])
-    return replace(TARGET, covariance=torch.diag(deviations.square()))
+    """The target with what its file may say of such prints."""
+    sigma = torch.as_tensor(errors.center_sigma, dtype=F64).expand(3)
+    rough, grown = raster_sigmas(errors.dpi) if errors.dpi is not None else (0.0, 0.0)
+    places = torch.diag((sigma.square() + rough**2).repeat(len(TARGET)))
+    # a saddle of any direction, whose axis and diagonal are each up by the same on average
+    x, y = TARGET.centers[:, :2].T
+    reach = (TARGET.centers.norm(dim=1) + TARGET.radii[:, 0]).max()
+    saddles = torch.stack([x.square() - y.square(), 2 * x * y], -1) * (float(errors.warp) / reach.square())
+    places[2::3, 2::3] += 0.5 * saddles @ saddles.T
+    gain = torch.tensor([float(errors.gain) ** 2 + grown**2], dtype=F64)
+    return replace(TARGET, covariance=torch.block_diag(places, torch.diag(gain)))
+
+
+def files_of(case: Case) -> dict[str, tuple[tp.Camera, tp.Target]]:
+    """Files of camera and target: those that claim nothing of what is amiss, and those that state it if they can."""
+    filed = camera_of(case.k1 + case.k1_error)
+    files = {"perfect": (filed, TARGET)}
+    if case.errors is not None:
+        files["stated"] = filed, stated(case.errors)
+    if case.k1_error:
+        covariance = torch.zeros(8, 8, dtype=F64)
+        covariance[4, 4] = case.k1_error**2
+        files["stated"] = replace(filed, covariance=covariance), TARGET
+    if case.gamma != 1:
+        files["stated"] = replace(filed, tone=Tone("gamma", case.gamma)), TARGET
+    return files
+
+
+@cache
+def raster_sigmas(dpi: float, draws: int = 1000) -> tuple[float, float]:
+    """How far a raster displaces the rings of the target along x or y, and their edges outwards, RMS in mm.
+
+    Both of a rim's first harmonics are those of its area: how far the middle of what is black lies off, and by how much
+    there is more of it. The edges of a ring count by their length.
+    """
+    g, cell = torch.Generator().manual_seed(0), INCH / dpi
+    phase = cell * torch.rand(draws, 2, dtype=F64, generator=g)
+    radii = TARGET.radii.flatten()
+    center, radius = torch.zeros(draws * len(radii), 2, dtype=F64), radii.repeat(draws)
+    circle, ends = raster_sides(center, radius, cell, phase.repeat_interleave(len(radii), 0))
+    cross = ends[:, 0, 0] * ends[:, 1, 1] - ends[:, 1, 0] * ends[:, 0, 1]
+    of = torch.zeros(len(radius), 3, dtype=F64)
+    of.index_add_(0, circle, torch.cat([cross[:, None] / 2, cross[:, None] * ends.sum(1) / 6], -1))
+    area = math.pi * radius.square()
+    grown, moved = (of[:, 0] - area) / (2 * math.pi * radius), of[:, 1:] / area[:, None]
+    share = TARGET.radii / TARGET.radii.sum(1, keepdim=True)
+    moved = (share[..., None] * moved.view(draws, *TARGET.radii.shape, 2)).sum(2)
+    sides = torch.tensor([1.0, -1.0], dtype=F64)
+    grown = (share * sides * grown.view(draws, *TARGET.radii.shape)).sum(2)
+    return float(moved.square().mean().sqrt()), float(grown.square().mean().sqrt())
 
 
 def photographed(case: Case, clean: Tensor, seed: int, index: Tensor) -> Tensor:
@@ -307,22 +367,21 @@ def run(name: str, case: Case, methods: list[Method], frames: int, seed: int) ->
     camera = camera_of(case.k1)
     r, t = case.poses(frames, g)
     prints = printed_anew(case, frames, g)
-    filed = camera_of(case.k1 + case.k1_error)
-    files = {"perfect": TARGET} | ({} if case.errors is None else {"stated": stated(case.errors)})
     estimators = {
         (m, file): tp.PoseEstimator(filed, target, method=m, srgb=case.srgb)
         for m in methods
-        for file, target in files.items()
+        for file, (filed, target) in files_of(case).items()
     }
     parts: dict[tuple[str, str], list[tuple[Tensor, ...]]] = {key: [] for key in estimators}
     bounds = []
     for a in range(0, frames, BATCH):
         s = slice(a, a + BATCH)
         drawn = without_first(TARGET) if case.missing else TARGET
-        clean = picture(case, camera, drawn if prints is None else prints[s], r[s], t[s])
+        index = torch.arange(a, min(a + BATCH, frames))
+        clean = picture(case, camera, drawn if prints is None else prints[s], r[s], t[s], index=index)
         if case.cover:
             clean = covered(case, camera, clean, r[s], t[s], g)
-        noisy = photographed(case, clean, seed, torch.arange(a, a + len(clean)))
+        noisy = photographed(case, clean, seed, index)
         bounds.append(bound_of(case, camera, r[s], t[s]))
         for key, estimator in estimators.items():
             poses = estimator(noisy)

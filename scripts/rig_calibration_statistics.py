@@ -6,8 +6,9 @@ Every set: cameras on an arc around the target, 170 mm away, each with a lens of
 unknown; a plate of 5 x 4 points 12 mm apart, 0.05 px of noise on every point. A camera sees the plate where it is
 turned away from it by less than 50 degrees and all of it is in the frame; so of three and six cameras those at the ends
 never see it at one moment. Columns: RMS error of all places over what is claimed (translation, rotation), mean NEES of
-the places over its freedom with the deviation of that mean, and the same errors of a chain of cv2.stereoCalibrate over
-the same pixels, pair by pair along the arc, with the intrinsics that cv2.calibrateCamera gives from all views of each.
+the places over its freedom with the deviation of that mean, and the same errors over the same claims of two others on
+the same pixels: a chain of cv2.stereoCalibrate, pair by pair along the arc, and cv2.calibrateMultiview (OpenCV 5), both
+begun with the intrinsics that cv2.calibrateCamera gives from all views of each.
 
     python scripts/rig_calibration_statistics.py --rendered --cameras 3 --sets 10 --moments 40
 
@@ -43,6 +44,8 @@ BORDER = 10.0  # px
 LENS = "brown4"
 NOISE = 2.0  # grey levels, of rendered frames
 LEAST = 4  # moments of a pair for cv2.stereoCalibrate
+METRE = 1000.0  # mm
+STOP = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-12)
 
 
 class Drawn(NamedTuple):
@@ -125,8 +128,17 @@ def errors(rig: tp.CameraRig, true: tp.CameraRig) -> Tensor:
     return torch.cat([true.t - rig.t, rotations.log(true.R @ rig.R.mT)], -1)[1:]
 
 
-def by_opencv(scene: Drawn, views: list[Views]) -> tp.CameraRig | None:
-    """Pair by pair along the arc; None where a pair has too few moments in common."""
+class Seen(NamedTuple):
+    """What OpenCV's functions take: points of the plate, pixels of each camera by moment, matrix and distortion."""
+
+    points: np.ndarray
+    pixels: list[dict[str, np.ndarray]]
+    lenses: list[Any]
+    size: tuple[int, int]
+
+
+def seen_by_opencv(scene: Drawn, views: list[Views]) -> Seen:
+    """With the lens of each camera by itself."""
     points = scene.points.numpy().astype(np.float32)
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_USE_INTRINSIC_GUESS
     size = (scene.rig.cameras[0].width, scene.rig.cameras[0].height)
@@ -137,22 +149,26 @@ def by_opencv(scene: Drawn, views: list[Views]) -> tp.CameraRig | None:
     for camera, own in zip(scene.rig.cameras, seen, strict=True):
         start = camera.matrix.numpy().copy(), np.zeros(5)
         lenses.append(cv2.calibrateCamera([points] * len(own), [*own.values()], size, *start, flags=flags)[1:3])
+    return Seen(points, seen, lenses, size)
+
+
+def by_chain(scene: Drawn, given: Seen) -> tp.CameraRig | None:
+    """Pair by pair along the arc; None where a pair has too few moments in common."""
     R, t = [torch.eye(3, dtype=F64)], [torch.zeros(3, dtype=F64)]
-    for k in range(len(views) - 1):
-        both = [name for name in seen[k] if name in seen[k + 1]]
+    for k in range(len(given.pixels) - 1):
+        both = [name for name in given.pixels[k] if name in given.pixels[k + 1]]
         if len(both) < LEAST:
             return None
-        one, two = ([seen[j][name] for name in both] for j in (k, k + 1))
-        stop = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-12)
+        one, two = ([given.pixels[j][name] for name in both] for j in (k, k + 1))
         _, *_, turn, shift, _, _ = cv2.stereoCalibrate(
-            [points] * len(both),
+            [given.points] * len(both),
             one,
             two,
-            *lenses[k],
-            *lenses[k + 1],
-            size,
+            *given.lenses[k],
+            *given.lenses[k + 1],
+            given.size,
             flags=cv2.CALIB_FIX_INTRINSIC,
-            criteria=stop,
+            criteria=STOP,
         )
         step = rotations.compose(torch.from_numpy(turn), torch.from_numpy(shift)[:, 0], R[-1], t[-1])
         R.append(step[0])
@@ -160,11 +176,42 @@ def by_opencv(scene: Drawn, views: list[Views]) -> tp.CameraRig | None:
     return tp.CameraRig(scene.rig.cameras, torch.stack(R), torch.stack(t))
 
 
+def by_multiview(scene: Drawn, given: Seen) -> tp.CameraRig | None:
+    """All at once, in metres, since it takes points for collinear whose distances are large numbers; None where OpenCV
+    has no such function, or fails."""
+    if not hasattr(cv2, "calibrateMultiview"):
+        return None
+    names = sorted({name for own in given.pixels for name in own})
+    nothing, count = np.full((len(given.points), 2), -1, np.float32), len(given.pixels)
+    try:
+        _, _, _, turns, shifts = cv2.calibrateMultiview(
+            [given.points / METRE] * len(names),
+            [[own.get(name, nothing) for name in names] for own in given.pixels],
+            [given.size] * count,
+            np.array([[name in own for name in names] for own in given.pixels], np.uint8),
+            np.full(count, cv2.CALIB_MODEL_PINHOLE, np.uint8),
+            [matrix.copy() for matrix, _ in given.lenses],
+            [distortion.copy() for _, distortion in given.lenses],
+            None,
+            None,
+            np.full(count, cv2.CALIB_FIX_K3 | cv2.CALIB_USE_INTRINSIC_GUESS, np.int32),
+            cv2.CALIB_USE_INTRINSIC_GUESS,
+            STOP,
+        )
+    except cv2.error:
+        return None
+    R = [torch.from_numpy(cv2.Rodrigues(np.asarray(turn, float))[0]) for turn in turns[1:]]
+    R = [torch.eye(3, dtype=F64), *R]
+    t = METRE * torch.stack([torch.from_numpy(np.asarray(shift, float)).flatten() for shift in shifts])
+    t[0] = 0
+    return tp.CameraRig(scene.rig.cameras, torch.stack(R), t)
+
+
 class Row(NamedTuple):
     found: RigCalibration
     off: Tensor  # (6 (C - 1),)
     nees: float
-    opencv: Tensor | None
+    theirs: tuple[Tensor | None, ...] = (None, None)  # of the chain, and of all at once
 
 
 def drawn_set(cameras: int, moments: int, seed: int, *, compare: bool = True) -> Row:
@@ -173,9 +220,12 @@ def drawn_set(cameras: int, moments: int, seed: int, *, compare: bool = True) ->
     found = calibrate_rig(located(scene, views), lens=LENS)
     off = errors(found.rig, scene.rig).flatten()
     assert found.rig.covariance is not None
-    theirs = by_opencv(scene, views) if compare else None
     nees = float(off @ torch.linalg.solve(found.rig.covariance, off))
-    return Row(found, off, nees, None if theirs is None else errors(theirs, scene.rig).flatten())
+    if not compare:
+        return Row(found, off, nees)
+    given = seen_by_opencv(scene, views)
+    theirs = (by_chain(scene, given), by_multiview(scene, given))
+    return Row(found, off, nees, tuple(None if rig is None else errors(rig, scene.rig).flatten() for rig in theirs))
 
 
 def rendered_set(cameras: int, moments: int, seed: int) -> Row:
@@ -192,7 +242,7 @@ def rendered_set(cameras: int, moments: int, seed: int) -> Row:
     found = calibrate_cameras(several, target, lens=LENS, tone=LINEAR)
     off = errors(found.rig, scene.rig).flatten()
     assert found.rig.covariance is not None
-    return Row(found, off, float(off @ torch.linalg.solve(found.rig.covariance, off)), None)
+    return Row(found, off, float(off @ torch.linalg.solve(found.rig.covariance, off)))
 
 
 def row_of(cameras: int, moments: int, sets: int, *, rendered: bool = False) -> dict[str, Any]:
@@ -202,9 +252,9 @@ def row_of(cameras: int, moments: int, sets: int, *, rendered: bool = False) -> 
     for row in rows:
         assert row.found.rig.covariance is not None
         sigma = row.found.rig.covariance.diagonal().sqrt()
-        theirs = torch.full_like(row.off, torch.nan) if row.opencv is None else row.opencv
-        whitened.append(torch.stack([row.off / sigma, theirs / sigma, sigma]).unflatten(1, (-1, 6)))
-    mine, theirs, claimed = torch.stack(whitened, 1)  # (S, C - 1, 6) each
+        theirs = [torch.full_like(row.off, torch.nan) if off is None else off for off in row.theirs]
+        whitened.append(torch.stack([row.off / sigma, *(off / sigma for off in theirs), sigma]).unflatten(1, (-1, 6)))
+    mine, chain, multiview, claimed = torch.stack(whitened, 1)  # (S, C - 1, 6) each
     apart = int((rows[0].found.common == 0).sum()) // 2
     nees = torch.tensor([row.nees for row in rows]) / freedom
 
@@ -221,8 +271,10 @@ def row_of(cameras: int, moments: int, sets: int, *, rendered: bool = False) -> 
         "rotation / claimed": rms(mine[..., 3:]),
         "NEES / freedom": float(nees.mean()),
         "deviation of it": math.sqrt(2 / freedom / sets),
-        "opencv translation / claimed": rms(theirs[..., :3]),
-        "opencv rotation / claimed": rms(theirs[..., 3:]),
+        "chain translation / claimed": rms(chain[..., :3]),
+        "chain rotation / claimed": rms(chain[..., 3:]),
+        "multiview translation / claimed": rms(multiview[..., :3]),
+        "multiview rotation / claimed": rms(multiview[..., 3:]),
     }
 
 

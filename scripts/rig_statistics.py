@@ -1,18 +1,21 @@
 """Poses from several cameras beside their joint Cramer-Rao bound, and whether the covariance explains the errors.
 
-    python scripts/rig_statistics.py --moments 1000 --out rigs.csv
-    python scripts/rig_statistics.py --case three-35 knocked --moments 60
+    python scripts/rig_statistics.py --moments 100 --processes 2 --out rigs.csv
+    python scripts/rig_statistics.py --case three-35 knocked-5 --moments 60
 
 Simulated frames of quad40, as much of 2 megapixels as the target is in, 8 bit, noise 2, blur 0.7 px; cameras of one rig
 look at one place, 160 mm away, from angles that a case names, the first of which is 0. One row a case: moments with a
 pose, RMS error over RMS bound across and along the axis of the first camera and of the rotation, RMS errors, share of
-rows that claim 1.3 times the bound in depth or more, mean NEES (ideal 6), consistency (mean chi-squared between the
-cameras over its freedom, ideal 1).
+rows that claim 1.3 times the bound in depth or more, mean NEES (ideal 6) and the deviation of that mean,
+consistency (mean chi-squared between the cameras over its freedom, ideal 1). A last row has all cases together whose
+rigs are as they say: of ratios the root mean square over the cases.
 
 Cases end in `-places` where the rig states a covariance of its places (20 um, 0.2 mrad a camera) and every moment has
-places of its own from it. `two-markers`: each camera sees two markers of the four, at opposite corners in turns.
+places of its own from it; in `-fixed` all 16 moments of a call have the same ones. `two-markers`: each camera sees two
+markers of the four, at opposite corners in turns.
 `missing`: one camera has no picture, each in turn. `knocked-N`: the second camera is turned by N deviations of the
-centre of a ring at the noise of the frames, which the rig does not know.
+centre of a ring at the noise of the frames, which the rig does not know; `-first` the first one, in whose axes the
+poses are. What a call says of a rig depends on how many moments it has: `--batch`.
 """
 
 from __future__ import annotations
@@ -21,7 +24,10 @@ import argparse
 import math
 import sys
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -49,13 +55,16 @@ TARGET = tp.Target.load("quad40")
 
 @dataclass(frozen=True)
 class Case:
-    """Angles of the cameras; ``places``: uncertain; what is missing; deviations by which one camera is turned."""
+    """Angles of the cameras; ``places``: uncertain; what is missing; deviations by which one camera is turned, the
+    first or the second; whether all moments of a call have the same places."""
 
     angles_deg: tuple[float, ...]
     places: bool = False
     missing: bool = False
     two_markers: bool = False
     knocked: float = 0.0
+    first: bool = False
+    fixed: bool = False
 
 
 CASES = {
@@ -68,7 +77,9 @@ CASES = {
     "four-40-places": Case((0, 40, -40, 80), places=True),
     "three-35-missing": Case((0, 35, -35), missing=True),
     "three-35-two-markers": Case((0, 35, -35), two_markers=True),
+    "three-35-places-fixed": Case((0, 35, -35), places=True, fixed=True),
     **{f"knocked-{n}": Case((0, 35, -35), knocked=float(n)) for n in (1, 2, 5, 20)},
+    "knocked-5-first": Case((0, 35, -35), knocked=5.0, first=True),
 }
 
 
@@ -125,8 +136,7 @@ def pictures(case: Case, rig: tp.CameraRig, R: Tensor, t: Tensor, moved: Tensor,
     """Frames (B, H, W) of every camera."""
     frames = []
     for camera, lens in enumerate(rig.cameras):
-        off = torch.zeros(len(t), 6, dtype=F64) if camera == 0 else moved[:, 6 * (camera - 1) : 6 * camera]
-        own = in_view(rig, camera, R, t, off)
+        own = in_view(rig, camera, R, t, moved[:, 6 * camera : 6 * camera + 6])
         seen, imaging = targets_of(case, camera), {"psf_sigma": BLUR, "dark": DARK, "light": LIGHT}
         parts = [slice(k, None, len(seen)) for k in range(len(seen))]
         images = torch.empty(len(t), HEIGHT, WIDTH)
@@ -160,29 +170,30 @@ def _fisher_of(rig: tp.CameraRig, target: tp.Target, R: Tensor, t: Tensor) -> Te
     return torch.linalg.inv(bound[0])
 
 
-def measure(name: str, case: Case, moments: int, seed: int) -> dict[str, Any]:
+def measure(name: str, case: Case, moments: int, seed: int, batch: int = BATCH) -> dict[str, Any]:
     """The row of a case."""
+    torch.set_num_threads(1)
     generator = torch.Generator().manual_seed(seed)
     rig = rig_of(case)
     estimator = tp.PoseEstimator(rig, TARGET)
     found, truth, bound = [], [], []
-    for first in range(0, moments, BATCH):
-        count = min(BATCH, moments - first)
+    for first in range(0, moments, batch):
+        count = min(batch, moments - first)
         R, t = poses(case, count, generator)
-        moved = torch.zeros(count, 6 * (len(rig) - 1), dtype=F64)
+        moved = torch.zeros(count, 6 * len(rig), dtype=F64)
         if case.places and rig.covariance is not None:
-            moved = torch.randn(moved.shape, dtype=F64, generator=generator) * rig.covariance.diagonal().sqrt()
+            drawn = torch.randn(count, 6 * (len(rig) - 1), dtype=F64, generator=generator)
+            moved[:, 6:] = (drawn[:1] if case.fixed else drawn) * rig.covariance.diagonal().sqrt()
         if case.knocked:
-            moved[:, 4] = case.knocked * CENTER / FOCAL
+            moved[:, 4 if case.first else 10] = case.knocked * CENTER / FOCAL
         seen = torch.ones(len(rig), count, dtype=torch.bool)
         if case.missing:
             seen[(first + torch.arange(count)) % len(rig), torch.arange(count)] = False
         frames = pictures(case, rig, R, t, moved, seed + 1000 * first)
         found.append(estimator(frames, seen))
-        truth.append((R, t))
+        truth.append(in_view(rig, 0, R, t, moved[:, :6]))
         bound.append(bounds(case, rig, R, t, first))
-        print(f"\r{name}: {first + count} of {moments}", end="", file=sys.stderr, flush=True)
-    print(file=sys.stderr)
+        print(f"{name}: {first + count} of {moments}", file=sys.stderr, flush=True)
     return row_of(name, tp.Poses.cat(found), truth, torch.cat(bound))
 
 
@@ -210,9 +221,32 @@ def row_of(name: str, found: tp.Poses, truth: list[tuple[Tensor, Tensor]], bound
         "rotation_deg": math.degrees(float(errs[2])),
         "widened": float((found.std[good, 2] > _WIDE * variance[:, 2].sqrt()).double().mean()),
         "nees": float(errors.nees.mean()) if len(good) else math.nan,
+        "nees_deviation": float(errors.nees.std() / len(good) ** 0.5) if len(good) else math.nan,
         "consistency": chi2 / freedom if freedom else math.nan,
         "worst": float(errors.nees.max()) if len(good) else math.nan,
     }
+
+
+def _measured(name: str, moments: int, seed: int, batch: int) -> dict[str, Any]:
+    return measure(name, CASES[name], moments, seed, batch)
+
+
+def together(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """One row of several cases."""
+    number = {key: torch.tensor([float(row[key]) for row in rows], dtype=F64) for key in rows[0] if key != "case"}
+    share = number["ok"] / number["ok"].sum()
+    row: dict[str, Any] = {key: float((share * values).sum()) for key, values in number.items()}
+    for key in ("lateral", "depth", "rotation", "lateral_um", "depth_um", "rotation_deg"):
+        row[key] = float((share * number[key].square()).sum().sqrt())
+    row["nees_deviation"] = float((share * number["nees_deviation"]).square().sum().sqrt())
+    counts = {key: int(number[key].sum()) for key in ("moments", "ok", "disagree")}
+    return {"case": "all as filed"} | row | counts | {"worst": float(number["worst"].max())}
+
+
+def shown(row: dict[str, Any]) -> str:
+    return "  ".join(
+        f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in row.items()
+    )
 
 
 def main() -> None:
@@ -220,19 +254,26 @@ def main() -> None:
     parser.add_argument("--case", nargs="+", choices=[*CASES, "all"], default=["all"])
     parser.add_argument("--moments", type=int, default=100)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--batch", type=int, default=BATCH, help="moments a call")
+    parser.add_argument("--processes", type=int, default=1, help="cases side by side")
     parser.add_argument("--out", type=Path, help="Table: .csv, .jsonl or .parquet")
     parser.add_argument("--markdown", action="store_true", help="print a table for the documentation")
     args = parser.parse_args()
+    names = list(CASES) if "all" in args.case else args.case
+    row_of_case = partial(_measured, moments=args.moments, seed=args.seed, batch=args.batch)
     rows = []
-    for name in CASES if "all" in args.case else args.case:
-        rows.append(measure(name, CASES[name], args.moments, args.seed))
-        print(
-            "  ".join(
-                f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}"
-                for key, value in rows[-1].items()
-            ),
-            flush=True,
-        )
+    if args.processes > 1:
+        with ProcessPoolExecutor(args.processes, get_context("spawn")) as pool:
+            for row in pool.map(row_of_case, names):
+                print(shown(row), flush=True)
+                rows.append(row)
+    else:
+        for name in names:
+            rows.append(row_of_case(name))
+            print(shown(rows[-1]), flush=True)
+    if len(as_filed := [row for row in rows if not CASES[row["case"]].knocked]) > 1:
+        rows.append(together(as_filed))
+        print(shown(rows[-1]), flush=True)
     if args.markdown:
         print("| " + " | ".join(rows[0]) + " |\n|" + " --- |" * len(rows[0]))
         for row in rows:

@@ -259,7 +259,7 @@ def run(model: WrongModel, frames: int, seed: int, method: Any = "photometric") 
     for a in range(0, frames, BATCH):
         s = slice(a, min(a + BATCH, frames))
         what = drawn if isinstance(drawn, tp.Target) else drawn[s]
-        clean = model.light(picture(case, camera, what, r[s], t[s], model.twist))
+        clean = model.light(picture(case, camera, what, r[s], t[s], twist=model.twist))
         noisy = model.file(photographed(case, clean, seed, torch.arange(a, s.stop)))
         poses = estimator(noisy)
         e = pose_errors(poses, Pose(r[s], t[s]))

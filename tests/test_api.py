@@ -8,8 +8,8 @@ import torchpose as tp
 
 PUBLIC = [
     "ArgumentError", "Camera", "CameraRig", "ConfigError", "Detections", "FrameError", "HandEye", "Misfit",
-    "Motions", "PoseEstimator", "Poses", "Reason", "Status", "Target", "TorchposeError", "analysis", "calibration",
-    "centers", "design", "detect", "ellipse", "pnp", "sim", "zernike",
+    "Motions", "PoseEstimator", "Poses", "Reason", "Status", "Target", "TorchposeError", "Tracker", "analysis",
+    "calibration", "centers", "design", "detect", "ellipse", "pnp", "sim", "zernike",
 ]  # fmt: skip
 
 

@@ -68,6 +68,7 @@ from torchpose.rings import (
     mapped,
     measure_circles,
     measure_exactly,
+    measure_predicted,
     rough_rings,
 )
 from torchpose.target import Target
@@ -76,7 +77,6 @@ _LEAST_CANDIDATE = (
     3.0  # px of semi-minor axis: rings below 4 are refused (`rings.measure`); candidates of covered ones err
 )
 _LEGIBLE = 1.8  # px, of blur, up to which the mean profile of a ring tells its code (measured: decisions/0059)
-_FEW_OTHERS = 2  # circles a marker that are measured sooner than they are chosen from (convention: cost alone depends)
 _LAYOUT = ("ids", "centers", "normals", "radii", "valid", "polarity")  # of the table: what makes a target
 Method = Literal["photometric", "edges", "centers", "paper"]
 Near = Poses | tuple[Tensor, Tensor]
@@ -215,10 +215,11 @@ class PoseEstimator(nn.Module):
             frames: (H, W), (B, H, W) or (B, 1, H, W) grey, or (B, 3, H, W) RGB, of which the luma counts; tensors or
                 NumPy arrays of uint8, uint16, or floating point with white at ``float_range``.
             near: poses not long before, row by row of the frame of the batch that they are near to: of a sequence, what
-                the last call gave (`tracking.Tracker`); or R (B, T, 3, 3) and t (B, T, 3), NaN where unknown. The rings are looked for where these put them, up to `identify.near.MOST_MOVE` px
-                away, and all over the frame only where a target is not found whole there; so one that was lost is found
-                again. The result is the same to a fraction of its deviation, but for `Poses.copies`, which then counts
-                what is near. Boards, and several instances, are looked for everywhere.
+                the last call gave (`tracking.Tracker`); or R (B, T, 3, 3) and t (B, T, 3), NaN where unknown. The rings
+                are looked for where these put them, up to `identify.near.MOST_MOVE` px away, and all over the frame
+                only where a target is not found whole there; so one that was lost is found again. The result is the
+                same to a fraction of its deviation, but for `Poses.copies`, which then counts what is near. Boards, and
+                several instances, are looked for everywhere.
 
         Returns:
             Rows sorted by frame, target and instance, on the device of the frames: B * T of them with
@@ -270,17 +271,20 @@ class PoseEstimator(nn.Module):
             circles, others = self._useful(scene, find_candidates(frames, wanted=wanted, float_range=255.0))
             scene, found = self._read(scene, Rings.cat([self._measured(scene, circles), others]))
             return scene, found, found.rings
-        coarse = None if near is None else find_near(scene, *_placed(scene, near), wanted)
-        tracked = coarse is not None
-        if coarse is None:
-            coarse = find_coarse(frames, wanted=wanted, float_range=255.0)
+        there = None if near is None else find_near(scene, *_placed(scene, near))
+        if there is not None:
+            rings, _ = measure_predicted(frames, *there, scene.camera, correct=self._recipe.correct)
+            first = self._read(scene, rings)
+            settled = self._settled(*first)
+            if bool(settled.all()):
+                return *first, rings
+            return self._found_elsewhere(scene, first, settled, rings)
+        coarse = find_coarse(frames, wanted=wanted, float_range=255.0)
         rings, copies, tried = self._likely(scene, coarse)
         first = self._read(scene, rings, copies)
         settled = self._settled(*first)
         if bool(settled.all()):
             return *first, tried.rings
-        if tracked:
-            return self._found_elsewhere(scene, first, settled, tried.rings)
         rest, number = (~settled).nonzero()[:, 0], (~settled).cumsum(0) - 1
         known = coarse[~settled[coarse.frame]]
         known = replace(known, frame=number[known.frame])
@@ -372,8 +376,9 @@ class PoseEstimator(nn.Module):
         Also how many copies (B T,) were seen, and what was measured for that.
         """
         circles, count, least = self._circles(scene, candidates), len(scene.frames), int(scene.table.valid.sum())
-        # frames with fewer circles than markers are searched at all scales anyway
-        if self._recipe.on_rims and _few(circles, _FEW_OTHERS * least, count):
+        # frames with fewer circles than markers are searched at all scales anyway; up to twice as many are measured
+        # sooner than they are chosen from
+        if self._recipe.on_rims and _few(circles, 2 * least, count):
             circles = circles[_full(circles.outer.frame, count, least)[circles.outer.frame]]
             rings, of = self._rings(scene, circles)  # when they are measured they tell which of them are markers
             return rings, of.new_zeros(scene.groups), _Tried(circles.outer[of[:0]], rings[:0], rings.clipped[:0])

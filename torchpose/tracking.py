@@ -47,7 +47,7 @@ class Tracker:
         if len(names) != count or len(set(names)) != count:
             raise ArgumentError(f"sequences: {len(names)} names for {count} frames; give each frame one of its own")
         if self.estimator.instances > 1 or not count:
-            return self.estimator(frames)  # type: ignore[no-any-return]  # of torch
+            return self.estimator(frames)
         poses: Poses = self.estimator(frames, near=self._near(names))
         rows = poses.R.view(count, -1, 3, 3), poses.t.view(count, -1, 3)
         self._last.update(zip(names, zip(*(part.unbind() for part in rows), strict=True), strict=True))

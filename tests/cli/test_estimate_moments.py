@@ -14,6 +14,7 @@ import torchpose as tp
 from tests.moments.rig_scenes import pictures, poses, rig
 from torchpose.cli.main import main
 from torchpose.geometry import rotations
+from torchpose.io.moments import MomentStore
 
 COUNT = 4
 
@@ -73,6 +74,44 @@ def test_json_and_parquet_have_the_shares(shots: Path) -> None:
     assert lines[0]["shares"][1]["share"] == 0
     assert sum(share["share"] for share in lines[3]["shares"]) == pytest.approx(1)
     assert pq.read_table(shots / "poses.parquet").to_pylist()[0]["shares"] == lines[0]["shares"]
+
+
+def test_markers_and_pictures_of_every_camera(shots: Path, tmp_path: Path) -> None:
+    marks, drawn = tmp_path / "marks.csv", tmp_path / "drawn"
+    run(shots, "drawn.csv", "--detections", str(marks), "--overlay", str(drawn))
+    rows = table(marks)
+    cameras, (R, t) = tp.CameraRig.load(shots / "rig.yaml"), torch.load(shots / "truth.pt")
+    assert {(row["frame"], row["camera"]) for row in rows} == {
+        (f"{k}.png", name) for k in range(COUNT) for name in cameras.names
+    } - {("0.png", "cam1"), ("1.png", "right"), ("2.png", "left")}
+    centers = tp.Target.load("quad40").centers
+    for row in rows:
+        k, number, marker = int(row["frame"][0]), cameras.names.index(row["camera"]), int(row["marker"])
+        own_R, own_t = cameras.seen_by(number, R[k], t[k])
+        at = cameras.cameras[number].project((own_R @ centers[marker] + own_t)[None])[0]
+        assert [float(row["u"]), float(row["v"])] == pytest.approx(at.tolist(), abs=0.05)
+    assert sorted(str(p.relative_to(drawn)) for p in drawn.rglob("*.png")) == sorted(
+        f"{name}/{frame}" for frame, name in {(row["frame"], row["camera"]) for row in rows}
+    )
+    # the first axis is drawn from where each camera has the origin: bent into its own picture
+    for number, name in enumerate(cameras.names):
+        origin = cameras.cameras[number].project(cameras.seen_by(number, R[3], t[3])[1][None])[0]
+        u, v = origin.round().int().tolist()
+        around = cv2.imread(str(drawn / name / "3.png"))[v - 6 : v + 7, u - 6 : u + 7].astype(int)
+        assert (around.max(-1) - around.min(-1)).max() > 100  # colours in a grey picture
+
+
+@pytest.mark.parametrize("name", ["killed.csv", "killed.jsonl"])
+def test_a_killed_run_goes_on(shots: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    shutil.copy(shots / "rig.yaml", tmp_path)
+    shutil.copytree(shots / "in", tmp_path / "in")
+    with monkeypatch.context() as killed:
+        killed.setattr(MomentStore, "finish", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        assert run(tmp_path, name, "-d", str(tmp_path / "marks.csv")) == 130
+    assert run(tmp_path, name, "-d", str(tmp_path / "marks.csv"), "--resume") == 0
+    run(tmp_path, f"whole_{name}", "-d", str(tmp_path / "again.csv"))
+    assert (tmp_path / name).read_text() == (tmp_path / f"whole_{name}").read_text()
+    assert (tmp_path / "marks.csv").read_text() == (tmp_path / "again.csv").read_text()
 
 
 def test_resume_does_what_has_changed(shots: Path, tmp_path: Path) -> None:
@@ -144,7 +183,7 @@ def test_plans_with_several_cameras(shots: Path, tmp_path: Path) -> None:
     ("more", "message"),
     [
         (["--camera", "cam.yaml"], "--camera: stands beside --cameras"),
-        (["--detections", "d.csv"], "-d: is of one camera"),
+        (["--engine", "ray"], "--engine ray: is of one camera"),
         (["--instances", "2"], "--instances: several cameras look for one copy"),
         (["--method", "paper"], "method: 'paper' is of one camera"),
     ],

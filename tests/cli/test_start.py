@@ -11,7 +11,18 @@ import torch
 from torchpose.camera import Camera
 
 # modules that cost between 50 ms and seconds, and that no frame of a PNG folder needs
-HEAVY = ("kornia", "matplotlib", "pandas", "pyarrow", "scipy", "skimage", "sympy", "torch._dynamo", "torch._inductor")
+HEAVY = (
+    "kornia",
+    "matplotlib",
+    "pandas",
+    "pyarrow",
+    "rich",
+    "scipy",
+    "skimage",
+    "sympy",
+    "torch._dynamo",
+    "torch._inductor",
+)
 CODE = """
 import sys
 from torchpose.cli.main import main

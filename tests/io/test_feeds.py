@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import logging
 import math
@@ -106,6 +107,29 @@ def test_a_websocket_refuses_what_it_should() -> None:
             assert json.loads(good.recv(timeout=20))["frame"] == "a"
         with pytest.raises(ConfigError, match=f"--websocket: 127.0.0.1:{port} cannot be served"):
             WebSocketFeed(Place(port), schema=POSE_SCHEMA).__enter__()
+
+
+def test_a_flood_of_websockets_holds_up_nobody() -> None:
+    """Connections that never greet, greetings beyond what is let in, messages and frames that are too long."""
+    client = pytest.importorskip("websockets.sync.client")
+    exceptions = pytest.importorskip("websockets.exceptions")
+    port = free_port()
+    address = f"ws://127.0.0.1:{port}"
+    with WebSocketFeed(Place(port), schema=POSE_SCHEMA) as feed, contextlib.ExitStack() as stack:
+        for number in range(100):
+            silent = stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=10))
+            silent.sendall((b"", b"GET / HT", b"GET / HTTP/1.1\r\nX: ")[number % 3])
+        talker = stack.enter_context(client.connect(address, compression=None))
+        with contextlib.suppress(exceptions.ConnectionClosed):
+            talker.send("x" * 1_000_000)
+        with pytest.raises(exceptions.ConnectionClosed):
+            talker.recv(timeout=20)
+        clients = [stack.enter_context(client.connect(address)) for _ in range(64)]
+        until(lambda: len(feed._clients) == 64)
+        with client.connect(address) as late, pytest.raises(exceptions.ConnectionClosed, match="too many"):
+            late.recv(timeout=20)
+        feed.publish([row("a")])
+        assert all(json.loads(one.recv(timeout=20))["frame"] == "a" for one in clients)
 
 
 @pytest.mark.parametrize(("host", "good"), [("::1", True), ("localhost", True), ("0.0.0.0", False), ("cell", False)])

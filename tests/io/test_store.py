@@ -443,6 +443,18 @@ def test_a_journal_from_before_there_were_instances_is_resumed(tmp_path: Path, w
     assert [(row["instance"], row["copies"]) for row in rows] == [(0, None)] * 5
 
 
+@pytest.mark.parametrize("column", sorted(set(POSE_SCHEMA) - {"frame", "target", "status"}))
+def test_a_cell_that_a_journal_lacks_is_an_empty_one(tmp_path: Path, column: str) -> None:
+    """In the tally and in the table alike, whatever the column."""
+    record = {"frame": "0.png", "rows": [{key: cell for key, cell in ROW.items() if key != column}], "detections": []}
+    (tmp_path / "p.csv.partial").write_bytes(seal({"origin": ORIGIN}) + seal(record))
+    resumed = store(tmp_path, resume=True)
+    resumed.finish(["0.png"])
+    resumed.close()
+    (row,) = read_rows(tmp_path / "p.csv", POSE_SCHEMA)
+    assert row.get(column) == (0 if column == "instance" else None)  # a CSV file has no matrices
+
+
 def test_copies_without_a_row_are_counted(tmp_path: Path) -> None:
     """Frames that show more copies than they have rows, of every target the most."""
     of = store(tmp_path)

@@ -8,18 +8,21 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
 import pytest
 
 from tests.live.cell import CAMERA, TARGET, Page, Scene, looking, picture, served
+from torchpose import pipeline
 from torchpose.cli.main import main
 from torchpose.io.images import decode
 from torchpose.io.manifest import read_manifest
 from torchpose.io.reader import Fault
 from torchpose.io.rows import POSE_SCHEMA
 from torchpose.live import engine, recording
+from torchpose.live.engine import Observer
 from torchpose.live.sources import Shot
 from torchpose.pipeline import PoseEstimator
 from torchpose.results import Status
@@ -45,6 +48,41 @@ def test_state_is_the_row_of_estimate_with_its_age(tmp_path: Path) -> None:
         assert [row["tx"], row["ty"], row["tz"]] == poses.t[0].tolist()
         assert row["sz"] == float(poses.std[0, 2])
         assert row["nz"] == float(poses.noise_std[0, 2])
+
+
+def test_a_target_that_moves_leaves_and_comes_back_is_seen_as_in_single_frames(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Looked for near the last pose; covered, lost, or elsewhere, all over the frame."""
+    searches: list[int] = []
+    search = pipeline.find_coarse
+
+    def counted(*args: Any, **kwargs: Any) -> Any:
+        searches.append(1)
+        return search(*args, **kwargs)
+
+    monkeypatch.setattr(pipeline, "find_coarse", counted)
+    covered = picture(3)
+    covered[:180, :240] = 90
+    empty, far = np.full_like(covered, 110), picture(6, t=(14.0, -6.0, 155.0))
+    near, nearer = picture(2, t=(2.0, 1.0, 150.0)), picture(7, t=(13.0, -6.0, 155.0))
+    images = [picture(1), near, covered, empty, picture(4), far, nearer]
+    follows = Observer(CAMERA, TARGET)
+    whole = []
+    for number, image in enumerate(images):
+        shot = Shot(f"{number}", 0.0, image)
+        searches.clear()
+        row = follows.look(shot).row
+        whole.append(bool(searches))
+        alone = Observer(CAMERA, TARGET).look(shot).row
+        assert (row["status"], row["markers"]) == (alone["status"], alone["markers"])
+        for axis in "xyz" if row["tx"] is not None else "":
+            assert abs(row[f"t{axis}"] - alone[f"t{axis}"]) < 0.1 * alone[f"n{axis}"]
+    assert whole == [True, False, True, True, True, True, False]
+    follows.look(Shot("gap", 0.0, None, Fault(Status.UNREADABLE, "corrupt")))
+    searches.clear()
+    assert follows.look(Shot("again", 0.0, images[-1])).row["status"] == "ok"
+    assert not searches  # a frame that could not be read says nothing of where the target is
 
 
 def test_a_recording_is_estimated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

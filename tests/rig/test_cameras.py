@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,9 +16,10 @@ from numpy.typing import NDArray
 from torchpose.errors import ConfigError
 from torchpose.rig.cameras import Cameras
 from torchpose.rig.faults import CameraFault, CameraReason
-from torchpose.rig.settings import CameraSettings, load_rig
+from torchpose.rig.settings import CameraSettings, Rig, load_rig
 
-pytest.importorskip("pypylon.pylon", reason="pypylon is not installed (extra: rig)")
+pylon = pytest.importorskip("pypylon.pylon", reason="pypylon is not installed (extra: rig)")
+ROBOT = {"host": "192.0.2.1", "workspace": {"min": [0, 0, 0], "max": [1, 1, 1]}}
 
 SIZE = (64, 48)
 
@@ -206,3 +208,57 @@ def test_mistakes_in_a_rig_file(tmp_path: Path, text: str, words: list[str]) -> 
     assert "\n" not in message
     for word in words:
         assert word in message
+
+
+def test_cameras_on_one_line_are_triggered_at_once(tmp_path: Path) -> None:
+    pictures = Pictures(tmp_path)
+    follows = settings(name="right", nodes={"TriggerSource": "Line1"})
+    with Cameras([settings(name="left"), follows], pictures) as cameras:
+        first, second = cameras.grab(["left", "right"])
+        assert first.trigger_time_s == second.trigger_time_s
+        # its frame alone needs the camera that drives the line
+        (alone,) = cameras.grab(["right"])
+        np.testing.assert_array_equal(alone.image, pictures.shown["right"])
+        # one that fails has the others taken again: frames of one moment are of one time
+        driver(cameras, "right").ForceFailedBufferCount.Value = 1
+        driver(cameras, "right").ForceFailedBuffer.Execute()
+        first, second = cameras.grab(["left", "right"])
+        assert first.trigger_time_s == second.trigger_time_s
+        assert (first.attempts, second.failures) == (1, ("failed_buffer",))
+
+
+def test_one_action_command_triggers_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    nodes = {"TriggerSource": "Action1", "ActionDeviceKey": 7, "ActionGroupKey": 5, "ActionGroupMask": 1}
+    with Cameras([settings(name="left"), settings(name="right")]) as cameras:
+        sent: list[tuple[int, ...]] = []
+
+        class Command:
+            def __init__(self, *given: int) -> None:
+                self.given = given
+
+            def IssueNoWait(self) -> None:
+                sent.append(self.given)
+                for name in ("left", "right"):  # what the network does
+                    driver(cameras, name).ExecuteSoftwareTrigger()
+
+        monkeypatch.setattr(pylon.GigETransportLayer, "ActionCommand", Command)
+        for name, camera in cameras._open.items():  # as if these were cameras on a network
+            camera.settings, camera.emulated = settings(name=name, nodes=nodes), False
+        first, second = cameras.grab(["left", "right"])
+    assert sent == [(7, 5, pylon.AllGroupMask)]
+    assert first.trigger_time_s == second.trigger_time_s
+
+
+@pytest.mark.parametrize(
+    ("sources", "message"),
+    [
+        (("Line1", "Line1"), "wait for a line that none of them drives (left, right)"),
+        (("Action1", "Action1"), "waits for an action command without ActionDeviceKey among its nodes"),
+    ],
+)
+def test_triggers_that_nobody_sends_are_refused(sources: tuple[str, str], message: str) -> None:
+    names = ("left", "right")
+    size = {"width": SIZE[0], "height": SIZE[1], "exposure_us": 5000}
+    cameras = [{**size, "name": n, "nodes": {"TriggerSource": s}} for n, s in zip(names, sources, strict=True)]
+    with pytest.raises(ValueError, match=re.escape(message)):
+        Rig.model_validate({"robot": ROBOT, "cameras": cameras})

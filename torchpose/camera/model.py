@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from copy import copy
@@ -12,7 +13,6 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from torchpose.camera.fold import polynomial_fold, rational_fold
 from torchpose.camera.tone import Tone
@@ -27,6 +27,7 @@ Model = Literal["brown_conrady", "kannala_brandt"]
 # of normalised coordinates: a step of less leaves an error of its own square, about, which one more step squares again
 _LAST_STEP = 1e-6
 _MAX_ITERATIONS = 60
+_NEAR = 1e-2  # of the root of the rounding: a step of Newton's from there is exact to rounding (derived: it squares)
 # the tensors of a camera and what files call them
 _FIELDS = {
     "matrix": "camera_matrix",
@@ -299,7 +300,7 @@ class Camera:
         eps = torch.finfo(u.dtype).eps
         limit = self.fold_radius
         radius = torch.hypot(u, v)
-        scale = 1 + radius
+        near = _NEAR * math.sqrt(eps) * (1 + radius)
         inside = (0.99 * limit / radius.clamp_min(eps)).clamp_max(1)
         x, y = inside * u, inside * v
         x_distorted, y_distorted, *jacobian = self._warp(x, y)
@@ -307,7 +308,7 @@ class Camera:
         error = torch.hypot(ex, ey)
         fraction = torch.ones_like(error)
         for _ in range(_MAX_ITERATIONS):
-            if bool(((error <= 4 * eps * scale) | ~error.isfinite() | (fraction < 1e-6)).all()):
+            if bool(((error <= near) | ~error.isfinite() | (fraction < 1e-6)).all()):
                 break
             dx, dy = _newton_step(ex, ey, *jacobian)
             x_trial, y_trial = x - fraction * dx, y - fraction * dy
@@ -320,7 +321,7 @@ class Camera:
             x, y, ex, ey, error, *jacobian = (torch.where(better, b, a) for a, b in zip(old, new, strict=True))
             fraction = torch.where(better, 1.0, 0.5 * fraction)
         j_xx, j_xy, j_yy = jacobian
-        valid = (error <= 1e4 * eps * scale) & (j_xx * j_yy - j_xy * j_xy > 0)
+        valid = (error <= near.clamp_min(1e4 * eps)) & (j_xx * j_yy - j_xy * j_xy > 0)
         return torch.where(valid, x, torch.nan), torch.where(valid, y, torch.nan)
 
     def _intrinsics(self, like: Tensor) -> tuple[Tensor, Tensor]:
@@ -329,7 +330,7 @@ class Camera:
 
     def _warp(self, x: Tensor, y: Tensor, *, slopes: bool = True) -> tuple[Tensor, ...]:
         """Distorted normalised x, y; with ``slopes`` the xx, xy, yy of the Jacobian, symmetric in both models."""
-        r2 = x * x + y * y
+        r2 = torch.addcmul(x * x, y, y)
         if self.model == "kannala_brandt":
             k1, k2, k3, k4 = self.distortion.to(x).unbind()
             small = r2 < 1e-6
@@ -345,26 +346,40 @@ class Camera:
             slope = torch.where(small, 2 * (k1 - 1 / 3) + r2 * (4 * k2 - 4 * k1 + 0.8), (growth - s) / r2_safe)
             return s * x, s * y, s + slope * x * x, slope * x * y, s + slope * y * y
         d = self.distortion.to(x)
-        k1, k2, p1, p2, k3, k4, k5, k6 = pad(d, (0, 8 - len(d))).unbind()
-        s = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        if rational := len(d) == 8:
-            denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        if not len(d):
+            one = torch.ones_like(x)
+            return (x, y, one, torch.zeros_like(x), one) if slopes else (x, y)
+        k1, k2, p1, p2, *more = d.unbind()
+        along, below = [k1, k2, *more[:1]], more[1:]
+        twice = [*(2 * (power + 1) * k for power, k in enumerate(along))] if slopes else []
+        s = 1 + r2 * _polynomial(r2, along)
+        if below:
+            denominator = 1 + r2 * _polynomial(r2, below)
             s = s / denominator
         # 2 (p1 y + p2 x) x + p2 r^2 is OpenCV's 2 p1 x y + p2 (r^2 + 2 x^2)
-        shear = 2 * (p2 * x + p1 * y)
-        s_tangential = s + shear
-        bent = s_tangential * x + p2 * r2, s_tangential * y + p1 * r2
+        px, py = 2 * p2 * x, 2 * p1 * y
+        s_tangential = s + (px + py)
+        bent = torch.addcmul(s_tangential * x, r2, p2), torch.addcmul(s_tangential * y, r2, p1)
         if not slopes:
             return bent
-        slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
-        if rational:
-            slope = (slope - 2 * s * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / denominator
+        slope = _polynomial(r2, twice)
+        if below:
+            slope = (slope - s * _polynomial(r2, [2 * (power + 1) * k for power, k in enumerate(below)])) / denominator
+        sx = slope * x
         return (
             *bent,
-            s_tangential + slope * x * x + 4 * p2 * x,
-            slope * x * y + 2 * (p1 * x + p2 * y),
-            s_tangential + slope * y * y + 4 * p1 * y,
+            torch.addcmul(s_tangential + 2 * px, sx, x),
+            torch.addcmul(2 * (p1 * x + p2 * y), sx, y),
+            torch.addcmul(s_tangential + 2 * py, slope * y, y),
         )
+
+
+def _polynomial(at: Tensor, coefficients: Sequence[Tensor]) -> Tensor:
+    """c0 + c1 at + c2 at^2 + ... (Horner)."""
+    value = coefficients[-1]
+    for c in reversed(coefficients[:-1]):
+        value = torch.addcmul(c, at, value)
+    return value
 
 
 def _check_covariance(covariance: Tensor, coefficients: int) -> None:

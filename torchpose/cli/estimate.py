@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypedDict
@@ -73,6 +73,10 @@ _INPUTS = (
 _JUDGED = 16  # frames that the tone is judged by
 _RESUME = "Keep the frames that an earlier run finished and do the rest."
 _DEVICE = "Where the frames are worked on; with cuda, --threads decode for it."
+_TRACK = (
+    "The frames of a folder, film or manifest follow each other: look for targets near their last pose first. The same "
+    "results, sooner where much else is in sight."
+)
 _DETECTIONS = "Table of the markers found: .csv, .jsonl or .parquet."
 
 
@@ -88,6 +92,7 @@ def estimate(
     instances: Instances = None,
     assume_upright: Upright = None,
     resume: Annotated[bool, typer.Option("--resume", help=_RESUME)] = False,
+    track: Annotated[bool, typer.Option("--track", help=_TRACK)] = False,
     hand_eye: HandEyeFile = None,
     relative_to: RelativeTo = None,
     method: LastStage = None,
@@ -123,14 +128,12 @@ def estimate(
     stated = settings([*places, *listed], **options, tone="srgb" if srgb and tone is None else tone)
     how: _How = {"resume": resume, "batch": batch, "threads": threads or cores(), "quiet": quiet, "told": stated.told}
     if cameras is not None:
-        other = {"--device": device != "cpu"}
-        check_several(
-            camera, {"-d": detections, "--overlay": overlay, "--engine ray": on_ray, "-f": files_from, **other}
-        )
+        other = {"--device": device != "cpu", "--track": track, "--engine ray": on_ray}
+        check_several(camera, {"-f": files_from, **other})
         rest, several = partial(estimation, stated), {**how, "tone": stated["tone"]}
-        return estimate_moments(cameras, places, rest, tables.out, several)
+        return estimate_moments(cameras, places, rest, (tables.out, tables.detections, overlay), several)
     sources = frames_of(places, listed)
-    work = estimation(stated, sources)
+    work = _check_track(replace(estimation(stated, sources), track=track), tables, on_ray=on_ray)
     check_outputs([*places, *listed], sources, tables.paths, overlay)
     with native_stderr_silenced():
         if on_ray:
@@ -229,14 +232,23 @@ def _check_shared(sources: Sequence[Source]) -> None:
         )
 
 
+def _check_track(work: Estimation, tables: _Tables, *, on_ray: bool) -> Estimation:
+    """The same work. ConfigError: it tracks, and has options that do not go with it."""
+    from torchpose.io.stream import is_standard
+
+    options = {"--engine ray": on_ray, "--instances": work.instances > 1}
+    options["--out -"] = isinstance(tables.out, Path) and is_standard(tables.out)  # rows of several stretches mix
+    for option in [option for option, given in options.items() if given and work.track]:
+        raise ConfigError(f"--track: cannot be combined with {option}; leave one of them out")
+    return work
+
+
 def with_judged_tone(lens: Camera, target: Target, sources: Sequence[Source]) -> Camera:
     """The camera with the tone that the frames tell, where their kind of file makes one likely; says what it took."""
     from torchpose.io.images import UnreadableImageError, WrongSizeError
 
     if not sources or not sources[0].likely_encoded():
         return lens
-    from dataclasses import replace
-
     import numpy as np
     import torch
 
@@ -282,9 +294,8 @@ def _run(
 ) -> int:
     """Estimates what is not done yet and writes the tables; returns the exit code."""
     from torchpose.cli.terminal import FrameProgress
-    from torchpose.io.estimates import estimated
+    from torchpose.io.estimates import estimated, tracked
     from torchpose.io.processes import Crew
-    from torchpose.io.reader import default_batch, in_batches
     from torchpose.io.staged import Staged
     from torchpose.io.storage import REQUESTS
     from torchpose.io.stream import StreamedRows
@@ -295,14 +306,14 @@ def _run(
     staged = Staged(tables.out, tables.detections, resume=resume)
     store = _opened(work, sources, staged.out, staged.detections, resume)
     # a resumed run works on the same batches as one that was not interrupted, so that rows agree to the last bit
-    batches = in_batches(sources, batch or default_batch(work.camera.width, work.camera.height))
-    pending = [one for one in batches if any(source.name not in store for source in one)]
+    pending = [one for one in _batches(work, sources, batch) if any(source.name not in store for source in one)]
     # a single process decodes ahead with all threads, several do so with one each, or more that wait for a store;
     # neither a GPU nor an open film, whose decoder has threads of its own, can be shared with processes
     stored = any(not isinstance(source.path, Path) for source in sources)
     processes = threads if device == "cpu" and all(source.film is None for source in sources) else 1
     decoding = max(threads if min(processes, len(pending)) < 2 else 1, REQUESTS if stored else 1)
-    job = partial(estimated, work, estimator, None if painter is None else painter.write, decoding)
+    paint = None if painter is None else painter.write
+    job = partial(tracked if work.track else estimated, work, estimator, paint, decoding)
     try:
         with (
             Crew(job, pending, processes, let_go=store.close, fresh=stored) as crew,
@@ -327,6 +338,16 @@ def _run(
         lost = f"{store.damaged} damaged lines of {staged.out}.partial left out, their frames done again"
         say(f"torchpose: {lost}", err=True)
     return _told(store.tally, work, len(sources), quiet=quiet, told=told)
+
+
+def _batches(work: Estimation, sources: Sequence[Source], batch: int | None) -> Sequence[Any]:
+    """What is worked on at a time: batches of frames, or of frames that follow others."""
+    from torchpose.io.lanes import in_lanes
+    from torchpose.io.reader import default_batch, in_batches
+
+    return (in_lanes if work.track else in_batches)(
+        sources, batch or default_batch(work.camera.width, work.camera.height)
+    )
 
 
 def _run_on_ray(

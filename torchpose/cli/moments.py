@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,11 +11,15 @@ from torchpose.cli.common import check_outputs, ended, interrupted, read_tone, s
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from torchpose.camera import Camera
     from torchpose.io.estimates import Estimation
-    from torchpose.io.moments import Moment, RigEstimation
+    from torchpose.io.moments import Moment, Paint, RigEstimation
     from torchpose.io.sources import Source
     from torchpose.io.storage import Place
+    from torchpose.io.tally import Tally
+    from torchpose.results import Poses
 
 
 def check_several(camera: str | None, options: dict[str, Any]) -> None:
@@ -31,7 +35,7 @@ def estimate_moments(
     cameras: Path,
     inputs: list[Path | Place],
     rest: Callable[[list[Source], Camera], Estimation],
-    out: Path | Place,
+    out: tuple[Path | Place, Path | Place | None, Path | None],
     options: dict[str, Any],
 ) -> int:
     """Estimates what is not done yet and writes the table; returns the exit code.
@@ -40,7 +44,7 @@ def estimate_moments(
         cameras: file of the rig.
         inputs: of the command: one folder, or one manifest.
         rest: what the rows depend on besides, by a picture of every moment and the first camera.
-        out: table of the poses.
+        out: table of the poses, that of the markers, and the folder for pictures of what was found.
         options: ``tone``, ``resume``, ``batch``, ``threads``, ``quiet`` and ``told`` of the command.
     """
     from torchpose.camera import CameraRig
@@ -50,7 +54,10 @@ def estimate_moments(
 
     if len(inputs) != 1:
         raise ConfigError("INPUT: with --cameras there is one; give the folder of all cameras")
-    if not isinstance(inputs[0], Path) or not isinstance(out, Path) or is_standard(out):
+    poses, marks, overlay = out
+    tables = [table for table in (poses, marks) if table is not None]
+    here = [table for table in tables if isinstance(table, Path) and not is_standard(table)]
+    if not isinstance(inputs[0], Path) or len(here) < len(tables):
         raise ConfigError("--cameras: reads and writes files of this machine; copy the pictures here, and name a file")
     rig = CameraRig.load(cameras)
     if (tone := read_tone(options["tone"])) is not None:
@@ -61,19 +68,38 @@ def estimate_moments(
     if work.rest.instances > 1:
         raise ConfigError("--instances: several cameras look for one copy; leave it out with --cameras")
     sources = [source for moment in moments for source in moment.sources if source is not None]
-    check_outputs(inputs, sources, [out], None)
+    check_outputs(inputs, sources, here, overlay)
+    paint = None if overlay is None else _painter(work, overlay)
     with native_stderr_silenced():
-        return _run(work, moments, out, options)
+        return _run(work, moments, here, paint, options)
 
 
-def _run(work: RigEstimation, moments: list[Moment], out: Path, options: dict[str, Any]) -> int:
+def _painter(work: RigEstimation, folder: Path) -> Paint:
+    """Writes pictures of what every camera found below a folder of its name."""
+    from torchpose.report.overlay import Overlay
+
+    rig, targets = work.rig, work.rest.targets
+    places = zip(rig.cameras, rig.names, rig.R, rig.t, strict=True)
+    painters = [Overlay(lens, targets, folder / name, place=(R, t)) for lens, name, R, t in places]
+
+    def paint(frames: Sequence[Tensor], seen: Tensor, poses: Poses, names: list[str]) -> None:
+        found = poses.detections
+        for number, painter in enumerate(painters):
+            own = replace(poses, detections=found[found.camera == number])
+            painter.write(frames[number], own, names, seen[number].tolist())
+
+    return paint
+
+
+def _run(
+    work: RigEstimation, moments: list[Moment], tables: list[Path], paint: Paint | None, options: dict[str, Any]
+) -> int:
     import cv2
     import torch
 
     from torchpose.cli.terminal import FrameProgress
-    from torchpose.io.moments import MomentReader, batches_of
+    from torchpose.io.moments import MomentReader, MomentStore, batches_of
     from torchpose.io.reader import default_batch
-    from torchpose.io.store import ResultStore
     from torchpose.results import Status
 
     cv2.setNumThreads(1)
@@ -81,12 +107,13 @@ def _run(work: RigEstimation, moments: list[Moment], out: Path, options: dict[st
     use_threads(options["threads"], share=0.5)
     estimator = work.estimator()
     roots = sorted({str(s.root) for moment in moments for s in moment.sources if s is not None})
-    store = ResultStore(
+    out, marks = tables[0], tables[1] if len(tables) > 1 else None
+    store = MomentStore(
         out,
-        None,
+        marks,
         schema=work.schema,
         targets=len(work.rest.rows_of),
-        origin=work.origin(roots),
+        origin=work.origin(roots, detections=marks is not None),
         resume=options["resume"],
         files={moment.name: moment.stamp for moment in moments},
     )
@@ -98,7 +125,7 @@ def _run(work: RigEstimation, moments: list[Moment], out: Path, options: dict[st
     try:
         with FrameProgress(len(moments), len(store), quiet=options["quiet"]) as progress, torch.inference_mode():
             for pictures in MomentReader(pending, work.rig, threads=options["threads"]):
-                new = [record for record in work.records(pictures, estimator) if record["frame"] not in store]
+                new = [record for record in work.records(pictures, estimator, paint) if record["frame"] not in store]
                 for number, camera, status, reason in pictures.faults:
                     kind = unreadable if status == Status.UNREADABLE else other
                     kind[f"{work.rig.names[camera]}/{pictures.moments[number].name}"] = reason
@@ -118,12 +145,22 @@ def _run(work: RigEstimation, moments: list[Moment], out: Path, options: dict[st
     if not options["quiet"]:
         if options["told"]:
             say(f"torchpose: {options['told']}", err=True)
-        _tell_disagreement(store.tally.disagree, work)
+        _tell_disagreement(store.tally, work)
     return ended(unreadable)
 
 
-def _tell_disagreement(count: int, work: RigEstimation) -> None:
-    """Tells, on stderr, of moments whose cameras contradict each other."""
+def _tell_disagreement(tally: Tally, work: RigEstimation) -> None:
+    """Tells, on stderr, of moments whose cameras contradict each other, and of a run whose cameras do by little."""
+    from torchpose.geometry.robust import CUT, quantile
+
+    count = tally.disagree
+    if tally.compared and tally.surprise > quantile(2.0 * tally.compared, CUT):
+        say(
+            f"torchpose: the cameras contradict each other by more than chance over {tally.compared} ok rows (column "
+            "consistency, 1 in the mean where they do not), too little in each to reject it; s* counts that: calibrate "
+            "the rig again",
+            err=True,
+        )
     if not count:
         return
     stated = "" if work.rig.covariance is not None else ", or state extrinsics_covariance, which --cameras does not"

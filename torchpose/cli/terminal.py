@@ -1,19 +1,18 @@
 """What a command shows on stderr while it runs. Nothing unless stderr is a terminal."""
 
+from __future__ import annotations
+
 import contextlib
 import os
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, Self
-
-from rich import box
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
-from rich.table import Table
-from rich.text import Text
+from typing import TYPE_CHECKING, Any, Self
 
 from torchpose.errors import printable
+
+if TYPE_CHECKING:  # imported where something is shown: rich takes a twentieth of a second
+    from rich.console import Console
 
 STATUS_STYLE = {"ok": "green", "ambiguous": "yellow"}  # all others are red
 
@@ -21,17 +20,34 @@ STATUS_STYLE = {"ok": "green", "ambiguous": "yellow"}  # all others are red
 class _Bar:
     """A bar on stderr of a terminal, gone when the block ends."""
 
-    def __init__(self, columns: Sequence[str | ProgressColumn], *, quiet: bool) -> None:
+    def __init__(self, *, quiet: bool) -> None:
+        self._progress: Any = None
+        if quiet or not _may_be_terminal():
+            return
+        from rich.console import Console
+        from rich.progress import Progress
+
         self._console = Console(stderr=True)
-        self._shown = self._console.is_terminal and not quiet
-        self._progress = Progress(*columns, console=self._console, disable=not self._shown, transient=True)
+        if self._console.is_terminal:
+            self._progress = Progress(*self._columns(), console=self._console, transient=True)
+
+    def _columns(self) -> tuple[Any, ...]:
+        raise NotImplementedError
 
     def __enter__(self) -> Self:
-        self._progress.start()
+        if self._progress is not None:
+            self._progress.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._progress.stop()
+        if self._progress is not None:
+            self._progress.stop()
+
+
+def _may_be_terminal() -> bool:
+    """Whether stderr is one, or the environment may want it to be taken for one."""
+    wanted = any(name in os.environ for name in ("FORCE_COLOR", "TTY_COMPATIBLE"))
+    return sys.stderr is not None and (wanted or sys.stderr.isatty())
 
 
 class FrameProgress(_Bar):
@@ -44,21 +60,31 @@ class FrameProgress(_Bar):
     """
 
     def __init__(self, total: int, done: int, *, quiet: bool) -> None:
+        super().__init__(quiet=quiet)
+        if self._progress is not None:
+            self._task = self._progress.add_task("frames", total=total, completed=done, speed="", counts="")
+
+    def _columns(self) -> tuple[Any, ...]:
+        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+
         speed, counts = TextColumn("{task.fields[speed]}"), TextColumn("{task.fields[counts]}")
-        columns = (TextColumn("frames"), BarColumn(), MofNCompleteColumn(), speed, TimeRemainingColumn(), counts)
-        super().__init__(columns, quiet=quiet)
-        self._task = self._progress.add_task("frames", total=total, completed=done, speed="", counts="")
+        return TextColumn("frames"), BarColumn(), MofNCompleteColumn(), speed, TimeRemainingColumn(), counts
 
     def advance(self, frames: int, counts: Counter[str]) -> None:
         """Tells of ``frames`` more finished frames and of the rows so far by status."""
+        if self._progress is None:
+            return
         task = self._progress.tasks[0]
         speed = f"{task.speed:.1f} frames/s" if task.speed else ""
         self._progress.update(self._task, advance=frames, speed=speed, counts="  ".join(_coloured(counts)))
 
     def summary(self, counts: Counter[str], out: object) -> None:
         """Shows the rows by status and where they are."""
-        if not self._shown:
+        if self._progress is None:
             return
+        from rich.table import Table
+        from rich.text import Text
+
         table = Table("status", "rows", title=Text(printable(str(out))), title_justify="left")
         for status, count in counts.most_common():
             table.add_row(Text(status, STATUS_STYLE.get(status, "red")), str(count))
@@ -74,18 +100,29 @@ class StudyProgress(_Bar):
     """
 
     def __init__(self, names: list[str], *, quiet: bool) -> None:
-        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:.0f} %"))
-        super().__init__(columns, quiet=quiet)
+        super().__init__(quiet=quiet)
         self._names = names
-        self._task = self._progress.add_task("studies", total=len(names))
+        if self._progress is not None:
+            self._task = self._progress.add_task("studies", total=len(names))
+
+    def _columns(self) -> tuple[Any, ...]:
+        from rich.progress import BarColumn, TextColumn
+
+        return TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:.0f} %")
 
     def advance(self, name: str, done: float) -> None:
         """Tells that ``done``, 0 to 1, of the study ``name`` is finished."""
-        self._progress.update(self._task, description=name, completed=self._names.index(name) + done)
+        if self._progress is not None:
+            self._progress.update(self._task, description=name, completed=self._names.index(name) + done)
 
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str | float | None]]) -> Console:
     """Prints a table, its numbers with three digits; the console, for what comes below."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
     console = Console(width=max(Console().width, 100))  # a pipe counts as 80 columns, which would cut the numbers
     # as text: names in brackets are no markup
     table = Table(box=box.SIMPLE_HEAD, title=Text(printable(title)))
@@ -97,12 +134,6 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str 
         )
     console.print(table)
     return console
-
-
-def _cell(value: str | float | None) -> Text:
-    if isinstance(value, str):
-        return Text(printable(value))
-    return Text("-" if value is None or value != value else f"{value:.3g}")
 
 
 def _coloured(counts: Counter[str]) -> list[str]:

@@ -123,7 +123,6 @@ def find_coarse(
     *,
     wanted: Wanted = ANYTHING,
     float_range: float | None = None,
-    among: int | None = None,
 ) -> Candidates:
     """What `find_candidates` finds at the coarser of its scales, at a fraction of its cost, and without its exclusion.
 
@@ -134,7 +133,6 @@ def find_coarse(
         factor: likewise, of the finer scale.
         wanted: likewise.
         float_range: likewise.
-        among: pixels of the frames that these are windows of: the ellipses that might have been tried are theirs.
     """
     frames = levels(as_frames(frames), float_range)
     _expect_factor(factor)
@@ -142,10 +140,6 @@ def find_coarse(
     reduced = area_reduce(area_reduce(frames, factor), 2, exact=True)
     found = accepted(find_ellipses(gradient(reduced), wanted.reduced(2 * factor)))
     found = replace(found, ellipse=conics.rescaled(found.ellipse, 2 * factor))
-    if among is not None:
-        more = 2.5 * math.log10(among / (frames.shape[-2] * frames.shape[-1]))
-        found = replace(found, log10_nfa=found.log10_nfa + more)
-        found = found[found.log10_nfa < 0]
     return found[wanted.admits(found)]
 
 

@@ -28,6 +28,10 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
     """The function, with its arguments checked. What torch compiles or traces is not: there are no numbers to check."""
     parameters, annotations = signature(function), dict(function.__annotations__)
     hints: dict[str, Any] = {}
+    every = parameters.parameters.values()
+    positional = [p.name for p in every if p.kind is p.POSITIONAL_OR_KEYWORD]
+    known = {p.name for p in every if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
+    needed = {p.name for p in every if p.default is p.empty and p.name in known}
 
     @functools.wraps(function)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> T:
@@ -36,6 +40,10 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
             return inner(*args, **kwargs)
         if not hints:
             hints.update({name: _resolved(hint, function) for name, hint in annotations.items()})
+        named = {**dict(zip(positional, args, strict=False)), **kwargs}
+        # as `bind` does it, in a tenth of the time
+        if len(named) == len(args) + len(kwargs) and needed <= named.keys() <= known:
+            return inner(**checked_values(named, hints))
         try:
             bound = parameters.bind(*args, **kwargs)
         except TypeError as error:

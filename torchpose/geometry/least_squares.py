@@ -230,14 +230,14 @@ class Normal(Rows):
         inner = part.information if damping is None else _damped(part.information, damping[owner])
         columns = [part.mixed.mT, part.right[..., None], *([_eye_like(inner)] if variances else [])]
         by_own, alone, inverse = solve_scaled(inner, torch.cat(columns, -1)).tensor_split([n, n + 1], -1)
-        information = information - segment_sum(part.mixed @ by_own, owner, len(self))
-        right = right - segment_sum((part.mixed @ alone).squeeze(-1), owner, len(self))
+        taken = segment_sum(torch.bmm(part.mixed, torch.cat([by_own, alone], -1)), owner, len(self))
+        information, right = information - taken[..., :-1], right - taken[..., -1]
         columns = [right[..., None], *([_eye_like(information)] if variances else [])]
         own, covariance = solve_scaled(information, torch.cat(columns, -1)).tensor_split([1], -1)
-        rest = (alone - by_own @ own[owner]).squeeze(-1)
+        rest = torch.baddbmm(alone, by_own, own[owner], alpha=-1).squeeze(-1)
         own = own.squeeze(-1)
         if variances:
-            variance = inverse.diagonal(dim1=-2, dim2=-1) + ((by_own @ covariance[owner]) * by_own).sum(-1)
+            variance = inverse.diagonal(dim1=-2, dim2=-1) + (torch.bmm(by_own, covariance[owner]) * by_own).sum(-1)
         return Step(own, rest, information, (own * right).sum(-1), variance if variances else rest[:0])
 
     def promised(self, step: Step, damping: Tensor | None = None) -> Tensor:

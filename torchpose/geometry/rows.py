@@ -5,11 +5,15 @@ moving to a device. A field may be a tensor, other rows, a tuple of these, or No
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import MISSING, field, fields, replace
+from dataclasses import MISSING, field, fields
+from functools import cache
 from typing import Any, Self
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from torchpose.geometry.segments import positions
 
 
 def shared(default: Any = MISSING) -> Any:
@@ -21,11 +25,18 @@ class Rows:
     """Base of frozen dataclasses of tensors that share their first dimension; the first field has it for certain."""
 
     def __len__(self) -> int:
-        return len(getattr(self, fields(self)[0].name))  # type: ignore[arg-type]
+        return len(getattr(self, _fields(type(self))[0][0]))  # type: ignore[arg-type]  # classes are hashable
 
     def __getitem__(self, index: Any) -> Self:
         """The rows selected by a mask, a slice or an index tensor."""
+        count = len(self)
+        if isinstance(index, Tensor) and (rows := _rows(index, count)) is not None:
+            return self if _all_of(rows, count) else self._at(rows)
         return self._each(lambda value: value[index])
+
+    def _at(self, rows: Tensor) -> Self:
+        """As `self[rows]`, (K,) int64 from 0, in a third of the time for each field."""
+        return self._each(lambda value: value._at(rows) if isinstance(value, Rows) else value.index_select(0, rows))
 
     @classmethod
     def cat(cls, parts: Sequence[Self]) -> Self:
@@ -69,20 +80,43 @@ class Rows:
     def _each(self, change: Callable[..., Any], *others: Self, with_shared: bool = False) -> Self:
         """These rows with every field changed, given the same field of the others."""
         changed = {}
-        for f in fields(self):  # type: ignore[arg-type]
-            values = [getattr(rows, f.name) for rows in (self, *others)]
-            if f.metadata.get("shared") and not with_shared:
-                if not all(_same(value, values[0]) for value in values):
-                    raise ValueError(
-                        f"{type(self).__name__}.{f.name} belongs to all rows and differs between the parts"
-                    )
-            elif isinstance(values[0], tuple) and all(isinstance(item, (Tensor, Rows)) for item in values[0]):
-                changed[f.name] = tuple(change(*items) for items in zip(*values, strict=True))
-            elif isinstance(values[0], (Tensor, Rows)):
-                changed[f.name] = change(*values)
-            elif values[0] is not None and not f.metadata.get("shared"):
-                raise TypeError(f"{type(self).__name__}.{f.name} is no tensor and no rows; mark it as shared")
-        return replace(self, **changed)  # type: ignore[type-var]
+        for name, common in _fields(type(self)):  # type: ignore[arg-type]
+            values = [getattr(rows, name) for rows in (self, *others)]
+            changed[name] = first = values[0]
+            if common and not with_shared:
+                if not all(_same(value, first) for value in values):
+                    raise ValueError(f"{type(self).__name__}.{name} belongs to all rows and differs between the parts")
+            elif isinstance(first, (Tensor, Rows)):
+                changed[name] = change(*values)
+            elif isinstance(first, tuple) and all(isinstance(item, (Tensor, Rows)) for item in first):
+                changed[name] = tuple(change(*items) for items in zip(*values, strict=True))
+            elif first is not None and not common:
+                raise TypeError(f"{type(self).__name__}.{name} is no tensor and no rows; mark it as shared")
+        # rows are made of rows some hundred times a frame: without the frozen class's own way, which takes most of it
+        made = object.__new__(type(self))
+        made.__dict__.update(changed)
+        return made
+
+
+@cache
+def _fields(kind: type) -> tuple[tuple[str, bool], ...]:
+    """Names of the fields of such rows, and whether each belongs to all rows."""
+    return tuple((f.name, bool(f.metadata.get("shared"))) for f in fields(kind))
+
+
+def _rows(index: Tensor, count: int) -> Tensor | None:
+    """The rows that a mask or index means, of ``count``; None for what is neither, or goes by torch's own rules."""
+    if index.ndim != 1:
+        return None
+    if index.dtype == torch.bool:  # where it is True is asked once, not for every field
+        return positions(index) if len(index) == count else None
+    known = index.dtype == torch.int64 and index.device.type == "cpu"
+    return index if known and (index.numel() == 0 or index.numpy().min() >= 0) else None
+
+
+def _all_of(rows: Tensor, count: int) -> bool:
+    """Whether these are all of ``count`` rows in their order: of few frames every row is often right."""
+    return len(rows) == count and rows.device.type == "cpu" and bool((rows.numpy() == np.arange(count)).all())
 
 
 def _same(a: Any, b: Any) -> bool:

@@ -2,8 +2,8 @@
 
 Each ring's ellipse gives two poses of its plane. In such a plane another marker lies on a circle about the ring, and
 only rings of its code near the image of that circle, of the size and in the place that the layout predicts, are paired
-with it. Both searches look into a small part of the image (`segments.near_pairs`), and a ring keeps the best few partners of
-each code: the cost grows with the number of rings, not with its square.
+with it. Both searches look into a small part of the image (`segments.near_pairs`), and a ring keeps the best few
+partners of each code: the cost grows with the number of rings, not with its square.
 """
 
 from typing import NamedTuple, Self

@@ -1,63 +1,118 @@
-"""Stage: candidates where the last poses put the rings, for sequences; the rest of the frames is not looked at.
+"""Stage: where the rings of a sequence are by its last poses, without a search: candidates that are measured at once.
 
-Each marker gets a window, as wide as its ring and what it may have moved since. The windows are searched as frames of
-their own, on the pixels that the whole frame would be reduced to: the same ellipses come out, at the cost of the rings
-instead of that of all that is in sight.
+Edges are looked for within a few pixels, and targets move by more. So each marker is drawn as the last pose shows it,
+and found again by correlation within what it may have moved; the shifts of a target's markers correct its pose by one
+step. What is measured where the pose then puts the rings is named by its code as any ring is: a ring that is another
+one, or none, makes no pose.
 """
 
-from dataclasses import replace
+import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchpose.camera import Camera
-from torchpose.detect import Candidates, Wanted, find_coarse, merge_duplicates, reduction_factor
+from torchpose.detect import Candidates
+from torchpose.geometry import conics, rotations
 from torchpose.geometry.arguments import checked
+from torchpose.geometry.least_squares import solve_scaled
+from torchpose.geometry.projection import by_pose, image_by_point
+from torchpose.geometry.segments import segment_sum, values_at
 from torchpose.identify.scene import Scene
+from torchpose.identify.second_look import predicted
 
 MOST_MOVE = 20.0  # px between two frames (convention): 0.1 m/s at 1 m, 50 frames/s and a 12 mm lens
-_OBLIQUE = 1.2  # of a ring's semi-axis f r / z: perspective and distortion within the ring (convention)
-_GROUND = 6  # coarse pixels beside a ring: its edge, and ground to tell the noise from
+_AROUND = 1.25  # of the outer circle: the ground that belongs to its picture (convention)
+_ACROSS = 3  # cells across the ring, or its hole, at which it is still told from a disc (convention)
+_TURN = 0.1  # rad between two frames, as a deviation: what shifts of centres hardly tell stays as it was (convention)
+
+
+class _Places(NamedTuple):
+    """P markers in view: row and number (P,), outer and inner ellipse (P, 2, 5) in pixels of the frame."""
+
+    row: Tensor
+    marker: Tensor
+    raw: Tensor
 
 
 @checked
-def find_near(scene: Scene, R: Tensor, t: Tensor, wanted: Wanted) -> Candidates | None:
-    """What `detect.find_coarse` would find near the markers; None where looking at all of the frames costs less.
+def find_near(scene: Scene, R: Tensor, t: Tensor) -> tuple[Candidates, Tensor] | None:
+    """Outer circles where the markers must be, and the inner ellipses (M, 5); None where no pose is known.
 
     Args:
         scene: a row for every frame and target.
         R: (N, 3, 3), the last pose of each row, NaN where it is not known.
         t: (N, 3), the same, mm.
-        wanted: as for `detect.find_coarse`.
     """
-    height, width = scene.frames.shape[-2:]
-    factor = reduction_factor(height, width)
-    grid = 2 * factor  # corners on it, so that windows are reduced as their frames are
-    row, middle, radius = _places(scene, R, t)
-    if row.numel() == 0:
+    last = _places(scene, R, t)
+    if last.row.numel() == 0:
         return None
-    half = _OBLIQUE * radius.amax() + MOST_MOVE + _GROUND * grid
-    side = grid * int((2 * half / grid).ceil())
-    if side > min(height, width) - grid or row.numel() * side**2 > len(scene.frames) * height * width:
+    shift = _shifts(scene, last)
+    if shift is None:
         return None
-    most = (middle.new_tensor([width, height]) - side) / grid
-    corner = (((middle - 0.5 * side) / grid).round().clamp_min(0).minimum(most.floor()) * grid).long()
-    frame, along = scene.frame[row], torch.arange(side, device=middle.device)
-    x, y = (corner[:, axis, None] + along for axis in range(2))
-    windows = scene.frames[frame[:, None, None], y[:, :, None], x[:, None]]
-    found = find_coarse(windows, factor, wanted=wanted, float_range=255.0, among=height * width)
-    ellipse = torch.cat([found.ellipse[:, :2] + corner[found.frame], found.ellipse[:, 2:]], -1)
-    return merge_duplicates(replace(found, frame=frame[found.frame], ellipse=ellipse))
+    now = _places(scene, *_corrected(scene, R, t, last, shift))
+    polarity = scene.table.polarity[scene.target][now.row]
+    return Candidates.unscored(scene.frame[now.row], now.raw[:, 0], polarity), now.raw[:, 1]
 
 
-def _places(scene: Scene, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Row (P,), middle (P, 2) px and semi-axis (P,) px of every ring that the poses put into the frames."""
-    camera: Camera = scene.camera
-    markers = scene.table[scene.target]
-    center = markers.centers @ R.mT + t[:, None]
-    pixel = camera.project(center)
-    limit = pixel.new_tensor([camera.width, camera.height])
-    seen = markers.valid & ((pixel > 0) & (pixel < limit)).all(-1)  # NaN is not
-    row, marker = seen.nonzero().unbind(-1)
-    focal = camera.matrix.diagonal()[:2].amax()
-    return row, pixel[row, marker], focal * markers.radii[row, marker, 0] / center[row, marker, 2]
+def _places(scene: Scene, R: Tensor, t: Tensor) -> _Places:
+    markers, camera = scene.table[scene.target], scene.camera
+    row, marker = (markers.valid & t.isfinite().all(1)[:, None]).nonzero().unbind(-1)
+    _, raw, depth = predicted(markers, camera, R[row], t[row], (row, marker))
+    outer, limit = raw[:, 0], raw.new_tensor([camera.width - 1, camera.height - 1])
+    seen = ((outer[:, :2] > 0) & (outer[:, :2] < limit)).all(-1) & (outer[:, 2] < limit.amin()) & (depth > 0)
+    seen &= raw.isfinite().flatten(1).all(1)
+    return _Places(row[seen], marker[seen], raw[seen])
+
+
+def _shifts(scene: Scene, at: _Places) -> Tensor | None:
+    """By how many px (P, 2) each marker has moved; None where the frame is too small to look so far."""
+    frames = scene.frames
+    height, width = frames.shape[-2:]
+    outer, inner = at.raw.unbind(1)
+    cell = max(1, int(float(torch.minimum(outer[:, 3] - inner[:, 3], inner[:, 3]).amin()) / _ACROSS))
+    reach, span = math.ceil(_AROUND * float(outer[:, 2].amax()) / cell), math.ceil(MOST_MOVE / cell)
+    side = (2 * (reach + span) + 1) * cell
+    if side > min(height, width):
+        return None
+    limit = torch.tensor([width - side, height - side], device=frames.device)
+    corner = (outer[:, :2] - 0.5 * (side - 1)).round().long().clamp_min(0).minimum(limit)
+    along = torch.arange(side, device=frames.device)
+    first = (scene.frame[at.row] * height + corner[:, 1]) * width + corner[:, 0]
+    windows = values_at(frames, first[:, None, None] + along[:, None] * width + along)
+    cells = torch.nn.functional.avg_pool2d(windows[None].nan_to_num(nan=0.0), cell)
+    drawn = _drawn(at.raw, cell, reach) * scene.table.polarity[scene.target][at.row][:, None, None]
+    score = torch.nn.functional.conv2d(cells, drawn.to(cells)[:, None], groups=len(drawn))[0]
+    best = score.flatten(1).argmax(1)
+    count = score.shape[-1]
+    found = torch.stack([best % count, best // count], -1)
+    return corner + (found + reach) * cell + 0.5 * (cell - 1) - outer[:, :2]
+
+
+def _drawn(raw: Tensor, cell: int, reach: int) -> Tensor:
+    """Pictures (P, k, k) of dark rings: the mean grey around and inside of the ring less that on it, as weights."""
+    along = torch.arange(-reach, reach + 1, dtype=raw.dtype, device=raw.device) * cell
+    xy = torch.stack(torch.meshgrid(along, along, indexing="xy")).flatten(1)
+    offset = (raw[:, :, :2] - raw[:, :1, :2])[..., None]
+    rho = torch.linalg.vector_norm(torch.linalg.inv(conics.shape_matrix(raw)) @ (xy - offset), dim=2)  # (P, 2, k k)
+    # cells on a rim belong to both sides
+    steep = raw[:, :, 3:4] / cell
+    inside, hole = ((1 - rho) * steep + 0.5).clamp(0, 1).unbind(1)
+    around = ((_AROUND - rho[:, 0]) * steep[:, 0] + 0.5).clamp(0, 1) - inside
+    parts = torch.stack([0.5 * around, 0.5 * hole, hole - inside], 1)
+    share = parts / parts.sum(-1, keepdim=True).abs().clamp_min(1e-9) * parts.new_tensor([0.5, 0.5, 1.0])[:, None]
+    return share.sum(1).unflatten(1, (2 * reach + 1, -1))
+
+
+def _corrected(scene: Scene, R: Tensor, t: Tensor, at: _Places, shift: Tensor) -> tuple[Tensor, Tensor]:
+    """The poses after one step to where their markers have moved."""
+    row, focal = at.row, scene.camera.matrix.diagonal()[:2]
+    arm = (R[row] @ scene.table.centers[scene.target[row], at.marker][..., None]).squeeze(-1)
+    x = arm + t[row]
+    jacobian = by_pose(focal[:, None] * image_by_point(x[:, :2] / x[:, 2:], x[:, 2]), arm)
+    # shifts are good to a pixel; what they do not tell of is within what a target moves and turns by
+    move = (focal.mean() / (MOST_MOVE * t[:, 2:])).square().expand(-1, 3)
+    prior = torch.cat([move, torch.full_like(move, _TURN**-2)], 1)
+    information = segment_sum(jacobian.mT @ jacobian, row, len(R)) + torch.diag_embed(prior)
+    step = solve_scaled(information, segment_sum((jacobian.mT @ shift[..., None]).squeeze(-1), row, len(R)))
+    return rotations.exp(step[:, 3:]) @ R, t + step[:, :3]

@@ -100,7 +100,7 @@ def _missing(scene: Scene, identified: Identified, views: Views) -> _Missing:
         nothing = markers.radii.new_zeros(0, 2, 5)
         return _Missing(row, marker, nothing[:, 0], nothing)
     printed = replace(markers, radii=scene.printed_radii(scene.stated_gain(identified.gain)))
-    ideal, raw, depth = _predicted(printed, camera, views.R[row, option], views.t[row, option], (row, marker))
+    ideal, raw, depth = predicted(printed, camera, views.R[row, option], views.t[row, option], (row, marker))
     outer, limit = raw[:, 0], torch.tensor([camera.width - 1, camera.height - 1], device=row.device)
     # a circle that reaches behind the camera, or a plane seen edge-on, has no ellipse
     in_view = ((outer[:, :2] > 0) & (outer[:, :2] < limit)).all(-1) & (outer[:, 2] < limit.amin()) & (depth > 0)
@@ -142,7 +142,7 @@ def _clipping(rings: Rings, ring: Tensor, scene: Scene) -> Tensor:
     return each.nanmedian(1).values
 
 
-def _predicted(
+def predicted(
     markers: MarkerTable, camera: Camera, R: Tensor, t: Tensor, at: tuple[Tensor, Tensor]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Ellipses (P, 2, 5) of both circles, ideal and raw pixels, and depths (P,), of markers ``at`` (row, number)."""

@@ -44,6 +44,12 @@ class _Solution(BaseModel):
     chi2: Number | None
 
 
+class _Share(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    camera: Word
+    share: Number
+
+
 class _File(BaseModel):
     """A table's row, lax where cells are text."""
 
@@ -55,6 +61,7 @@ _LISTS: dict[str, Any] = {
     "systematic": Annotated[list[list[Number]], Field(min_length=6, max_length=6)],
     "place": list[_Place | None],
     "quaternion": _Quaternion,
+    "shares": list[_Share],
     "solutions": Annotated[list[_Solution], Field(max_length=2)],
 }
 _NEEDED: dict[str, Any] = {"frame": FileName, "target": Word, "status": Literal[_STATUSES]}

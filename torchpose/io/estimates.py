@@ -14,15 +14,19 @@ from torch import Tensor
 from torchpose.camera import LINEAR, Camera
 from torchpose.geometry import rotations
 from torchpose.handeye import HandEye
+from torchpose.io.lanes import Lanes
 from torchpose.io.reader import Batch, FrameReader
 from torchpose.io.rows import BASE_SCHEMA, POSE_SCHEMA, Row, Schema, base_cells, detection_rows, fault_row, pose_rows
 from torchpose.io.sources import Source
 from torchpose.pipeline import PoseEstimator
 from torchpose.results import Poses
 from torchpose.target import Target
+from torchpose.tracking import Tracker
 
 Paint = Callable[[Tensor, Poses, list[str]], None]
 """Is given the frames of a group, their poses and their names."""
+Measure = Callable[[Tensor, list[str]], Poses]
+"""Poses of frames of these names."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,7 @@ class Estimation:
         instances: most copies of a target in a frame.
         relative_to: name of the target in whose frame the poses of the others are given; it has no rows of its own.
         upright: whether the boards among the targets are said to be upright, which the targets hold already.
+        track: whether frames follow each other, and are measured near the last pose.
     """
 
     camera: Camera
@@ -46,6 +51,7 @@ class Estimation:
     instances: int = 1
     relative_to: str | None = None
     upright: bool = False
+    track: bool = False
 
     @property
     def rows_of(self) -> list[Target]:
@@ -74,6 +80,7 @@ class Estimation:
             "--instances": self.instances,
             "--relative-to": self.relative_to,
             "--assume-upright": self.upright,
+            "--track": self.track,
             "--detections": detections,
             "INPUT": sorted(set(roots)),
         }
@@ -83,8 +90,10 @@ class Estimation:
         method: Any = self.method  # it checks
         return PoseEstimator(replace(self.camera, tone=None), self.targets, instances=self.instances, method=method)
 
-    def records(self, batch: Batch, estimator: PoseEstimator, paint: Paint | None = None) -> list[Row]:
-        """Rows and detections of every frame of a batch, see `ResultStore.append`."""
+    def records(
+        self, batch: Batch, estimator: PoseEstimator, paint: Paint | None = None, measure: Measure | None = None
+    ) -> list[Row]:
+        """Rows and detections of every frame of a batch, see `ResultStore.append`; by ``measure`` if that is given."""
         names = [target.name for target in self.targets]
         records: dict[str, Row] = {s.name: {"frame": s.name, "rows": [], "detections": []} for s in batch.sources}
         for position, fault in batch.faults.items():
@@ -93,7 +102,8 @@ class Estimation:
         for positions, frames in batch.groups:
             sources = [batch.sources[position] for position in positions]
             frame_names = [source.name for source in sources]
-            poses = estimator(frames.to(estimator.table.ids.device, non_blocking=True)).cpu()
+            there = frames.to(estimator.table.ids.device, non_blocking=True)
+            poses = (estimator(there) if measure is None else measure(there, frame_names)).cpu()
             if paint is not None:
                 paint(frames, poses, frame_names)
             for row in self.rows(poses, sources):
@@ -124,11 +134,31 @@ def estimated(
         threads: that decode ahead.
         paint: see `Estimation.records`.
     """
-    camera = work.camera
-    pinned = estimator.table.ids.is_cuda
-    tone = camera.tone or LINEAR
-    for batch in FrameReader(batches, camera.width, camera.height, threads=threads, tone=tone, pinned=pinned):
+    for batch in _read(work, estimator, threads, batches):
         yield work.records(batch, estimator, paint)
+
+
+def _read(
+    work: Estimation, estimator: PoseEstimator, threads: int, batches: Sequence[Sequence[Source]]
+) -> Iterable[Batch]:
+    camera, pinned = work.camera, estimator.table.ids.is_cuda
+    tone = camera.tone or LINEAR
+    return FrameReader(batches, camera.width, camera.height, threads=threads, tone=tone, pinned=pinned)
+
+
+@torch.inference_mode()
+def tracked(
+    work: Estimation, estimator: PoseEstimator, paint: Paint | None, threads: int, lanes: Sequence[Lanes]
+) -> Iterator[list[Row]]:
+    """As `estimated`, of frames that follow each other: one list for all frames of some lanes."""
+    for some in lanes:
+        tracker = Tracker(estimator)
+
+        def measure(frames: Tensor, names: list[str], some: Lanes = some, tracker: Tracker = tracker) -> Poses:
+            return tracker(frames, [some.lane[name] for name in names])
+
+        read = _read(work, estimator, threads, some.batches)
+        yield [record for batch in read for record in work.records(batch, estimator, paint, measure)]
 
 
 def _of_parts(poses: Poses, targets: list[Target]) -> Poses:

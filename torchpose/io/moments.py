@@ -20,9 +20,9 @@ from torchpose.errors import ConfigError
 from torchpose.io.estimates import Estimation, digest
 from torchpose.io.manifest import read_manifest
 from torchpose.io.reader import Batch, FrameReader
-from torchpose.io.rows import POSE_SCHEMA, Row, Schema, fault_row, finite
+from torchpose.io.rows import DETECTION_SCHEMA, POSE_SCHEMA, Row, Schema, detection_rows, fault_row, finite
 from torchpose.io.sources import MANIFEST_SUFFIX, Source, find_sources, natural_key
-from torchpose.io.store import Stamp
+from torchpose.io.store import ResultStore, Stamp
 from torchpose.pipeline import PoseEstimator
 from torchpose.results import Poses, Status
 
@@ -39,8 +39,18 @@ How many of them contribute; chi-squared of what they say against each other ove
 one as large is by chance; the camera that contradicts all others, where that is clear; and of every camera its name and
 share of the information about the pose.
 """
+RIG_DETECTION_SCHEMA: Schema = DETECTION_SCHEMA | {"camera": str}
+"""One row a marker and camera; `frame` is the moment."""
 _APART = 1e-3  # s (convention): pictures of one moment that lie farther apart are told
+Paint = Callable[[Sequence[Tensor], Tensor, Poses, list[str]], None]
+"""Is given the frames of every camera, which of them are pictures, the poses and the names of moments."""
 _TELL = 1e15  # of times in ns: so many digits of each are told apart
+
+
+class MomentStore(ResultStore):
+    """The rows of moments, and the markers of all their pictures."""
+
+    marks = RIG_DETECTION_SCHEMA
 
 
 @dataclass(frozen=True)
@@ -232,11 +242,11 @@ class RigEstimation:
         more = {name: kind for name, kind in self.rest.schema.items() if name not in POSE_SCHEMA}
         return POSE_SCHEMA | RIG_SCHEMA | more
 
-    def origin(self, roots: Sequence[str]) -> dict[str, Any]:
+    def origin(self, roots: Sequence[str], *, detections: bool) -> dict[str, Any]:
         """As `Estimation.origin`."""
         cameras = [digest(camera) for camera in self.rig.cameras]
         places = digest(replace(self.rig, cameras=self.rig.cameras[:1] * len(self.rig)))
-        base = self.rest.origin(roots, detections=False)
+        base = self.rest.origin(roots, detections=detections)
         return {"--cameras": [cameras, places], **{name: value for name, value in base.items() if name != "--camera"}}
 
     def estimator(self) -> PoseEstimator:
@@ -246,8 +256,8 @@ class RigEstimation:
         rig = CameraRig(linear, self.rig.R, self.rig.t, self.rig.covariance, self.rig.names)
         return PoseEstimator(rig, self.rest.targets, method=method)
 
-    def records(self, pictures: Pictures, estimator: PoseEstimator) -> list[Row]:
-        """Rows of every moment, see `ResultStore.append`."""
+    def records(self, pictures: Pictures, estimator: PoseEstimator, paint: Paint | None = None) -> list[Row]:
+        """Rows and detections of every moment, see `ResultStore.append`."""
         moments = pictures.moments
         records: dict[str, Row] = {m.name: {"frame": m.name, "rows": [], "detections": []} for m in moments}
         usable = pictures.seen.any(0)
@@ -271,7 +281,20 @@ class RigEstimation:
                 cells = [cell for cell, target in zip(cells, poses.target.tolist(), strict=True) if keep[target]]
             for row, cell in zip(rows, cells, strict=True):
                 records[row["frame"]]["rows"].append(row | cell)
+            for row in self._marks(poses, [source.name for source in sources]):
+                records[row["frame"]]["detections"].append(row)
+            if paint is not None:
+                paint(frames, pictures.seen[:, index], poses, [source.name for source in sources])
         return list(records.values())
+
+    def _marks(self, poses: Poses, names: Sequence[str]) -> list[Row]:
+        """Rows of `RIG_DETECTION_SCHEMA`, camera by camera."""
+        targets, found = [target.name for target in self.rest.targets], poses.detections
+        return [
+            row | {"camera": name}
+            for number, name in enumerate(self.rig.names)
+            for row in detection_rows(found[found.camera == number], names, targets)
+        ]
 
     def _why(self, camera: int, reason: str) -> str:
         return f"{self.rig.names[camera]}: {reason}"

@@ -62,6 +62,7 @@ class ResultStore:
             rows are kept, of the others those that were made from the same file.
 
     Attributes:
+        marks: columns of ``detections``.
         tally: of all rows, those of an earlier run included.
         damaged: lines of the journal that were not as they had been written.
 
@@ -69,6 +70,8 @@ class ResultStore:
         ConfigError: a place cannot be written, another run is writing there, or there is an earlier run that cannot be
             resumed because it was made from something else.
     """
+
+    marks: Schema = DETECTION_SCHEMA
 
     def __init__(
         self,
@@ -156,7 +159,7 @@ class ResultStore:
         frames = [frame for frame in self._places if frame not in listed] + [f for f in order if f in self._places]
         if self._detections is not None:
             rows = (row for record in self._records(frames) for row in record["detections"])
-            write_rows(self._detections, rows, DETECTION_SCHEMA)
+            write_rows(self._detections, rows, self.marks)
         write_rows(self._out, (row for record in self._records(frames) for row in record["rows"]), self._schema)
         files = {frame: self._made_from[frame] for frame in frames if self._made_from[frame] is not None}
         with atomic_path(self._origin_path) as path:
@@ -205,7 +208,7 @@ class ResultStore:
             self._forget()
             self._places = places
             for record in self._journal.read(list(places.values())):
-                self._note(record)
+                self._note(self._completed(record))
         return True
 
     def _is_fresh(self, record: Row) -> bool:
@@ -217,7 +220,7 @@ class ResultStore:
 
     def _record_check(self) -> Callable[[Any], Row]:
         """Refuses, by a ValueError, records that `append` did not write."""
-        rows, detections = row_check(self._schema), row_check(DETECTION_SCHEMA)
+        rows, detections = row_check(self._schema), row_check(self.marks)
 
         def check(line: Any) -> Row:
             try:
@@ -233,11 +236,14 @@ class ResultStore:
         return check
 
     def _records(self, frames: Sequence[str]) -> Iterator[Row]:
-        for record in self._journal.read([self._places[frame] for frame in frames]):
-            for part, schema in (("rows", self._schema), ("detections", DETECTION_SCHEMA)):
-                newer = {column: cell for column, cell in NEWER.items() if column in schema}
-                record[part] = [newer | row for row in record[part]]
-            yield record
+        yield from map(self._completed, self._journal.read([self._places[frame] for frame in frames]))
+
+    def _completed(self, record: Row) -> Row:
+        """A record of the journal with all columns: one that a row lacks is empty, as its check has it."""
+        for part, schema in (("rows", self._schema), ("detections", self.marks)):
+            empty: Row = {column: NEWER.get(column) for column in schema}
+            record[part] = [empty | row for row in record[part]]
+        return record
 
     def _finished(self) -> Iterator[Row]:
         """Records of the tables of a run that was completed."""
@@ -255,7 +261,7 @@ class ResultStore:
             empty: Row = {"frame": row["frame"], "rows": [], "detections": [], "file": files.get(row["frame"])}
             records.setdefault(row["frame"], empty)["rows"].append(row)
         if self._detections is not None:
-            for row in read_rows(self._detections, DETECTION_SCHEMA):
+            for row in read_rows(self._detections, self.marks):
                 if row["frame"] in records:
                     records[row["frame"]]["detections"].append(row)
         whole = (r for r in records.values() if len({row["target"] for row in r["rows"]}) == self._targets)

@@ -7,11 +7,11 @@ for no more than it tells, and the covariance of the pose holds what all of them
 
 What residuals show beyond that (`pose.excess`) is looked for within each camera, with a pose of its own: cameras that
 contradict each other are no misfit of the print. Whether they do is asked then: chi-squared of poses of their own.
+What that leaves possible widens the covariance (`moments.places`).
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -26,18 +26,18 @@ from torchpose.geometry.robust import CUT, quantile
 from torchpose.geometry.rows import Rows
 from torchpose.moments.views import motion_in_view, motion_of_place
 from torchpose.pose import MarkerNormals, Setting
-from torchpose.pose.excess import OF_CAMERA, SURE, Excess, excess_of, no_excess
+from torchpose.pose.excess import OF_CAMERA, SURE, Excess, beyond_chance, excess_of, no_excess
 from torchpose.pose.systematic import (
     POSE,
-    _among,
-    _assembled,
-    _by_camera,
-    _by_size,
-    _by_target,
-    _Joint,
-    _places,
-    _print_shifts,
-    _remaining,
+    JointSolution,
+    among,
+    assembled,
+    motions_by_camera,
+    motions_by_size,
+    motions_by_target,
+    places_of,
+    print_shifts,
+    remaining_of,
 )
 from torchpose.results import Misfit
 
@@ -74,6 +74,10 @@ class JointPose(Rows):
         between_freedom: its degrees of freedom.
         odd: the camera alone against which all others agree; -1 where none is.
         torn: whether they contradict each other beyond their covariance.
+        told: information about the numbers that all rows share, and about how far cameras are beside their places
+            (of each three turns, rad, and three shifts, mm), pose and blurs being unknown.
+        pull: its right side.
+        by_place: error of the pose with each of the latter.
     """
 
     R: Float[Tensor, "J 3 3"]
@@ -93,6 +97,9 @@ class JointPose(Rows):
     between_freedom: Int[Tensor, " J"]
     odd: Int[Tensor, " J"]
     torn: Bool[Tensor, " J"]
+    told: Float[Tensor, "J E E"]
+    pull: Float[Tensor, "J E"]
+    by_place: Float[Tensor, "J 6 P"]
 
 
 class _Parts(NamedTuple):
@@ -122,24 +129,28 @@ def joint_pose(rig: CameraRig, views: list[Seen], R: Tensor, t: Tensor, moved: T
     parts = _parts(rig, views, R, t, moved)
     excess, further = _excess(parts, views)
     n = parts.normals.right.shape[-1]
-    beside = parts.numbers
+    odd_ones = parts.numbers[..., :0]
     if further is not None:
-        beside = torch.cat([beside, _among(further * excess.deviation[:, None, None], n)], -1)
+        odd_ones = among(further * excess.deviation[:, None, None], n)
+    beside = torch.cat([parts.numbers, odd_ones], -1)
     normals = parts.normals.over(excess.factor)
     between, freedom, odd, torn = _between(normals, parts, beside, len(views))
+    off = _off(rig, views, R, t, n)
+    own = torch.cat([parts.own, odd_ones], -1)
+    told, pull = remaining_of(normals, own, torch.cat([parts.numbers, off], -1), odd_ones.shape[-1])
     # counted, not estimated: the pose is the one of a rig that is as its file says
-    loose = _loosened(normals, parts, beside, _turns(rig, views, R, t, n))
-    joint = _Joint.of(normals, parts.own, beside, beside[..., :0] if loose is None else loose, True)
+    joint = JointSolution.of(normals, parts.own, beside, off, True)
+    covariance = joint.noise + joint.by_print @ joint.by_print.mT
     place = look = _print_places(parts, views, joint, excess.deviation, further)
     other = ((excess.misfit == Misfit.CAMERA) | (excess.misfit == Misfit.SCATTER)).nonzero()[:, 0]
     if other.numel() and further is not None:
         look = place.index_copy(0, other, _if_printed(parts, views, excess, further, other))
-    known = joint.known & (torch.linalg.cholesky_ex(joint.covariance.nan_to_num(nan=-1.0))[1] == 0)
+    known = joint.known & (torch.linalg.cholesky_ex(covariance.nan_to_num(nan=-1.0))[1] == 0)
     step = joint.step.nan_to_num(nan=0.0)
     return JointPose(
         R=rotations.exp(step[:, 3:]) @ R,
         t=t + step[:, :3],
-        covariance=joint.covariance,
+        covariance=covariance,
         noise=joint.noise,
         systematic=joint.by_print[..., : parts.numbers.shape[-1]],
         place=place,
@@ -154,6 +165,9 @@ def joint_pose(rig: CameraRig, views: list[Seen], R: Tensor, t: Tensor, moved: T
         between_freedom=freedom,
         odd=odd,
         torn=torn,
+        told=told,
+        pull=pull,
+        by_place=joint.by_camera - _in_axes_of_first(views, off),
     )
 
 
@@ -175,7 +189,7 @@ def _parts(rig: CameraRig, views: list[Seen], R: Tensor, t: Tensor, moved: Tenso
         placed = pose @ motion_of_place(rig, view.camera, own_t)
         own, apart = (x.expand(rows, markers, *x.shape) for x in (own, apart))
         placed = placed[:, None].expand(-1, markers, -1, -1)
-        lens, printed = _among(_by_camera(setting), n), _among(_by_target(setting), n)
+        lens, printed = among(motions_by_camera(setting), n), among(motions_by_target(setting), n)
         parts.append((normals, own, apart, lens, placed, printed))
     lenses = [part[3].shape[-1] for part in parts]
     spread = [torch.nn.functional.pad(part[3], (sum(lenses[:k]), sum(lenses[k + 1 :]))) for k, part in enumerate(parts)]
@@ -191,9 +205,9 @@ def _about(view: Seen, setting: Setting, moved: Tensor) -> MarkerNormals:
     n = right.shape[-1]
     aside = (view.R[:, None] @ moved[..., :3, None])[..., 0]
     formed = setting._replace(R=view.R, t=view.t)
-    back = torch.cat([aside, torch.zeros_like(aside), moved[..., 3:4]], -1) + moved[..., 4:] * _by_size(formed)
+    back = torch.cat([aside, torch.zeros_like(aside), moved[..., 3:4]], -1) + moved[..., 4:] * motions_by_size(formed)
     off = torch.cat([setting.t - view.t, rotations.log(setting.R @ view.R.mT), torch.zeros_like(view.t[:, :1])], -1)
-    change = _among((back - off[:, None])[..., None], n)
+    change = among((back - off[:, None])[..., None], n)
     right = right + (information @ change)[..., 0]
     # of a camera without a picture no blur is known, nor is it asked for
     nothing = torch.zeros(n, dtype=right.dtype, device=right.device)
@@ -213,21 +227,24 @@ def _excess(parts: _Parts, views: list[Seen]) -> tuple[Excess, Tensor | None]:
     known = torch.cat([parts.apart, parts.numbers], -1)
     count = parts.numbers.shape[-1]
     alone = torch.eye(items * (POSE + 1)).to(known).unflatten(0, (items, -1)).expand(rows, -1, -1, -1)
-    excess = no_excess(*_remaining(normals, known, _among(alone, n), count))
+    excess = no_excess(*remaining_of(normals, known, among(alone, n), count))
     odd = (~excess.explained).nonzero()[:, 0]
     if odd.numel() == 0:
         return excess, None
     # what one camera's lens does is scatter here: of which one it is would be one more question
-    shifts = torch.cat([_print_shifts(view.setting.of_rows(odd)) for view in views], 1)
+    shifts = torch.cat([print_shifts(view.setting.of_rows(odd)) for view in views], 1)
     shifts = torch.nn.functional.pad(shifts, (0, OF_CAMERA))
-    again = excess_of(*_remaining(normals[odd], known[odd], _among(shifts, n), count))
+    refuted = beyond_chance(excess)[odd]
+    again = excess_of(*remaining_of(normals[odd], known[odd], among(shifts, n), count), refuted=refuted)
     every = shifts.new_zeros(rows, *shifts.shape[1:]).index_copy(0, odd, shifts)
     nothing = shifts.new_zeros(rows, shifts.shape[-1])
     excess = replace(excess, deviation=nothing, printed=nothing)
     return excess.replaced(odd, replace(again, chi2=excess.chi2[odd], freedom=excess.freedom[odd])), every
 
 
-def _print_places(parts: _Parts, views: list[Seen], joint: _Joint, deviation: Tensor, further: Tensor | None) -> Tensor:
+def _print_places(
+    parts: _Parts, views: list[Seen], joint: JointSolution, deviation: Tensor, further: Tensor | None
+) -> Tensor:
     """Places (J, M, 5) of the markers on the print, by the motions that they are in the first of the cameras."""
     setting, markers = views[0].setting, views[0].setting.evidence.mask.shape[1]
     first = parts.numbers.shape[-1] - parts.printed
@@ -236,15 +253,15 @@ def _print_places(parts: _Parts, views: list[Seen], joint: _Joint, deviation: Te
     if further is not None:
         by = torch.cat([by, further[:, :markers] * deviation[:, None, None]], -1)
     numbers = joint.numbers[:, first : first + by.shape[-1]]
-    return _places(by, joint._replace(numbers=numbers), setting, deviation)
+    return places_of(by, joint._replace(numbers=numbers), setting, deviation)
 
 
 def _if_printed(parts: _Parts, views: list[Seen], excess: Excess, further: Tensor, rows: Tensor) -> Tensor:
     """The same of some rows (K,) if the print is behind their misfit: where to look for the markers next."""
     some = _Parts(parts.normals[rows], parts.own[rows], parts.apart[rows], parts.numbers[rows], parts.printed)
     n, deviation = some.normals.right.shape[-1], excess.printed[rows]
-    beside = torch.cat([some.numbers, _among(further[rows] * deviation[:, None, None], n)], -1)
-    joint = _Joint.of(some.normals, some.own, beside, some.numbers[..., :0], True)
+    beside = torch.cat([some.numbers, among(further[rows] * deviation[:, None, None], n)], -1)
+    joint = JointSolution.of(some.normals, some.own, beside, some.numbers[..., :0], True)
     seen = [view._replace(setting=view.setting.of_rows(rows)) for view in views]
     return _print_places(some, seen, joint, deviation, further[rows])
 
@@ -259,7 +276,7 @@ def _between(
     camera's shift is judged by itself, too.
     """
     known = torch.cat([parts.own, numbers], -1)
-    information, right = _remaining(normals, known, parts.apart[..., : POSE * views], numbers.shape[-1])
+    information, right = remaining_of(normals, known, parts.apart[..., : POSE * views], numbers.shape[-1])
     chi2, freedom = _taken(information, right)
     each = torch.arange(views, device=right.device)
     own = right.unflatten(-1, (views, POSE))
@@ -280,58 +297,28 @@ def _of_each(blocks: Tensor, own: Tensor) -> tuple[Tensor, Tensor]:
     return found[0].unflatten(0, own.shape[:2]), found[1].unflatten(0, own.shape[:2])
 
 
-def _turns(rig: CameraRig, views: list[Seen], R: Tensor, t: Tensor, n: int) -> Tensor:
-    """How markers move (J, V M, n, 6 V) if a camera is not where the rig has it: turned by 1 rad, or moved by as much
-    as shifts its picture alike."""
+def _off(rig: CameraRig, views: list[Seen], R: Tensor, t: Tensor, n: int) -> Tensor:
+    """How markers move (J, V M, n, 6 V) if a camera is not where the rig has it: turned by 1 rad, or moved by 1 mm."""
     parts = []
     for k, view in enumerate(views):
         at = rig.seen_by(view.camera, R, t)[1]
-        turn = torch.zeros(len(t), n, 2 * 3, dtype=t.dtype, device=t.device)
+        turn = torch.zeros(len(t), n, POSE, dtype=t.dtype, device=t.device)
         eye = torch.eye(3).to(t)
         turn[:, :3, :3] = -rotations.skew(at)
         turn[:, 3:POSE, :3] = eye
-        turn[:, :3, 3:] = eye * torch.linalg.vector_norm(at, dim=-1)[:, None, None]
+        turn[:, :3, 3:] = eye
         turn = torch.nn.functional.pad(turn, (POSE * k, POSE * (len(views) - 1 - k)))
         parts.append(turn[:, None].expand(-1, view.setting.evidence.mask.shape[1], -1, -1))
     return torch.cat(parts, 1)
 
 
-def _loosened(normals: MarkerNormals, parts: _Parts, numbers: Tensor, turns: Tensor) -> Tensor | None:
-    """The columns ``turns`` by as much as cameras seem to be beside their places; None where none does.
-
-    One camera may be turned, or beside its place in all six numbers, or all are. Which it is and how much, nobody
-    knows: it is averaged over by its likelihood, as `pose.excess` does for prints.
-    """
-    known = torch.cat([parts.own, numbers], -1)
-    information, right = _remaining(normals, known, turns, numbers.shape[-1])
-    finite = (information.isfinite().all(-1) & right.isfinite()).all(-1)
-    information = torch.where(finite[:, None, None], information, 0.0)
-    right = torch.where(finite[:, None], right, 0.0)
-    cameras = torch.eye(right.shape[-1] // POSE, dtype=right.dtype, device=right.device)
-    turned = torch.nn.functional.pad(right.new_ones(2), (0, POSE - 2))
-    which = torch.cat(
-        [torch.kron(cameras, turned[None]), cameras.repeat_interleave(POSE, 1), right.new_ones(1, len(right[0]))]
-    )
-    found = [_likelihood(information, right, some > 0) for some in which]
-    likelihood, variance = (torch.stack(part, 1) for part in zip(*found, strict=True))
-    weight = torch.softmax(likelihood.flatten(1), -1).view_as(likelihood)
-    evidence = torch.logsumexp(likelihood.flatten(1), -1) - math.log(likelihood[0].numel())
-    off = torch.where((evidence > math.log(_LIKELIER))[:, None], (weight * variance).sum(-1) @ which, 0.0)
-    return turns * off.sqrt()[:, None, None] if bool((off > 0).any()) else None
-
-
-def _likelihood(information: Tensor, right: Tensor, some: Tensor) -> tuple[Tensor, Tensor]:
-    """Logarithm (J, G) of how much likelier some of the unknowns are off with G variances (J, G) than not at all."""
-    information, right = information[:, some][:, :, some], right[:, some]
-    values, vectors = torch.linalg.eigh(0.5 * (information + information.mT))
-    values = values.clamp_min(0.0)[:, None]
-    known = values[..., -1:].clamp_min(torch.finfo(values.dtype).tiny)
-    variance = torch.logspace(*_OFF, _GRID, dtype=right.dtype, device=right.device)[:, None].square() / known
-    along = (vectors.mT @ right[..., None])[..., 0].square()[:, None]
-    # the right side along a direction has the variance l + v l^2
-    spread = 1 + variance * values
-    likelihood = 0.5 * (torch.where(values > 0, along * variance / spread, 0.0) - spread.log()).sum(-1)
-    return likelihood, variance[..., 0]
+def _in_axes_of_first(views: list[Seen], off: Tensor) -> Tensor:
+    """By how much poses (J, 6, 6 V) in the axes of the rig's first camera differ from those of its place if that one
+    is off."""
+    moved = torch.zeros_like(off[:, 0, :POSE])
+    if views[0].camera == 0:
+        moved[..., :POSE] = off[:, 0, :POSE, :POSE]
+    return moved
 
 
 def _taken(information: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
@@ -347,20 +334,12 @@ def _taken(information: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(there, along.square() / values.clamp_min(LEAST_DIRECTION), 0.0).sum(-1), there.sum(-1)
 
 
-# deviations of what the pictures tell best, by which a camera may be off: from none that would show to what nobody
-# would call a calibration (convention)
-_OFF, _GRID = (-1.0, 3.0), 24
-# times as likely as not at all: of rows of rigs that are as they say, one in ten is widened (measured:
-# `scripts/rig_statistics.py`); from 1 on knocks of five deviations are not covered
-_LIKELIER = 0.5
-
-
 def _share(normals: MarkerNormals, own: Tensor, views: int) -> Tensor:
     """(J, V): how much of the information about the pose each camera has, by the mean over its six directions."""
     blocks = []
     for k in range(views):
         items = slice(k * own.shape[1] // views, (k + 1) * own.shape[1] // views)
-        matrix = _assembled(_items(normals, items), own[:, items])[0]
+        matrix = assembled(_items(normals, items), own[:, items])[0]
         taken = matrix[:, :POSE, POSE:] @ solve_scaled(matrix[:, POSE:, POSE:], matrix[:, POSE:, :POSE])
         blocks.append(matrix[:, :POSE, :POSE] - taken)
     each = torch.stack(blocks, 1)

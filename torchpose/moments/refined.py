@@ -23,6 +23,7 @@ from torchpose.geometry.robust import LEAST_KEPT
 from torchpose.geometry.rows import Rows
 from torchpose.identify import MIN_MARKERS
 from torchpose.moments.joint import JointPose, Seen, joint_pose
+from torchpose.moments.places import widened
 from torchpose.moments.start import Start, ambiguous
 from torchpose.moments.views import Moments, motion_in_view
 from torchpose.pose import (
@@ -94,6 +95,7 @@ def refine_moments(moments: Moments, rows: Tensor, start: Start, refine: Refine 
         if refine is None
         else _on_frames(moments, views, begun, place, refine)
     )
+    pose = widened(pose, pose.known & pose.explained & ~pose.torn & ~start.against.any(1))
     rms = _rms(moments, views, pose.R, pose.t)
     return _judged(moments, views, start, pose, rms)
 
@@ -283,6 +285,7 @@ def _laid_out(look: Look, some: Tensor, rows: int) -> Look:
         spread(look.levels, 0.0),
         spread(look.band, 1.0),
         spread(look.reduction, 1),
+        spread(look.doubt, False),
     )
 
 

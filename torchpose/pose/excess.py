@@ -43,7 +43,13 @@ _OFF = (  # what may be off of a camera's numbers, in the order of `OF_CAMERA`: 
 # how large each may be, from below any noise: mm, places and edges of an office print (50 to 100 um);
 # px at the corner of the frame, where a file without distortion may be off by a hundred; of variances, as a factor
 _PRINT, _CAMERA, _SCALE = (1e-4, 0.15), (1e-3, 300.0), (1.0, 1e3)
-SURE = 2.33  # deviations: one row in 100 that is as its files say is made wider in vain, by a factor of two (derived)
+SURE = 2.33  # deviations: one row in 100 that is as its files say is looked at as closely as can be (derived)
+_LOOKED_AT = (
+    1.0  # deviations, beyond which a row's residuals are held against a camera, which costs little (convention)
+)
+# logarithm of how much likelier no misfit is beforehand than each of the three: as likely as all (convention). Of rows
+# that are as their files say one in 1,000 is made wider in vain
+_NOTHING = math.log(3.0)
 _GRID = 16  # values, logarithmic, apart by a factor of 1.5, of a camera 2.3, which few residuals do not tell
 _COARSE = 10  # of each of three: 2.3
 _FEW_FACTORS = 4  # of ten, of the scatter beside a print or a camera (convention)
@@ -93,7 +99,7 @@ class _Modes(NamedTuple):
 
     def existing(self) -> Self:
         """Those that exist in any row; they come last."""
-        most = int(self.there.sum(-1).amax())
+        most = max(1, int(self.there.sum(-1).amax())) if len(self.there) else self.there.shape[1]
         return type(self)(*(x[:, x.shape[1] - most :] for x in self))
 
 
@@ -111,22 +117,23 @@ def excess_of(
     right: Float[Tensor, "N E"],
     even: Float[Tensor, " N"] | None = None,
     across: Float[Tensor, "N M 3 2"] | None = None,
+    refuted: Bool[Tensor, " N"] | None = None,
 ) -> Excess:
     """What speaks from the information about the further unknowns, and their right side, all else being unknown.
 
     Args:
         even: degrees of freedom of other residuals that are those of noise: what makes all noise larger would have made
             them larger, too.
+        across: two directions across the line of sight as places of the markers.
+        refuted: rows in which residuals that the further unknowns do not reach are beyond chance; something is amiss.
     """
     modes = _modes(information, right)
     none = _none(right, modes)
-    row = (~none.explained).nonzero()[:, 0]
+    none = replace(none, explained=(none.chi2 < _most(none.freedom)) & (True if refuted is None else ~refuted))
+    row, families = _explanations(modes, none, even)
     if row.numel() == 0:
         return none
-    some = _Modes(*(x[row] for x in modes)).existing()
-    even = torch.zeros_like(none.factor) if even is None else even
-    # in the order of `Misfit`
-    families = (_beside_scatter(_print, some), _beside_scatter(_camera, some), _scatter(some, even[row]))
+    some = _Modes(*(x[row] for x in modes))
     evidence = torch.stack([f.evidence for f in families], -1)
     best = evidence.argmax(-1)
     at = torch.arange(len(row), device=row.device)
@@ -160,6 +167,28 @@ def excess_of(
     )
 
 
+def _explanations(modes: _Modes, none: Excess, even: Tensor | None) -> tuple[Tensor, list[_Family]]:
+    """Rows (K,) of which an explanation is likelier than that there is nothing to explain, or which chance does not
+    reach, and the three of them, in the order of `Misfit`.
+
+    One thing that is off, as k1, may stand in one direction of the residuals, where their sum says little. So a camera,
+    which costs little to try, is held against rows whose sum is no surprise, too.
+    """
+    row = ((none.chi2 > _usual(none.freedom)) | ~none.explained).nonzero()[:, 0]
+    some, silent = _Modes(*(x[row] for x in modes)).existing(), torch.zeros_like(none.chi2)
+    # beforehand as likely as all three; where noise is known to be more than that of independent pixels, as each
+    expected = torch.ones_like(none.explained) if even is None else even > 0
+    nothing = math.log(_SCATTER + 1) * expected[row] - 0.5 * some.residual.square().sum(-1)
+    camera = _beside_scatter(_camera, some)
+    kept = (none.chi2[row] > quantile(none.freedom[row].clamp_min(1), SURE)) | (camera.evidence > nothing)
+    kept |= ~none.explained[row]
+    row, some, nothing = row[kept], _Modes(*(x[kept] for x in some)), nothing[kept]
+    scatter = _scatter(some, (silent if even is None else even)[row])
+    families = [_beside_scatter(_print, some), _Family(*(x[kept] for x in camera)), scatter]
+    likelier = (torch.stack([f.evidence for f in families]).amax(0) > nothing) | ~none.explained[row]
+    return row[likelier], [_Family(*(x[likelier] for x in f)) for f in families]
+
+
 def _is_tone(deviation: Tensor) -> Tensor:
     """Prints (N,) bool by whose deviations (N, E) it is edges in the picture that are off, more than all else."""
     markers, edges, _ = by_kind(deviation)
@@ -172,6 +201,11 @@ def by_kind(unknowns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return markers, edges, camera
 
 
+def beyond_chance(excess: Excess) -> Bool[Tensor, " N"]:
+    """Rows (N,) whose residuals noise does not reach."""
+    return excess.chi2 > _most(excess.freedom)
+
+
 def no_excess(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) -> Excess:
     """The same where noise explains the residuals; elsewhere `Excess.explained` is False and nothing else is said."""
     return _none(right, _modes(information, right))
@@ -180,9 +214,14 @@ def no_excess(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) 
 def _none(right: Tensor, modes: _Modes) -> Excess:
     chi2, freedom = modes.residual.square().sum(-1), modes.there.sum(-1)
     zero, one = torch.zeros_like(right), torch.ones_like(chi2)
-    by_chance = chi2 < quantile(freedom.clamp_min(1), SURE)
+    by_chance = chi2 < _usual(freedom)
     nothing = torch.zeros_like(freedom)
     return Excess(zero, zero, one, one, zero[:, 0], zero[:, 0], nothing, by_chance, chi2, freedom)
+
+
+def _usual(freedom: Tensor) -> Tensor:
+    """What chi-squared (N,) of noise stays below by one of its deviations: five times in six."""
+    return freedom + (2 * freedom).sqrt()
 
 
 def _most(freedom: Tensor) -> Tensor:
@@ -303,7 +342,7 @@ def _weighed(
     rows, r = modes.residual.shape
     grid = len(parts[0][1]) if parts else 1
     some = max(1, _AT_ONCE // (grid * max(r * r, off.numel() * len(values))))
-    found = [_likelihood(modes, few, off, values, parts, slice(k, k + some)) for k in range(0, rows, some)]
+    found = [_likelihood(modes, few, off, values, parts, slice(k, k + some)) for k in range(0, max(rows, 1), some)]
     likelihood, square = (torch.cat(x) for x in zip(*found, strict=True))
     weight = torch.softmax(likelihood.flatten(1), -1).view_as(likelihood)
     return _mean(likelihood.flatten(1)), weight, (weight * square).sum((1, 2))

@@ -66,6 +66,8 @@ def _on_solved(change: Step) -> Step:
         index = solutions.solved.nonzero()[:, 0]
         if index.numel() == 0:
             return solutions
+        if len(index) == len(solutions):
+            return change(solutions, replace(evidence, mask=solutions.mask), replace(sight, mask=solutions.mask))
         rows = solutions[index]
         seen, shown = replace(evidence[index], mask=rows.mask), replace(sight[index], mask=rows.mask)
         return solutions.replaced(index, change(rows, seen, shown))
@@ -85,7 +87,8 @@ def on_frames(refine: Callable[..., Refined]) -> Step:
         found, good = rows, torch.zeros_like(rows.status, dtype=torch.bool)
         active = torch.arange(len(rows), device=good.device)
         for number in range(ROUNDS):
-            some = rows[active], seen[active], sight[active].displaced(beyond(place[active], seen[active]))
+            some = (rows, seen, sight) if number == 0 else (rows[active], seen[active], sight[active])
+            some = (*some[:2], some[2].displaced(beyond(place[active], some[1])))
             # what seems to contradict the model may be a marker beside its place
             refined = refine(some[2], start.R[active], start.t[active], thorough=number > 0)
             now, joint, held = _on_print(refined, *some, place[active])

@@ -166,11 +166,18 @@ def refined_by_blur(
     if sight.look is not None:
         factor, kind, doubt = sight.look.reduction, sight.look.kind, sight.look.doubt.long()
     each = torch.stack([factor, kind, doubt], -1)
+    groups = each.unique(dim=0).tolist() or [[1, 0, 0]]
+
+    def part(by: int, sight: Sight, start: Pose, known: PosePrior | None) -> Refined:
+        some = refine(sight.reduced(by), start, known)
+        return some if by == 1 else replace(some, spread=blurs.enlarged(some.spread, by))
+
+    if len(groups) == 1:
+        return part(groups[0][0], sight, start, known)
     order, parts = [], []
-    for one in each.unique(dim=0).tolist() or [[1, 0, 0]]:
-        index, by = (each == each.new_tensor(one)).all(-1).nonzero()[:, 0], one[0]
-        some = refine(sight[index].reduced(by), start[index], None if known is None else known[index])
-        parts.append(some if by == 1 else replace(some, spread=blurs.enlarged(some.spread, by)))
+    for one in groups:
+        index = (each == each.new_tensor(one)).all(-1).nonzero()[:, 0]
+        parts.append(part(one[0], sight[index], start[index], None if known is None else known[index]))
         order.append(index)
     return Refined.cat(parts)[torch.argsort(torch.cat(order))]
 

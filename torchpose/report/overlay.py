@@ -63,15 +63,22 @@ class Overlay:
         targets: as for `PoseEstimator`.
         folder: where the pictures go, created if missing; only `write` needs it.
         threads: pictures that are drawn and written side by side.
+        place: R (3, 3), t (3,) mm, from the axes of the poses to those of the camera.
 
     Raises:
         ConfigError: the folder cannot be created or written.
     """
 
     def __init__(
-        self, camera: Camera, targets: Sequence[Target], folder: Path | None = None, *, threads: int = 1
+        self,
+        camera: Camera,
+        targets: Sequence[Target],
+        folder: Path | None = None,
+        *,
+        threads: int = 1,
+        place: tuple[Tensor, Tensor] | None = None,
     ) -> None:
-        self._camera = camera
+        self._camera, self._place = camera, place
         self._names = [target.name for target in targets]
         self._folder = folder or Path()
         self._threads = threads
@@ -84,13 +91,14 @@ class Overlay:
         if folder is not None:
             make_folder(folder, "--overlay")
 
-    def write(self, frames: Tensor, poses: Poses, names: Sequence[str]) -> None:
+    def write(self, frames: Tensor, poses: Poses, names: Sequence[str], seen: Sequence[bool] | None = None) -> None:
         """Writes one picture a frame.
 
         Args:
             frames: (B, H, W) uint8 or uint16.
             poses: of these frames, targets to camera.
             names: of the frames.
+            seen: which of them are pictures; by default all.
 
         Raises:
             ConfigError: a picture cannot be written.
@@ -102,7 +110,7 @@ class Overlay:
             write_picture(picture_path(self._folder, names[index]), picture)
 
         with ThreadPoolExecutor(self._threads) as pool:
-            list(pool.map(write_one, range(len(names))))
+            list(pool.map(write_one, [k for k in range(len(names)) if seen is None or seen[k]]))
 
     def draw(self, frame: Tensor, poses: Poses, name: str) -> np.ndarray:
         """Picture (H, W, 3) uint8, blue-green-red, of one frame (H, W) with the poses of a batch of one."""
@@ -111,6 +119,8 @@ class Overlay:
     def project_axes(self, poses: Poses) -> np.ndarray:
         """Pixels (N, 3, points, 2) of the axes of each pose, NaN where there is none or it is behind the camera."""
         points = self._axes[poses.target] @ poses.R[:, None].mT + poses.t[:, None, None]
+        if self._place is not None:
+            points = points @ self._place[0].mT + self._place[1]
         pixels = self._camera.project(points)
         return torch.where(points[..., 2:] > 0, pixels, torch.nan).numpy()
 

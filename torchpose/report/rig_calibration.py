@@ -13,7 +13,7 @@ from torch import Tensor
 from torchpose.calibration.several import RigCalibration
 from torchpose.geometry import rotations
 from torchpose.io.writers import write_rows
-from torchpose.report.figures import COLOURS, GREY, subplots
+from torchpose.report.figures import COLOURS, GREY, legend_below, subplots
 from torchpose.report.files import make_folder, save_figures
 
 _DRAWN = 0.25  # of the distance to the target: depth of the pyramid that stands for a camera
@@ -83,7 +83,7 @@ def plot_cameras(found: RigCalibration) -> Figure:
     for number, row in enumerate((sums / points).sqrt()):
         panel.plot(row.tolist(), "o", ms=4, color=COLOURS[number % len(COLOURS)], label=found.rig.names[number])
     panel.set(xlabel="moment", ylabel="RMS residual, px", ylim=(0, None))
-    panel.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=count, fontsize=8, frameon=False)
+    legend_below(figure, [panel], min(count, 8))
     panel.grid(alpha=0.25, lw=0.5)
     return figure
 
@@ -96,7 +96,7 @@ def _arrows(panel: Any, found: RigCalibration, number: int) -> None:
     enlarged = max(step * decade for step in (1, 2, 5) if step * decade <= most)
     colour = COLOURS[number % len(COLOURS)]
     panel.quiver(*pixels.T, *(enlarged * residual.T), angles="xy", scale_units="xy", scale=1, width=0.002, color=colour)
-    panel.set(xlim=(-0.5, camera.width - 0.5), ylim=(camera.height - 0.5, -0.5))
+    panel.set(xlim=(-0.5, camera.width - 0.5), ylim=(camera.height - 0.5, -0.5), xlabel="u, px", ylabel="v, px")
     panel.set_aspect("equal")
     panel.set_title(
         f"{found.rig.names[number]}: RMS {float(found.rms_px[number]):.3g} px, enlarged {enlarged:g} times", fontsize=10

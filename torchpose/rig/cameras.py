@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from torchpose.errors import ConfigError
 from torchpose.rig.faults import CameraFault, CameraReason
-from torchpose.rig.settings import CameraSettings
+from torchpose.rig.settings import ACTION, SOFTWARE, CameraSettings
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # as an error, a warning of its types crashes the interpreter
@@ -44,7 +44,7 @@ class BaslerCamera:
 
     def __init__(self, settings: CameraSettings, device: Any) -> None:
         self.settings = settings
-        self._emulated = device.GetDeviceClass() == EMULATOR
+        self.emulated = device.GetDeviceClass() == EMULATOR
         try:
             self._camera = pylon.InstantCamera(pylon.TlFactory.GetInstance().CreateDevice(device))
             self._camera.Open()
@@ -58,7 +58,7 @@ class BaslerCamera:
             "serial": device.GetSerialNumber(),
             "device_class": device.GetDeviceClass(),
             "firmware": self._read("DeviceFirmwareVersion"),
-            "emulated": self._emulated,
+            "emulated": self.emulated,
         }
         try:
             self.description["settings"] = self._configure()
@@ -81,10 +81,15 @@ class BaslerCamera:
                 raise self._fault(CameraReason.NOT_READY, "does not become ready for a trigger; check its cable")
 
     def trigger(self) -> float:
-        """Triggers the exposure; Unix time just before."""
+        """Triggers the exposure, unless something else does; Unix time just before."""
         now = time.time()
         with self._driver():
-            self._camera.ExecuteSoftwareTrigger()
+            if self.emulated or not self.settings.waits_for:  # emulated cameras have no wire
+                self._camera.ExecuteSoftwareTrigger()
+            elif self.settings.waits_for == "action":
+                device, group, _ = (self.settings.nodes[name] for name in ACTION)
+                layer = pylon.TlFactory.GetInstance().CreateTl(pylon.BaslerGigEDeviceClass)
+                layer.ActionCommand(device, group, pylon.AllGroupMask).IssueNoWait()
         return now
 
     def fetch(self) -> tuple[NDArray[np.integer[Any]], int]:
@@ -131,7 +136,7 @@ class BaslerCamera:
             ("X", "Width", given.offset_x, given.width),
             ("Y", "Height", given.offset_y, given.height),
         ):
-            if self._emulated and size > self._read(f"{side}Max"):
+            if self.emulated and size > self._read(f"{side}Max"):
                 self._set(f"{side}Max", size)
             self._set(side, size)
             if corner is not None:
@@ -144,7 +149,9 @@ class BaslerCamera:
         exposure = self._set("ExposureTime", given.exposure_us, "ExposureTimeAbs")
         gain = self._set("Gain", given.gain_db, "GainAbs", optional=given.gain_db == 0)
         # last, whatever the file's nodes say: waiting for a trigger that nobody sends would never end
-        trigger = {"TriggerSelector": "FrameStart", "TriggerMode": "On", "TriggerSource": "Software"}
+        trigger = {"TriggerSelector": "FrameStart", "TriggerMode": "On"}
+        if self.emulated or not given.waits_for:
+            trigger["TriggerSource"] = SOFTWARE
         for nodes in (given.nodes, {"AcquisitionMode": "Continuous"}, trigger):
             for name, value in nodes.items():
                 self._set(name, value)
@@ -252,14 +259,20 @@ class Cameras:
         return [camera.description for camera in self._open.values()]
 
     def grab(self, names: Collection[str]) -> list[Frame]:
-        """A frame of each of the named cameras, triggered one right after the other.
+        """A frame of each of the named cameras, triggered one right after the other, or by one line or action command.
 
-        A camera whose frame fails is tried again alone, up to its number of attempts.
+        A camera whose frame fails is tried again, up to its number of attempts: alone, or with all others where they
+        are triggered at once.
 
         Raises:
             CameraFault: a camera has none left, has been removed or gives frames of another size.
         """
-        waiting = {name: camera for name, camera in self._open.items() if name in names}
+        wanted = {name: camera for name, camera in self._open.items() if name in names}
+        at_once = any(camera.settings.waits_for for camera in wanted.values())
+        if any(camera.settings.waits_for == "line" for camera in wanted.values()):
+            # whoever drives the line exposes, too
+            wanted = {n: c for n, c in self._open.items() if n in wanted or not c.settings.waits_for}
+        waiting = wanted
         if self._scene is not None:
             for name, camera in waiting.items():
                 camera.show(self._scene(name))
@@ -273,8 +286,8 @@ class Cameras:
                 failures[name] += (fault.reason.value,)
                 if fault.reason not in _PASSING or len(failures[name]) >= waiting[name].settings.attempts:
                     raise fault
-            waiting = {name: waiting[name] for name in faults}
-        return [done[name] for name in self._open if name in done]
+            waiting = wanted if at_once and faults else {name: waiting[name] for name in faults}
+        return [done[name] for name in self._open if name in names]
 
     def _devices(self) -> list[tuple[CameraSettings, Any]]:
         """The device of each camera: by serial number, the others in the order of the enumeration."""
@@ -317,12 +330,32 @@ def _attempt(
 
     try:
         each(lambda camera: camera.start())
-        times = each(lambda camera: camera.trigger())
-        images = each(lambda camera: camera.fetch())
+        times = _triggered(cameras, each, faults)
+        images = each(lambda camera: camera.fetch()) if times else {}
     finally:
         for camera in cameras.values():
             camera.stop()
     return {name: (times[name], *image) for name, image in images.items()}, faults
+
+
+def _triggered(
+    cameras: Mapping[str, BaslerCamera],
+    each: Callable[[Callable[[BaslerCamera], float]], dict[str, float]],
+    faults: Mapping[str, CameraFault],
+) -> dict[str, float]:
+    """Triggers cameras that take one; trigger times by name, of those that wait for others the first of these."""
+    waits = {name: camera.settings.waits_for for name, camera in cameras.items()}
+    if faults and any(waits.values()):  # all at once, or none
+        return {}
+    commands = [name for name in cameras if waits[name] == "action"]
+    unneeded = set(commands[1:])  # one command is for all
+
+    def own(camera: BaslerCamera) -> float:
+        return time.time() if camera.settings.name in unneeded and not camera.emulated else camera.trigger()
+
+    times = each(own)
+    first = min(times.values(), default=0.0)
+    return {name: first if waits[name] else at for name, at in times.items()}
 
 
 def _first_line(error: Exception) -> str:

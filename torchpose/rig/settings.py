@@ -17,6 +17,8 @@ MAX_SPEED_MM_S = 250.0  # the reduced speed of ISO 10218-1, for work beside peop
 MAX_ACCELERATION_MM_S2 = 1200.0  # the default of the controller's own moves
 
 MOST_CAMERAS = 64  # of a rig (convention)
+SOFTWARE = "Software"  # GenICam's name of the source of a trigger that is a call
+ACTION = ("ActionDeviceKey", "ActionGroupKey", "ActionGroupMask")  # GenICam's, which an action command is addressed by
 Positive = Annotated[FiniteFloat, Field(gt=0, le=MOST_LENGTH)]
 AS_TUPLE = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)  # files have lists
 SixNumbers = Annotated[list[Length], Field(min_length=6, max_length=6)]
@@ -90,7 +92,10 @@ class CameraSettings(Strict):
     gain_db: FiniteFloat = Field(default=0.0, ge=-100, le=100)
     timeout_s: Positive = 5.0  # from trigger to image
     attempts: int = Field(default=3, ge=1, le=20)  # at one frame, before the session ends
-    nodes: dict[str, bool | int | FiniteFloat | str] = {}  # further GenICam features, set in this order
+    nodes: dict[
+        str, bool | int | FiniteFloat | str
+    ] = {}  # further GenICam features, set in this order; `TriggerSource`
+    # says that a line, or an action command, triggers it with others at once
 
     @field_validator("serial", mode="before")
     @classmethod
@@ -104,6 +109,19 @@ class CameraSettings(Strict):
         if self.timeout_s <= 1e-6 * self.exposure_us:
             raise ValueError(f"has timeout_s {self.timeout_s:g} below the exposure; give more time")
         return self
+
+    @model_validator(mode="after")
+    def _action_is_addressed(self) -> CameraSettings:
+        missing = [name for name in ACTION if not isinstance(self.nodes.get(name), int)]
+        if self.waits_for == "action" and missing:
+            raise ValueError(f"waits for an action command without {missing[0]} among its nodes; give it as a number")
+        return self
+
+    @property
+    def waits_for(self) -> Literal["", "line", "action"]:
+        """What triggers it but its own software trigger."""
+        source = str(self.nodes.get("TriggerSource", SOFTWARE))
+        return "" if source == SOFTWARE else "action" if source.startswith("Action") else "line"
 
     @property
     def bits(self) -> int:
@@ -130,6 +148,20 @@ class Rig(Strict):
             twice = sorted({entry for entry in given if given.count(entry) > 1})
             if twice:
                 raise ValueError(f"has the {what} {twice[0]!r} twice; give every camera its own")
+        return value
+
+    @field_validator("cameras")
+    @classmethod
+    def _triggered_by_one(cls, value: list[CameraSettings]) -> list[CameraSettings]:
+        lines = [c.name for c in value if c.waits_for == "line"]
+        if lines and all(c.waits_for for c in value):
+            raise ValueError(
+                f"wait for a line that none of them drives ({', '.join(lines)}); leave TriggerSource out of the nodes "
+                "of the one whose output line triggers the others"
+            )
+        actions = [[c.nodes[name] for name in ACTION[:2]] for c in value if c.waits_for == "action"]
+        if any(action != actions[0] for action in actions):
+            raise ValueError(f"wait for different action commands; give all the same {' and '.join(ACTION[:2])}")
         return value
 
 

@@ -293,19 +293,7 @@ def _by_edges(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
     shown = clear.repeat(2, 1)[edges.ring, sector]
     edges, sector = edges[shown], sector[shown]
 
-    near = ellipse.Near.of(edges.points, edges.ring, rough)
-    conic, keep = near.robust(near.circle, _SCALES)
-    slopes, outside = near.slopes(conic), outward[edges.ring]
-    distance = edges.offset - near.tiles.flat(near.distances(conic, slopes)) * outside
-    kept = near.tiles.flat(keep) > 0
-    blur = zernike.edge_blur(edges.offset[kept], distance[kept], edges.normal[kept], edges.ring[kept] % count, count)
-    points = edges.points
-    if how.correct:
-        bend = near.tiles.flat(near.curvatures(conic, slopes)) * outside
-        points = points + _correction(edges, blur, bend)[:, None] * edges.normal
-        near = near.moved(points)
-    _, keep = near.robust(conic, _SCALES[-1:])
-    keep = near.tiles.flat(keep) > 0
+    points, blur, keep = _freed(edges, rough, outward, how.correct)
     ring, points = edges.ring[keep], points[keep]
     ideal_points = ideal_pixels(camera, points)
     # as the frame shows them, and without the lens
@@ -343,6 +331,29 @@ def _within(reach: Tensor, fitted: Tensor, rough: Tensor) -> Tensor:
     shift = torch.linalg.vector_norm(fitted[:, :2] - rough[:, :2], dim=-1)
     growth = (conics.shape_matrix(fitted) - conics.shape_matrix(rough)).abs().amax((1, 2))
     return torch.maximum(shift, growth) < reach + 1.5
+
+
+def _freed(edges: RingEdges, rough: Tensor, outward: Tensor, correct: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """Edge points (E, 2) freed of what blur and curvature do to them, the blur (M / 2, 3), and which are of a circle.
+
+    Args:
+        edges: of M circles, the outer ones first.
+        rough: their ellipses (M, 5). outward: (M,), as for `ring_edges`.
+        correct: free them; else they stay as the moments read them.
+    """
+    count, outside = len(rough) // 2, outward[edges.ring]
+    near = ellipse.Near.of(edges.points, edges.ring, rough)
+    conic, keep = near.robust(near.circle, _SCALES)
+    slopes, kept = near.slopes(conic), near.tiles.flat(keep) > 0
+    distance = edges.offset - near.tiles.flat(near.distances(conic, slopes)) * outside
+    blur = zernike.edge_blur(edges.offset[kept], distance[kept], edges.normal[kept], edges.ring[kept] % count, count)
+    points = edges.points
+    if correct:
+        bend = near.tiles.flat(near.curvatures(conic, slopes)) * outside
+        points = points + _correction(edges, blur, bend)[:, None] * edges.normal
+        near = near.moved(points)
+    _, keep = near.robust(conic, _SCALES[-1:])
+    return points, blur, near.tiles.flat(keep) > 0
 
 
 def _as_a_whole(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tuple[Rings, Tensor]:

@@ -250,5 +250,5 @@ def edge_correlation(size: int = MASK) -> float:
     a row of edge pixels have the autocorrelation of that kernel; the factor is its sum (derived; checked by Monte-Carlo
     in tests/rings/test_zernike.py).
     """
-    kernel = kernels(size, ((2, 0),))[0]
+    kernel = kernels(size, EDGE_ORDERS)[-1]  # which are made anyway
     return float(kernel.sum(1).square().sum() / kernel.square().sum())

@@ -39,12 +39,14 @@ def band_pixels(outer: Tensor, inner: Tensor, band: Tensor, height: int, width: 
     last = (outer[:, 1] + reach).floor().clamp(-1, height - 1).long()
     ring, offset = ragged_arange((last - first + 1).clamp_min(0))
     v = first[ring] + offset
-    spans = [_span(e[ring], sign * band[ring], v.double(), width) for e in (outer, inner) for sign in (1, -1)]
-    (low0, high0), (low1, high1), (low2, high2), (low3, high3) = spans
-    # nested, from outside inwards; a span that the row misses is empty in the middle of the one around it
-    low1, high1 = _within(low1, high1, low0, high0)
-    low2, high2 = _within(low2, high2, low1, high1)
-    low3, high3 = _within(low3, high3, low2, high2)
+    # each ellipse grown, then shrunk: nested, from outside inwards
+    grow = torch.stack([band, -band, band, -band], -1)
+    four = torch.stack([outer, outer, inner, inner], 1)
+    low, high = (x.unbind(-1) for x in _spans(four[ring], grow[ring], v.double(), width))
+    # a span that the row misses is empty in the middle of the one around it
+    (low0, high0), (low1, high1) = (low[0], high[0]), _within(low[1], high[1], low[0], high[0])
+    low2, high2 = _within(low[2], high[2], low1, high1)
+    low3, high3 = _within(low[3], high[3], low2, high2)
     start = torch.stack([low0, low2, high3, high1], -1)
     length = torch.stack([low1 - low0, low3 - low2, high2 - high3, high0 - high1], -1)
     segment, position = ragged_arange(length.flatten())
@@ -57,16 +59,18 @@ def _half_height(ellipse: Tensor, band: Tensor) -> Tensor:
     return torch.hypot(a * theta.sin(), b * theta.cos())
 
 
-def _span(ellipse: Tensor, grow: Tensor, v: Tensor, width: int) -> tuple[Tensor, Tensor]:
-    """First pixel inside and first one beyond it, int64, where rows ``v`` cut grown ellipses; equal where they miss."""
-    a, b = (ellipse[:, 2] + grow).clamp_min(1e-3), (ellipse[:, 3] + grow).clamp_min(1e-3)
-    cos, sin = ellipse[:, 4].cos(), ellipse[:, 4].sin()
-    y = v - ellipse[:, 1]
+def _spans(ellipse: Tensor, grow: Tensor, v: Tensor, width: int) -> tuple[Tensor, Tensor]:
+    """First pixel inside and first one beyond it (S, E), int64, where rows ``v`` (S,) of pixels cut grown ellipses
+    (S, E, 5); equal where they miss.
+    """
+    cx, cy, *axes, theta = ellipse.unbind(-1)
+    a, b = ((axis + grow).clamp_min(1e-3) for axis in axes)
+    cos, sin, y = theta.cos(), theta.sin(), v[:, None] - cy
     # (x cos + y sin)^2 / a^2 + (y cos - x sin)^2 / b^2 = 1, a quadratic in x
     p = (cos / a).square() + (sin / b).square()
     half = cos * sin * (1 / b.square() - 1 / a.square()) * y
     root = half.square() - p * (((sin / a).square() + (cos / b).square()) * y.square() - 1)
-    middle, reach = ellipse[:, 0] + half / p, root.clamp_min(0).sqrt() / p
+    middle, reach = cx + half / p, root.clamp_min(0).sqrt() / p
     low, high = (middle - reach).ceil().clamp(0, width).long(), (middle + reach).floor().clamp(-1, width - 1).long() + 1
     return low, torch.where(root > 0, high, low).maximum(low)
 

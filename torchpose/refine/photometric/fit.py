@@ -60,6 +60,7 @@ from torchpose.refine.photometric.sectors import (
     level_scatter,
     of_more,
     overdispersion,
+    shift_scatter,
     sum_sectors,
     trust,
 )
@@ -95,7 +96,7 @@ _FEWER = 0.02
 _MOST_GAIN = 0.5
 _COARSELY = _Stage(2, coarse=True)
 _QUICK = (_Stage(1),)  # after the coarse steps
-_AGAIN = (_Stage(2),)  # from where a fit of the same rows ended
+_AGAIN = (_Stage(1),)  # from where a fit of the same rows ended
 _THOROUGH = (_Stage(1, wary=True), _Stage(2, wary=True, tempered=True))
 
 
@@ -196,7 +197,7 @@ class _Fits:
     def again(self, result: _Result, rows: Tensor, kind: int, stages: tuple[_Stage, ...]) -> tuple[Tensor, _Result]:
         """Those of the rows (N,) bool that could be refined once more from where they are, and what came out."""
         look, fresh = result.look, self.sight.look is None
-        band = band_width(Spread.of(result.spread, KINDS[kind])) if fresh else self.band
+        band = self._band_for(Spread.of(result.spread, KINDS[kind])) if fresh else self.band
         begun = (look.kind == kind) & (look.band == band) & result.good
         cases, parts = 2 * (band == self.band) + begun, [(rows.nonzero()[:0, 0], result[:0])]
         for case in cases[rows].unique().tolist():
@@ -210,6 +211,11 @@ class _Fits:
             parts.append((some, self.refined(fit, begin, spread, steps, levels)))
         index, other = torch.cat([some for some, _ in parts]), _Result.cat([part for _, part in parts])
         return index[other.good], other[other.good]
+
+    def _band_for(self, spread: Spread) -> Tensor:
+        """Bands (N,) px for these blurs: those that are there where they are as wide, but for a pixel."""
+        wanted = band_width(spread)
+        return torch.where(wanted > self.band + 1, wanted, self.band)
 
     def _fit(self, rows: Tensor, band: Tensor) -> _Fit:
         return _Fit(self.sight[rows], band[rows], None if self.known is None else self.known[rows])
@@ -246,7 +252,7 @@ class _Fits:
 
     def widened(self, result: _Result, rows: Tensor) -> _Result:
         """With a wider band for the rows (N,) bool whose blur takes the levels beside the edge for its own."""
-        wide = rows & (result.look.kind == 0) & (band_width(Spread(result.spread)) > self.band + 1)
+        wide = rows & (result.look.kind == 0) & (self._band_for(Spread(result.spread)) > self.band)
         if not bool(wide.any()):
             return result
         index, other = self.again(result, wide, 0, _QUICK)
@@ -324,7 +330,8 @@ def _beyond_rims(fit: _Fit, found: Minimum, normals: MarkerNormals, wider: Tenso
     """
     row, pose, rows = fit.blocks.row, found.unknowns.pose, len(wider)
     factor, freedom, alone = in_step(fit.sectors.scaled(fit.factor), fit.variance[row], fit.blocks.rings, row, rows)
-    beyond = torch.where(of_more(factor, freedom), (factor - wider[:, None]).clamp_min(0), 0.0)
+    shifted = shift_scatter(fit.sectors.scaled(fit.factor), fit.variance[row], fit.blocks.rings, row, rows)[:, None]
+    beyond = (torch.where(of_more(factor, freedom), factor, 0.0).maximum(shifted) - wider[:, None]).clamp_min(0)
     away = (pose.R[row] @ fit.blocks.center[..., None])[:, 2] + pose.t[row, 2:]
     mm = (beyond[row] * alone).sqrt() * away / fit.focal
     shifts = torch.nn.functional.pad(torch.diag_embed(mm), (0, 0, 0, POSE - 1))

@@ -32,7 +32,7 @@ def first_levels(blocks: PixelBlocks, model: RingModel) -> Tensor:
     ring, paper = _pure_levels(blocks, model.fraction)
     levels = torch.stack([ring, none, none, paper, none, none], -1).nan_to_num(0.0, 0.0, 0.0).double()
     for _ in range(_FIRST_STEPS):
-        predicted = (levels.float()[:, None, None] @ columns[:, :, :LEVELS]).flatten(1)
+        predicted = (levels.float()[:, None, :, None] * columns[:, :, :LEVELS]).sum(2).flatten(1)
         residual = blocks.grey - predicted
         weight = blocks.valid * blocks.seen * geman_mcclure(residual / (2 * noise_spread(residual, blocks)[:, None]))
         sums = sum_products(columns, weight)
@@ -95,7 +95,8 @@ def _tiled(planes: tuple[Tensor, ...]) -> Tensor:
 def sum_products(columns: Tensor, weight: Tensor) -> Tensor:
     """Sums over all pixels of weight times the products of every two columns: (K, n, n) float64."""
     weighted = columns * weight.unflatten(1, (-1, 1, TILE))
-    return (weighted @ columns.mT).double().sum(1)
+    products = torch.bmm(weighted.flatten(0, 1), columns.flatten(0, 1).mT)
+    return products.unflatten(0, columns.shape[:2]).sum(1, dtype=torch.float64)
 
 
 def inliers(

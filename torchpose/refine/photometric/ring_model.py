@@ -220,9 +220,8 @@ class _Foot(NamedTuple):
 
 def _feet(blocks: PixelBlocks, R: Tensor, t: Tensor) -> _Foot:
     """The radius in the plane is formed in float64, what is small beside it in float32."""
-    rk = R[blocks.row]
-    normal = (rk @ blocks.normal[..., None]).squeeze(-1)
-    arm = (rk @ blocks.center[..., None]).squeeze(-1)  # marker's centre about the target's origin, camera axes
+    # the arm: marker's centre about the target's origin, camera axes
+    normal, arm = torch.bmm(R[blocks.row], torch.stack([blocks.normal, blocks.center], -1)).unbind(-1)
     center = arm + t[blocks.row]
     one, two = plane_axes(normal)
     # the ray of the pixel meets the plane at depth * ray; coordinates there, about the circle's centre, are quotients

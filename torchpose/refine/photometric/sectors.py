@@ -31,6 +31,14 @@ _KEPT = 0.9  # of a sector's pixels that must follow the model for it to count (
 _CELL = 4  # sectors over which a misfit is taken for one
 _BAND = 2  # sectors of the outer circle that a band of lines is high: half as much apart, most of them share it
 _UNCLEAR = 3  # sectors of an outer circle: more are no chance (measured: decisions/0064)
+_ODD = (
+    3,
+    5,
+    7,
+)  # harmonics that neither pose nor gain nor blur can have, and that a box of 12 cells resolves (derived)
+# of the spectrum of what displaces a rim, as reciprocals of the harmonic of the outer circle at which it has fallen to
+# 1/e: white, and down to a correlation over half of the radius (convention: none is told better)
+_WIDTHS = (0.0, 0.03, 0.06, 0.12, 0.24)
 _DISPLACED = 0.005  # px, displacement that a camera or print slightly off may cause: no reason for doubt
 _TINY = 1e-12  # least divisor (convention: below any sum that counts)
 
@@ -235,6 +243,43 @@ def in_step(
     total = expected.sum(1).clamp_min(_TINY)
     freedom = total.square() / expected.square().sum(1).clamp_min(_TINY)
     return found.square().sum(1) / total, freedom, 1 / alone.sum((-1, -2)).mT.clamp_min(_TINY)
+
+
+def shift_scatter(sectors: Sectors, variance: Tensor, rings: Tensor, row: Tensor, rows: int) -> Float[Tensor, " N"]:
+    """By how much the shifts of rings scatter more than independent edges would let them (N,), as a factor of variance.
+
+    A shift is the first harmonic of what displaces a rim. It cannot be told from the pose, but the third, fifth and
+    seventh can: what is white along the rim gives all of them the same power, what is correlated over some px gives the
+    first one more, and what is symmetric (the cells of a printer) gives another to even ones, of which sizes and tilts
+    are made. Their power is taken for a Gaussian of the frequency along the rim, A exp(-(q k / r)^2), and the first
+    one's is its mean over the widths q that remain possible.
+
+    Args:
+        sectors, variance, rings, row, rows: as for `in_step`.
+    """
+    pull, hold = (v.double().unflatten(1, (2, SECTORS)) / variance[:, None, None] for v in (sectors.pull, sectors.hold))
+    error = torch.where(hold > 0, pull / hold.clamp_min(_TINY), 0.0)
+    basis = _harmonics(hold)
+    weighted = hold[..., None] * basis
+    taken = solve_scaled((weighted.mT @ basis).flatten(0, 1), (weighted.mT @ error[..., None]).flatten(0, 1))
+    pull = hold * (error - (basis @ taken.unflatten(0, (-1, 2)))[..., 0])
+    order = torch.tensor(_ODD, dtype=hold.dtype, device=hold.device)
+    wave = torch.polar(torch.ones_like(order)[:, None], order[:, None] * middles(hold.device).to(hold))  # (3, 48)
+    held = hold.sum(-1)  # (K, 2)
+    power = (pull.to(wave) @ wave.mT).abs().square() / held.clamp_min(_TINY)[..., None]  # 1 of independent edges
+    radius = rings.flip(1)[..., 2:4].prod(-1).sqrt()  # inner circle first, as the sectors
+    about = (rings[:, 0, 2:4].prod(-1).sqrt()[:, None] / radius.clamp_min(_TINY))[..., None, None]
+    width = torch.tensor(_WIDTHS, dtype=hold.dtype, device=hold.device)
+    damping = (-(width * about * order[:, None]).square()).exp()  # (K, 2, 3, Q)
+    seen = (held > 0).to(hold)[..., None, None]
+    count = len(_ODD) * segment_sum(seen.sum((1, 2, 3)), row, rows)[:, None]
+    height = segment_sum((seen * power[..., None] / damping).sum((1, 2)), row, rows) / count.clamp_min(1)
+    fall = segment_sum((seen * damping.log()).sum((1, 2)), row, rows)
+    share = torch.softmax(-count * height.clamp_min(_TINY).log() - fall, -1)  # powers are exponential about their means
+    first = (-(width * about[..., 0]).square()).exp()  # (K, 2, Q)
+    weight = segment_sum(held.sum(-1), row, rows).clamp_min(_TINY)
+    first = segment_sum((held[..., None] * first).sum(1), row, rows) / weight[:, None]
+    return (share * height * first).sum(-1)
 
 
 def level_scatter(
