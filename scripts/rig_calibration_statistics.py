@@ -160,7 +160,8 @@ def by_chain(scene: Drawn, given: Seen) -> tp.CameraRig | None:
         if len(both) < LEAST:
             return None
         one, two = ([given.pixels[j][name] for name in both] for j in (k, k + 1))
-        _, *_, turn, shift, _, _ = cv2.stereoCalibrate(
+        calibrate: Any = cv2.stereoCalibrate  # whose stub knows no lists of pictures' points
+        _, *_, turn, shift, _, _ = calibrate(
             [given.points] * len(both),
             one,
             two,
@@ -184,7 +185,8 @@ def by_multiview(scene: Drawn, given: Seen) -> tp.CameraRig | None:
     names = sorted({name for own in given.pixels for name in own})
     nothing, count = np.full((len(given.points), 2), -1, np.float32), len(given.pixels)
     try:
-        _, _, _, turns, shifts = cv2.calibrateMultiview(
+        calibrate: Any = cv2.calibrateMultiview  # as above
+        _, _, _, turns, shifts = calibrate(
             [given.points / METRE] * len(names),
             [[own.get(name, nothing) for name in names] for own in given.pixels],
             [given.size] * count,

@@ -17,6 +17,7 @@ import pytest
 from tests.live.cell import CAMERA, TARGET, Page, Scene, looking, picture, served
 from torchpose import pipeline
 from torchpose.cli.main import main
+from torchpose.detect import find_coarse
 from torchpose.io.images import decode
 from torchpose.io.manifest import read_manifest
 from torchpose.io.reader import Fault
@@ -55,7 +56,7 @@ def test_a_target_that_moves_leaves_and_comes_back_is_seen_as_in_single_frames(
 ) -> None:
     """Looked for near the last pose; covered, lost, or elsewhere, all over the frame."""
     searches: list[int] = []
-    search = pipeline.find_coarse
+    search = find_coarse
 
     def counted(*args: Any, **kwargs: Any) -> Any:
         searches.append(1)

@@ -251,7 +251,7 @@ def _neighbours(cell: Tensor, width: int) -> tuple[Tensor, Tensor]:
             first.append(index)
             second.append(beneath.index_select(0, index))
         return torch.cat(first), torch.cat(second)
-    padded = torch.nn.functional.pad(cell, (0, 3), value=torch.iinfo(cell.dtype).max)
+    padded = torch.nn.functional.pad(cell, (0, 3), value=-1)  # meets no cell: what is wanted is never negative
     wanted = cell + (width - 1)
     below = _search(cell, wanted)
     for k in range(3):
