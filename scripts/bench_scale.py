@@ -23,7 +23,6 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -315,16 +314,15 @@ def store(folder: Path, arguments: argparse.Namespace) -> None:
     """Small frames from and to a store, by both engines; memory of the command with a tenth of them and with all."""
     import cv2
 
-    from tests.io.stores import ENVIRONMENT, s3_server
+    from tests.io.stores import ENVIRONMENT, put, s3_server
 
     logging.getLogger("werkzeug").setLevel(logging.ERROR)
     count, picture = arguments.frames or 10000, cv2.imencode(".png", small_sample(folder))[1].tobytes()
     with s3_server("cell", every=0) as (url, application):
         os.environ.update(ENVIRONMENT | {"AWS_ENDPOINT_URL": url, "XDG_CACHE_HOME": str(folder)})
         for share in (10, 1):
-            with ThreadPoolExecutor(8) as pool:
-                places = [Place(f"s3://cell/{share}") / f"{number:06d}.png" for number in range(count // share)]
-                list(pool.map(lambda place: place.write(picture), places))
+            for number in range(count // share):
+                put("cell", f"{share}/{number:06d}.png", picture)
         application._every = 50
         for engine in ("ray", "local"):
             for share in (10, 1):

@@ -50,3 +50,13 @@ def s3_server(bucket: str, *, every: int = 0) -> Iterator[tuple[str, Unsteady]]:
     finally:
         server.shutdown()
         thread.join()
+
+
+def put(bucket: str, key: str, data: bytes) -> None:
+    """Has a server that runs in this process keep a file, without a request."""
+    from moto.s3.models import s3_backends
+
+    for account in s3_backends.values():
+        for backend in account.values():
+            if bucket in backend.buckets:
+                backend.put_object(bucket, key, data)

@@ -61,6 +61,14 @@ def test_round_trip_and_listing(bucket: Place) -> None:
     assert place.kind() == "nothing"
 
 
+def test_requests_are_tried_again_however_many_have_failed(bucket: Place, server: tuple[str, Unsteady]) -> None:
+    """More than the hundred failures that AWS's standard strategy lets a process have."""
+    place, before = bucket / "often.bin", server[1].failed
+    place.write(b"x" * 1000)  # longer than the answer that says why: Arrow asks again only then
+    while server[1].failed - before < 105:
+        assert place.read(1000) == b"x" * 1000
+
+
 @pytest.mark.parametrize("scheme", ["memory://shelf", "file"])
 def test_other_file_systems(scheme: str, tmp_path: Path) -> None:
     folder = as_place(tmp_path / "a b") if scheme == "file" else Place(scheme)

@@ -5,7 +5,8 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,14 @@ import pytest
 
 from tests.io.stores import ENVIRONMENT, s3_server
 from torchpose.cli.main import main
+from torchpose.errors import ConfigError
 from torchpose.io import storage
 from torchpose.io.rows import DETECTION_SCHEMA, POSE_SCHEMA, Row
 from torchpose.io.sources import find_sources
-from torchpose.io.storage import Place
+from torchpose.io.storage import Place, StorageError
 from torchpose.io.tally import Tally
 from torchpose.io.writers import read_table
+from torchpose.scale.cluster import answered, answers
 from torchpose.scale.estimate import pending
 from torchpose.scale.parts import Parts
 
@@ -88,6 +91,33 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.copy(path, folder)
     (folder / "009.png").write_bytes(b"no picture")
     return folder
+
+
+def test_what_a_worker_meets_reaches_the_command_as_it_is() -> None:
+    ray = pytest.importorskip("ray")
+
+    class Data:
+        """Of a data set what `answers` asks for."""
+
+        def __init__(self, *work: Callable[[], Any]) -> None:
+            self._work = work
+
+        def iter_rows(self) -> Iterator[dict[str, Any]]:
+            yield from ({"result": answered(one)} for one in self._work)
+
+    def fail(error: Exception) -> Any:
+        raise error
+
+    assert [result for _, result in answers(Data(lambda: 1, lambda: "two"), "result")] == [1, "two"]
+    with pytest.raises(ConfigError, match=r"^--out: access is denied; ask; add --resume to go on$"):
+        list(answers(Data(partial(fail, StorageError("access is denied", "ask"))), "result"))
+    with pytest.raises(ConfigError, match=r"^x: is none$"):
+        list(answers(Data(partial(fail, ConfigError("x: is none"))), "result"))
+    text = (
+        "ray::submit()\n  File x\nZeroDivisionError: by 0\n\nThe above exception was the direct cause of\nHow to retry"
+    )
+    with pytest.raises(ConfigError, match=r"^--engine ray: a worker ended \(ZeroDivisionError: by 0\); add --resume"):
+        list(answers(Data(partial(fail, ray.exceptions.RayError(text))), "result"))
 
 
 def test_workers_elsewhere_find_the_frames(frames: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

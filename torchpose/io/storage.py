@@ -44,8 +44,11 @@ class StorageError(Exception):
     """A store refuses or does not answer; `problem` and `fix` as error messages say them."""
 
     def __init__(self, problem: str, fix: str) -> None:
-        super().__init__(f"{problem}; {fix}")
+        super().__init__(problem, fix)  # so it can be pickled
         self.problem, self.fix = problem, fix
+
+    def __str__(self) -> str:
+        return f"{self.problem}; {self.fix}"
 
 
 @dataclass(frozen=True)
@@ -260,7 +263,9 @@ def _file_system(scheme: str, netloc: str, query: str) -> "fs.FileSystem":
         if not given["region"] and not given["endpoint_override"]:
             with _told():
                 given["region"] = fs.resolve_s3_region(netloc)
-        retry = fs.AwsStandardS3RetryStrategy(max_attempts=_TRIES)
+        # AWS's standard strategy has 500 tokens and takes five for a try; Arrow gives none back, so after a hundred
+        # failures in a process nothing would be tried again
+        retry = fs.AwsDefaultS3RetryStrategy(max_attempts=_TRIES)
         named = {name: value for name, value in given.items() if value}
         # a small file is sent in one request rather than in three
         how = {"background_writes": False, "allow_delayed_open": True}

@@ -5,13 +5,15 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import pickle
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any, cast
 
 from torchpose.errors import ConfigError
+from torchpose.io.storage import StorageError
 
 _CONNECT = 5.0  # seconds (convention)
 
@@ -133,29 +135,39 @@ def _check_nodes() -> None:
             raise ConfigError(f"{name}: --address: this node of the cluster {has}; install torchpose {own} there")
 
 
-def blocks_done(data: Any) -> Iterator[dict[str, Any]]:
-    """The rows of a data set as they are done. ConfigError: what a worker raised, in one line."""
+def answered(work: Callable[[], Any]) -> bytes:
+    """What a worker sends: ``(True, result)``, or ``(False, error)`` of the user or of a store, as a result.
+
+    What is raised in a worker reaches the command as text alone, without its cause.
+    """
+    try:
+        return pickle.dumps((True, work()))
+    except (ConfigError, StorageError) as error:
+        return pickle.dumps((False, error))
+
+
+def answers(data: Any, column: str) -> Iterator[tuple[dict[str, Any], Any]]:
+    """The rows of a data set as they are done, with the result in a column (`answered`).
+
+    Raises:
+        ConfigError: what a worker has answered or raised, in one line.
+    """
     import ray.exceptions
 
     try:
-        yield from data.iter_rows()
+        for row in data.iter_rows():
+            well, result = pickle.loads(row[column])
+            if not well:
+                raise result
+            yield row, result
+    except StorageError as error:
+        raise ConfigError(f"--out: {error}; add --resume to go on") from None
     except ray.exceptions.RayError as error:
-        raise _of_worker(error) from None
+        raise ConfigError(f"--engine ray: a worker ended ({_reason(error)}); add --resume to go on") from None
 
 
-def _of_worker(error: BaseException) -> ConfigError:
-    """What a worker raised, as an error of the command."""
-    from torchpose.io.storage import StorageError
-
-    cause: BaseException | None = error
-    while cause is not None:
-        inner = getattr(cause, "cause", None) or cause.__cause__
-        if isinstance(cause, ConfigError):
-            return ConfigError(str(cause))
-        if isinstance(cause, StorageError):
-            return ConfigError(f"--out: {cause.problem}; {cause.fix}; add --resume to go on")
-        if inner is None or inner is cause:
-            break
-        cause = inner
-    lines = [line for line in str(cause).splitlines() if line.strip()] or [type(cause).__name__]
-    return ConfigError(f"--engine ray: a worker ended ({lines[-1].strip()[:200]}); add --resume to go on")
+def _reason(error: Exception) -> str:
+    """The line of Ray's text that says what was raised in a worker: the last of the first traceback."""
+    first = str(error).partition("\n\nThe above exception")[0]
+    lines = [line.strip() for line in first.splitlines() if line.strip()] or [type(error).__name__]
+    return lines[-1][:200]

@@ -9,7 +9,7 @@ from typing import Any, Generic, Self, TypeVar
 import numpy as np
 
 from torchpose.io.processes import one_thread
-from torchpose.scale.cluster import blocks_done
+from torchpose.scale.cluster import answered, answers
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -63,10 +63,10 @@ class RayCrew(Generic[Item, Result]):
         )
         early: dict[int, Any] = {}
         following = 0
-        for row in blocks_done(data):
-            early[row["number"]] = row["result"]
+        for row, result in answers(data, "result"):
+            early[row["number"]] = result
             while following in early:
-                yield pickle.loads(early.pop(following))
+                yield early.pop(following)
                 following += 1
 
 
@@ -78,5 +78,5 @@ class _Worker:
         self._work = work
 
     def __call__(self, batch: dict[str, np.ndarray]) -> dict[str, Any]:
-        (result,) = self._work([pickle.loads(batch["item"][0])])
-        return {"number": batch["number"], "result": np.array([pickle.dumps(result)], dtype=object)}
+        result = answered(lambda: next(iter(self._work([pickle.loads(batch["item"][0])]))))
+        return {"number": batch["number"], "result": np.array([result], dtype=object)}

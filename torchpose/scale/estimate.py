@@ -27,7 +27,7 @@ from torchpose.io.rows import Row
 from torchpose.io.sources import Source
 from torchpose.io.storage import REQUESTS
 from torchpose.io.tally import Tally
-from torchpose.scale.cluster import blocks_done
+from torchpose.scale.cluster import answered, answers
 from torchpose.scale.parts import Parts, part_name
 
 _CALLS = 2  # of a worker side by side: one decodes while the other measures
@@ -56,9 +56,13 @@ class Measure:
         self._estimator = work.estimator()
         self._measuring = threading.Lock()
 
-    @torch.inference_mode()
     def __call__(self, batch: dict[str, np.ndarray]) -> dict[str, Any]:
-        block: Block = pickle.loads(batch["block"][0])
+        rows = answered(lambda: self._done(pickle.loads(batch["block"][0])))
+        return {"rows": np.array([rows], dtype=object)}
+
+    @torch.inference_mode()
+    def _done(self, block: Block) -> list[tuple[str, list[Row]]]:
+        """Rows by frame of a block, once they are written."""
         stamps = {source.name: source.stamp() for source in block.sources}  # before they are read
         read = decoded(block, self._work.camera)
         with self._measuring:
@@ -67,8 +71,7 @@ class Measure:
             self._detections.write(block.name, (row for r in records for row in r["detections"]), stamps)
         # the last: where it is there, the block is done
         self._poses.write(block.name, (row for r in records for row in r["rows"]), stamps)
-        rows = pickle.dumps([(record["frame"], record["rows"]) for record in records])
-        return {"rows": np.array([rows], dtype=object)}
+        return [(record["frame"], record["rows"]) for record in records]
 
 
 def decoded(block: Block, camera: Camera) -> Batch:
@@ -133,5 +136,5 @@ def measured(
             enable_true_multi_threading=True,
         ),
     )
-    for row in blocks_done(data):
-        yield pickle.loads(row["rows"])
+    for _, rows in answers(data, "rows"):
+        yield rows
