@@ -14,6 +14,7 @@ import torch
 from torchpose import pipeline
 from torchpose.camera import Camera
 from torchpose.cli.main import main
+from torchpose.detect import find_coarse
 from torchpose.geometry import rotations
 from torchpose.io.films import Film
 from torchpose.io.lanes import in_lanes
@@ -58,7 +59,7 @@ def rows(path: str) -> list[dict[str, str]]:
 def test_rows_are_those_of_frames_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     assert estimated("--out", "alone.csv") == 1  # a file is none
     searched: list[int] = []
-    search: Callable[..., Any] = pipeline.find_coarse
+    search: Callable[..., Any] = find_coarse
 
     def counted(frames: torch.Tensor, *args: Any, **kwargs: Any) -> Any:
         searched.append(len(frames))
