@@ -123,7 +123,7 @@ class Everywhere(Observer):
     """Looks for the target all over every frame."""
 
     def look(self, shot: Shot) -> Sight:
-        self._last = None
+        self._tracker.forget()
         return super().look(shot)
 
 

@@ -44,6 +44,7 @@ BORDER = 10.0  # px
 LENS = "brown4"
 NOISE = 2.0  # grey levels, of rendered frames
 LEAST = 4  # moments of a pair for cv2.stereoCalibrate
+METRE = 1000.0  # mm
 STOP = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-12)
 
 
@@ -159,7 +160,8 @@ def by_chain(scene: Drawn, given: Seen) -> tp.CameraRig | None:
         if len(both) < LEAST:
             return None
         one, two = ([given.pixels[j][name] for name in both] for j in (k, k + 1))
-        _, *_, turn, shift, _, _ = cv2.stereoCalibrate(
+        calibrate: Any = cv2.stereoCalibrate  # whose stub knows no lists of pictures' points
+        _, *_, turn, shift, _, _ = calibrate(
             [given.points] * len(both),
             one,
             two,
@@ -176,14 +178,16 @@ def by_chain(scene: Drawn, given: Seen) -> tp.CameraRig | None:
 
 
 def by_multiview(scene: Drawn, given: Seen) -> tp.CameraRig | None:
-    """All at once; None where OpenCV has no such function, or fails."""
+    """All at once, in metres, since it takes points for collinear whose distances are large numbers; None where OpenCV
+    has no such function, or fails."""
     if not hasattr(cv2, "calibrateMultiview"):
         return None
     names = sorted({name for own in given.pixels for name in own})
     nothing, count = np.full((len(given.points), 2), -1, np.float32), len(given.pixels)
     try:
-        _, _, _, turns, shifts = cv2.calibrateMultiview(
-            [given.points] * len(names),
+        calibrate: Any = cv2.calibrateMultiview  # as above
+        _, _, _, turns, shifts = calibrate(
+            [given.points / METRE] * len(names),
             [[own.get(name, nothing) for name in names] for own in given.pixels],
             [given.size] * count,
             np.array([[name in own for name in names] for own in given.pixels], np.uint8),
@@ -200,7 +204,7 @@ def by_multiview(scene: Drawn, given: Seen) -> tp.CameraRig | None:
         return None
     R = [torch.from_numpy(cv2.Rodrigues(np.asarray(turn, float))[0]) for turn in turns[1:]]
     R = [torch.eye(3, dtype=F64), *R]
-    t = torch.stack([torch.from_numpy(np.asarray(shift, float)).flatten() for shift in shifts])
+    t = METRE * torch.stack([torch.from_numpy(np.asarray(shift, float)).flatten() for shift in shifts])
     t[0] = 0
     return tp.CameraRig(scene.rig.cameras, torch.stack(R), t)
 

@@ -11,7 +11,8 @@ consistency (mean chi-squared between the cameras over its freedom, ideal 1). A 
 rigs are as they say: of ratios the root mean square over the cases.
 
 Cases end in `-places` where the rig states a covariance of its places (20 um, 0.2 mrad a camera) and every moment has
-places of its own from it; in `-fixed` all 16 moments of a call have the same ones. `two-markers`: each camera sees two markers of the four, at opposite corners in turns.
+places of its own from it; in `-fixed` all 16 moments of a call have the same ones. `two-markers`: each camera sees two
+markers of the four, at opposite corners in turns.
 `missing`: one camera has no picture, each in turn. `knocked-N`: the second camera is turned by N deviations of the
 centre of a ring at the noise of the frames, which the rig does not know; `-first` the first one, in whose axes the
 poses are. What a call says of a rig depends on how many moments it has: `--batch`.

@@ -561,7 +561,7 @@ def test_a_run_killed_again_and_again_and_resumed_gives_the_rows_of_an_undisturb
     kills: list[Any] = []
     for _ in range(3):
         # two processes may be some rows ahead of the one that writes: once, so that rows are left for the others
-        moment = str(chance.randint(2, 5)), str(chance.uniform(1e-6, 0.01))
+        moment = str(chance.randint(2, 5)), str(chance.uniform(1e-6, 0.002))
         process = start(*words, *(["--resume"] if kills else ["--threads", "2"]), ended=moment)
         assert finish(process) == (-signal.SIGALRM, "")
         kills.append(journal.read_bytes().count(b"\n") - 1)

@@ -97,7 +97,9 @@ def test_markers_and_pictures_of_every_camera(shots: Path, tmp_path: Path) -> No
     for number, name in enumerate(cameras.names):
         origin = cameras.cameras[number].project(cameras.seen_by(number, R[3], t[3])[1][None])[0]
         u, v = origin.round().int().tolist()
-        around = cv2.imread(str(drawn / name / "3.png"))[v - 6 : v + 7, u - 6 : u + 7].astype(int)
+        picture = cv2.imread(str(drawn / name / "3.png"))
+        assert picture is not None
+        around = picture[v - 6 : v + 7, u - 6 : u + 7].astype(int)
         assert (around.max(-1) - around.min(-1)).max() > 100  # colours in a grey picture
 
 

@@ -17,6 +17,7 @@ import pytest
 from tests.live.cell import CAMERA, TARGET, Page, Scene, looking, picture, served
 from torchpose import pipeline
 from torchpose.cli.main import main
+from torchpose.detect import find_coarse
 from torchpose.io.images import decode
 from torchpose.io.manifest import read_manifest
 from torchpose.io.reader import Fault
@@ -55,7 +56,7 @@ def test_a_target_that_moves_leaves_and_comes_back_is_seen_as_in_single_frames(
 ) -> None:
     """Looked for near the last pose; covered, lost, or elsewhere, all over the frame."""
     searches: list[int] = []
-    search = pipeline.find_coarse
+    search = find_coarse
 
     def counted(*args: Any, **kwargs: Any) -> Any:
         searches.append(1)
@@ -65,15 +66,8 @@ def test_a_target_that_moves_leaves_and_comes_back_is_seen_as_in_single_frames(
     covered = picture(3)
     covered[:180, :240] = 90
     empty, far = np.full_like(covered, 110), picture(6, t=(14.0, -6.0, 155.0))
-    images = [
-        picture(1),
-        picture(2, t=(2.0, 1.0, 150.0)),
-        covered,
-        empty,
-        picture(4),
-        far,
-        picture(7, t=(13.0, -6.0, 155.0)),
-    ]
+    near, nearer = picture(2, t=(2.0, 1.0, 150.0)), picture(7, t=(13.0, -6.0, 155.0))
+    images = [picture(1), near, covered, empty, picture(4), far, nearer]
     follows = Observer(CAMERA, TARGET)
     whole = []
     for number, image in enumerate(images):

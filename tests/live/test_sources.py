@@ -117,6 +117,7 @@ def test_a_film_that_ends_early_shows_so_and_goes_on(film: Path) -> None:
     film.write_bytes(whole[: 8 * len(whole) // 10])
     time = Time()
     found = player(film, SIZE, 20.0, lambda line: None)
+    found._clock = Clock(20.0, time)
     shots = [found.newest(time.wait) for _ in range(12)]
     some = len(found.sources)  # frames, and one that says that there were to be more
     assert 2 <= some < 10
@@ -134,6 +135,7 @@ def test_frames_that_a_film_lacks_are_asked_for_once(film: Path, tmp_path: Path)
     found.sources = [Source(f"clip.avi#{k + 1}", film, tmp_path, directory=k, film=longer) for k in range(13)]
     found.sources.append(Source("z.png", tmp_path / "z.png", tmp_path))
     time = Time()
+    found._clock = Clock(20.0, time)
     names = [found.newest(time.wait).name for _ in range(14)]
     shown = [f"clip.avi#{k}" for k in range(1, 12)]  # the eleventh says that it is not there
     assert names == [*shown, "z.png", *shown[:2]]

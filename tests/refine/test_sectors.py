@@ -18,6 +18,7 @@ from torchpose.refine.photometric.sectors import (
     doubtful,
     in_step,
     level_scatter,
+    shift_scatter,
     trust,
 )
 from torchpose.sim import add_noise, render, shapes
@@ -91,6 +92,29 @@ def test_edges_in_step_along_lines_tell_the_variance_of_shifts() -> None:
         assert 0.6 < mean / true < 1.2
         assert (true > 5) == (name == "lines")
         assert abs(float(factor[:, 1].mean()) / mean - 1) < 0.1 if name == "noise" else factor[:, 1].mean() < 0.6 * mean
+
+
+def test_odd_harmonics_tell_the_variance_of_shifts() -> None:
+    """White displacements, and such that are alike over 4 px along the rim: what drawings do to the shift of a ring."""
+    count, rows = 1600, 400
+    g = torch.Generator().manual_seed(14)
+    rings = torch.tensor([[100.0, 100.0, 36.0, 36.0, 0.0], [100.0, 100.0, 16.0, 16.0, 0.0]], dtype=F64)
+    angle = (torch.arange(SECTORS) + 0.5) * (2 * torch.pi / SECTORS)
+    hold, empty = torch.full((count, 2, SECTORS), 100.0), torch.ones(count, 2 * SECTORS)
+    noise = hold.rsqrt() * torch.randn(hold.shape, generator=g)
+    place = torch.stack([angle.cos(), angle.sin()], -1)
+    alike = [torch.exp(-(torch.cdist(place * radius, place * radius) / 4).square()) for radius in (16.0, 36.0)]
+    roots = torch.stack([torch.linalg.cholesky(each + 1e-4 * torch.eye(SECTORS)) for each in alike])
+    shared = 0.3 * (roots @ torch.randn(count, 2, SECTORS, 1, generator=g))[..., 0]
+    one, row = torch.ones(count, dtype=F64), torch.arange(count) // 4
+    for moved, beyond in ((torch.zeros_like(noise), 1.0), (shared, 15.0)):
+        pull, cell = hold * (noise + moved), torch.zeros(count, 1, dtype=torch.int64)
+        sectors = Sectors(empty, empty, empty, pull.flatten(1), hold.flatten(1), cell)
+        factor = shift_scatter(sectors, one, rings.expand(count, 2, 5), row, rows)
+        weight = hold * angle.cos()
+        true = float((pull * angle.cos()).sum((1, 2)).square().mean() / (weight * angle.cos()).sum((1, 2)).mean())
+        assert true > 0.9 * beyond
+        assert 0.8 < float(factor.mean()) / true < 1.2
 
 
 def test_level_scatter_is_that_of_sums() -> None:

@@ -63,8 +63,8 @@ def _torchpose(
 # what stands below the options: help/COMMAND.md
 _MEASURING = (estimate, live, watch, detect, simulate, evaluate, capture)
 _COMMANDS = (*_MEASURING, sensitivity, reproduce, design, calibrate, examples)
-for _command in _COMMANDS:
-    app.command(epilog=(_HELP / f"{_command.__name__}.md").read_text(encoding="utf-8"))(_command)
+for _each in _COMMANDS:
+    app.command(epilog=(_HELP / f"{_each.__name__}.md").read_text(encoding="utf-8"))(_each)
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from torchpose.io.moments import Moment, Paint, RigEstimation
     from torchpose.io.sources import Source
     from torchpose.io.storage import Place
+    from torchpose.io.tally import Tally
     from torchpose.results import Poses
 
 
@@ -144,12 +145,22 @@ def _run(
     if not options["quiet"]:
         if options["told"]:
             say(f"torchpose: {options['told']}", err=True)
-        _tell_disagreement(store.tally.disagree, work)
+        _tell_disagreement(store.tally, work)
     return ended(unreadable)
 
 
-def _tell_disagreement(count: int, work: RigEstimation) -> None:
-    """Tells, on stderr, of moments whose cameras contradict each other."""
+def _tell_disagreement(tally: Tally, work: RigEstimation) -> None:
+    """Tells, on stderr, of moments whose cameras contradict each other, and of a run whose cameras do by little."""
+    from torchpose.geometry.robust import CUT, quantile
+
+    count = tally.disagree
+    if tally.compared and tally.surprise > quantile(2.0 * tally.compared, CUT):
+        say(
+            f"torchpose: the cameras contradict each other by more than chance over {tally.compared} ok rows (column "
+            "consistency, 1 in the mean where they do not), too little in each to reject it; s* counts that: calibrate "
+            "the rig again",
+            err=True,
+        )
     if not count:
         return
     stated = "" if work.rig.covariance is not None else ", or state extrinsics_covariance, which --cameras does not"

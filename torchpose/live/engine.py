@@ -37,6 +37,7 @@ from torchpose.report.overlay import Overlay
 from torchpose.results import Detections, Poses
 from torchpose.rig.faults import RigFault
 from torchpose.target import Target
+from torchpose.tracking import Tracker
 
 AGAIN_S = 2.0  # after which a camera that failed is opened anew
 _KEPT = 600  # points of the strips (convention): two minutes at five frames a second
@@ -124,8 +125,8 @@ class Observer:
     def __init__(self, camera: Camera, target: Target, **options: Any) -> None:
         self.camera, self.target = camera, target
         self.estimator = PoseEstimator(camera, target, **options)
+        self._tracker = Tracker(self.estimator)
         self._overlay = Overlay(camera, [target])
-        self._last: Poses | None = None
 
     def look(self, shot: Shot) -> Sight:
         """What is seen in a frame."""
@@ -134,7 +135,7 @@ class Observer:
             row = fault_row(shot.name, self.target.name, shot.fault.status, shot.fault.reason)
             return Sight(shot, row, [], None, self.target.ids.tolist(), [], None, None, None)
         frame = torch.from_numpy(shot.image)
-        poses = self._last = self.estimator(frame[None], near=self._last)
+        poses = self._tracker(frame)
         part = self.target.part_from_target
         (row,) = pose_rows(poses if part is None else poses.moved(*part), [shot.name], [self.target.name])
         outlines = _outlines(poses.detections)

@@ -26,18 +26,18 @@ from torchpose.geometry.robust import CUT, quantile
 from torchpose.geometry.rows import Rows
 from torchpose.moments.views import motion_in_view, motion_of_place
 from torchpose.pose import MarkerNormals, Setting
-from torchpose.pose.excess import OF_CAMERA, SURE, Excess, excess_of, no_excess
+from torchpose.pose.excess import OF_CAMERA, SURE, Excess, beyond_chance, excess_of, no_excess
 from torchpose.pose.systematic import (
     POSE,
-    _among,
-    _assembled,
-    _by_camera,
-    _by_size,
-    _by_target,
-    _Joint,
-    _places,
-    _print_shifts,
-    _remaining,
+    JointSolution,
+    among,
+    assembled,
+    motions_by_camera,
+    motions_by_size,
+    motions_by_target,
+    places_of,
+    print_shifts,
+    remaining_of,
 )
 from torchpose.results import Misfit
 
@@ -131,15 +131,15 @@ def joint_pose(rig: CameraRig, views: list[Seen], R: Tensor, t: Tensor, moved: T
     n = parts.normals.right.shape[-1]
     odd_ones = parts.numbers[..., :0]
     if further is not None:
-        odd_ones = _among(further * excess.deviation[:, None, None], n)
+        odd_ones = among(further * excess.deviation[:, None, None], n)
     beside = torch.cat([parts.numbers, odd_ones], -1)
     normals = parts.normals.over(excess.factor)
     between, freedom, odd, torn = _between(normals, parts, beside, len(views))
     off = _off(rig, views, R, t, n)
     own = torch.cat([parts.own, odd_ones], -1)
-    told, pull = _remaining(normals, own, torch.cat([parts.numbers, off], -1), odd_ones.shape[-1])
+    told, pull = remaining_of(normals, own, torch.cat([parts.numbers, off], -1), odd_ones.shape[-1])
     # counted, not estimated: the pose is the one of a rig that is as its file says
-    joint = _Joint.of(normals, parts.own, beside, off, True)
+    joint = JointSolution.of(normals, parts.own, beside, off, True)
     covariance = joint.noise + joint.by_print @ joint.by_print.mT
     place = look = _print_places(parts, views, joint, excess.deviation, further)
     other = ((excess.misfit == Misfit.CAMERA) | (excess.misfit == Misfit.SCATTER)).nonzero()[:, 0]
@@ -189,7 +189,7 @@ def _parts(rig: CameraRig, views: list[Seen], R: Tensor, t: Tensor, moved: Tenso
         placed = pose @ motion_of_place(rig, view.camera, own_t)
         own, apart = (x.expand(rows, markers, *x.shape) for x in (own, apart))
         placed = placed[:, None].expand(-1, markers, -1, -1)
-        lens, printed = _among(_by_camera(setting), n), _among(_by_target(setting), n)
+        lens, printed = among(motions_by_camera(setting), n), among(motions_by_target(setting), n)
         parts.append((normals, own, apart, lens, placed, printed))
     lenses = [part[3].shape[-1] for part in parts]
     spread = [torch.nn.functional.pad(part[3], (sum(lenses[:k]), sum(lenses[k + 1 :]))) for k, part in enumerate(parts)]
@@ -205,9 +205,9 @@ def _about(view: Seen, setting: Setting, moved: Tensor) -> MarkerNormals:
     n = right.shape[-1]
     aside = (view.R[:, None] @ moved[..., :3, None])[..., 0]
     formed = setting._replace(R=view.R, t=view.t)
-    back = torch.cat([aside, torch.zeros_like(aside), moved[..., 3:4]], -1) + moved[..., 4:] * _by_size(formed)
+    back = torch.cat([aside, torch.zeros_like(aside), moved[..., 3:4]], -1) + moved[..., 4:] * motions_by_size(formed)
     off = torch.cat([setting.t - view.t, rotations.log(setting.R @ view.R.mT), torch.zeros_like(view.t[:, :1])], -1)
-    change = _among((back - off[:, None])[..., None], n)
+    change = among((back - off[:, None])[..., None], n)
     right = right + (information @ change)[..., 0]
     # of a camera without a picture no blur is known, nor is it asked for
     nothing = torch.zeros(n, dtype=right.dtype, device=right.device)
@@ -227,21 +227,24 @@ def _excess(parts: _Parts, views: list[Seen]) -> tuple[Excess, Tensor | None]:
     known = torch.cat([parts.apart, parts.numbers], -1)
     count = parts.numbers.shape[-1]
     alone = torch.eye(items * (POSE + 1)).to(known).unflatten(0, (items, -1)).expand(rows, -1, -1, -1)
-    excess = no_excess(*_remaining(normals, known, _among(alone, n), count))
+    excess = no_excess(*remaining_of(normals, known, among(alone, n), count))
     odd = (~excess.explained).nonzero()[:, 0]
     if odd.numel() == 0:
         return excess, None
     # what one camera's lens does is scatter here: of which one it is would be one more question
-    shifts = torch.cat([_print_shifts(view.setting.of_rows(odd)) for view in views], 1)
+    shifts = torch.cat([print_shifts(view.setting.of_rows(odd)) for view in views], 1)
     shifts = torch.nn.functional.pad(shifts, (0, OF_CAMERA))
-    again = excess_of(*_remaining(normals[odd], known[odd], _among(shifts, n), count))
+    refuted = beyond_chance(excess)[odd]
+    again = excess_of(*remaining_of(normals[odd], known[odd], among(shifts, n), count), refuted=refuted)
     every = shifts.new_zeros(rows, *shifts.shape[1:]).index_copy(0, odd, shifts)
     nothing = shifts.new_zeros(rows, shifts.shape[-1])
     excess = replace(excess, deviation=nothing, printed=nothing)
     return excess.replaced(odd, replace(again, chi2=excess.chi2[odd], freedom=excess.freedom[odd])), every
 
 
-def _print_places(parts: _Parts, views: list[Seen], joint: _Joint, deviation: Tensor, further: Tensor | None) -> Tensor:
+def _print_places(
+    parts: _Parts, views: list[Seen], joint: JointSolution, deviation: Tensor, further: Tensor | None
+) -> Tensor:
     """Places (J, M, 5) of the markers on the print, by the motions that they are in the first of the cameras."""
     setting, markers = views[0].setting, views[0].setting.evidence.mask.shape[1]
     first = parts.numbers.shape[-1] - parts.printed
@@ -250,15 +253,15 @@ def _print_places(parts: _Parts, views: list[Seen], joint: _Joint, deviation: Te
     if further is not None:
         by = torch.cat([by, further[:, :markers] * deviation[:, None, None]], -1)
     numbers = joint.numbers[:, first : first + by.shape[-1]]
-    return _places(by, joint._replace(numbers=numbers), setting, deviation)
+    return places_of(by, joint._replace(numbers=numbers), setting, deviation)
 
 
 def _if_printed(parts: _Parts, views: list[Seen], excess: Excess, further: Tensor, rows: Tensor) -> Tensor:
     """The same of some rows (K,) if the print is behind their misfit: where to look for the markers next."""
     some = _Parts(parts.normals[rows], parts.own[rows], parts.apart[rows], parts.numbers[rows], parts.printed)
     n, deviation = some.normals.right.shape[-1], excess.printed[rows]
-    beside = torch.cat([some.numbers, _among(further[rows] * deviation[:, None, None], n)], -1)
-    joint = _Joint.of(some.normals, some.own, beside, some.numbers[..., :0], True)
+    beside = torch.cat([some.numbers, among(further[rows] * deviation[:, None, None], n)], -1)
+    joint = JointSolution.of(some.normals, some.own, beside, some.numbers[..., :0], True)
     seen = [view._replace(setting=view.setting.of_rows(rows)) for view in views]
     return _print_places(some, seen, joint, deviation, further[rows])
 
@@ -273,7 +276,7 @@ def _between(
     camera's shift is judged by itself, too.
     """
     known = torch.cat([parts.own, numbers], -1)
-    information, right = _remaining(normals, known, parts.apart[..., : POSE * views], numbers.shape[-1])
+    information, right = remaining_of(normals, known, parts.apart[..., : POSE * views], numbers.shape[-1])
     chi2, freedom = _taken(information, right)
     each = torch.arange(views, device=right.device)
     own = right.unflatten(-1, (views, POSE))
@@ -336,7 +339,7 @@ def _share(normals: MarkerNormals, own: Tensor, views: int) -> Tensor:
     blocks = []
     for k in range(views):
         items = slice(k * own.shape[1] // views, (k + 1) * own.shape[1] // views)
-        matrix = _assembled(_items(normals, items), own[:, items])[0]
+        matrix = assembled(_items(normals, items), own[:, items])[0]
         taken = matrix[:, :POSE, POSE:] @ solve_scaled(matrix[:, POSE:, POSE:], matrix[:, POSE:, :POSE])
         blocks.append(matrix[:, :POSE, :POSE] - taken)
     each = torch.stack(blocks, 1)

@@ -285,6 +285,7 @@ def _laid_out(look: Look, some: Tensor, rows: int) -> Look:
         spread(look.levels, 0.0),
         spread(look.band, 1.0),
         spread(look.reduction, 1),
+        spread(look.doubt, False),
     )
 
 

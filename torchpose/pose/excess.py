@@ -117,16 +117,19 @@ def excess_of(
     right: Float[Tensor, "N E"],
     even: Float[Tensor, " N"] | None = None,
     across: Float[Tensor, "N M 3 2"] | None = None,
+    refuted: Bool[Tensor, " N"] | None = None,
 ) -> Excess:
     """What speaks from the information about the further unknowns, and their right side, all else being unknown.
 
     Args:
         even: degrees of freedom of other residuals that are those of noise: what makes all noise larger would have made
             them larger, too.
+        across: two directions across the line of sight as places of the markers.
+        refuted: rows in which residuals that the further unknowns do not reach are beyond chance; something is amiss.
     """
     modes = _modes(information, right)
     none = _none(right, modes)
-    none = replace(none, explained=none.chi2 < _most(none.freedom))
+    none = replace(none, explained=(none.chi2 < _most(none.freedom)) & (True if refuted is None else ~refuted))
     row, families = _explanations(modes, none, even)
     if row.numel() == 0:
         return none
@@ -171,13 +174,14 @@ def _explanations(modes: _Modes, none: Excess, even: Tensor | None) -> tuple[Ten
     One thing that is off, as k1, may stand in one direction of the residuals, where their sum says little. So a camera,
     which costs little to try, is held against rows whose sum is no surprise, too.
     """
-    row = (none.chi2 > quantile(none.freedom.clamp_min(1), _LOOKED_AT)).nonzero()[:, 0]
+    row = ((none.chi2 > _usual(none.freedom)) | ~none.explained).nonzero()[:, 0]
     some, silent = _Modes(*(x[row] for x in modes)).existing(), torch.zeros_like(none.chi2)
-    # where noise is known to be more than that of independent pixels, still more is no surprise
+    # beforehand as likely as all three; where noise is known to be more than that of independent pixels, as each
     expected = torch.ones_like(none.explained) if even is None else even > 0
-    nothing = _NOTHING * expected[row] - 0.5 * some.residual.square().sum(-1)
+    nothing = math.log(_SCATTER + 1) * expected[row] - 0.5 * some.residual.square().sum(-1)
     camera = _beside_scatter(_camera, some)
     kept = (none.chi2[row] > quantile(none.freedom[row].clamp_min(1), SURE)) | (camera.evidence > nothing)
+    kept |= ~none.explained[row]
     row, some, nothing = row[kept], _Modes(*(x[kept] for x in some)), nothing[kept]
     scatter = _scatter(some, (silent if even is None else even)[row])
     families = [_beside_scatter(_print, some), _Family(*(x[kept] for x in camera)), scatter]
@@ -197,6 +201,11 @@ def by_kind(unknowns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return markers, edges, camera
 
 
+def beyond_chance(excess: Excess) -> Bool[Tensor, " N"]:
+    """Rows (N,) whose residuals noise does not reach."""
+    return excess.chi2 > _most(excess.freedom)
+
+
 def no_excess(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) -> Excess:
     """The same where noise explains the residuals; elsewhere `Excess.explained` is False and nothing else is said."""
     return _none(right, _modes(information, right))
@@ -205,9 +214,14 @@ def no_excess(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) 
 def _none(right: Tensor, modes: _Modes) -> Excess:
     chi2, freedom = modes.residual.square().sum(-1), modes.there.sum(-1)
     zero, one = torch.zeros_like(right), torch.ones_like(chi2)
-    by_chance = chi2 < quantile(freedom.clamp_min(1), _LOOKED_AT)
+    by_chance = chi2 < _usual(freedom)
     nothing = torch.zeros_like(freedom)
     return Excess(zero, zero, one, one, zero[:, 0], zero[:, 0], nothing, by_chance, chi2, freedom)
+
+
+def _usual(freedom: Tensor) -> Tensor:
+    """What chi-squared (N,) of noise stays below by one of its deviations: five times in six."""
+    return freedom + (2 * freedom).sqrt()
 
 
 def _most(freedom: Tensor) -> Tensor:

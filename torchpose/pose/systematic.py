@@ -28,7 +28,7 @@ from torchpose.geometry.rotations import plane_axes
 from torchpose.geometry.rows import Rows
 from torchpose.pose.covariance import center_jacobian, derivative
 from torchpose.pose.evidence import Evidence
-from torchpose.pose.excess import OF_CAMERA, OF_EDGES, OF_MARKER, Excess, by_kind, excess_of, no_excess
+from torchpose.pose.excess import OF_CAMERA, OF_EDGES, OF_MARKER, Excess, beyond_chance, by_kind, excess_of, no_excess
 from torchpose.results import Misfit
 
 POSE = 6
@@ -147,13 +147,13 @@ def on_print(
     """
     R, n = setting.R, normals.right.shape[-1]
     aside = (R[:, None] @ moved[..., :3, None])[..., 0]
-    back = torch.cat([aside, torch.zeros_like(aside), moved[..., 3:4]], -1) + moved[..., 4:] * _by_size(setting)
-    right = normals.right + (normals.information @ _among(back[..., None], n))[..., 0]
+    back = torch.cat([aside, torch.zeros_like(aside), moved[..., 3:4]], -1) + moved[..., 4:] * motions_by_size(setting)
+    right = normals.right + (normals.information @ among(back[..., None], n))[..., 0]
     normals = MarkerNormals(normals.information, right)
     own = torch.eye(n, dtype=right.dtype, device=right.device)[:, :-1].expand(*right.shape[:2], n, n - 1)
-    by_camera, by_target = _by_camera(setting), _by_target(setting)
+    by_camera, by_target = motions_by_camera(setting), motions_by_target(setting)
     stated = torch.cat([by_camera, by_target], -1)
-    known = torch.cat([own, _among(stated, n)], -1)
+    known = torch.cat([own, among(stated, n)], -1)
     excess, further = _excess(normals, known, stated.shape[-1], setting, even)
     printed, lens = by_target, by_camera
     if further is not None:
@@ -164,16 +164,16 @@ def on_print(
     if bool((excess.shift > 0).any()):
         shifts = excess.shift[:, None, None, None] * _across(setting, n)
         noisy = noisy.scattered(noisy.by_motions(shifts))
-    joint = _Joint.of(noisy, own, _among(printed, n), _among(lens, n), estimate)
-    place = look = _places(printed, joint, setting, excess.deviation)
+    joint = JointSolution.of(noisy, own, among(printed, n), among(lens, n), estimate)
+    place = look = places_of(printed, joint, setting, excess.deviation)
     other = ((excess.misfit == Misfit.CAMERA) | (excess.misfit == Misfit.SCATTER)).nonzero()[:, 0]
     if other.numel() and further is not None:
         # a fit that looks for the markers where they are not may only seem to scatter
         if_printed = torch.cat([by_target, (further * excess.printed[:, None, None])[..., :-OF_CAMERA]], -1)[other]
-        alone = _Joint.of(normals[other], own[other], _among(if_printed, n), _among(lens[other], n), True)
-        look = place.index_copy(0, other, _places(if_printed, alone, setting.of_rows(other), excess.printed[other]))
+        alone = JointSolution.of(normals[other], own[other], among(if_printed, n), among(lens[other], n), True)
+        look = place.index_copy(0, other, places_of(if_printed, alone, setting.of_rows(other), excess.printed[other]))
         noisy = normals[other].over(excess.printed_factor[other])
-        alone = _Joint.of(noisy, own[other], _among(if_printed, n), _among(lens[other], n), estimate)
+        alone = JointSolution.of(noisy, own[other], among(if_printed, n), among(lens[other], n), estimate)
         joint = joint.perhaps(other, alone, excess.maybe[other])
     sure = joint.known & (torch.linalg.cholesky_ex(joint.covariance)[1] == 0)
     parts = (joint.by_camera[..., : by_camera.shape[-1]], joint.by_print[..., : by_target.shape[-1]])
@@ -182,7 +182,7 @@ def on_print(
     return OnPrint(*found, excess.misfit, excess.explained, excess.chi2, excess.freedom, sure)
 
 
-def _places(printed: Tensor, joint: _Joint, setting: Setting, deviation: Tensor) -> Tensor:
+def places_of(printed: Tensor, joint: JointSolution, setting: Setting, deviation: Tensor) -> Tensor:
     """Places (N, M, 5) of markers moved by the numbers of a solution, by their motions (N, M, 7, L).
 
     Where these go beyond what is stated, the last ones are those of edges, see `excess.OF_EDGES`.
@@ -200,7 +200,7 @@ def _places(printed: Tensor, joint: _Joint, setting: Setting, deviation: Tensor)
     return (by @ joint.numbers[:, None, :, None])[..., 0]
 
 
-class _Joint(NamedTuple):
+class JointSolution(NamedTuple):
     """Solution of N problems of own unknowns, and numbers of unit variance of the print and of the camera.
 
     The print's are unknowns, too. The camera's are not: a frame tells next to nothing of them, and poses that followed
@@ -226,7 +226,7 @@ class _Joint(NamedTuple):
         the covariance (I + S)^-1, and every part of the pose's covariance is a sum of squares, whatever is large.
         """
         columns = torch.cat([own, by_print], -1)
-        matrix, right = _assembled(normals, columns)
+        matrix, right = assembled(normals, columns)
         by_lens = columns.flatten(1, 2).mT @ (normals.information @ by_camera).flatten(1, 2)
         k = own.shape[-1]
         alone, known = scaled_inverse(matrix[:, :k, :k])
@@ -265,21 +265,22 @@ def _excess(
     """
     rows, markers, n = known.shape[:3]
     alone = torch.eye(markers * (POSE + 1), dtype=known.dtype, device=known.device).unflatten(0, (markers, -1))
-    excess = no_excess(*_remaining(normals, known, _among(alone.expand(rows, -1, -1, -1), n), count))
+    excess = no_excess(*remaining_of(normals, known, among(alone.expand(rows, -1, -1, -1), n), count))
     odd = (~excess.explained).nonzero()[:, 0]
     if odd.numel() == 0:
         return excess, None
     some = setting.of_rows(odd)
-    shifts = torch.cat([_print_shifts(some), _camera_shifts(some)], -1)
-    remaining = _remaining(normals[odd], known[odd], _among(shifts, n), count)
-    again = excess_of(*remaining, None if even is None else even[odd], _in_places(some))
+    shifts = torch.cat([print_shifts(some), _camera_shifts(some)], -1)
+    remaining = remaining_of(normals[odd], known[odd], among(shifts, n), count)
+    refuted = beyond_chance(excess)[odd]
+    again = excess_of(*remaining, None if even is None else even[odd], _in_places(some), refuted)
     every = shifts.new_zeros(rows, *shifts.shape[1:]).index_copy(0, odd, shifts)
     nothing = shifts.new_zeros(rows, shifts.shape[-1])
     excess = replace(excess, deviation=nothing, printed=nothing)
     return excess.replaced(odd, replace(again, chi2=excess.chi2[odd], freedom=excess.freedom[odd])), every
 
 
-def _by_target(setting: Setting) -> Tensor:
+def motions_by_target(setting: Setting) -> Tensor:
     """How markers seem moved (N, M, 7, L), each alone, by the numbers of unit variance of the target.
 
     A target that is larger as a whole looks like the same one that is nearer: all markers move towards the camera.
@@ -310,7 +311,7 @@ def displaced(
     return torch.cat([aside, turn, by[..., 6:, :].expand(*turn.shape[:2], 1, -1)], -2)
 
 
-def _by_camera(setting: Setting) -> Tensor:
+def motions_by_camera(setting: Setting) -> Tensor:
     """The same (N, M, 7, C) by those of the camera.
 
     A camera's error moves the image of a ring; the motion of the marker that does the same, by its own information, is
@@ -344,7 +345,7 @@ def _camera_shifts(setting: Setting) -> Tensor:
     return _as_motions(setting, by)
 
 
-def _print_shifts(setting: Setting) -> Tensor:
+def print_shifts(setting: Setting) -> Tensor:
     """The same (N, M, 7, E) of the numbers of a print in `excess`, by 1 mm each."""
     evidence, R = setting.evidence, setting.R
     rows, markers = evidence.mask.shape
@@ -362,12 +363,12 @@ def _print_shifts(setting: Setting) -> Tensor:
     columns[:, :, :POSE, :-OF_EDGES] = own
     columns[:, :, -1, -3] = 1
     columns[..., -2] = _by_bloom(setting)
-    columns[..., -1] = _by_size(setting)
+    columns[..., -1] = motions_by_size(setting)
     return columns
 
 
 def _in_places(setting: Setting) -> Tensor:
-    """Two directions across the line of sight as places (N, M, 3, 2) of the markers in `_print_shifts`."""
+    """Two directions across the line of sight as places (N, M, 3, 2) of the markers in `print_shifts`."""
     normal = setting.evidence.normals
     axes = torch.stack([*plane_axes(normal), normal], -1)
     return (setting.R[:, None] @ axes).mT[..., :2]
@@ -389,7 +390,7 @@ def _by_bloom(setting: Setting) -> Tensor:
     return _least_squares(setting, jacobian, weight, across)[..., 0] * mm[:, None, None]
 
 
-def _by_size(setting: Setting) -> Tensor:
+def motions_by_size(setting: Setting) -> Tensor:
     """Motions (N, M, 7) that do to a ring what both its edges do 1 mm further out: it is nearer, with less gain.
 
     A disc has one edge, and nothing but gain.
@@ -421,12 +422,12 @@ def _least_squares(setting: Setting, jacobian: Tensor, weight: Tensor, pixels: T
     return torch.where(mask[..., None, None], solve_scaled(*both), 0.0)
 
 
-def _remaining(normals: MarkerNormals, known: Tensor, excess: Tensor, count: int) -> tuple[Tensor, Tensor]:
+def remaining_of(normals: MarkerNormals, known: Tensor, excess: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Information (N, E, E) about the ``excess`` columns and their right side (N, E), with the ``known`` unknowns.
 
     The last ``count`` of these are numbers with a prior of unit variance about 0.
     """
-    matrix, right = _assembled(normals, torch.cat([known, excess], -1))
+    matrix, right = assembled(normals, torch.cat([known, excess], -1))
     k = known.shape[-1]
     matrix.diagonal(dim1=-2, dim2=-1)[:, k - count : k] += 1
     both = torch.cat([matrix[:, :k, k:], right[:, :k, None]], -1)
@@ -434,7 +435,7 @@ def _remaining(normals: MarkerNormals, known: Tensor, excess: Tensor, count: int
     return matrix[:, k:, k:] - taken[..., :-1], right[:, k:] - taken[..., -1]
 
 
-def _assembled(normals: MarkerNormals, columns: Tensor) -> tuple[Tensor, Tensor]:
+def assembled(normals: MarkerNormals, columns: Tensor) -> tuple[Tensor, Tensor]:
     """Normal equations (N, k, k), (N, k) of unknowns with these columns (N, M, n, k)."""
     # all markers in one product: with many of them single ones are large together
     every = columns.flatten(1, 2).mT
@@ -442,7 +443,7 @@ def _assembled(normals: MarkerNormals, columns: Tensor) -> tuple[Tensor, Tensor]
     return matrix, (every @ normals.right.flatten(1)[..., None])[..., 0]
 
 
-def _among(by: Tensor, n: int) -> Tensor:
+def among(by: Tensor, n: int) -> Tensor:
     """Columns (N, M, n, L) of pose and gain (N, M, 7, L), with 0 for what stands between."""
     between = by.new_zeros(*by.shape[:2], n - POSE - 1, by.shape[-1])
     return torch.cat([by[:, :, :POSE], between, by[:, :, POSE:]], 2)

@@ -63,8 +63,7 @@ def _levels(values: Tensor) -> list[float]:
     """Steps of a map, round numbers: what hardly varies is of one colour."""
     low, high = float(values.min()), float(values.max())
     more = max(0.0, 0.5 * (_LEAST_RANGE * high - (high - low)))
-    levels: list[float] = MaxNLocator(12).tick_values(low - more, high + more).tolist()
-    return levels
+    return [float(level) for level in MaxNLocator(12).tick_values(low - more, high + more)]
 
 
 def save_plot(found: PrecisionMap, title: str, path: Path, volume: WorkingVolume | None = None) -> None:

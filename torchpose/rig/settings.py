@@ -156,8 +156,8 @@ class Rig(Strict):
         lines = [c.name for c in value if c.waits_for == "line"]
         if lines and all(c.waits_for for c in value):
             raise ValueError(
-                f"wait for a line that none of them drives ({', '.join(lines)}); leave TriggerSource out of the nodes of "
-                "the one whose output line triggers the others"
+                f"wait for a line that none of them drives ({', '.join(lines)}); leave TriggerSource out of the nodes "
+                "of the one whose output line triggers the others"
             )
         actions = [[c.nodes[name] for name in ACTION[:2]] for c in value if c.waits_for == "action"]
         if any(action != actions[0] for action in actions):

@@ -21,7 +21,7 @@ from torchpose import pnp
 from torchpose.geometry import rotations
 from torchpose.io.rows import Row
 from torchpose.kernels import has_compiler
-from torchpose.report.figures import curve, legend_below, subplots
+from torchpose.report.figures import GREY, curve, legend_below, subplots
 from torchpose.studies.study import Comparison, Picture, Progress, StudyResult, Table, ignore_progress
 from torchpose.studies.views import turned
 
@@ -192,13 +192,14 @@ def plot(rows: list[Row], seconds: dict[str, float]) -> Figure:
     """Errors against noise for all methods and for lines against points, and the times."""
     figure, axes = subplots(2, 3, (15, 8.5))
     names = list(seconds)
-    colours = {name: colormaps["tab20"](i) for i, name in enumerate(names)}
+    colours: dict[str, Any] = {name: colormaps["tab20"](i) for i, name in enumerate(names)}
+    colours |= {BY_POINTS: "black", BY_LINES: GREY}  # in one legend with the methods
 
     def curves(panel: Any, some: Sequence[Row], group: Sequence[str], key: str, label: str) -> None:
         for name in group:
-            style = "--" if name in colours and not name.startswith("torchpose") else "-"
+            style = "--" if name in names and not name.startswith("torchpose") else "-"
             part = [row for row in some if row["method"] == name]
-            curve(panel, part, "noise_px", key, f"{style}o", ms=3, color=colours.get(name), label=name)
+            curve(panel, part, "noise_px", key, f"{style}o", ms=3, color=colours[name], label=name)
         panel.set(xlabel="noise of the image points [px]", ylabel=label, xscale="log")
         panel.grid(True, which="both", alpha=0.3)
 
