@@ -73,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     Args:
         arguments: of the command line, without the program's name; those of the process by default.
     """
-    command = _command(sys.argv[1:] if arguments is None else arguments)
+    command = _wanted(sys.argv[1:] if arguments is None else arguments)
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _say
@@ -99,7 +99,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     sys.exit(code if isinstance(code, int) else 0)
 
 
-def _command(arguments: Sequence[str]) -> Any:
+def _wanted(arguments: Sequence[str]) -> Any:
     """What runs: all commands, or the one alone that is named; the options of all are a tenth of a second's reading."""
     named = [one for one in app.registered_commands if one.callback and one.callback.__name__ in arguments[:1]]
     some = copy(app)
