@@ -96,7 +96,7 @@ _FEWER = 0.02
 _MOST_GAIN = 0.5
 _COARSELY = _Stage(2, coarse=True)
 _QUICK = (_Stage(1),)  # after the coarse steps
-_AGAIN = (_Stage(1),)  # from where a fit of the same rows ended
+_AGAIN = (_Stage(2),)  # from where a fit of the same rows ended
 _THOROUGH = (_Stage(1, wary=True), _Stage(2, wary=True, tempered=True))
 
 
