@@ -35,6 +35,8 @@ def s3_server(bucket: str, *, every: int = 0) -> Iterator[tuple[str, Unsteady]]:
     from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
     from werkzeug.serving import make_server
 
+    for backend in _backends():  # which outlive their servers
+        backend.reset()
     application = Unsteady(DomainDispatcherApplication(create_backend_app), 0)
     server = make_server("127.0.0.1", 0, application, threaded=True)
     thread = threading.Thread(target=server.serve_forever, daemon=True)
@@ -54,9 +56,13 @@ def s3_server(bucket: str, *, every: int = 0) -> Iterator[tuple[str, Unsteady]]:
 
 def put(bucket: str, key: str, data: bytes) -> None:
     """Has a server that runs in this process keep a file, without a request."""
+    for backend in _backends():
+        if bucket in backend.buckets:
+            backend.put_object(bucket, key, data)
+
+
+def _backends() -> list[Any]:
+    """What the servers of this process keep, by account and region."""
     from moto.s3.models import s3_backends
 
-    for account in s3_backends.values():
-        for backend in account.values():
-            if bucket in backend.buckets:
-                backend.put_object(bucket, key, data)
+    return [backend for account in s3_backends.values() for backend in account.values()]

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpose.geometry.segments import positions
+from torchpose.geometry.segments import as_array, positions
 
 
 def shared(default: Any = MISSING) -> Any:
@@ -110,13 +110,14 @@ def _rows(index: Tensor, count: int) -> Tensor | None:
         return None
     if index.dtype == torch.bool:  # where it is True is asked once, not for every field
         return positions(index) if len(index) == count else None
-    known = index.dtype == torch.int64 and index.device.type == "cpu"
-    return index if known and (index.numel() == 0 or index.numpy().min() >= 0) else None
+    known = as_array(index) if index.dtype == torch.int64 else None
+    return index if known is not None and (known.size == 0 or known.min() >= 0) else None
 
 
 def _all_of(rows: Tensor, count: int) -> bool:
     """Whether these are all of ``count`` rows in their order: of few frames every row is often right."""
-    return len(rows) == count and rows.device.type == "cpu" and bool((rows.numpy() == np.arange(count)).all())
+    known = as_array(rows) if len(rows) == count else None
+    return known is not None and bool((known == np.arange(count)).all())
 
 
 def _same(a: Any, b: Any) -> bool:

@@ -20,10 +20,23 @@ def values_at(frames: Real[Tensor, "B H W"], cell: Int[Tensor, "*S"]) -> Float32
     return (found.view(torch.uint16) if wide else found).view_as(cell).float()
 
 
+def as_array(values: Tensor) -> np.ndarray | None:
+    """A tensor's values without a copy, for calls that cost a fraction of torch's where there are few of them.
+
+    None on other devices, and within torch's function transforms (`torch.func.grad`), where there are none to look at.
+    """
+    if values.device.type != "cpu":
+        return None
+    try:
+        return values.numpy()
+    except RuntimeError:
+        return None
+
+
 def positions(mask: Bool[Tensor, " E"]) -> Int[Tensor, " K"]:
     """Where a mask is True, rising; NumPy searches several times as fast as torch."""
-    if mask.device.type == "cpu":
-        return torch.from_numpy(np.flatnonzero(mask.numpy()))
+    if (known := as_array(mask)) is not None:
+        return torch.from_numpy(np.flatnonzero(known))
     return mask.nonzero()[:, 0]
 
 
@@ -74,8 +87,8 @@ class Tiles:
     @classmethod
     def of(cls, index: Int[Tensor, " E"], count: int, size: int = 32) -> Tiles:
         """Tiles for the groups ``index`` in [0, count)."""
-        if index.device.type == "cpu":
-            return cls._by_numpy(index.numpy(), count, size)
+        if (known := as_array(index)) is not None:
+            return cls._by_numpy(known, count, size)
         order = None
         if bool((index[1:] < index[:-1]).any()):
             index, order = index.sort(stable=True)
@@ -117,8 +130,7 @@ class Tiles:
 
 def ragged_arange(counts: Int[Tensor, " K"]) -> tuple[Int[Tensor, " E"], Int[Tensor, " E"]]:
     """Flat enumeration of groups of the given sizes: the group of each element and its position in the group."""
-    if counts.device.type == "cpu":
-        size = counts.numpy()
+    if (size := as_array(counts)) is not None:
         which = np.arange(len(size)).repeat(size)
         offset = np.arange(len(which)) - (size.cumsum() - size).repeat(size)
         return torch.from_numpy(which), torch.from_numpy(offset)
@@ -132,8 +144,7 @@ def rank_in_group(
     group: Int[Tensor, " E"], count: int = 0, *, by: Real[Tensor, " E"] | None = None
 ) -> Int[Tensor, " E"]:
     """Position of each element among those of its group, by rising ``by`` and then in order of appearance."""
-    if group.device.type == "cpu":
-        own = group.numpy()
+    if (own := as_array(group)) is not None:
         turn = own.argsort(kind="stable") if by is None else np.lexsort((by.detach().numpy(), own))
         size = np.bincount(own, minlength=count)
         rank = np.empty_like(own)

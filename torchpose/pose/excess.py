@@ -185,7 +185,7 @@ def _explanations(modes: _Modes, none: Excess, even: Tensor | None) -> tuple[Ten
     some, silent = _Modes(*(x[row] for x in modes)).existing(), torch.zeros_like(none.chi2)
     # beforehand as likely as all three; where noise is known to be more than that of independent pixels, as each
     expected = torch.ones_like(none.explained) if even is None else even > 0
-    nothing = math.log(_SCATTER + 1) * expected[row] - 0.5 * some.residual.square().sum(-1)
+    nothing = math.log(_SCATTER + 1) * expected[row].to(some.residual) - 0.5 * some.residual.square().sum(-1)
     camera = _beside_scatter(_camera, some)
     kept = (none.chi2[row] > quantile(none.freedom[row].clamp_min(1), SURE)) | (camera.evidence > nothing)
     kept |= ~none.explained[row]
@@ -228,6 +228,7 @@ def _none(right: Tensor, modes: _Modes) -> Excess:
 
 def _usual(freedom: Tensor) -> Tensor:
     """What chi-squared (N,) of noise stays below by one of its deviations: five times in six."""
+    freedom = freedom.double()  # torch takes roots of integers in its default type
     return freedom + (2 * freedom).sqrt()
 
 

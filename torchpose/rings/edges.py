@@ -66,7 +66,8 @@ def _edge_keys(
     height, width = frames.shape[-2:]
     count = (conics.perimeter(ellipses) * _SAMPLES_PER_PIXEL).ceil().long()
     ring, position = ragged_arange(count)
-    x, y, nx, ny = conics.boundary(ellipses, ring, position * (2 * torch.pi / count).index_select(0, ring))
+    step = 2 * torch.pi / count.double()
+    x, y, nx, ny = conics.boundary(ellipses, ring, position * step.index_select(0, ring))
     k = torch.arange(-REACH - 1, REACH + 2, device=frames.device, dtype=torch.float64)
     u = (x[:, None] + nx[:, None] * k).round_().clamp_(0, width - 1)
     v = (y[:, None] + ny[:, None] * k).round_().clamp_(0, height - 1)
