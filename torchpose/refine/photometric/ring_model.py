@@ -249,7 +249,8 @@ class _Rim(NamedTuple):
 
     per_mm: px for a mm of radius. bend: curvature of the circle's image, 1/px. second: to second order in the distance,
     half the second over the first derivative of the radius, 1/px. normal: (nu, nv) of the image. by_pose: derivatives
-    (6, K, P) of the distance.
+    (6, K, P) of the distance. turn: by how much the normal at the edge is turned against that in the pixel, rad a px
+    between them, where it is asked for.
     """
 
     per_mm: Tensor
@@ -257,9 +258,10 @@ class _Rim(NamedTuple):
     second: Tensor
     normal: tuple[Tensor, Tensor]
     by_pose: Tensor
+    turn: Tensor | None
 
 
-def _rims(blocks: PixelBlocks, foot: _Foot) -> _Rim:
+def _rims(blocks: PixelBlocks, foot: _Foot, *, turning: bool) -> _Rim:
     x, y, radius, toward, depth = foot.x, foot.y, foot.radius, foot.toward, foot.depth
     one, two, normal, arm = foot.axes.unbind(0)
     ex, ey = x / radius, y / radius
@@ -281,13 +283,29 @@ def _rims(blocks: PixelBlocks, foot: _Foot) -> _Rim:
     recede = (normal[0] * ray_u + normal[1] * ray_v) * toward
     second = 0.5 * oblique.square() * depth * flat / radius - recede
     by_pose = torch.cat([m, torch.linalg.cross(x * one + y * two + arm, m, dim=0)]) * -per_mm
-    return _Rim(per_mm, bend, second, (nu, nv), by_pose)
+    turn = None
+    if turning:  # the mixed second derivative of the radius, along the normal and across it, over the first
+        along_u, along_v = w01 * nu - w00 * nv, w11 * nu - w10 * nv
+        across = h[0] * along_u + h[1] * along_v
+        turn = oblique * across * depth.square() * per_mm / radius
+        turn = turn - (normal[0] * along_u + normal[1] * along_v) * toward
+    return _Rim(per_mm, bend, second, (nu, nv), by_pose, turn)
+
+
+def _normals(rim: _Rim, distance: Tensor) -> tuple[Tensor, Tensor]:
+    """Normals (nu, nv) of the edges at these distances (2, K, P): what a blur with a direction does depends on them."""
+    nu, nv = rim.normal
+    if rim.turn is None:
+        return nu, nv
+    turn = rim.turn * distance
+    length = (1 + turn.square()).rsqrt()
+    return (nu + turn * nv) * length, (nv - turn * nu) * length
 
 
 def ring_model(blocks: PixelBlocks, R: Tensor, t: Tensor, spread: Spread, *, check: bool = False) -> RingModel:
     """Predicts every pixel at poses (N, 3, 3), (N, 3) and N blurs, and with ``check`` says where that is sound."""
     foot = _feet(blocks, R, t)
-    rim = _rims(blocks, foot)
+    rim = _rims(blocks, foot, turning=spread.kind == "line")
     straight = foot.inner * rim.per_mm
     d_outer, d_inner = (d + rim.second * d.square() for d in (foot.outer * rim.per_mm, straight))
     sound = None
@@ -296,7 +314,8 @@ def ring_model(blocks: PixelBlocks, R: Tensor, t: Tensor, spread: Spread, *, che
         most = blurs.axes(blur)[1][:, None]
         near = (rim.bend.square() * most < _CURVED) & ((rim.second * straight).abs() < HOLDS)
         sound = near | (d_inner.square() > CUT**2 * blurs.across(blur[:, None], *rim.normal))
-    both = spread.at(blocks.row, *rim.normal)(torch.stack([d_outer, d_inner]), rim.bend)
+    distance = torch.stack([d_outer, d_inner])
+    both = spread.at(blocks.row, *_normals(rim, distance))(distance, rim.bend)
     by_blur = tuple(one - other for one, other in both.by_blur)
     size = blocks.radii[:, :1].float()
     fraction, by_d = both.fraction[0] + 1 - both.fraction[1], both.by_distance[0] - both.by_distance[1]
