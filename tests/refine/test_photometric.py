@@ -86,6 +86,23 @@ def test_noise_free_frames_leave_a_tenth_of_a_micron() -> None:
     assert rms[3:].max() < math.radians(0.001)
 
 
+@pytest.mark.parametrize("smear", [(8.5, 8.5), (12.0, 0.0)])
+def test_noise_free_frames_of_tilted_rings_that_moved_leave_a_micron(smear: tuple[float, float]) -> None:
+    """With the pixel's normals in place of those of the edges they are up to 0.39 um off across."""
+    r = rotations.exp(torch.tensor([[0.55, 0.1, 0.0], [0.1, 0.55, 0.5]], dtype=F64))
+    t = torch.tensor([[1.0, 2.0, 150.0], [-3.0, 1.0, 155.0]], dtype=F64)
+    frames = add_noise(render(CAMERA, QUAD, r, t, psf_sigma=0.7, plate=PLATE, smear=torch.tensor(smear, dtype=F64)), 0.0)
+    a, b = smear
+    blur = torch.tensor([a * a / 12 + 0.57, a * b / 12, b * b / 12 + 0.57], dtype=F64)
+    sight = Sight.of(frames, CAMERA, QUAD, torch.arange(2), exact_ellipses(QUAD, CAMERA, r, t))
+    result = refine_photometric(replace(sight, blur=blur.expand(2, 4, 3)), r, t + 0.002)
+    assert result.look is not None
+    assert result.look.kind.tolist() == [1, 1]
+    off = errors(result, r, t).abs()
+    assert off[:, :2].max() < 2e-4
+    assert off[:, 2].max() < 1e-3
+
+
 def test_light_may_fall_unevenly() -> None:
     """Grey levels with a gradient of 2:1 over the frame, unknown to the model but for each marker's plane."""
     r, t = random_poses(6, 40, (150, 170), seed=3)
