@@ -61,6 +61,7 @@ from torchpose.pose import (
 from torchpose.refine import METHODS, Recipe, Sight
 from torchpose.results import Poses, Reason, Status
 from torchpose.rings import (
+    LARGE,
     Circles,
     Rings,
     find_circles,
@@ -658,9 +659,12 @@ def _full(frame: Tensor, frames: int, least: int) -> Tensor:
 
 
 def _few(circles: Circles, most: int, frames: int) -> bool:
-    """Whether circles are legible, and no frame has so many of them that choosing costs less than measuring all."""
+    """Whether circles are legible, and no frame has so many of them that choosing costs less than measuring all.
+
+    The profile of a small ring hides a blur of its size, and its code may be another than it seems: a choice tells.
+    """
     few = bool((torch.bincount(circles.outer.frame, minlength=frames) <= most).all())
-    return few and bool(_legible(circles.inside.blur).all())
+    return few and bool((_legible(circles.inside.blur) & (circles.outer.ellipse[:, 3] >= LARGE)).all())
 
 
 def _lacking(scene: Scene, identified: Identified) -> Tensor:

@@ -91,7 +91,9 @@ def test_noise_free_frames_of_tilted_rings_that_moved_leave_a_micron(smear: tupl
     """With the pixel's normals in place of those of the edges they are up to 0.39 um off across."""
     r = rotations.exp(torch.tensor([[0.55, 0.1, 0.0], [0.1, 0.55, 0.5]], dtype=F64))
     t = torch.tensor([[1.0, 2.0, 150.0], [-3.0, 1.0, 155.0]], dtype=F64)
-    frames = add_noise(render(CAMERA, QUAD, r, t, psf_sigma=0.7, plate=PLATE, smear=torch.tensor(smear, dtype=F64)), 0.0)
+    frames = add_noise(
+        render(CAMERA, QUAD, r, t, psf_sigma=0.7, plate=PLATE, smear=torch.tensor(smear, dtype=F64)), 0.0
+    )
     a, b = smear
     blur = torch.tensor([a * a / 12 + 0.57, a * b / 12, b * b / 12 + 0.57], dtype=F64)
     sight = Sight.of(frames, CAMERA, QUAD, torch.arange(2), exact_ellipses(QUAD, CAMERA, r, t))

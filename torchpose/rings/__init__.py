@@ -2,6 +2,7 @@
 
 from torchpose.rings.lens import ideal_pixels, mapped
 from torchpose.rings.measure import (
+    LARGE,
     Circles,
     Rings,
     find_circles,
@@ -13,6 +14,7 @@ from torchpose.rings.measure import (
 )
 
 __all__ = [
+    "LARGE",
     "Circles",
     "Rings",
     "find_circles",

@@ -32,7 +32,7 @@ _LEAST_COVER = (0.4, 0.33)
 _SMALL = 4.0
 # px, outer and inner circle: smaller ones are letters and specks as well as rings (measured: decisions/0051)
 _LEAST_SEMI_MINOR = (4.0, 1.2)
-_LARGE = 20.0  # px, of the outer semi-minor axis, from which on a fit of all pixels costs too much (convention)
+LARGE = 20.0  # px, of the outer semi-minor axis, from which on a fit of all pixels costs too much (convention)
 # px, along the minor axis: what is soft along lines alone may be fields of an interlaced frame (measured:
 # `scripts/corruption_statistics.py --only interlacing`)
 _SOFT_ALL_AROUND = 1.0
@@ -255,12 +255,12 @@ def _measure(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tup
     # ... and so do two edges with less than a pixel beside it
     narrow = torch.minimum((1 - ratio) * outer[:, 3] - 1, ratio * outer[:, 3]) < _SMALL
     # a frame was reduced because a mask sees little of such edges; the whole ring tells as much, and its blur as well
-    small = (narrow | (how.reduced & how.correct)) & (outer[:, 3] < _LARGE)
+    small = (narrow | (how.reduced & how.correct)) & (outer[:, 3] < LARGE)
     parts, index = [], (~small).nonzero()[:, 0]
     if index.numel():
         rings, of = _by_edges(frames, circles[index], camera, how)
         # a narrow ring may hide its blur from its profile, not from its edges
-        wide = _soft(rings.blur) & (outer[index[of], 3] < _LARGE)
+        wide = _soft(rings.blur) & (outer[index[of], 3] < LARGE)
         parts.append((rings[~wide], index[of[~wide]]))
         small = small.index_fill(0, index[of[wide]], True)
     index = small.nonzero()[:, 0]
