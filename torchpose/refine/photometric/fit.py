@@ -223,7 +223,8 @@ class _Fits:
     def shaped(self, result: _Result, rows: Tensor) -> _Result:
         """With the kind of blur that explains misshapen ones of the rows (N,) bool better, where there is one."""
         least, most = blurs.axes(result.spread)
-        long, rows = most > _LONG * least, rows & result.misshapen & (result.look.kind == 0)
+        # where a ring is all edge, none stand out: what contradicts the model there may be its blur
+        long, rows = most > _LONG * least, rows & (result.misshapen | result.doubt) & (result.look.kind == 0)
         for kind, some in ((1, rows & long), (2, rows & ~long)):
             if not bool(some.any()):
                 continue
