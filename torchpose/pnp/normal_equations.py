@@ -285,7 +285,7 @@ def _full(device: torch.device) -> Tensor:
 
 def moved(pose: Tensor, step: Tensor) -> Tensor:
     """Poses [R C(w) | R d + t] (3, 4, ...) of steps (d, w) (6, ...), with Cayley's rotation C(w)."""
-    if not tracing() and pose.ndim == 3 and pose.shape[-1] <= MOST:
+    if few(step):
         return moved_few(pose, step)
     result = matmul3(pose[:, :3], torch.cat([cayley(step[3:]), step[:3, None]], 1))
     result[:, 3] += pose[:, 3]

@@ -45,12 +45,6 @@ _OFF = (  # what may be off of a camera's numbers, in the order of `OF_CAMERA`: 
 _PRINT, _CAMERA, _SCALE = (1e-4, 0.15), (1e-3, 300.0), (1.0, 1e3)
 _FIELD = (1e-3, 1.0)  # px, of displacements of the picture: more would be no ring's shape
 SURE = 2.33  # deviations: one row in 100 that is as its files say is looked at as closely as can be (derived)
-_LOOKED_AT = (
-    1.0  # deviations, beyond which a row's residuals are held against a camera, which costs little (convention)
-)
-# logarithm of how much likelier no misfit is beforehand than each of the three: as likely as all (convention). Of rows
-# that are as their files say one in 1,000 is made wider in vain
-_NOTHING = math.log(3.0)
 _GRID = 16  # values, logarithmic, apart by a factor of 1.5, of a camera 2.3, which few residuals do not tell
 _COARSE = 10  # of each of three: 2.3
 _FEW_FACTORS = 4  # of ten, of the scatter beside a print or a camera (convention)

@@ -40,9 +40,8 @@ def draw_shapes(frame: np.ndarray, rows: list[Row]) -> np.ndarray:
         if note:
             across = math.hypot(params[2] * math.cos(params[4]), params[3] * math.sin(params[4]))
             notes.append((note, (params[0] + across, params[1]), colour))
-    for (note, _, colour), place in zip(
-        notes, _apart([place for _, place, _ in notes], 90 * unit, 16 * unit), strict=True
-    ):
+    places = _apart([place for _, place, _ in notes], 90 * unit, 16 * unit)
+    for (note, _, colour), place in zip(notes, places, strict=True):
         draw_text(picture, note, place, 0.4 * unit, colour)
     return picture
 

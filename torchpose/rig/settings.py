@@ -92,10 +92,9 @@ class CameraSettings(Strict):
     gain_db: FiniteFloat = Field(default=0.0, ge=-100, le=100)
     timeout_s: Positive = 5.0  # from trigger to image
     attempts: int = Field(default=3, ge=1, le=20)  # at one frame, before the session ends
-    nodes: dict[
-        str, bool | int | FiniteFloat | str
-    ] = {}  # further GenICam features, set in this order; `TriggerSource`
-    # says that a line, or an action command, triggers it with others at once
+    # further GenICam features, set in this order; `TriggerSource` says that a line, or an action command, triggers it
+    # with others at once
+    nodes: dict[str, bool | int | FiniteFloat | str] = {}
 
     @field_validator("serial", mode="before")
     @classmethod

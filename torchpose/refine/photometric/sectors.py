@@ -31,11 +31,8 @@ _KEPT = 0.9  # of a sector's pixels that must follow the model for it to count (
 _CELL = 4  # sectors over which a misfit is taken for one
 _BAND = 2  # sectors of the outer circle that a band of lines is high: half as much apart, most of them share it
 _UNCLEAR = 3  # sectors of an outer circle: more are no chance (measured: decisions/0064)
-_ODD = (
-    3,
-    5,
-    7,
-)  # harmonics that neither pose nor gain nor blur can have, and that a box of 12 cells resolves (derived)
+# harmonics that neither pose nor gain nor blur can have, and that a box of 12 cells resolves (derived)
+_ODD = (3, 5, 7)
 # of the spectrum of what displaces a rim, as reciprocals of the harmonic of the outer circle at which it has fallen to
 # 1/e: white, and down to a correlation over half of the radius (convention: none is told better)
 _WIDTHS = (0.0, 0.03, 0.06, 0.12, 0.24)
@@ -194,6 +191,12 @@ def _beyond_harmonics(error: Tensor, hold: Tensor) -> tuple[Tensor, Tensor]:
     return ((hold * error.square()).sum(-1) - taken).sum(-1), free
 
 
+def _displacements(sectors: Sectors, variance: Tensor) -> tuple[Tensor, Tensor]:
+    """Displacements (K, 2, 48) in px of the rims in single sectors, inner circle first, and their information."""
+    pull, hold = (v.double().unflatten(1, (2, SECTORS)) / variance[:, None, None] for v in (sectors.pull, sectors.hold))
+    return torch.where(hold > 0, pull / hold.clamp_min(_TINY), 0.0), hold
+
+
 def _harmonics(around: Tensor) -> Tensor:
     """A mean and two harmonics (S, 5) of what goes around a circle in S parts, the last dimension."""
     parts = around.shape[-1]
@@ -218,8 +221,7 @@ def in_step(
         sectors: weighted as in the fit. variance: (K,) of noise. rings: (K, 2, 5) ellipses, outer one first.
             row: (K,) of ``rows``.
     """
-    pull, hold = (v.double().unflatten(1, (2, SECTORS)) / variance[:, None, None] for v in (sectors.pull, sectors.hold))
-    error = torch.where(hold > 0, pull / hold.clamp_min(_TINY), 0.0)
+    error, hold = _displacements(sectors, variance)
     basis = _harmonics(hold)
     inverse = scaled_inverse(((hold[..., None] * basis).mT @ basis).flatten(0, 1))[0].unflatten(0, (-1, 2))
     taken = basis @ inverse @ ((hold * error)[..., None, :] @ basis).mT
@@ -257,8 +259,7 @@ def shift_scatter(sectors: Sectors, variance: Tensor, rings: Tensor, row: Tensor
     Args:
         sectors, variance, rings, row, rows: as for `in_step`.
     """
-    pull, hold = (v.double().unflatten(1, (2, SECTORS)) / variance[:, None, None] for v in (sectors.pull, sectors.hold))
-    error = torch.where(hold > 0, pull / hold.clamp_min(_TINY), 0.0)
+    error, hold = _displacements(sectors, variance)
     basis = _harmonics(hold)
     weighted = hold[..., None] * basis
     taken = solve_scaled((weighted.mT @ basis).flatten(0, 1), (weighted.mT @ error[..., None]).flatten(0, 1))
