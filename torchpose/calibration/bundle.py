@@ -98,7 +98,7 @@ def adjust(
     Raises:
         ConfigError: the start puts points behind the camera, or the points of a view leave its pose open.
     """
-    rig = camera if isinstance(camera, CameraRig) else CameraRig.alone(camera)
+    rig = CameraRig.of(camera)
     problem, count = _Problem(views, rig, plate, free), lenses.count(rig.cameras)
     own: dict[str, Vector | Places] = {"intrinsics": Vector(views.pixels.new_zeros(1, count))} if free else {}
     if len(rig) > 1:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchpose.cli.common import say
+from torchpose.cli.options import MOST_ANGLE
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from torchpose.studies.study import StudyResult
     from torchpose.target import Target
 
-_MOST_ANGLE, _STEP = 80.0, 5.0  # degrees between the cameras (convention): a flat target is seen from less than 90
+_STEP = 5.0  # degrees between the cameras (convention)
 _NOISE = 2.0  # grey levels (convention): where --noise is not given
 _CLEAR = 1.05  # an angle is as good as the best one where its depth error is within 5 % of it (convention)
 
@@ -105,7 +106,7 @@ def _second(result: StudyResult, camera: Camera, target: Target, setting: Settin
     from torchpose.studies.study import Picture, Table
 
     R, t = (values[len(values) // 2] for values in setting.poses())
-    degrees = torch.arange(_STEP, _MOST_ANGLE + 1, _STEP, dtype=torch.float64)
+    degrees = torch.arange(_STEP, MOST_ANGLE + 1, _STEP, dtype=torch.float64)
     alone = pose_crlb(camera, target, R[None], t[None], **setting.conditions)
     if not bool(alone.isfinite().all()):
         raise ConfigError(
