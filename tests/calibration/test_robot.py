@@ -14,7 +14,8 @@ from scripts import rig_calibration_statistics as statistics
 from tests.calibration.test_several import held, of_seed
 from torchpose.calibration import Views
 from torchpose.calibration.hand_eye import restricted_noise
-from torchpose.calibration.rig_session import RobotPoses
+from torchpose.calibration.plate import stated_plate
+from torchpose.calibration.rig_session import RobotPoses, hand_eye_of
 from torchpose.calibration.robot import Robot
 from torchpose.calibration.several import RigCalibration, calibrate_rig
 from torchpose.errors import ConfigError
@@ -224,6 +225,28 @@ def test_a_robot_is_left_alone_where_moments_tie_the_cameras() -> None:
     )
     assert with_robot.hand_eye is None
     assert torch.equal(with_robot.rig.t, without.rig.t)
+    # where the first camera is on it is asked afterwards
+    exact = hand_eye_of(without, statistics.robot_poses(scene, "tool", 3, noise=(0.0, 0.0))).hand_eye
+    noisy = hand_eye_of(without, statistics.robot_poses(scene, "tool", 3)).hand_eye
+    assert exact.mount == noisy.mount == "tool"
+    assert noisy.covariance is not None
+    off = torch.cat([exact.translation - noisy.translation, rotations.log(exact.rotation @ noisy.rotation.mT)])
+    assert float(off @ torch.linalg.solve(noisy.covariance, off)) < 6 + 4 * math.sqrt(12)
+
+
+def test_what_is_unknown_of_the_plate_stands_beside_the_chain() -> None:
+    """A plate that its file has to 0.1 um is the same as an exact one, to a hundredth of a deviation."""
+    scene, views = of_seed(2, 40, 3)
+    cameras, robot = held(scene, statistics.shared_out(views)), statistics.robot_poses(scene, "base", 3)
+    count = len(scene.points)
+    plate = stated_plate(torch.arange(count), scene.points, 1e-8 * torch.eye(3 * count, dtype=F64))
+    one, other = (calibrate_rig(cameras, lens=None, plate=known, robot=robot) for known in (plate, None))
+    assert one.joint.shape[0] == 2 * 8 + 6 + 12 + len(plate)
+    assert one.hand_eye is not None
+    assert other.rig.covariance is not None
+    sigma = other.rig.covariance.diagonal().sqrt()
+    assert float((statistics.errors(one.rig, other.rig).flatten() / sigma).abs().max()) < 0.01
+    torch.testing.assert_close(one.joint[16:34, 16:34], other.joint[16:34, 16:34], rtol=0.01, atol=1e-9)
 
 
 def none(robot: RobotPoses, views: list[Views]) -> RobotPoses:

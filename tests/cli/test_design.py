@@ -102,6 +102,10 @@ def test_a_second_camera_at_an_angle(run: Callable[..., Any], tmp_path: Path) ->
     promised = predict_volume(rig, Target.load("quad40"), WorkingVolume((150.0, 150.0)), Imaging())
     assert [float(row["worst"]) for row in rows] == pytest.approx(promised.worst.tolist())
     assert float(rows[2]["worst_first_camera_alone"]) > 2.5 * float(rows[2]["worst"])
+    with (tmp_path / "made" / "second_camera.csv").open(newline="") as file:
+        angles = {float(row["angle deg"]): float(row["z um"]) for row in csv.DictReader(file)}
+    assert 0.98 < float(rows[2]["middle"]) / angles[40.0] < 1.2  # the bound
+    assert (tmp_path / "made" / "second_camera.png").is_file()
 
 
 def test_a_print_class_is_counted_and_stated(run: Callable[..., Any], tmp_path: Path) -> None:

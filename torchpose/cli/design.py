@@ -91,7 +91,7 @@ def design(
     if existing is None or any(x is not None for x in (camera, cameras, second_camera, distance, distance_range)):
         volume = _volume(distance, distance_range, tilt, roll, offset)
         rig = _rig(camera, cameras, second_camera, volume)
-        scene = _Scene(rig, volume, _imaging(volume, blur, noise, levels, f_number, focal_length))
+        scene = _Scene(rig, volume, _imaging(volume, blur, noise, levels, f_number, focal_length), second_camera)
     made = None if printing is None else print_of(printing)
     need = None if accuracy_um is None else Need(*accuracy_um, *(() if accuracy_deg is None else (accuracy_deg,)))
     make_folder(out, "--out")
@@ -136,6 +136,7 @@ class _Scene:
     rig: CameraRig
     volume: WorkingVolume
     imaging: Imaging
+    angle: float | None = None  # to a second camera that is not there yet, degrees
 
     @property
     def camera(self) -> Camera:
@@ -259,7 +260,17 @@ def _tell_precision(target: Target, scene: _Scene, promise: _Promise, need: Need
     table, picture = out / f"{target.name}_precision.csv", out / f"{target.name}_map.png"
     write_rows(table, rows, {column: str if column in ("axis", "unit") else float for column in rows[0]})
     save_plot(precision_map(scene.rig, *setting), target.name, picture, scene.volume)
-    return [table, picture]
+    return [table, picture, *(() if scene.angle is None else _angles(scene, target, out))]
+
+
+def _angles(scene: _Scene, target: Target, out: Path) -> list[Path]:
+    """What a second camera tells by its angle, in the middle of the volume: table and plot."""
+    from torchpose.cli.sensitivity_rig import Setting, second_camera
+
+    imaging, middle = scene.imaging, scene.volume.middle[1][:, 2]
+    seen = {"psf_sigma": float(imaging.blur(scene.camera, middle)), "noise_sigma": imaging.noise}
+    setting = Setting(middle, 0.0, seen | {"dark": imaging.dark, "light": imaging.light})
+    return second_camera(scene.camera, target, setting).save(out)
 
 
 def _seen(scene: _Scene, target: Target) -> Iterator[str]:

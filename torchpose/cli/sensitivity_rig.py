@@ -54,8 +54,8 @@ def predict(rig: CameraRig | None, camera: Camera, target: Target, setting: Sett
     result = StudyResult()
     if rig is not None:
         _together(result, rig, target, setting)
-    _second(result, camera, target, setting)
-    for path in result.save(out):
+    second = second_camera(camera, target, setting)
+    for path in (*result.save(out), *second.save(out)):
         say(str(path))
     return 0
 
@@ -97,13 +97,13 @@ def _together(result: StudyResult, rig: CameraRig, target: Target, setting: Sett
     _print("cameras alone and together: standard deviations in the axes of the first", rows, len(bounds))
 
 
-def _second(result: StudyResult, camera: Camera, target: Target, setting: Setting) -> None:
-    """A second camera like the first, at angles from the first, at the middle distance."""
+def second_camera(camera: Camera, target: Target, setting: Setting) -> StudyResult:
+    """A second camera like the first, at angles from the first, at the middle distance; shows what it tells."""
     import torch
 
     from torchpose.analysis import pose_crlb, second_camera_crlb
     from torchpose.report.placing import plot_angles
-    from torchpose.studies.study import Picture, Table
+    from torchpose.studies.study import Picture, StudyResult, Table
 
     R, t = (values[len(values) // 2] for values in setting.poses())
     degrees = torch.arange(_STEP, MOST_ANGLE + 1, _STEP, dtype=torch.float64)
@@ -117,10 +117,10 @@ def _second(result: StudyResult, camera: Camera, target: Target, setting: Settin
     rows += [
         {"angle deg": angle, "cameras": 2, **_cells(own)} for angle, own in zip(degrees.tolist(), bound, strict=True)
     ]
-    result.tables.append(Table("second_camera", "A second camera at an angle", rows))
-    result.pictures.append(
-        Picture("second_camera", "A second camera at an angle", plot_angles(degrees, bound, alone[0], float(t[2])))
-    )
+    result, title = StudyResult(), "A second camera at an angle"
+    result.tables.append(Table("second_camera", title, rows))
+    picture = plot_angles(degrees, bound, alone[0], float(t[2]))
+    result.pictures.append(Picture("second_camera", title, picture))
     _print(f"a second camera like the first, target at {float(t[2]):g} mm: standard deviations", rows, 1)
     depth = bound[:, 2, 2].sqrt()
     enough = degrees[depth <= _CLEAR * depth[depth.isfinite()].min()]
@@ -130,6 +130,7 @@ def _second(result: StudyResult, camera: Camera, target: Target, setting: Settin
         f"{float(enough[-1]):g} degrees: {first / best:.3g} times less; two at one place would make it "
         f"{math.sqrt(2):.3g} times less"
     )
+    return result
 
 
 def _print(title: str, rows: list[Row], block: int) -> None:
