@@ -211,7 +211,7 @@ def test_a_wrong_robot_pose_is_left_out_and_told_and_so_are_few() -> None:
     few = {name: pose for name, pose in robot.items() if name in (*views[0].names, *views[1].names[:2])}
     found = calibrate_rig(held(scene, views), lens=None, robot=few)
     assert nees(found, statistics.errors(found.rig, scene.rig).flatten()) < 6 + 4 * math.sqrt(12)
-    assert [text for text in found.warnings if text.startswith(f"robot poses of 1 moments ({odd}) contradict")]
+    assert [text for text in found.warnings if text.startswith(f"robot poses of 1 moment ({odd}) contradict")]
     assert [
         text for text in found.warnings if text.startswith("cam1 is tied to the others by the robot in 2 moments only")
     ]

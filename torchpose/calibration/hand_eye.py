@@ -26,6 +26,7 @@ _RELATIVE = 1e-12  # decrease that a step must promise, of the cost
 _LEAST_TURN_DEG = 1.0  # RMS rotation about an axis, below which the robot has not turned about it
 START_NOISE = (0.05, 2e-4)  # mm, rad of the robot, until the residuals tell
 _NOISE_ROUNDS, _NOISE_STEPS = 8, 100
+_SETTLED = 1e-6  # relative change of a variance in a step: far below what residuals tell of it
 LEAST_NOISE = (1e-6, 1e-9)  # mm, rad: where an estimate of none ends
 
 _MOST_NOISE = (5.0, 0.05)  # mm, rad: a robot that is farther off was not there when the frames were taken
@@ -274,6 +275,8 @@ def restricted_noise(
         left = weight @ (y - columns @ own)
         outer = weight - pulled.mT @ inverse @ pulled
         over = (left.mT @ parts @ left).sum((1, 2, 3)) / (outer * parts).sum((1, 2, 3))
-        variance = torch.maximum(variance * over, least)
+        before, variance = variance, torch.maximum(variance * over, least)
+        if bool(((variance / before).log().abs() < _SETTLED).all()):
+            break
     mm, rad = variance.sqrt().tolist()
     return mm, rad

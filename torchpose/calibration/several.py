@@ -294,8 +294,8 @@ def _warnings(found: RigCalibration, seen: Views, *, free: bool) -> list[str]:
     rest = [name for name in seen.names if name not in views.names]
     if rest:
         told.append(
-            f"{len(rest)} moments ({_some(rest)}) contradict the others: the target moved between their pictures, or a "
-            "camera in its place"
+            f"{_moments(len(rest))} ({_some(rest)}) contradict the others: the target moved between their pictures, "
+            "or a camera in its place"
         )
     return told
 
@@ -309,9 +309,13 @@ def _lost_poses(views: Views, seen: Views) -> list[str]:
     if not lost:
         return []
     return [
-        f"robot poses of {len(lost)} moments ({_some(lost)}) contradict the others and were left out: check that each "
-        "was read when its pictures were taken"
+        f"robot poses of {_moments(len(lost))} ({_some(lost)}) contradict the others and were left out: check that "
+        "each was read when its pictures were taken"
     ]
+
+
+def _moments(count: int) -> str:
+    return f"{count} moment{'' if count == 1 else 's'}"
 
 
 def _some(names: Sequence[str]) -> str:
@@ -328,7 +332,7 @@ def _few_ties(found: RigCalibration) -> list[str]:
         moments = torch.bincount(group_of_moments(found.views, group)[robot.known], minlength=len(members)).tolist()
         ties += [(names_of(names, group, k), "by the robot in", count) for k, count in enumerate(moments)]
     return [
-        f"{name} is tied to the others {by} {count} moments only; add some, so that a false one shows"
+        f"{name} is tied to the others {by} {_moments(count)} only; add some, so that a false one shows"
         for name, by, count in ties
         if count < _FEW_TIES
     ]
