@@ -64,6 +64,7 @@ class Sight(Rows):
         reduction: of the frames, by block means: their rounding counts for less.
         seen: sectors of every ring in which it was seen so far, see `geometry.sectors`; None where nothing is known.
         look: of an earlier fit, with which to begin.
+        disc: whether the blur of most rings was seen to be a disc's; None where nothing is known.
     """
 
     frame: Int[Tensor, " N"]
@@ -79,6 +80,7 @@ class Sight(Rows):
     reduction: int = shared(1)
     seen: Bool[Tensor, "N M 48"] | None = None
     look: Look | None = None
+    disc: Bool[Tensor, " N"] | None = None
 
     @classmethod
     def of(cls, frames: Tensor, camera: Camera, target: Target, frame: Tensor, rings: Tensor) -> Self:
@@ -110,6 +112,7 @@ class Sight(Rows):
             scene.camera,
             blur.view(*evidence.mask.shape, 3),
             seen=ring.seen.view(*evidence.mask.shape, -1),
+            disc=2 * (ring.disc.view_as(evidence.mask) & evidence.mask).sum(-1) > evidence.mask.sum(-1),
         )
 
     @property

@@ -224,7 +224,9 @@ class _Fits:
         """With the kind of blur that explains misshapen ones of the rows (N,) bool better, where there is one."""
         least, most = blurs.axes(result.spread)
         # where a ring is all edge, none stand out: what contradicts the model there may be its blur
-        long, rows = most > _LONG * least, rows & (result.misshapen | result.doubt) & (result.look.kind == 0)
+        amiss = result.misshapen | result.doubt
+        amiss = amiss if self.sight.disc is None else amiss | self.sight.disc
+        long, rows = most > _LONG * least, rows & amiss & (result.look.kind == 0)
         for kind, some in ((1, rows & long), (2, rows & ~long)):
             if not bool(some.any()):
                 continue
