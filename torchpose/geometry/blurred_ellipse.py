@@ -13,7 +13,6 @@ converges faster than any power of its step (Trefethen, Weideman, SIAM Review 56
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -26,34 +25,23 @@ _STEP = 1.25
 _RIM, _SOFTNESS = 3.66, 0.6
 
 
-class Profile(NamedTuple):
-    """A blur's profile in m, see above.
-
-    Attributes:
-        of: from m (...), which it may overwrite, -M(m) and 2 M'(m), which is 1 at m = 0 for a Gaussian.
-        nodes: times as many as a Gaussian needs.
-    """
-
-    of: Callable[[Tensor], tuple[Tensor, Tensor]]
-    nodes: int = 1
+Profile = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""Of a blur, from m (...), which it may overwrite: -M(m), see above, and 2 M'(m), 1 at m = 0 for a Gaussian."""
 
 
-def _gaussian(square: Tensor) -> tuple[Tensor, Tensor]:
+def gaussian(square: Tensor) -> tuple[Tensor, Tensor]:
     """Of a Gaussian: M = 1 - exp(-m / 2)."""
     less = (-0.5 * square).expm1_()
     return less, less + 1
 
 
-def _disc(square: Tensor) -> tuple[Tensor, Tensor]:
+def disc(square: Tensor) -> tuple[Tensor, Tensor]:
     """Of a disc with a soft rim: M' falls as a logistic function of m, and m has the mean 2 that is a Gaussian's."""
     begin = math.log1p(math.exp(-_RIM / _SOFTNESS))
     whole = _RIM + _SOFTNESS * begin
     beyond = (square - _RIM) / _SOFTNESS
     within = square - _SOFTNESS * (torch.nn.functional.softplus(beyond) - begin)
     return within.div_(-whole), beyond.neg_().sigmoid_().mul_(2 / whole)
-
-
-GAUSSIAN, DISC = Profile(_gaussian), Profile(_disc, 2)
 
 
 def nodes_of_each(semi_major: Float[Tensor, " K"], sigma: Float[Tensor, " K"]) -> Float[Tensor, " K"]:
@@ -74,7 +62,7 @@ def blurred_ellipse(
     scale: Float[Tensor, " K"],
     blur: Float[Tensor, "K 3"],
     nodes: int,
-    profile: Profile = GAUSSIAN,
+    profile: Profile = gaussian,
 ) -> tuple[Float[Tensor, "K P"], Float[Tensor, "K P 9"]]:
     """Blurred indicators, in [0, 1], of K ellipses at P points each, and their derivatives.
 
@@ -82,13 +70,12 @@ def blurred_ellipse(
         shape: symmetric, see `conics.shape_matrix`.
         scale: factor on the shape.
         blur: covariance s11, s12, s22.
-        nodes: of the trapezoidal rule, see `nodes_needed`; times those of the profile.
+        nodes: of the trapezoidal rule, see `nodes_needed`; a disc with its rim is then right to 0.015.
         profile: of the blur.
 
     Returns:
         Values, and derivatives by centre (2), shape s11, s12, s22, scale and blur (3).
     """
-    nodes = nodes * profile.nodes
     angle = torch.arange(nodes, dtype=xy.dtype, device=xy.device) * (2 * math.pi / nodes)
     unit = torch.stack([angle.cos(), angle.sin()])  # (2, M)
     turn = torch.stack([-unit[1], unit[0]]) * (2 * math.pi / nodes)
@@ -108,7 +95,7 @@ def blurred_ellipse(
     moves = [nx, ny, q * ex * nx, q * (ey * nx + ex * ny), q * ey * ny, outward / q]
     columns = torch.stack([*moves, bx * nx, by * nx, bx * ny, by * ny, outward], -1)
     norm = 2 * math.pi * area.sqrt()[..., None]
-    within, density = profile.of(square)
+    within, density = profile(square)
     flux = within.div_(square) @ columns[..., (0, 1, 10)] / -norm  # (K, P, 3)
     by_motion = density @ columns[..., :10] / norm  # (K, P, 10)
     value = flux[..., 2] - (from_center * flux[..., :2]).sum(-1)

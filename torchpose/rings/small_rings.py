@@ -32,7 +32,7 @@ from torchpose.ellipse import EllipseFit
 from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
 from torchpose.geometry.blurred_edge import BLUR, MOST, Spread
-from torchpose.geometry.blurred_ellipse import DISC, nodes_of_each
+from torchpose.geometry.blurred_ellipse import disc, nodes_of_each
 from torchpose.geometry.least_squares import (
     Block,
     Normal,
@@ -125,9 +125,7 @@ _ROUGH = _Scheme(first_order, 1e-3, (_Stage(2, held=True, sectors=False), _Stage
 # blur, width and contrast of a ring much blurred are hard to tell apart: no step is to be shortened
 _PRECISE = _Scheme(exact, 1e-5, (_Stage(6), _Stage(4, hard=True)))
 # from afar a weight would leave out what contradicts the beginning
-_OUT_OF_FOCUS = _Scheme(
-    partial(exact, profile=DISC), 1e-5, (_Stage(6, sectors=False, even=True), _Stage(4), _Stage(4, hard=True))
-)
+_OUT_OF_FOCUS = _Scheme(partial(exact, profile=disc), 1e-5, (_Stage(5, sectors=False, even=True), _Stage(4, hard=True)))
 
 
 def fit_small_rings(
@@ -193,7 +191,7 @@ def _out_of_focus(frames: Tensor, candidates: Candidates, first: _Start, fit: _F
         fit = fit.replaced(left[better], other[better])
         told = fit.variance.minimum(fit.noise)  # a ring that fits tells the noise of all
         least = told.new_full((number,), math.inf).scatter_reduce(0, frame, told, "amin")[frame]
-        left = left[fit.variance[left] > _WHITE * least[left]]
+        left = left[fit.variance[left] > _WHITE**2 * least[left]]  # twice beyond chance, as both have some
         if left.numel() == 0:
             break
     return fit
