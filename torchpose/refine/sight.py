@@ -14,6 +14,7 @@ from torchpose.camera import Camera
 from torchpose.detect.reduce import only_reduced
 from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
+from torchpose.geometry.blurred_edge import KINDS
 from torchpose.geometry.least_squares import Pose, PosePrior
 from torchpose.geometry.robust import LEAST_KEPT as LEAST_KEPT
 from torchpose.geometry.rows import Rows, shared
@@ -129,6 +130,12 @@ class Sight(Rows):
         median = torch.where(self.mask[..., None], self.blur, torch.nan).nanmedian(1).values
         return torch.where(median.isnan(), blurs.isotropic(start), median)
 
+    @property
+    def told(self) -> Int[Tensor, " N"]:
+        """The kind of blur that the rings tell, its number in `geometry.blurred_edge.KINDS`."""
+        known = torch.zeros_like(self.frame) if self.disc is None else self.disc.to(self.frame)
+        return known * KINDS.index("disc")
+
     def displaced(self, by: Float[Tensor, "N M 5"]) -> Self:
         """The same rows with places of their markers beside those they have, as `Poses.place`."""
         grown = (self.polarity * by[..., 3])[..., None] * by.new_tensor([1.0, -1.0]) + by[..., 4:]
@@ -165,7 +172,7 @@ def refined_by_blur(
         factor: for rows without a look.
     """
     known = None if prior is None else PosePrior(prior, start)
-    kind = doubt = torch.zeros_like(factor)
+    kind, doubt = sight.told, torch.zeros_like(factor)
     if sight.look is not None:
         factor, kind, doubt = sight.look.reduction, sight.look.kind, sight.look.doubt.long()
     each = torch.stack([factor, kind, doubt], -1)

@@ -31,7 +31,7 @@ from torchpose.detect import Candidates
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
-from torchpose.geometry.blurred_edge import BLUR, MOST, Spread
+from torchpose.geometry.blurred_edge import BLUR, LONG, MOST, Spread
 from torchpose.geometry.blurred_ellipse import disc, nodes_of_each
 from torchpose.geometry.least_squares import (
     Block,
@@ -85,7 +85,7 @@ class SmallRings(Rows):
         blur: px^2, see `geometry.blur`.
         good: whether the model explains what is seen.
         promising: whether it is that of a blur too wide for it, and the exact one may explain more.
-        disc: whether a disc explains its blur better than a Gaussian.
+        disc: whether a round disc explains its blur, and a Gaussian does not.
         seen: sectors in which it does.
     """
 
@@ -411,13 +411,16 @@ def _judged(fit: _Fit, outer: Tensor, polarity: Tensor) -> SmallRings:
     inner = torch.cat([params[:, :2] + theta[:, 6:], params[:, 2:4] * ratio[:, None], params[:, 4:]], -1)
     # a first fit may leave twice as much
     may = shape_ok & fit.sound & (fit.contrast * polarity < 0) & (1 - fit.explained < 2 * (1 - _LEAST_EXPLAINED))
-    promising = may & (blurs.axes(fit.blur)[1].sqrt() > BLURRED * ratio * params[:, 3])
+    least, most = blurs.axes(fit.blur)
+    promising = may & (most.sqrt() > BLURRED * ratio * params[:, 3])
     # both circles tell the same shape and nearly the same centre: as independent ones each has twice the variance
     fits = [
         EllipseFit(p, 2 * j @ covariance @ j.mT, fit.variance.sqrt(), fit.pixels)
         for p, j in ((params, outer_jacobian), (inner, inner_jacobian))
     ]
-    return SmallRings(fits[0], fits[1], fit.blur, good, promising, fit.disc, fit.seen)
+    round_ = most < LONG * least
+    disc = fit.disc & round_ & (fit.variance < _WHITE**2 * fit.noise)
+    return SmallRings(fits[0], fits[1], fit.blur, good, promising, disc, fit.seen)
 
 
 class _Window(NamedTuple):
