@@ -124,6 +124,7 @@ class _Scheme(NamedTuple):
 _ROUGH = _Scheme(first_order, 1e-3, (_Stage(2, held=True, sectors=False), _Stage(6), _Stage(3, hard=True)))
 # blur, width and contrast of a ring much blurred are hard to tell apart: no step is to be shortened
 _PRECISE = _Scheme(exact, 1e-5, (_Stage(6), _Stage(4, hard=True)))
+_GLANCE = _PRECISE._replace(stages=(_Stage(3), _Stage(1, hard=True)))  # enough to see that a Gaussian will not do
 # from afar a weight would leave out what contradicts the beginning
 _OUT_OF_FOCUS = _Scheme(partial(exact, profile=disc), 1e-5, (_Stage(5, sectors=False, even=True), _Stage(4, hard=True)))
 
@@ -155,11 +156,15 @@ def fit_small_rings(
     first = _Start(torch.cat([*start, apart], -1), spread, inside.seen, parted, inside.clipped)
     if not begun:
         return _judged(_fitted_all(frames, candidates, first, _ROUGH), outer, candidates.polarity)
-    fit = _fitted_all(frames, candidates, first, _PRECISE)
+    fit = _fitted_all(frames, candidates, first, _GLANCE)
     frame, number = candidates.frame, int(candidates.frame.max()) + 1
-    left = (segment_mean(fit.variance / fit.noise, frame, number)[frame] > _WHITE).nonzero()[:, 0]
+    odd = (segment_mean(fit.variance / fit.noise, frame, number)[frame] > _WHITE).nonzero()[:, 0]
+    if odd.numel():
+        fit = fit.replaced(odd, _out_of_focus(frames, candidates[odd], first[odd], fit[odd]))
+    left = (~(fit.disc & (fit.variance < _WHITE**2 * fit.noise))).nonzero()[:, 0]
     if left.numel():
-        fit = fit.replaced(left, _out_of_focus(frames, candidates[left], first[left], fit[left]))
+        fit = replace(fit, variance=fit.variance.where(fit.disc, torch.inf))  # a glance is no fit
+        fit = fit.bettered(left, _fitted_all(frames, candidates[left], first[left], _PRECISE))
     return _judged(fit, outer, candidates.polarity)
 
 
@@ -187,8 +192,7 @@ def _out_of_focus(frames: Tensor, candidates: Candidates, first: _Start, fit: _F
     for ratio in _BEGINNINGS:
         theta = torch.cat([begun.theta[:, :5], torch.full_like(usual, ratio)[:, None], begun.theta[:, 6:]], -1)
         other = _fitted_all(frames, candidates[left], replace(begun, theta=theta)[left], _OUT_OF_FOCUS)
-        better = (other.sound & (other.loss < fit.loss[left])).nonzero()[:, 0]
-        fit = fit.replaced(left[better], other[better])
+        fit = fit.bettered(left, other)
         told = fit.variance.minimum(fit.noise)  # a ring that fits tells the noise of all
         least = told.new_full((number,), math.inf).scatter_reduce(0, frame, told, "amin")[frame]
         left = left[fit.variance[left] > _WHITE**2 * least[left]]  # twice beyond chance, as both have some
@@ -244,6 +248,11 @@ class _Fit(Rows):
     def loss(self) -> Tensor:
         """(K,): mean squares of the residuals, those left out with the least that they have."""
         return self.variance * (self.kept + CUT**2 * (1 - self.kept))
+
+    def bettered(self, index: Tensor, others: _Fit) -> _Fit:
+        """With those of the others, of the rings ``index``, that leave less."""
+        better = (others.sound & (others.loss < self.loss[index])).nonzero()[:, 0]
+        return self.replaced(index[better], others[better])
 
 
 def _no_fit(begun: _Start) -> _Fit:
