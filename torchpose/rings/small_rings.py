@@ -126,7 +126,7 @@ _ROUGH = _Scheme(first_order, 1e-3, (_Stage(2, held=True, sectors=False), _Stage
 _PRECISE = _Scheme(exact, 1e-5, (_Stage(6), _Stage(4, hard=True)))
 _GLANCE = _PRECISE._replace(stages=(_Stage(3), _Stage(1, hard=True)))  # enough to see that a Gaussian will not do
 # from afar a weight would leave out what contradicts the beginning
-_OUT_OF_FOCUS = _Scheme(partial(exact, profile=disc), 1e-5, (_Stage(5, sectors=False, even=True), _Stage(4, hard=True)))
+_OUT_OF_FOCUS = _Scheme(partial(exact, profile=disc), 1e-5, (_Stage(4, sectors=False, even=True), _Stage(2, hard=True)))
 
 
 def fit_small_rings(
