@@ -13,7 +13,7 @@ view, of the view's pose and of X and Z. X and Z are common to all cameras, whos
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import torch
 from jaxtyping import Float
@@ -47,6 +47,10 @@ class Robot(Rows):
     x: Transform = shared()
     z: Transform = shared()
     noise: Noise = shared()
+
+    def coarser(self, times: float) -> Self:
+        """The same with so much more noise."""
+        return replace(self, noise=(times * self.noise[0], times * self.noise[1]))
 
     @property
     def known(self) -> Tensor:

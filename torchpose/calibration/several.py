@@ -52,6 +52,7 @@ from torchpose.handeye import HandEye
 
 _FEW_TIES = 3  # moments that tie a camera to the others (convention): fewer leave a false one unseen
 _START_SIGMA = 1.0  # px (convention): of every point, for the start
+_ORDINARY_SIGMA = 0.01  # px: of the centres of rings in the end (docs/precision.md)
 _LOST = 27.6  # chi-squared of a point that a start does not explain (derived: one good one in 10^6 has more)
 _NAMED = 3  # moments in a sentence (convention)
 
@@ -155,6 +156,8 @@ def calibrate_rig(
     together, free = _started(located, robot or {}), lens is not None
     cameras, before = together.rig.cameras, len(together.views.view)
     equal = replace(together.views, covariance=widened(torch.zeros_like(together.views.covariance), _START_SIGMA))
+    if equal.robot is not None:  # in proportion: else views would follow the robot
+        equal = replace(equal, robot=equal.robot.coarser(_START_SIGMA / _ORDINARY_SIGMA))
     start = adjust(equal, together.rig, together.R, together.t, free=free)
     views, bundle, common = weigh(together.views, start, lenses.count(cameras) if free else 0, plate)
     names = tuple(one.name for one in located)
