@@ -21,6 +21,7 @@ from torchpose.design import (
     predicted_covariance,
     share_that_counts,
 )
+from torchpose.design.printing import PRINTS
 from torchpose.design.view import rings_that_count
 from torchpose.geometry import rotations
 from torchpose.sim import Defocus, add_noise, render
@@ -47,6 +48,17 @@ def poses(count: int) -> tuple[torch.Tensor, torch.Tensor]:
     return VOLUME.random(count, torch.Generator().manual_seed(3))
 
 
+def stated_by_estimate(several: tp.CameraRig, target: tp.Target, R: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+    """Median of what the estimator states for each pose in five frames."""
+    frames = [render(one, target, *several.seen_by(k, R, t), psf_sigma=0.7) for k, one in enumerate(several.cameras)]
+    estimator, every = tp.PoseEstimator(several, target), []
+    for seed in range(5):
+        estimated = estimator([add_noise(own, 2.0, seed=10 * seed + k) for k, own in enumerate(frames)])
+        assert estimated.ok.all()
+        every.append(deviations(estimated.covariance))
+    return torch.stack(every).median(0).values
+
+
 @pytest.mark.parametrize("places", [False, True])
 def test_a_rig_promises_what_the_estimator_states_and_the_bound_allows(places: bool) -> None:
     several = rig(places=places)
@@ -55,16 +67,21 @@ def test_a_rig_promises_what_the_estimator_states_and_the_bound_allows(places: b
     bound = deviations(rig_crlb(several, TARGET, R, t, psf_sigma=0.7, noise_sigma=2.0))
     assert (found / bound > 0.98).all()
     assert (found / bound < 1.2).all()
-    frames = [render(one, TARGET, *several.seen_by(k, R, t), psf_sigma=0.7) for k, one in enumerate(several.cameras)]
-    estimator, every = tp.PoseEstimator(several, TARGET), []
-    for seed in range(5):
-        estimated = estimator([add_noise(own, 2.0, seed=10 * seed + k) for k, own in enumerate(frames)])
-        assert estimated.ok.all()
-        every.append(deviations(estimated.covariance))
-    torch.testing.assert_close(found, torch.stack(every).median(0).values, rtol=0.08, atol=0)
+    torch.testing.assert_close(found, stated_by_estimate(several, TARGET, R, t), rtol=0.08, atol=0)
     # the closed form that searches go by
     quick = deviations(edge_covariance(several, TARGET, R, t, Imaging()))
     assert ((found / quick - 1).abs() < 0.15).all()
+
+
+def test_a_rig_counts_what_the_files_of_cameras_and_target_state() -> None:
+    square = torch.diag(torch.tensor([0.2, 0.2, 0.1, 0.1], dtype=F64).square())
+    several = rig(places=True)
+    several = replace(several, cameras=tuple(replace(one, covariance=square) for one in several.cameras))
+    target = PRINTS["glass"].stated_by(TARGET)
+    R, t = poses(3)
+    found = deviations(predicted_covariance(several, target, R, t, Imaging()))
+    torch.testing.assert_close(found, stated_by_estimate(several, target, R, t), rtol=0.08, atol=0)
+    assert (found > 1.5 * deviations(predicted_covariance(rig(), TARGET, R, t, Imaging()))).any(1).all()
 
 
 def test_a_rig_of_one_camera_is_that_camera() -> None:
