@@ -309,6 +309,10 @@ class Operations(TorchDispatchMode):
         self.kinds: Counter[str] = Counter()
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        with self:  # in inference mode compound operations arrive whole
+            parts = func.decompose(*args, **(kwargs or {}))
+        if parts is not NotImplemented:
+            return parts
         chain, frame = [], sys._getframe(1)
         while frame is not None:
             if (name := _function(frame.f_code)) is not None:

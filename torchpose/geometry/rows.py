@@ -74,6 +74,10 @@ class Rows:
 
         return self._each(moved, with_shared=True)
 
+    def clone(self) -> Self:
+        """Copies of every tensor; outside of inference mode they are ordinary ones, whatever these are."""
+        return self._each(lambda value: value.clone(), with_shared=True)
+
     def cpu(self) -> Self:
         return self.to("cpu")
 

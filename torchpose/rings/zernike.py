@@ -68,6 +68,11 @@ def kernels(size: int = MASK, orders: tuple[tuple[int, int], ...] = ORDERS) -> T
     """
     if size < 3 or size % 2 == 0:
         raise ValueError(f"Zernike mask size must be odd and at least 3, not {size}")
+    with torch.inference_mode(False):  # kept, and used where gradients are wanted
+        return _kernels(size, orders)
+
+
+def _kernels(size: int, orders: tuple[tuple[int, int], ...]) -> Tensor:
     n = size * _SUBSAMPLES
     axis = (torch.arange(n, dtype=torch.float64) + 0.5) * (2.0 / n) - 1.0
     y, x = axis[:, None], axis[None, :]
