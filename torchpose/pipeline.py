@@ -36,6 +36,7 @@ from torchpose.identify import (
     Scene,
     Views,
     beside_another,
+    confirmed,
     find_near,
     identify,
     identify_boards,
@@ -43,6 +44,7 @@ from torchpose.identify import (
     indistinguishable,
     look_again,
     named,
+    outlines,
 )
 from torchpose.kernels import find_compiler
 from torchpose.moments import Moments, Start, View, begin, joined, refine_moments
@@ -275,8 +277,12 @@ class PoseEstimator(nn.Module):
             return scene, found, found.rings
         there = None if near is None else find_near(scene, *_placed(scene, near))
         if there is not None:
-            rings, _ = measure_predicted(frames, *there, scene.camera, correct=self._recipe.correct)
-            first = self._read(scene, rings)
+            rings, of = measure_predicted(frames, *outlines(scene, there), scene.camera, correct=self._recipe.correct)
+            identified = confirmed(scene, there, rings, of)
+            if identified is None:
+                first = self._read(scene, rings)
+            else:
+                first = scene, self._solved(scene, rings, identified, near=True)
             settled = self._settled(*first)
             if bool(settled.all()):
                 return *first, rings
@@ -430,20 +436,25 @@ class PoseEstimator(nn.Module):
             found = right_way_round(scene, found, solve)
         return best_copies(scene, found, self.instances)
 
-    def _solved(self, scene: Scene, rings: Rings, identified: Identified) -> Found:
-        """The evidence of every row, and the solutions of those rows that have enough of it."""
+    def _solved(self, scene: Scene, rings: Rings, identified: Identified, *, near: bool = False) -> Found:
+        """The evidence of every row, and the solutions of those rows that have enough of it.
+
+        ``near``: the rows' poses are those of frames not long before.
+        """
         gain = scene.stated_gain(identified.gain)
         markers = replace(scene.table[scene.target], radii=scene.printed_radii(gain))
         evidence = gather_evidence(rings, identified.ring, markers, scene.camera, self._recipe.locate)
         evidence = replace(evidence, gain=gain)
         solvable = (evidence.mask.sum(-1) >= MIN_MARKERS).nonzero()[:, 0]
         rough = identified.R[solvable], identified.t[solvable]
-        return Found(
-            rings, identified, evidence, solvable, solve_poses(evidence[solvable], rough, compile=self.solves_compiled)
-        )
+        solutions = solve_poses(evidence[solvable], rough, near=near, compile=self.solves_compiled)
+        return Found(rings, identified, evidence, solvable, solutions)
 
     def _second_look(self, scene: Scene, found: Found, tried: Rings) -> tuple[Rings, Identified]:
         """Looks for missing markers where the solutions put them, or the rough pose where there is none."""
+        seen = found.evidence.mask | ~scene.table.valid[scene.target]
+        if bool(seen.all()) and bool(found.solutions.mask.sum() == found.evidence.mask.sum()):
+            return found.rings, found.identified
         known = found.rings, found.identified, _views(found), _much_blurred(tried)
         return look_again(scene, *known, correct=self._recipe.correct)
 

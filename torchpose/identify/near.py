@@ -2,8 +2,8 @@
 
 Edges are looked for within a few pixels, and targets move by more. So each marker is drawn as the last pose shows it,
 and found again by correlation within what it may have moved; the shifts of a target's markers correct its pose by one
-step. What is measured where the pose then puts the rings is named by its code as any ring is: a ring that is another
-one, or none, makes no pose.
+step. Where every marker has a ring of its place and code alone, nothing else need be asked; all others are named by
+their codes as any ring is.
 """
 
 import math
@@ -18,8 +18,11 @@ from torchpose.geometry.arguments import checked
 from torchpose.geometry.least_squares import solve_scaled
 from torchpose.geometry.projection import by_pose, image_by_point
 from torchpose.geometry.segments import segment_sum, values_at
+from torchpose.identify.assignments import Codes, Marks
+from torchpose.identify.markers import Identified, likely_gain
 from torchpose.identify.scene import Scene
-from torchpose.identify.second_look import predicted
+from torchpose.identify.second_look import near_place, predicted
+from torchpose.rings import Rings
 
 MOST_MOVE = 20.0  # px between two frames (convention): 0.1 m/s at 1 m, 50 frames/s and a 12 mm lens
 _AROUND = 1.25  # of the outer circle: the ground that belongs to its picture (convention)
@@ -27,17 +30,21 @@ _ACROSS = 3  # cells across the ring, or its hole, at which it is still told fro
 _TURN = 0.1  # rad between two frames, as a deviation: what shifts of centres hardly tell stays as it was (convention)
 
 
-class _Places(NamedTuple):
-    """P markers in view: row and number (P,), outer and inner ellipse (P, 2, 5) in pixels of the frame."""
+class Places(NamedTuple):
+    """P markers in view: row and number (P,), ellipses (P, 2, 5), outer and inner one, in pixels of the frame and in
+    ideal ones; under poses R (N, 3, 3), t (N, 3) of all rows."""
 
     row: Tensor
     marker: Tensor
     raw: Tensor
+    ideal: Tensor
+    R: Tensor
+    t: Tensor
 
 
 @checked
-def find_near(scene: Scene, R: Tensor, t: Tensor) -> tuple[Candidates, Tensor] | None:
-    """Outer circles where the markers must be, and the inner ellipses (M, 5); None where no pose is known.
+def find_near(scene: Scene, R: Tensor, t: Tensor) -> Places | None:
+    """Where the markers must be; None where no pose is known.
 
     Args:
         scene: a row for every frame and target.
@@ -50,22 +57,64 @@ def find_near(scene: Scene, R: Tensor, t: Tensor) -> tuple[Candidates, Tensor] |
     shift = _shifts(scene, last)
     if shift is None:
         return None
-    now = _places(scene, *_corrected(scene, R, t, last, shift))
-    polarity = scene.table.polarity[scene.target][now.row]
-    return Candidates.unscored(scene.frame[now.row], now.raw[:, 0], polarity), now.raw[:, 1]
+    return _places(scene, *_corrected(scene, R, t, last, shift))
 
 
-def _places(scene: Scene, R: Tensor, t: Tensor) -> _Places:
+def outlines(scene: Scene, there: Places) -> tuple[Candidates, Tensor]:
+    """Places as candidates, and their inner ellipses (P, 5)."""
+    polarity = scene.table.polarity[scene.target][there.row]
+    return Candidates.unscored(scene.frame[there.row], there.raw[:, 0], polarity), there.raw[:, 1]
+
+
+@checked
+def confirmed(scene: Scene, there: Places, rings: Rings, of: Tensor) -> Identified | None:
+    """The rings by marker where every marker of every row has the one that lies in its place, None otherwise.
+
+    Each has its marker's code and no other: what else a ring might be is asked where all may be anything.
+
+    Args:
+        scene: a row for every frame and target.
+        there: where the markers must be.
+        rings: K, measured there.
+        of: (K,), the place of each.
+    """
+    table, rows = scene.table, len(scene.frame)
+    if len(of) < rows * int(table.valid.sum()) // len(table) or bool(rings.clipped.any()):
+        return None
+    row, marker = there.row[of], there.marker[of]
+    target = scene.target[row]
+    outer_mm, inner_mm = table.radii.unbind(-1)
+    marks = Marks(outer_mm[None], inner_mm[None], table.half_gap[None, :, None], table.gain_scale[None, :, None])
+    codes = Codes.of(rings, marks)
+    could = (codes.mismatch < 1) & table.valid & (rings.polarity[:, None, None] == table.polarity[:, None])
+    each = torch.arange(len(of), device=of.device)
+    own = Codes(*(code[each, target, marker] for code in codes))
+    gain = likely_gain(own, torch.ones_like(of, dtype=torch.bool), row, table.gain_scale[scene.target])
+    measured = rings.outer.params
+    miss = torch.linalg.vector_norm(measured[:, :2] - there.ideal[of, 0, :2], dim=-1)
+    sure = could[each, target, marker] & (could.sum((1, 2)) == 1)
+    sure &= (own.under(gain[row]) < 1) & (miss < near_place(measured))
+    if not bool(sure.all()):
+        return None
+    ring = torch.full((rows, table.ids.shape[1]), -1, device=of.device).index_put((row, marker), each)
+    group, none = scene.group, torch.zeros(rows, dtype=torch.bool, device=of.device)
+    proposal = torch.stack([group[row], marker, each], -1)
+    return Identified(group, ring, there.R, there.t, torch.ones_like(group), gain, none, proposal)
+
+
+def _places(scene: Scene, R: Tensor, t: Tensor) -> Places:
     markers, camera = scene.table[scene.target], scene.camera
     row, marker = (markers.valid & t.isfinite().all(1)[:, None]).nonzero().unbind(-1)
-    _, raw, depth = predicted(markers, camera, R[row], t[row], (row, marker))
+    ideal, raw, depth = predicted(markers, camera, R[row], t[row], (row, marker))
     outer, limit = raw[:, 0], raw.new_tensor([camera.width - 1, camera.height - 1])
     seen = ((outer[:, :2] > 0) & (outer[:, :2] < limit)).all(-1) & (outer[:, 2] < limit.amin()) & (depth > 0)
     seen &= raw.isfinite().flatten(1).all(1)
-    return _Places(row[seen], marker[seen], raw[seen])
+    if bool(seen.all()):
+        return Places(row, marker, raw, ideal, R, t)
+    return Places(row[seen], marker[seen], raw[seen], ideal[seen], R, t)
 
 
-def _shifts(scene: Scene, at: _Places) -> Tensor | None:
+def _shifts(scene: Scene, at: Places) -> Tensor | None:
     """By how many px (P, 2) each marker has moved; None where the frame is too small to look so far."""
     frames = scene.frames
     height, width = frames.shape[-2:]
@@ -94,7 +143,8 @@ def _drawn(raw: Tensor, cell: int, reach: int) -> Tensor:
     along = torch.arange(-reach, reach + 1, dtype=raw.dtype, device=raw.device) * cell
     xy = torch.stack(torch.meshgrid(along, along, indexing="xy")).flatten(1)
     offset = (raw[:, :, :2] - raw[:, :1, :2])[..., None]
-    rho = torch.linalg.vector_norm(torch.linalg.inv(conics.shape_matrix(raw)) @ (xy - offset), dim=2)  # (P, 2, k k)
+    u, v = (torch.linalg.inv(conics.shape_matrix(raw)) @ (xy - offset)).unbind(2)  # (P, 2, k k)
+    rho = torch.addcmul(u * u, v, v).sqrt_()
     # cells on a rim belong to both sides
     steep = raw[:, :, 3:4] / cell
     inside, hole = ((1 - rho) * steep + 0.5).clamp(0, 1).unbind(1)
@@ -104,7 +154,7 @@ def _drawn(raw: Tensor, cell: int, reach: int) -> Tensor:
     return share.sum(1).unflatten(1, (2 * reach + 1, -1))
 
 
-def _corrected(scene: Scene, R: Tensor, t: Tensor, at: _Places, shift: Tensor) -> tuple[Tensor, Tensor]:
+def _corrected(scene: Scene, R: Tensor, t: Tensor, at: Places, shift: Tensor) -> tuple[Tensor, Tensor]:
     """The poses after one step to where their markers have moved."""
     row, focal = at.row, scene.camera.matrix.diagonal()[:2]
     arm = (R[row] @ scene.table.centers[scene.target[row], at.marker][..., None]).squeeze(-1)

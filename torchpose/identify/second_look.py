@@ -77,7 +77,7 @@ def look_again(
     clipping = _clipping(rings, identified.ring, scene)[row]
     codes = Codes.of(found, Marks.of(scene.table, scene.target[row], marker))
     off = codes.under(torch.where(found.clipped, clipping, identified.gain[row]))
-    good = (miss < _near(measured)) & (off < 1)
+    good = (miss < near_place(measured)) & (off < 1)
     # of several poses of a row, the one that was nearest
     slot = row * identified.ring.shape[1] + marker
     nearest = torch.full((identified.ring.numel(),), torch.inf, dtype=miss.dtype, device=miss.device)
@@ -113,14 +113,14 @@ def _occupied(scene: Scene, there: _Missing, rings: Rings) -> Tensor:
     if len(rings) == 0 or there.row.numel() == 0:
         return none
     frame, outer = scene.frame[there.row], rings.outer.params
-    i, j = near_pairs(there.ideal[:, :2], outer[:, :2], _near(there.ideal), (frame, rings.frame))
+    i, j = near_pairs(there.ideal[:, :2], outer[:, :2], near_place(there.ideal), (frame, rings.frame))
     size = outer[j, 2] / there.ideal[i, 2]
     alike = (size < SIZE_TOLERANCE) & (size > 1 / SIZE_TOLERANCE)
     alike &= rings.polarity[j] == scene.table.polarity[scene.target][there.row[i]]
     return none.index_fill(0, i[alike], True)
 
 
-def _near(ellipse: Tensor) -> Tensor:
+def near_place(ellipse: Tensor) -> Tensor:
     """px, how far from their places rings (K, 5) may be: half of what is allowed for a pose that is guessed."""
     px, of_size, _ = PLACE_TOLERANCE
     return 0.5 * (px + of_size * ellipse[:, 2])

@@ -22,7 +22,9 @@ _ITERATIONS = 60  # of the solver, at most: rows that have converged rest
 
 
 @checked
-def solve_poses(evidence: Evidence, rough: tuple[Tensor, Tensor], *, compile: bool = False) -> Solutions:
+def solve_poses(
+    evidence: Evidence, rough: tuple[Tensor, Tensor], *, near: bool = False, compile: bool = False
+) -> Solutions:
     """Pose, alternative, covariance and status of N rows with three markers or more.
 
     A row whose centres contradict each other is solved again without each of its markers in turn; if one of these fits,
@@ -31,16 +33,18 @@ def solve_poses(evidence: Evidence, rough: tuple[Tensor, Tensor], *, compile: bo
     Args:
         evidence: N rows.
         rough: R (N, 3, 3), t (N, 3) to start from.
+        near: the rough poses are within pixels of the true ones: none is sought without them.
         compile: as for `pnp.solve`.
     """
     if len(evidence) == 0:
         return _no_solutions(evidence, *rough)
-    solved = _solve(evidence, rough, compile)
+    solved = _solve(evidence, _starts(evidence, rough, near), compile)
     bad = (solved.status == Status.REJECTED) & (evidence.mask.sum(-1) >= 4)
     row, marker = (bad[:, None] & evidence.mask).nonzero().unbind(-1)
     if row.numel() == 0:
         return solved
-    retry = _solve(evidence[row].without(marker), (rough[0][row], rough[1][row]), compile)
+    rest = evidence[row].without(marker)
+    retry = _solve(rest, _starts(rest, (rough[0][row], rough[1][row]), near), compile)
     # of the subsets that fit, the one with the least chi-squared
     cost = torch.where(retry.status == Status.REJECTED, torch.inf, retry.chi2.nan_to_num(nan=torch.inf))
     least = torch.full(bad.shape, torch.inf, dtype=cost.dtype, device=cost.device).scatter_reduce(0, row, cost, "amin")
@@ -48,14 +52,14 @@ def solve_poses(evidence: Evidence, rough: tuple[Tensor, Tensor], *, compile: bo
     return solved.replaced(row[winner], retry[winner])
 
 
-def _solve(evidence: Evidence, rough: tuple[Tensor, Tensor], compile: bool) -> Solutions:
+def _solve(evidence: Evidence, starts: tuple[Tensor, Tensor], compile: bool) -> Solutions:
     result = pnp.solve(
         evidence.points,
         torch.where(evidence.mask[..., None], evidence.center, 0.0),
         evidence.matrix,
         covariances=visible(evidence.covariance + evidence.placed, evidence.mask),
         mask=evidence.mask,
-        initial=_starts(evidence, rough),
+        initial=starts,
         max_iterations=_ITERATIONS,
         compile=compile,
     )
@@ -112,8 +116,11 @@ def _no_solutions(evidence: Evidence, R: Tensor, t: Tensor) -> Solutions:
     return Solutions(R, t, *parts, one, one, R, t, one, one, code, code, *rest)
 
 
-def _starts(evidence: Evidence, rough: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """Two poses (N, 2, 3, 3), (N, 2, 3) to start from: both planar solutions, or the rough pose and its mirror."""
+def _starts(evidence: Evidence, rough: tuple[Tensor, Tensor], near: bool) -> tuple[Tensor, Tensor]:
+    """Two poses (N, 2, 3, 3), (N, 2, 3) to start from: both planar solutions, or the rough pose and its mirror.
+
+    ``near``: the latter for all rows.
+    """
     R, t = rough
     # depth mirrored along the line of sight, the plane turned back on itself: the same weak-perspective image
     weight = evidence.mask.double() / evidence.mask.sum(-1, keepdim=True)
@@ -123,13 +130,16 @@ def _starts(evidence: Evidence, rough: tuple[Tensor, Tensor]) -> tuple[Tensor, T
     normal = evidence.normals[torch.arange(first.numel(), device=first.device), first]
     mirrored = _reflection(at) @ R @ _reflection(normal)
     mirrored_t = at - (mirrored @ middle[..., None]).squeeze(-1)
+    given = torch.stack([R, mirrored], 1), torch.stack([t, mirrored_t], 1)
+    if near:
+        return given
     focal, principal = evidence.matrix.diagonal()[:2], evidence.matrix[:2, 2]
     xy = torch.where(evidence.mask[..., None], (evidence.center - principal) / focal, 0.0)
     flat = pnp.planar(evidence.points, xy, mask=evidence.mask)
     both = flat.R.isfinite().all(-1).all(-1).all(-1)  # else a marker behind the camera, or no plane
     planar = (evidence.coplanar & (evidence.mask.sum(-1) >= 4) & both)[:, None]
-    start_r = torch.where(planar[..., None, None], flat.R, torch.stack([R, mirrored], 1))
-    start_t = torch.where(planar[..., None], flat.t, torch.stack([t, mirrored_t], 1))
+    start_r = torch.where(planar[..., None, None], flat.R, given[0])
+    start_t = torch.where(planar[..., None], flat.t, given[1])
     return start_r, start_t
 
 
