@@ -15,9 +15,8 @@ order, k^3 (X^2 Y^2 / 2 - Y^4 / 8), is counted there by its mean: of 12 px besid
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, Self, get_args
+from typing import Literal, NamedTuple, Protocol, Self, get_args
 
 import torch
 from jaxtyping import Float
@@ -118,9 +117,12 @@ class Spread(Rows):
         core = self.values[:, 0]
         return wanted.maximum(core / 4).minimum(4 * core).clamp(LEAST**2, MOST**2)
 
-    def at(self, row: Tensor, nu: Tensor, nv: Tensor) -> Callable[[Tensor, Tensor], Edge]:
-        """Edges, of distances and curvatures (..., K, P), under the blurs of rows (K,) where the normals are nu, nv."""
-        values = self.values[row].float()
+    def at(self, row: Tensor, nu: Tensor, nv: Tensor, dims: int = 1) -> Edges:
+        """Edges, of distances and curvatures (..., K, P), under the blurs of rows (K,) where the normals are nu, nv.
+
+        ``dims``: of P.
+        """
+        values = self.values.index_select(0, row).float().view(-1, *[1] * (dims - 1), BLUR)
         if self.kind == "gauss":
             return _Gauss(values, nu, nv)
         return _Line(values, nu, nv) if self.kind == "line" else _Disc(values)
@@ -136,6 +138,8 @@ class Edge(NamedTuple):
 
 class _Gauss:
     """Planes (K, P) of what the blur is across and along edges of the normals nu, nv."""
+
+    across: Tensor | None
 
     def __init__(self, values: Tensor, nu: Tensor, nv: Tensor) -> None:
         s11, s12, s22 = values.split(1, -1)
@@ -172,6 +176,14 @@ class _Gauss:
         change = by_across - by_along
         by_blur = (change * self.uu + by_along, change * self.uv2, change * self.vv + by_along)
         return Edge(step, slope, by_blur)
+
+
+class Edges(Protocol):
+    """Edges, of distances and curvatures; ``across`` is the blur's variance across them, None where it is not kept."""
+
+    across: Tensor | None
+
+    def __call__(self, distance: Tensor, bend: Tensor, /) -> Edge: ...
 
 
 class _Nodes(NamedTuple):
@@ -238,6 +250,8 @@ class _Averaged:
 class _Line:
     """A line of the vector m: displaced evenly from -m / 2 to m / 2."""
 
+    across: Tensor | None = None
+
     def __init__(self, values: Tensor, nu: Tensor, nv: Tensor) -> None:
         core, mu, mv = values.split(1, -1)
         self.nu, self.nv, self.along = nu, nv, nu * mv - nv * mu
@@ -255,6 +269,8 @@ class _Line:
 
 class _Disc:
     """A disc of a radius r: chords across the normal, of mean square (r^2 - x^2) / 3 along it."""
+
+    across: Tensor | None = None
 
     def __init__(self, values: Tensor) -> None:
         core, self.radius, _ = values.split(1, -1)
