@@ -752,10 +752,12 @@ def _check_boards(targets: Sequence[Target], method: str, instances: int) -> Non
 def _doubted(scene: Scene, found: Found) -> Solutions:
     """Rejects poses from three markers that put a fourth across a ring."""
     solutions, row = found.solutions, found.solvable
+    three = (solutions.mask.sum(-1) == MIN_MARKERS) & solutions.solved
+    if not bool(three.any()):
+        return solutions
     markers, matrix = scene.table[scene.target[row]], scene.camera.matrix
     across = crossed_out(found.rings, scene.frame[row], solutions.R, solutions.t, markers, solutions.mask, matrix)
-    bad = across & (solutions.mask.sum(-1) == MIN_MARKERS) & solutions.solved
-    return solutions.marked(bad, Status.REJECTED, Reason.RESIDUAL)
+    return solutions.marked(across & three, Status.REJECTED, Reason.RESIDUAL)
 
 
 def _tensors(owner: Camera | MarkerTable) -> dict[str, Tensor]:

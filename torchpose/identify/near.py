@@ -51,7 +51,7 @@ def find_near(scene: Scene, R: Tensor, t: Tensor) -> Places | None:
         R: (N, 3, 3), the last pose of each row, NaN where it is not known.
         t: (N, 3), the same, mm.
     """
-    last = _places(scene, R, t)
+    last = _places(scene, R, t, rough=True)
     if last.row.numel() == 0:
         return None
     shift = _shifts(scene, last)
@@ -102,10 +102,11 @@ def confirmed(scene: Scene, there: Places, rings: Rings, of: Tensor) -> Identifi
     return Identified(group, ring, there.R, there.t, torch.ones_like(group), gain, none, proposal)
 
 
-def _places(scene: Scene, R: Tensor, t: Tensor) -> Places:
+def _places(scene: Scene, R: Tensor, t: Tensor, *, rough: bool = False) -> Places:
+    """``rough``: circles have the shapes that a camera without distortion would see."""
     markers, camera = scene.table[scene.target], scene.camera
     row, marker = (markers.valid & t.isfinite().all(1)[:, None]).nonzero().unbind(-1)
-    ideal, raw, depth = predicted(markers, camera, R[row], t[row], (row, marker))
+    ideal, raw, depth = predicted(markers, camera, R[row], t[row], (row, marker), rough=rough)
     outer, limit = raw[:, 0], raw.new_tensor([camera.width - 1, camera.height - 1])
     seen = ((outer[:, :2] > 0) & (outer[:, :2] < limit)).all(-1) & (outer[:, 2] < limit.amin()) & (depth > 0)
     seen &= raw.isfinite().flatten(1).all(1)

@@ -143,11 +143,23 @@ def _clipping(rings: Rings, ring: Tensor, scene: Scene) -> Tensor:
 
 
 def predicted(
-    markers: MarkerTable, camera: Camera, R: Tensor, t: Tensor, at: tuple[Tensor, Tensor]
+    markers: MarkerTable, camera: Camera, R: Tensor, t: Tensor, at: tuple[Tensor, Tensor], *, rough: bool = False
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Ellipses (P, 2, 5) of both circles, ideal and raw pixels, and depths (P,), of markers ``at`` (row, number)."""
+    """Ellipses (P, 2, 5) of both circles, ideal and raw pixels, and depths (P,), of markers ``at`` (row, number).
+
+    ``rough``: the raw ones are the ideal ones moved to where the lens has their centres.
+    """
     center, k = (R @ markers.centers[at][..., None]).squeeze(-1) + t, camera.matrix
     normal = markers.normals[at][:, None]
     ideal = conics.circle_ellipse(k, R[:, None], center[:, None], normal, markers.radii[at])
-    raw = mapped(ideal.flatten(0, 1), lambda points: camera.distort((points - k[:2, 2]) / k.diagonal()[:2]))
-    return ideal, raw.view_as(ideal), center[:, 2]
+
+    def seen(points: Tensor) -> Tensor:
+        return camera.distort((points - k[:2, 2]) / k.diagonal()[:2])
+
+    if not camera.distorts:
+        raw = ideal
+    elif rough:
+        raw = torch.cat([seen(ideal[..., :2]), ideal[..., 2:]], -1)
+    else:
+        raw = mapped(ideal.flatten(0, 1), seen).view_as(ideal)
+    return ideal, raw, center[:, 2]
