@@ -27,6 +27,7 @@ from torchpose.detect import (
 )
 from torchpose.errors import ArgumentError, ConfigError, FrameError
 from torchpose.geometry import blur as blurs
+from torchpose.geometry.arguments import own_calls
 from torchpose.geometry.grey import FRAME_TYPES, as_frames
 from torchpose.geometry.segments import marked
 from torchpose.identify import (
@@ -230,7 +231,7 @@ class PoseEstimator(nn.Module):
         Raises:
             FrameError: wrong shape, size or dtype. ConfigError: ``near`` is of other targets.
         """
-        with torch.inference_mode():
+        with torch.inference_mode(), own_calls():
             frames = self._checked(frames)
             scene = Scene.of(frames, self.camera.to(frames.device), self.table.to(frames.device))
             scene, found, tried = self._found(scene, near)
@@ -555,7 +556,7 @@ class RigEstimator(PoseEstimator):
         Raises:
             FrameError: wrong shape, size or dtype, or not one tensor for each camera.
         """
-        with torch.inference_mode():
+        with torch.inference_mode(), own_calls():
             poses = self._of_moments(frames, seen)
         return _ordinary(poses)
 
