@@ -158,9 +158,24 @@ def circle_image(rotation: Matrix, center: Vector, normal: Vector, radius: Scala
 def circle_ellipse(
     matrix: Float[Tensor, "3 3"], rotation: Matrix, center: Vector, normal: Vector, radius: Scalar
 ) -> Ellipse:
-    """Ellipses in px of circles seen by a pinhole of this matrix; the rest as for `circle_image`."""
-    to_ray = torch.linalg.inv(matrix)
-    return ellipse_from_conic(from_matrix(to_ray.mT @ circle_image(rotation, center, normal, radius) @ to_ray))
+    """Ellipses in px of circles seen by a pinhole of this matrix; the rest as for `circle_image`.
+
+    By their dual conics, r^2 (1 - n n') - c c' in space, about the image of the centre (derived). NaN where the circle
+    reaches behind the camera.
+    """
+    n = (rotation @ normal[..., None])[..., 0]
+    seen = center @ matrix.mT
+    at = seen[..., :2] / seen[..., 2:]
+    # from space to homogeneous pixels about the image of the centre: the centre itself comes to (0, 0, depth)
+    first, last = matrix[:2] - at[..., None] * matrix[2], matrix[2]
+    turned, ahead = (first @ n[..., None])[..., 0], (n * last).sum(-1, keepdim=True)
+    square = radius.square()[..., None]
+    whole = square * ((last * last).sum() - ahead.square()) - seen[..., 2:].square()  # below 0 in front of the camera
+    side = square * ((first @ last[:, None])[..., 0] - ahead * turned) / whole
+    outer = first @ first.mT - turned[..., :, None] * turned[..., None, :]
+    spread = side[..., :, None] * side[..., None, :] - (square / whole)[..., None] * outer
+    ellipse = torch.cat([at + side, axes_of(spread)], -1)
+    return torch.where(whole < 0, ellipse, torch.nan)
 
 
 def circle_poses(conic: Matrix, radius: Scalar) -> tuple[Float[Tensor, "*N 2 3"], Float[Tensor, "*N 2 3"]]:

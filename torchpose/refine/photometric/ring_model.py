@@ -145,19 +145,19 @@ def gather_pixels(sight: Sight, band: Tensor) -> PixelBlocks:
     grey = values_at(frames, (frame.index_select(0, of) * height + v) * width + u)
     limits = _clipping(grey, of, frame.numel())[row]
     low, high = (limit.contiguous().index_select(0, block) for limit in limits.unbind(-1))
-    xy = camera.undistort_points(torch.stack([u, v]).double().mT)
-    x, y = xy.unbind(-1)
+    x, y, slopes = camera.rays(torch.stack([u, v]).double().mT)
     # what is clipped is no measurement
     sound = (x + y).isfinite() & grey.isfinite() & (grey > low) & (grey < high)
     # rays count from that of the marker's middle pixel; what is not sound gets one of the marker, too, and stays finite
-    origin = xy.index_select(0, (first + size // 2).clamp_max(block.numel() - 1)).nan_to_num(nan=0.0)
-    x0, y0 = (o.contiguous().index_select(0, block) for o in origin.unbind(-1))
+    middle = (first + size // 2).clamp_max(block.numel() - 1)
+    origin = torch.stack([x, y]).index_select(1, middle).nan_to_num(nan=0.0)
+    x0, y0 = origin.index_select(1, block)
     aside = (both[:, 0, 2] / camera.matrix[0, 0].to(x)).index_select(0, block)
     x, y = (torch.where(sound, ray - start, aside) for ray, start in ((x, x0), (y, y0)))
-    j00, j01, j10, j11 = camera.slopes((x0 + x).float(), (y0 + y).float())
+    j00, j01, j10, j11 = (torch.where(sound, j, s) for j, s in zip(slopes, (1.0, 0.0, 0.0, 1.0), strict=True))
     det = (j00 * j11 - j01 * j10).reciprocal()
     warp = (j11 * det, -j01 * det, -j10 * det, j00 * det, det.abs())
-    flat = torch.stack([*(v.to(det) for v in (x, y, torch.ones_like(x))), *warp, torch.where(sound, grey, 0.0), sound])
+    flat = torch.stack([x, y, torch.ones_like(x), *warp, torch.where(sound, grey, 0.0), sound]).float()
     planes = flat.index_select(1, index.flatten()).view(len(flat), count, most)
     tiled = planes[:8].unflatten(2, (most // TILE, TILE)).permute(1, 2, 0, 3)
     rays, warp_of = tiled.split([3, 5], 2)
@@ -165,7 +165,7 @@ def gather_pixels(sight: Sight, band: Tensor) -> PixelBlocks:
     normal = sight.normals[row, marker]
     return PixelBlocks(
         row,
-        torch.nn.functional.pad(origin, (0, 1), value=1.0)[..., None],
+        torch.nn.functional.pad(origin, (0, 0, 0, 1), value=1.0).mT[..., None],
         rays.double(),
         warp_of.contiguous(),
         planes[8],
