@@ -136,9 +136,7 @@ def perimeter(ellipse: Ellipse) -> Scalar:
 def circle_image(rotation: Matrix, center: Vector, normal: Vector, radius: Scalar) -> Matrix:
     """Image conic matrix on the normalised plane of a circle in space.
 
-    With the plane at the distance h along the unit normal n, and p from its foot to the centre, the cone through the
-    circle is Q = h^2 (1 - n n') + (p^2 - r^2) n n' - h (n p' + p n') (derived), times which H' Q H is diag(1, 1, -r^2)
-    for the homography H of the plane.
+    Q = H^-T diag(1, 1, -r^2) H^-1 with H = [e1 e2 c], written without the inverse through the adjugate of H.
 
     Args:
         rotation: target to camera.
@@ -147,12 +145,14 @@ def circle_image(rotation: Matrix, center: Vector, normal: Vector, radius: Scala
         radius: in the unit of the centre.
     """
     n = (rotation @ normal[..., None]).squeeze(-1)
-    away = (n * center).sum(-1, keepdim=True)
-    beside = center - away * n
-    size = beside.square().sum(-1, keepdim=True) - radius[..., None].square()
-    square = away.square()
-    half = n[..., :, None] * (0.5 * (size - square) * n - away * beside)[..., None, :]
-    return half + half.mT + square[..., None] * torch.eye(3, dtype=n.dtype, device=n.device)
+    # any unit vector not near n starts the in-plane basis
+    axis = torch.nn.functional.one_hot(n.abs().argmin(-1), 3).to(n.dtype)
+    e1 = torch.linalg.cross(n, axis)
+    e1 = e1 / torch.linalg.vector_norm(e1, dim=-1, keepdim=True)
+    e2 = torch.linalg.cross(n, e1)
+    adj = torch.stack([torch.linalg.cross(e2, center), torch.linalg.cross(center, e1), torch.linalg.cross(e1, e2)], -2)
+    weight = torch.stack([torch.ones_like(radius), torch.ones_like(radius), -radius.square()], -1)
+    return adj.mT @ (weight[..., None] * adj)
 
 
 def circle_ellipse(

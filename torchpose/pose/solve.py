@@ -6,6 +6,8 @@ centres by their covariances, and the shapes of the rings' own ellipses, which d
 seen.
 """
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -53,19 +55,8 @@ def solve_poses(
 
 
 def _solve(evidence: Evidence, starts: tuple[Tensor, Tensor], compile: bool) -> Solutions:
-    result = pnp.solve(
-        evidence.points,
-        torch.where(evidence.mask[..., None], evidence.center, 0.0),
-        evidence.matrix,
-        covariances=visible(evidence.covariance + evidence.placed, evidence.mask),
-        mask=evidence.mask,
-        initial=starts,
-        max_iterations=_ITERATIONS,
-        compile=compile,
-    )
+    R, t, rms, of_centers, behind, degenerate = _minima(evidence, starts, compile)
     # both minima of the centres, weighed again with the rings' shapes
-    R, t = torch.stack([result.R, result.R_alt], 1), torch.stack([result.t, result.t_alt], 1)
-    rms, of_centers = torch.stack([result.rms, result.rms_alt], 1), torch.stack([result.chi2, result.chi2_alt], 1)
     circles = predicted_circles(evidence, R, t)
     of_shapes = misfit_of_shapes(evidence, circles)
     chi2, best = (of_centers + of_shapes).nan_to_num(nan=torch.inf).sort(1)  # NaN: no such minimum
@@ -86,8 +77,8 @@ def _solve(evidence: Evidence, starts: tuple[Tensor, Tensor], compile: bool) -> 
         (contradicts, Reason.RESIDUAL),
         (_from_behind(evidence, R[:, 0], t[:, 0]), Reason.MIRRORED),
         (~solvable, Reason.NOT_CONVERGED),
-        (result.code == pnp.PnPCode.BEHIND_CAMERA, Reason.BEHIND_CAMERA),
-        ((result.code == pnp.PnPCode.DEGENERATE) | (solvable & ~determined), Reason.DEGENERATE),
+        (behind, Reason.BEHIND_CAMERA),
+        (degenerate | (solvable & ~determined), Reason.DEGENERATE),
     ):
         reason = torch.where(condition, int(why), reason)  # the last that holds
     status = torch.where(reason == Reason.NONE, int(Status.OK), int(Status.REJECTED))
@@ -99,6 +90,38 @@ def _solve(evidence: Evidence, starts: tuple[Tensor, Tensor], compile: bool) -> 
     unasked = torch.full_like(chi2[:, 0], torch.nan)
     rest = (evidence.mask, one[1].new_zeros(*evidence.mask.shape, PLACE), none, unasked, none, larger)
     return Solutions(one[0], one[1], *parts, one[2], chi2[:, 0], *two, chi2_alt, status, reason, *rest)
+
+
+class _Minima(NamedTuple):
+    """Of the centres alone: as `pnp.pairs.Pairs`, and which rows (N,) have no problem that makes sense."""
+
+    R: Tensor
+    t: Tensor
+    rms: Tensor
+    chi2: Tensor
+    behind: Tensor
+    degenerate: Tensor
+
+
+def _minima(evidence: Evidence, starts: tuple[Tensor, Tensor], compile: bool) -> _Minima:
+    given = (evidence.points, torch.where(evidence.mask[..., None], evidence.center, 0.0), evidence.matrix)
+    covariances = visible(evidence.covariance + evidence.placed, evidence.mask)
+    if not compile and 2 * len(evidence) <= pnp.FEW:
+        found = pnp.pair_minima(*given, covariances, evidence.mask, starts, _ITERATIONS)
+        return _Minima(*found, ~starts[0].isfinite().flatten(1).all(1))
+    result = pnp.solve(
+        *given,
+        covariances=covariances,
+        mask=evidence.mask,
+        initial=starts,
+        max_iterations=_ITERATIONS,
+        compile=compile,
+    )
+    each = (("R", "R_alt"), ("t", "t_alt"), ("rms", "rms_alt"), ("chi2", "chi2_alt"))
+    both = (torch.stack([getattr(result, name) for name in names], 1) for names in each)
+    return _Minima(
+        *both, result.code == pnp.PnPCode.BEHIND_CAMERA, result.code == pnp.PnPCode.DEGENERATE
+    )
 
 
 def _from_behind(evidence: Evidence, R: Tensor, t: Tensor) -> Tensor:
@@ -116,7 +139,7 @@ def _no_solutions(evidence: Evidence, R: Tensor, t: Tensor) -> Solutions:
     return Solutions(R, t, *parts, one, one, R, t, one, one, code, code, *rest)
 
 
-def _starts(evidence: Evidence, rough: tuple[Tensor, Tensor], near: bool) -> tuple[Tensor, Tensor]:
+def _starts(evidence: Evidence, rough: tuple[Tensor, Tensor], near: bool = False) -> tuple[Tensor, Tensor]:
     """Two poses (N, 2, 3, 3), (N, 2, 3) to start from: both planar solutions, or the rough pose and its mirror.
 
     ``near``: the latter for all rows.
