@@ -37,6 +37,7 @@ from torchpose.identify import (
     Scene,
     Views,
     beside_another,
+    by_codes,
     confirmed,
     find_near,
     identify,
@@ -279,18 +280,19 @@ class PoseEstimator(nn.Module):
         there = None if near is None else find_near(scene, *_placed(scene, near))
         if there is not None:
             rings, of = measure_predicted(frames, *outlines(scene, there), scene.camera, correct=self._recipe.correct)
-            identified = confirmed(scene, there, rings, of)
-            if identified is None:
-                first = self._read(scene, rings)
-            else:
-                first = scene, self._solved(scene, rings, identified, near=True)
+            first = self._named(scene, rings, confirmed(scene, there, rings, of), near=True)
+            first = first or self._read(scene, rings)
             settled = self._settled(*first)
             if bool(settled.all()):
                 return *first, rings
             return self._found_elsewhere(scene, first, settled, rings)
         coarse = find_coarse(frames, wanted=wanted, float_range=255.0)
         rings, copies, tried = self._likely(scene, coarse)
-        first = self._read(scene, rings, copies)
+        table = scene.table
+        # nothing else is to tell where the others begin
+        planes = bool((table.coplanar & (table.valid.sum(1) > MIN_MARKERS)).all())
+        first = self._named(scene, rings, by_codes(scene, rings), copies) if planes else None
+        first = first or self._read(scene, rings, copies)
         settled = self._settled(*first)
         if bool(settled.all()):
             return *first, tried.rings
@@ -414,6 +416,23 @@ class PoseEstimator(nn.Module):
             others, _ = measure_exactly(scene.frames, others, scene.camera)
         tried = _Tried(blurred.outer[of], known, exact)
         return Rings.cat([others, known[chosen[len(rough) :]]]), likely.copies, tried
+
+    def _named(
+        self,
+        scene: Scene,
+        rings: Rings,
+        identified: Identified | None,
+        copies: Tensor | None = None,
+        *,
+        near: bool = False,
+    ) -> tuple[Scene, Found] | None:
+        """As `_read`, of rings that are named without a question, where all of them then agree on poses."""
+        if identified is None:
+            return None
+        if copies is not None:
+            identified = replace(identified, copies=identified.copies.maximum(copies))
+        found = self._solved(scene, rings, identified, near=near)
+        return (scene, found) if bool(self._settled(scene, found, whole=True).all()) else None
 
     def _read(
         self, scene: Scene, rings: Rings, copies: Tensor | None = None, marks: Candidates | None = None

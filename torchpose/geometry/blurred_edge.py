@@ -154,27 +154,30 @@ class _Gauss:
         self.square = (1 - 2 * uv.square()) * _SQUARE
 
     def __call__(self, distance: Tensor, bend: Tensor) -> Edge:
-        half, bend2 = 0.5 * bend, bend.square()
-        variance = (self.across + bend2 * self.more).maximum(_LEAST_SHARE * self.across)
+        half, bend2 = 0.5 * bend, bend * bend
+        variance = torch.addcmul(self.across, bend2, self.more).maximum(_LEAST_SHARE * self.across)
         over2 = variance.reciprocal()
         over = over2.sqrt()
-        z = ((distance + half * self.along) * over).clamp(-_FAR, _FAR)
-        z2 = z.square()
-        density = torch.exp(-0.5 * z2) * (1 / math.sqrt(2 * math.pi))
+        z = (torch.addcmul(distance, half, self.along) * over).clamp_(-_FAR, _FAR)
+        z2 = z * z
+        density = torch.exp(z2 * -0.5) * (1 / math.sqrt(2 * math.pi))
         third = self.third * bend * over2 * over
-        fourth = (self.fourth * bend2 - self.square) * over2.square()
+        fourth = torch.addcmul(self.square, self.fourth, bend2, value=-1) * over2 * over2  # times -1
+        # Edgeworth's series by Hermite's polynomials He2 to He6, the last but one and the last as z He4 - 4 He3 and so on
         he3, he4 = z * (z2 - 3), z2 * (z2 - 6) + 3
-        correction, change = third * (z2 - 1) - fourth * he3, fourth * he4 - third * he3
-        sixth = 0.5 * third.square()
-        correction = correction - sixth * (z * he4 - 4 * he3)
-        change = change + sixth * (z2 * he4 - 4 * z * he3 - 5 * he4)
-        step = 0.5 * torch.erfc(-z * math.sqrt(0.5)) + density * correction
-        slope = density * (1 + change) * over
+        he5 = torch.sub(z * he4, he3, alpha=4)
+        sixth = third * third * 0.5
+        correction = torch.addcmul(torch.addcmul(third * (z2 - 1), fourth, he3), sixth, he5, value=-1)
+        change = torch.addcmul(torch.addcmul(fourth * he4, third, he3), sixth, torch.sub(z * he5, he4, alpha=5), value=-1)  # times -1
+        step = torch.addcmul(0.5 * torch.erfc(z * -math.sqrt(0.5)), density, correction)
+        slope = torch.addcmul(density, density, change, value=-1) * over
         by_across = slope * z * over * -0.5
         by_along = half * slope
         # the variance along is the trace less that across
         change = by_across - by_along
-        by_blur = (change * self.uu + by_along, change * self.uv2, change * self.vv + by_along)
+        by_blur = (
+            torch.addcmul(by_along, change, self.uu), change * self.uv2, torch.addcmul(by_along, change, self.vv)
+        )
         return Edge(step, slope, by_blur)
 
 

@@ -2,6 +2,7 @@
 
 from torchpose.identify.alike import indistinguishable
 from torchpose.identify.boards import identify_boards
+from torchpose.identify.by_codes import by_codes
 from torchpose.identify.company import beside_another, in_company, named
 from torchpose.identify.copies import MIN_MARKERS
 from torchpose.identify.markers import Identified, identify
@@ -16,6 +17,7 @@ __all__ = [
     "Scene",
     "Views",
     "beside_another",
+    "by_codes",
     "confirmed",
     "drawn_radii",
     "find_near",

@@ -7,6 +7,7 @@ their codes as any ring is.
 """
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -18,8 +19,8 @@ from torchpose.geometry.arguments import checked
 from torchpose.geometry.least_squares import solve_scaled
 from torchpose.geometry.projection import by_pose, image_by_point
 from torchpose.geometry.segments import segment_sum, values_at
-from torchpose.identify.assignments import Codes, Marks
-from torchpose.identify.markers import Identified, likely_gain
+from torchpose.identify.by_codes import by_codes
+from torchpose.identify.markers import Identified
 from torchpose.identify.scene import Scene
 from torchpose.identify.second_look import near_place, predicted
 from torchpose.rings import Rings
@@ -70,36 +71,21 @@ def outlines(scene: Scene, there: Places) -> tuple[Candidates, Tensor]:
 def confirmed(scene: Scene, there: Places, rings: Rings, of: Tensor) -> Identified | None:
     """The rings by marker where every marker of every row has the one that lies in its place, None otherwise.
 
-    Each has its marker's code and no other: what else a ring might be is asked where all may be anything.
-
     Args:
         scene: a row for every frame and target.
         there: where the markers must be.
         rings: K, measured there.
         of: (K,), the place of each.
     """
-    table, rows = scene.table, len(scene.frame)
-    if len(of) < rows * int(table.valid.sum()) // len(table) or bool(rings.clipped.any()):
+    named = by_codes(scene, rings)
+    if named is None:
         return None
-    row, marker = there.row[of], there.marker[of]
-    target = scene.target[row]
-    outer_mm, inner_mm = table.radii.unbind(-1)
-    marks = Marks(outer_mm[None], inner_mm[None], table.half_gap[None, :, None], table.gain_scale[None, :, None])
-    codes = Codes.of(rings, marks)
-    could = (codes.mismatch < 1) & table.valid & (rings.polarity[:, None, None] == table.polarity[:, None])
-    each = torch.arange(len(of), device=of.device)
-    own = Codes(*(code[each, target, marker] for code in codes))
-    gain = likely_gain(own, torch.ones_like(of, dtype=torch.bool), row, table.gain_scale[scene.target])
-    measured = rings.outer.params
-    miss = torch.linalg.vector_norm(measured[:, :2] - there.ideal[of, 0, :2], dim=-1)
-    sure = could[each, target, marker] & (could.sum((1, 2)) == 1)
-    sure &= (own.under(gain[row]) < 1) & (miss < near_place(measured))
-    if not bool(sure.all()):
+    wanted = there.ideal[of, 0]
+    miss = torch.linalg.vector_norm(rings.outer.params[:, :2] - wanted[:, :2], dim=-1)
+    own = named.ring[there.row[of], there.marker[of]] == torch.arange(len(of), device=of.device)
+    if not bool((own & (miss < near_place(wanted))).all()):
         return None
-    ring = torch.full((rows, table.ids.shape[1]), -1, device=of.device).index_put((row, marker), each)
-    group, none = scene.group, torch.zeros(rows, dtype=torch.bool, device=of.device)
-    proposal = torch.stack([group[row], marker, each], -1)
-    return Identified(group, ring, there.R, there.t, torch.ones_like(group), gain, none, proposal)
+    return replace(named, R=there.R, t=there.t)
 
 
 def _places(scene: Scene, R: Tensor, t: Tensor, *, rough: bool = False) -> Places:
