@@ -249,6 +249,13 @@ class Camera:
         focal, center = self._intrinsics(xy)
         return torch.stack(self._warp(*xy.unbind(-1), slopes=False), -1) * focal + center
 
+    def linearised(self, xy: Tensor) -> tuple[Tensor, Tensor]:
+        """`distort` and `J_distort` at once."""
+        focal, center = self._intrinsics(xy)
+        u, v, j_xx, j_xy, j_yy = self._warp(*xy.unbind(-1))
+        jacobian = torch.stack([j_xx, j_xy, j_xy, j_yy], -1).unflatten(-1, (2, 2)) * focal[:, None]
+        return torch.stack([u, v], -1) * focal + center, jacobian
+
     def J_distort(self, xy: Tensor) -> Tensor:
         """Jacobian (..., 2, 2) of `distort`: d(u, v)/d(x, y), px per unit of normalised coordinates."""
         return torch.stack(self.slopes(*xy.unbind(-1)), -1).unflatten(-1, (2, 2))

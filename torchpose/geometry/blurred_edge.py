@@ -168,7 +168,9 @@ class _Gauss:
         he5 = torch.sub(z * he4, he3, alpha=4)
         sixth = third * third * 0.5
         correction = torch.addcmul(torch.addcmul(third * (z2 - 1), fourth, he3), sixth, he5, value=-1)
-        change = torch.addcmul(torch.addcmul(fourth * he4, third, he3), sixth, torch.sub(z * he5, he4, alpha=5), value=-1)  # times -1
+        change = torch.addcmul(
+            torch.addcmul(fourth * he4, third, he3), sixth, torch.sub(z * he5, he4, alpha=5), value=-1
+        )  # times -1
         step = torch.addcmul(0.5 * torch.erfc(z * -math.sqrt(0.5)), density, correction)
         slope = torch.addcmul(density, density, change, value=-1) * over
         by_across = slope * z * over * -0.5
@@ -176,7 +178,9 @@ class _Gauss:
         # the variance along is the trace less that across
         change = by_across - by_along
         by_blur = (
-            torch.addcmul(by_along, change, self.uu), change * self.uv2, torch.addcmul(by_along, change, self.vv)
+            torch.addcmul(by_along, change, self.uu),
+            change * self.uv2,
+            torch.addcmul(by_along, change, self.vv),
         )
         return Edge(step, slope, by_blur)
 

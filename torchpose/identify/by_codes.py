@@ -42,6 +42,4 @@ def by_codes(scene: Scene, rings: Rings) -> Identified | None:
     nowhere = torch.full((rows, 3, 4), torch.nan, dtype=torch.float64, device=ring.device)
     group, none = scene.group, torch.zeros(rows, dtype=torch.bool, device=ring.device)
     proposal = torch.stack([row, marker, ring], -1)
-    return Identified(
-        group, of_marker, nowhere[..., :3], nowhere[..., 3], torch.ones_like(group), gain, none, proposal
-    )
+    return Identified(group, of_marker, nowhere[..., :3], nowhere[..., 3], torch.ones_like(group), gain, none, proposal)

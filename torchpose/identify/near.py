@@ -61,6 +61,7 @@ def find_near(scene: Scene, R: Tensor, t: Tensor) -> Places | None:
     return _places(scene, *_corrected(scene, R, t, last, shift))
 
 
+@checked
 def outlines(scene: Scene, there: Places) -> tuple[Candidates, Tensor]:
     """Places as candidates, and their inner ellipses (P, 5)."""
     polarity = scene.table.polarity[scene.target][there.row]

@@ -172,4 +172,6 @@ def _off_saddle(
     step, decrease, _ = _damped(few.whole(pose, newton=False)[0], damping)
     stretch = torch.where(damping < 1e-3, (0.1 * cost / decrease).sqrt().clamp(1, 1e3), 1.0)
     definite = newton[2]
-    return torch.where(definite[:, None], newton[0], stretch[:, None] * step), torch.where(definite, newton[1], decrease)
+    return torch.where(definite[:, None], newton[0], stretch[:, None] * step), torch.where(
+        definite, newton[1], decrease
+    )

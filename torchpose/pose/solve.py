@@ -119,9 +119,7 @@ def _minima(evidence: Evidence, starts: tuple[Tensor, Tensor], compile: bool) ->
     )
     each = (("R", "R_alt"), ("t", "t_alt"), ("rms", "rms_alt"), ("chi2", "chi2_alt"))
     both = (torch.stack([getattr(result, name) for name in names], 1) for names in each)
-    return _Minima(
-        *both, result.code == pnp.PnPCode.BEHIND_CAMERA, result.code == pnp.PnPCode.DEGENERATE
-    )
+    return _Minima(*both, result.code == pnp.PnPCode.BEHIND_CAMERA, result.code == pnp.PnPCode.DEGENERATE)
 
 
 def _from_behind(evidence: Evidence, R: Tensor, t: Tensor) -> Tensor:

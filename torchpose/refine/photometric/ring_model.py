@@ -30,7 +30,8 @@ from torchpose.refine.sight import Sight
 # blur's variance over the squared radius of curvature: nearer to its centre edges are on all sides (measured: with 0.16
 # a third of the pixels of a covered ring under 2.5 px of blur is lost, tests/refine/test_sectors.py)
 _CURVED = 0.2
-TILE = 256  # pixels summed in float32 at a time; sums of tiles are float64, so padding changes no digit that counts
+# pixels summed in float32 at a time; sums of tiles are float64, so padding changes no digit that counts (convention)
+TILE = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,8 +206,9 @@ class _Foot(NamedTuple):
     place: (K, T, 2, S), x and y in mm, about the circles' centre. radius: their length. past: (2, K, T, S), less that
     of the outer and the inner circle. toward: growth of the depth with the ray's angle, 1 / (n . ray). depth: of the
     point over that of the plane's foot. normal: (K, 3, 1), of the plane, camera axes.
-    lever: (K, 3, 3), from (x, y, 1) to the point about the target's origin. by_foot: (K, 5, 3), from the direction of
-    (x, y) and the radius to m, and to the first two of h, see `_rims`.
+    lever: (K, 5, 3), from (x, y, 1) to the point about the target's origin. by_foot: (K, 7, 3), from the direction of
+    (x, y) and the radius to m, and to the first two of h, see `_rims`. Of both the first two come once more after the
+    third, so that a cross product is two products of slices.
     """
 
     place: Tensor
@@ -239,16 +241,13 @@ def _feet(blocks: PixelBlocks, R: Tensor, t: Tensor) -> _Foot:
     radius = torch.addcmul(x * x, y, y).sqrt_().clamp_min_(1e-9)
     past = (radius - blocks.radii.mT[..., None, None]).float()
     toward = toward.float()
-    across = torch.stack([axes[:, 1, :2], -axes[:, 0, :2]], -1)
-    by_foot = torch.cat([torch.cat([axes.mT, across], 1), _third(normal / -away)], -1).float()
-    lever = torch.cat([plane, arm], -1).float()
+    first = torch.cat([axes.mT, normal / -away], -1)
+    across = torch.nn.functional.pad(torch.stack([axes[:, 1, :2], -axes[:, 0, :2]], -1), (0, 1))
+    by_foot = torch.cat([first, first[:, :2], across], 1).float()
+    lever = torch.cat([plane, arm], -1)
+    lever = torch.cat([lever, lever[:, :2]], 1).float()
     depth = toward * away.float()
     return _Foot(place.float(), radius.float(), past, toward, depth, normal.float(), lever, by_foot)
-
-
-def _third(column: Tensor) -> Tensor:
-    """A column (K, 3, 1) with two zeros below."""
-    return torch.nn.functional.pad(column, (0, 0, 0, 2))
 
 
 def by_tiles(matrix: Tensor, planes: Tensor) -> Tensor:
@@ -279,7 +278,7 @@ def _rims(blocks: PixelBlocks, foot: _Foot, *, turning: bool) -> _Rim:
     radius, toward, depth, warp = foot.radius, foot.toward, foot.depth, blocks.warp
     # a displacement w of the ray's foot, or of the plane against it, changes the radius by m . w; h is as m, but across
     both = by_tiles(foot.by_foot, torch.cat([foot.place / radius[:, :, None], radius[:, :, None]], 2))
-    m, h0, h1 = both[:, :, :3], both[:, :, 3], both[:, :, 4]
+    m, h0, h1 = both[:, :, :3], both[:, :, 5], both[:, :, 6]
     w00, w01, w10, w11, area = warp.unbind(2)
     gu, gv = torch.addcmul(m[:, :, 0] * w00, m[:, :, 1], w10), torch.addcmul(m[:, :, 0] * w01, m[:, :, 1], w11)
     # gradient of the radius in the image, over the depth
@@ -297,7 +296,8 @@ def _rims(blocks: PixelBlocks, foot: _Foot, *, turning: bool) -> _Rim:
     steep = square * per_mm / radius
     second = torch.addcmul(-recede, oblique * oblique, steep, value=0.5)
     at = by_tiles(foot.lever, torch.nn.functional.pad(foot.place, (0, 0, 0, 1), value=1.0))
-    by_pose = torch.cat([m, torch.linalg.cross(at, m, dim=2)], 2) * -per_mm[:, :, None]
+    turned = torch.addcmul(at[:, :, 1:4] * both[:, :, 2:5], at[:, :, 2:], both[:, :, 1:4], value=-1)
+    by_pose = torch.cat([m, turned], 2) * -per_mm[:, :, None]
     turn = None
     if turning:  # the mixed second derivative of the radius, along the normal and across it, over the first
         along_u, along_v = w01 * nu - w00 * nv, w11 * nu - w10 * nv

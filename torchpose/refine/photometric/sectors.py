@@ -83,12 +83,10 @@ def sum_sectors(
     slope = slope.masked_fill(weight == 0, 0.0)  # padded pixels have none
     pull = weight * slope
     planes = (usable, weight, weighted * residual, pull * residual, pull * slope)
-    sums = [torch.zeros(2 * SECTORS * count, dtype=weight.dtype, device=weight.device) for _ in planes]
-    total, used, square, pulls, hold = (
-        total.scatter_add_(0, flat, plane.flatten()).view(count, 2 * SECTORS)
-        for total, plane in zip(sums, planes, strict=True)
-    )
-    return Sectors(total, used, square, pulls, hold, cell)
+    sums = torch.zeros(len(planes), 2 * SECTORS * count, dtype=weight.dtype, device=weight.device).unbind(0)
+    for of_sectors, plane in zip(sums, planes, strict=True):
+        of_sectors.scatter_add_(0, flat, plane.flatten())
+    return Sectors(*(of_sectors.view(count, 2 * SECTORS) for of_sectors in sums), cell)
 
 
 def clear_sectors(sectors: Sectors, spread: Tensor, misfit: Tensor) -> Tensor:
