@@ -139,8 +139,6 @@ class Edge(NamedTuple):
 class _Gauss:
     """Planes (K, P) of what the blur is across and along edges of the normals nu, nv."""
 
-    across: Tensor | None
-
     def __init__(self, values: Tensor, nu: Tensor, nv: Tensor) -> None:
         s11, s12, s22 = values.split(1, -1)
         self.uu, self.vv, uv = nu * nu, nv * nv, nu * nv
@@ -163,7 +161,7 @@ class _Gauss:
         density = torch.exp(z2 * -0.5) * (1 / math.sqrt(2 * math.pi))
         third = self.third * bend * over2 * over
         fourth = torch.addcmul(self.square, self.fourth, bend2, value=-1) * over2 * over2  # times -1
-        # Edgeworth's series by Hermite's polynomials He2 to He6, the last but one and the last as z He4 - 4 He3 and so on
+        # Edgeworth's series by Hermite's polynomials; He5 = z He4 - 4 He3, He6 = z He5 - 5 He4
         he3, he4 = z * (z2 - 3), z2 * (z2 - 6) + 3
         he5 = torch.sub(z * he4, he3, alpha=4)
         sixth = third * third * 0.5
@@ -188,7 +186,8 @@ class _Gauss:
 class Edges(Protocol):
     """Edges, of distances and curvatures; ``across`` is the blur's variance across them, None where it is not kept."""
 
-    across: Tensor | None
+    @property
+    def across(self) -> Tensor | None: ...
 
     def __call__(self, distance: Tensor, bend: Tensor, /) -> Edge: ...
 

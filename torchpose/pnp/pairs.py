@@ -16,7 +16,7 @@ from torchpose.pnp.iterative import RESERVE
 from torchpose.pnp.verdict import COINCIDENCE, relevant
 
 _RTOL = 1e-12  # as of `iterative.minimise`
-# times, by which information with second derivatives may differ from that without (convention: cost alone depends on it)
+# times, by which information with second derivatives may differ from that without (convention: only cost depends on it)
 _BENT = 1e3
 
 

@@ -117,9 +117,10 @@ def _minima(evidence: Evidence, starts: tuple[Tensor, Tensor], compile: bool) ->
         max_iterations=_ITERATIONS,
         compile=compile,
     )
-    each = (("R", "R_alt"), ("t", "t_alt"), ("rms", "rms_alt"), ("chi2", "chi2_alt"))
-    both = (torch.stack([getattr(result, name) for name in names], 1) for names in each)
-    return _Minima(*both, result.code == pnp.PnPCode.BEHIND_CAMERA, result.code == pnp.PnPCode.DEGENERATE)
+    R, t = torch.stack([result.R, result.R_alt], 1), torch.stack([result.t, result.t_alt], 1)
+    rms, chi2 = torch.stack([result.rms, result.rms_alt], 1), torch.stack([result.chi2, result.chi2_alt], 1)
+    behind, degenerate = (result.code == code for code in (pnp.PnPCode.BEHIND_CAMERA, pnp.PnPCode.DEGENERATE))
+    return _Minima(R, t, rms, chi2, behind, degenerate)
 
 
 def _from_behind(evidence: Evidence, R: Tensor, t: Tensor) -> Tensor:

@@ -308,7 +308,7 @@ def _rims(blocks: PixelBlocks, foot: _Foot, *, turning: bool) -> _Rim:
 
 
 def _normals(rim: _Rim, distance: Tensor) -> tuple[Tensor, Tensor]:
-    """Normals (nu, nv) of the edges at these distances (2, K, T, S): what a blur with a direction does depends on them."""
+    """Normals (nu, nv) of the edges at distances (2, K, T, S): what a blur with a direction does depends on them."""
     nu, nv = rim.normal
     if rim.turn is None:
         return nu, nv
@@ -338,4 +338,5 @@ def ring_model(blocks: PixelBlocks, R: Tensor, t: Tensor, spread: Spread, *, che
     fraction, by_d = both.fraction[0] + 1 - both.fraction[1], both.by_distance[0] - both.by_distance[1]
     # dark edges move outwards: those of a dark ring away from each other
     by_gain = both.by_distance.sum(0) * rim.per_mm * -blocks.polarity[:, None, None].float()
-    return RingModel(fraction, by_d, by_blur, rim.by_pose, by_gain, *place.unbind(2), sound)
+    x, y = place.unbind(2)
+    return RingModel(fraction, by_d, by_blur, rim.by_pose, by_gain, x, y, sound)

@@ -86,7 +86,8 @@ def sum_sectors(
     sums = torch.zeros(len(planes), 2 * SECTORS * count, dtype=weight.dtype, device=weight.device).unbind(0)
     for of_sectors, plane in zip(sums, planes, strict=True):
         of_sectors.scatter_add_(0, flat, plane.flatten())
-    return Sectors(*(of_sectors.view(count, 2 * SECTORS) for of_sectors in sums), cell)
+    total, used, square, pulls, hold = (of_sectors.view(count, 2 * SECTORS) for of_sectors in sums)
+    return Sectors(total, used, square, pulls, hold, cell)
 
 
 def clear_sectors(sectors: Sectors, spread: Tensor, misfit: Tensor) -> Tensor:
