@@ -119,10 +119,10 @@ def _shifts(scene: Scene, at: Places) -> Tensor | None:
     windows = values_at(frames, first[:, None, None] + along[:, None] * width + along)
     cells = torch.nn.functional.avg_pool2d(windows[None].nan_to_num(nan=0.0), cell)
     drawn = _drawn(at.raw, cell, reach) * scene.table.polarity[scene.target][at.row][:, None, None]
-    # all shifts as rows of one matrix: a convolution of so many groups takes three times as long
-    across, count = drawn.shape[-1], cells.shape[-1] - drawn.shape[-1] + 1
-    shifted = cells[0].unfold(1, across, 1).unfold(2, across, 1).reshape(len(drawn), count * count, -1)
-    best = torch.bmm(shifted, drawn.to(cells).flatten(1)[..., None]).flatten(1).argmax(1)
+    size, count = cells.shape[-2:], cells.shape[-1] - drawn.shape[-1] + 1
+    here, wanted = (torch.fft.rfft2(part, s=size) for part in (cells[0], drawn.to(cells)))
+    score = torch.fft.irfft2(here * wanted.conj(), s=size)[:, :count, :count]  # further shifts go round the edges
+    best = score.flatten(1).argmax(1)
     found = torch.stack([best % count, best // count], -1)
     return corner + (found + reach) * cell + 0.5 * (cell - 1) - outer[:, :2]
 
