@@ -40,7 +40,7 @@ def own_calls() -> Iterator[None]:
         _thread.own = before
 
 
-def _unasked() -> bool:
+def unasked() -> bool:
     """Whether there is nothing to check: nothing from outside, or no numbers."""
     return getattr(_thread, "own", False) or torch.compiler.is_compiling()
 
@@ -57,7 +57,7 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
     @functools.wraps(function)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> T:
         inner: Callable[..., T] = wrapper.__wrapped__  # tests check this one in turn
-        if _unasked():
+        if unasked():
             return inner(*args, **kwargs)
         if not hints:
             hints.update({name: _resolved(hint, function) for name, hint in annotations.items()})
@@ -114,7 +114,7 @@ def expect_positive(**values: float) -> None:
 
 def expect_not_negative(**values: float | Tensor) -> None:
     """Raises ArgumentError where a number, or one of a tensor, is negative; NaN is none of them."""
-    if _unasked():
+    if unasked():
         return
     for name, value in values.items():
         if bool((value < 0).any()) if isinstance(value, Tensor) else value < 0:
@@ -125,7 +125,7 @@ def expect_not_negative(**values: float | Tensor) -> None:
 
 def expect_index(name: str, index: Tensor, count: int) -> None:
     """Raises ArgumentError where an index is negative or not below ``count``."""
-    if index.numel() and not _unasked():
+    if index.numel() and not unasked():
         low, high = (int(v) for v in index.aminmax())
         if low < 0 or high >= count:
             raise ArgumentError(f"{name}: goes from {low} to {high}; give integers from 0 to {count - 1}")
