@@ -89,7 +89,7 @@ def _basis(model: RingModel, curved: bool = False) -> tuple[Tensor, ...]:
 
 def tiled(plane: Tensor) -> Tensor:
     """A plane (K, P) as (K, P / 256, 256)."""
-    return plane.unflatten(1, (plane.shape[1] // TILE, TILE))
+    return plane.view(plane.shape[0], plane.shape[1] // TILE, TILE)
 
 
 def sum_products(columns: Tensor, weight: Tensor) -> Tensor:

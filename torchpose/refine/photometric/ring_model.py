@@ -255,9 +255,9 @@ def _feet(blocks: PixelBlocks, R: Tensor, t: Tensor) -> _Foot:
 
 def by_tiles(matrix: Tensor, planes: Tensor) -> Tensor:
     """Matrices (K, n, m) times the planes (K, T, m, S) of every tile."""
-    tiles = planes.shape[1]
+    count, tiles, _, size = planes.shape
     each = matrix[:, None].expand(-1, tiles, -1, -1).flatten(0, 1)
-    return torch.bmm(each, planes.flatten(0, 1)).unflatten(0, (len(matrix), tiles))
+    return torch.bmm(each, planes.flatten(0, 1)).view(count, tiles, -1, size)
 
 
 class _Rim(NamedTuple):
