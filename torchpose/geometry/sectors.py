@@ -40,14 +40,6 @@ def sector_about(u: Tensor, v: Tensor, ellipses: Tensor, owner: Tensor) -> Tenso
     return sector_of(i11 * dx + i12 * dy, i12 * dx + i22 * dy)
 
 
-def sector_within(u: Tensor, v: Tensor, ellipses: Tensor) -> Tensor:
-    """Sectors (K, P) of points u, v (K, P) about ellipses (K, 5)."""
-    inverse = torch.linalg.inv(conics.shape_matrix(ellipses)).flatten(1)
-    i11, i12, _, i22 = inverse.split(1, -1)
-    dx, dy = u - ellipses[:, :1], v - ellipses[:, 1:2]
-    return sector_of(i11 * dx + i12 * dy, i12 * dx + i22 * dy)
-
-
 def clear_of_ends(seen: Tensor) -> Tensor:
     """Sectors (K, 48) bool whose neighbours are mostly seen, too, and neither next one is hidden.
 

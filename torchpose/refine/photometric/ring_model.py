@@ -22,7 +22,7 @@ from torchpose.geometry.grey import full_scale
 from torchpose.geometry.robust import CUT, LEAST_KEPT
 from torchpose.geometry.rotations import plane_axes
 from torchpose.geometry.rows import Rows, shared
-from torchpose.geometry.sectors import SECTORS, sector_within
+from torchpose.geometry.sectors import SECTORS, sector_about
 from torchpose.geometry.segments import values_at
 from torchpose.refine.photometric.band import band_pixels
 from torchpose.refine.sight import Sight
@@ -137,33 +137,37 @@ def gather_pixels(sight: Sight, band: Tensor) -> PixelBlocks:
     count = row.numel()
     size = torch.bincount(block, minlength=count)
     most = (int(size.max()) // TILE + 1) * TILE if count else TILE
+    first = size.cumsum(0) - size
     place = torch.arange(most, device=block.device)
     inside, last = place < size[:, None], (size[:, None] - 1).clamp_min(0)
-    index = ((size.cumsum(0) - size)[:, None] + torch.minimum(place, last)).clamp_max(block.numel() - 1)
-    u, v = (pixel.index_select(0, index.flatten()).view_as(index) for pixel in (u, v))
+    index = (first[:, None] + torch.minimum(place, last)).clamp_max(block.numel() - 1).flatten()
 
-    grey = values_at(frames, (frame.index_select(0, row)[:, None] * height + v) * width + u)
-    limits = _clipping(grey, size, row, frame.numel()).index_select(0, row)
-    low, high = limits.split(1, -1)
-    x, y, slopes = camera.rays(torch.stack([u, v], -1).double())
+    of = row.index_select(0, block)
+    grey = values_at(frames, (frame.index_select(0, of) * height + v) * width + u)
+    limits = _clipping(grey, of, frame.numel()).index_select(0, row)
+    low, high = limits.mT.contiguous().index_select(1, block)
+    x, y, slopes = camera.rays(torch.stack([u, v]).double().mT)
     # what is clipped is no measurement
     sound = (x + y).isfinite() & grey.isfinite() & (grey > low) & (grey < high)
     # rays count from that of the marker's middle pixel; what is not sound gets one of the marker, too, and stays finite
-    middle = (size // 2)[:, None]
-    x0, y0 = (ray.gather(1, middle).nan_to_num(nan=0.0) for ray in (x, y))
-    aside = (both[:, :1, 2] / camera.matrix[0, 0]).to(x)
-    x, y = (torch.where(sound, ray - start, aside) for ray, start in ((x, x0), (y, y0)))
-    j00, j01, j10, j11 = (torch.where(sound, j, s).float() for j, s in zip(slopes, (1.0, 0.0, 0.0, 1.0), strict=True))
+    xy = torch.stack([x, y])
+    origin = xy.index_select(1, (first + size // 2).clamp_max(block.numel() - 1)).nan_to_num(nan=0.0)
+    aside = (both[:, 0, 2] / camera.matrix[0, 0]).to(xy).index_select(0, block)
+    xy = torch.where(sound, xy - origin.index_select(1, block), aside).index_select(1, index).view(2, count, most)
+    j00, j01, j10, j11 = (torch.where(sound, j.float(), s) for j, s in zip(slopes, (1.0, 0.0, 0.0, 1.0), strict=True))
     det = (j00 * j11 - j01 * j10).reciprocal()
-    sector = sector_within(u, v, both[:, 0])
+    warp = (j11 * det, -j01 * det, -j10 * det, j00 * det, det.abs())
+    flat = torch.stack([*warp, torch.where(sound, grey, 0.0), sound.float()])
+    *warp, grey, valid = flat.index_select(1, index).view(len(flat), count, most)
+    sector = sector_about(u, v, both[:, 0], block).index_select(0, index).view(count, most)
     normal = sight.normals[row, marker]
     return PixelBlocks(
         row,
-        torch.stack([x0, y0, torch.ones_like(x0)], 1),
-        _tiled(x, y, torch.ones_like(x)),
-        _tiled(j11 * det, -j01 * det, -j10 * det, j00 * det, det.abs()),
-        torch.where(sound, grey, 0.0),
-        (sound & inside).float(),
+        torch.nn.functional.pad(origin, (0, 0, 0, 1), value=1.0).mT[..., None],
+        _tiled(*xy, torch.ones_like(xy[0])),
+        _tiled(*warp),
+        grey,
+        valid * inside,
         sector,
         _seen(sight, row, marker).gather(1, sector),
         size,
@@ -189,16 +193,11 @@ def _seen(sight: Sight, row: Tensor, marker: Tensor) -> Tensor:
     return torch.where(seen.mean(-1, keepdim=True) < LEAST_KEPT, 1.0, seen)
 
 
-def _clipping(grey: Tensor, size: Tensor, row: Tensor, rows: int) -> Tensor:
-    """Limits (N, 2) at which each row's grey values are clipped: 0, and the full scale of its brightest pixel.
-
-    Args:
-        grey: (K, P), of blocks. size: (K,), pixels of each. row: (K,), of each.
-    """
+def _clipping(grey: Tensor, row: Tensor, rows: int) -> Tensor:
+    """Limits (N, 2) at which each row's grey values are clipped: 0, and the full scale of its brightest pixel."""
     ends = grey.new_tensor([torch.inf, -torch.inf]).repeat(rows, 1)
-    darkest, brightest = (torch.where(size > 0, *v) for v in ((grey.amin(1), torch.inf), (grey.amax(1), -torch.inf)))
-    darkest = ends[:, 0].scatter_reduce(0, row, darkest, "amin")
-    brightest = ends[:, 1].scatter_reduce(0, row, brightest, "amax")
+    darkest = ends[:, 0].scatter_reduce(0, row, grey, "amin")
+    brightest = ends[:, 1].scatter_reduce(0, row, grey, "amax")
     low = torch.where(darkest <= 0, 0.0, -torch.inf)
     return torch.stack([low, full_scale(brightest)], -1)
 
