@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from functools import partial
 
 import pytest
@@ -24,7 +25,7 @@ from torchpose.pose import (
     on_print,
     solve_poses,
 )
-from torchpose.pose.excess import OF_CAMERA, OF_EDGES, OF_MARKER, SURE, Picture, excess_of
+from torchpose.pose.excess import OF_CAMERA, OF_EDGES, OF_MARKER, SURE, Picture, excess_of, may_be_off
 from torchpose.results import Misfit
 from torchpose.target import Target
 
@@ -255,6 +256,52 @@ def test_one_thing_of_a_camera_is_seen_where_the_sum_is_no_surprise() -> None:
     usual = found.chi2 < quantile(found.freedom, SURE)
     assert usual.double().mean() > 0.2
     assert (found.misfit[usual] == Misfit.CAMERA).double().mean() > 0.4
+
+
+@pytest.mark.parametrize("deviations", [0.0, 2.5, 4.0])
+def test_a_number_that_may_be_off_counts_by_its_share(deviations: float) -> None:
+    """Against sums over the number itself: a hundred thousand of it under every deviation that it may have."""
+    told = torch.tensor([0.04, 1.0, 25.0], dtype=F64)
+    found = may_be_off(told, deviations * told.sqrt())
+    sizes = torch.logspace(-3, math.log10(300), 16, dtype=F64)[:, None, None]
+    unit = torch.linspace(-12, 12, 100_001, dtype=F64)
+    prior = torch.softmax(-0.5 * unit.square(), 0)
+    number = sizes * unit  # (16, 1, n)
+    likelihood = prior * (deviations * told.sqrt()[:, None] * number - 0.5 * told[:, None] * number.square()).exp()
+    evidence = likelihood.sum(-1)
+    share = evidence / (
+        3 * 6 * 16 + evidence.sum(0)
+    )  # nothing as likely as three families, k1 one of six of the camera
+    mean = (likelihood * number).sum(-1) / evidence
+    torch.testing.assert_close(found, (share * mean.square()).sum(0), rtol=1e-3, atol=1e-12)
+
+
+def test_what_residuals_do_not_tell_of_a_lens_is_not_counted() -> None:
+    nothing, zero = torch.tensor([0.0, 1e-9, 4.0], dtype=F64), torch.zeros(3, dtype=F64)
+    assert (may_be_off(nothing, zero) == 0).all()
+
+
+def test_rows_of_a_lens_that_bends_a_little_more_cover_more_of_their_errors() -> None:
+    """k1 off by few deviations of what a row tells of it, and the pose by a dozen of its own; a lens that is known."""
+    target = Target.load("hexa50")
+    r, t = random_poses(200, 30, (120, 140))
+    exact = evidence(target, r, t, 0.02)
+    nees = {}
+    for k1 in (0.0, 0.002):
+        true = dataclasses.replace(KNOWN_LENS, distortion=torch.tensor([k1, 0.0, 0.0, 0.0], dtype=F64))
+        xy = (exact.center - exact.matrix[:2, 2]) / exact.matrix.diagonal()[:2]
+        e = dataclasses.replace(exact, center=true.distort(xy))
+        s = solve_poses(e, (r, t))
+        for camera in (CAMERA_FILE, KNOWN_LENS):
+            setting = Setting(e, s.R, s.t, camera, False)
+            joint = on_print(center_normals(e, s.R, s.t), setting, torch.zeros(200, len(target), PLACE, dtype=F64))
+            turned = rotations.exp(joint.step[:, 3:]) @ s.R
+            error = torch.cat([s.t + joint.step[:, :3] - t, rotations.log(turned @ r.mT)], -1)
+            nees[k1, camera.lens_stated] = (
+                error[:, None] @ torch.linalg.solve(joint.covariance, error[..., None])
+            ).mean()
+    assert nees[0.002, False] < nees[0.002, True] / 3
+    assert 5.3 < nees[0.0, False] < 6.2  # and little is lost where the lens is as its file says
 
 
 def test_what_no_print_may_have_is_not_explained() -> None:
