@@ -26,6 +26,7 @@ from torchpose.pose import (
     solve_poses,
 )
 from torchpose.pose.excess import OF_CAMERA, OF_EDGES, OF_MARKER, SURE, Picture, excess_of, may_be_off
+from torchpose.refine.centers import refine_centers
 from torchpose.results import Misfit
 from torchpose.target import Target
 
@@ -244,6 +245,25 @@ def test_rings_that_shift_more_than_they_scatter() -> None:
     assert 0.2 < shifted[0] < 0.45
     assert shifted[1] < 0.3 * shifted[0]
     assert (still < 0.02).all()
+
+
+def test_centres_that_shift_leave_the_pose_where_it_is() -> None:
+    """Both circles of a ring by 0.1 px, and by 0.02 px apart: what they are apart does not tell the pose instead."""
+    r, t = random_poses(100, 40, (140, 190))
+    g = torch.Generator().manual_seed(5)
+    ellipses = exact_ellipses(QUAD, CAMERA_FILE, r, t)
+    ellipses[..., :2] += 0.1 * torch.randn(100, 4, 1, 2, dtype=F64, generator=g)
+    ellipses[..., :2] += 0.02 * torch.randn(100, 4, 2, 2, dtype=F64, generator=g)
+    rings = rings_of(ellipses.flatten(0, 1), torch.arange(100).repeat_interleave(4), 0.05)
+    table = MarkerTable.of([QUAD])[torch.zeros(100, dtype=torch.int64)]
+    e = gather_evidence(rings, torch.arange(400).view(100, 4), table, CAMERA_FILE)
+    s = solve_poses(e, (r, t))
+    found = refine_centers(e, s.R, s.t)
+    setting = Setting(e, found.R, found.t, CAMERA_FILE, False)
+    joint = on_print(found.normals, setting, torch.zeros(100, 4, PLACE, dtype=F64))
+    assert (joint.misfit == Misfit.SCATTER).sum() > 20
+    before = found.t - t
+    assert (before + joint.step[:, :3]).square().mean() < 1.5 * before.square().mean()
 
 
 def test_one_thing_of_a_camera_is_seen_where_the_sum_is_no_surprise() -> None:

@@ -310,7 +310,9 @@ def _excess(
         information, right = (x[odd[which]] for x in together)
         return Picture(information, right, _fields(some.of_rows(which)))
 
-    again = excess_of(*remaining, None if even is None else even[odd], picture, refuted)
+    # centres alone do not tell how a displacement bends a ring: there its scatter is that of all noise
+    seen = picture if setting.on_rims else None
+    again = excess_of(*remaining, None if even is None else even[odd], seen, refuted)
     every = shifts.new_zeros(rows, *shifts.shape[1:]).index_copy(0, odd, shifts)
     nothing = shifts.new_zeros(rows, shifts.shape[-1])
     excess = replace(excess, deviation=nothing, printed=nothing, field=shifts.new_zeros(rows, again.field.shape[1]))
@@ -439,7 +441,7 @@ def _fields(setting: Setting) -> Tensor:
     By 1 px along u and along v, alike over each of F lengths. Rings are so far apart that each is displaced by itself.
     """
     evidence = setting.evidence
-    jacobian, xy, weight = (_rim_jacobian if setting.on_rims else _center_jacobian)(evidence, setting.R, setting.t)
+    jacobian, xy, weight = _rim_jacobian(evidence, setting.R, setting.t)
     markers = evidence.mask.shape[1]
     weighted = (jacobian.mT @ weight).unflatten(1, (markers, -1))  # (N, M, P, 7, 2)
     held = (weighted @ jacobian.unflatten(1, (markers, -1))).sum(2)
