@@ -63,4 +63,4 @@ def rings_of(ellipses: Tensor, frame: Tensor, sigma: float = 0.005, polarity: fl
     outer, inner = fit(ellipses[:, 0]), fit(ellipses[:, 1])
     side, blur = torch.full((count,), polarity, dtype=F64), isotropic(torch.full((count,), 0.8, dtype=F64))
     seen = (frame >= 0)[:, None].expand(-1, SECTORS)
-    return Rings(frame, side, outer.params, inner.params, outer, inner, blur, frame < 0, seen)
+    return Rings(frame, side, outer.params, inner.params, outer, inner, blur, frame < 0, seen, frame < 0)

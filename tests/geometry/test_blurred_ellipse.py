@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch
 from scipy.ndimage import gaussian_filter
+from scipy.signal import fftconvolve
 from torch import Tensor
 
 from torchpose.geometry import conics
 from torchpose.geometry.blur import isotropic
-from torchpose.geometry.blurred_ellipse import blurred_ellipse, nodes_needed
+from torchpose.geometry.blurred_ellipse import Profile, blurred_ellipse, disc, gaussian, nodes_needed
 
 
 @pytest.mark.parametrize("axes", [(2.1, 2.1), (6.0, 3.0), (9.6, 8.0)])
@@ -40,7 +41,41 @@ def test_values(axes: tuple[float, float], sigma: tuple[float, float]) -> None:
     assert np.abs(value.numpy().reshape(picture.shape) - picture).max() < 1e-3
 
 
-def test_derivatives() -> None:
+@pytest.mark.parametrize("radius", [2.6, 5.0])
+def test_a_disc(radius: float) -> None:
+    """A ring of 6 px under a disc and 0.28 deviations of a Gaussian: both filtered from a supersampled picture."""
+    fine, size, axes = 16, 40, (6.0, 5.0)
+    grid = (np.arange(size * fine) + 0.5) / fine - size / 2
+    x, y = np.meshgrid(grid, grid)
+    inside = (np.hypot(x / axes[0], y / axes[1]) < 1).astype(float)
+    kernel = (np.hypot(x, y) < radius).astype(float)
+    picture = gaussian_filter(fftconvolve(inside, kernel / kernel.sum(), "same"), 0.28 * radius / 2 * fine)
+    xy = torch.from_numpy(np.stack(np.meshgrid(grid[::8], grid[::8]), -1).reshape(1, -1, 2))
+    shape = torch.diag_embed(torch.tensor([axes], dtype=torch.float64))
+    sigma = torch.tensor([radius / 2 * np.hypot(1, 0.28)], dtype=torch.float64)
+    none, one = torch.zeros(1, 2, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
+    nodes = nodes_needed(torch.tensor([axes[0]]), sigma)
+    seen, gauss = (
+        blurred_ellipse(xy, none, shape, one, isotropic(sigma), nodes, profile)[0].numpy().reshape(80, 80)
+        for profile in (disc, gaussian)
+    )
+    error = np.abs(seen - picture[::8, ::8]).max()
+    assert error < 0.015
+    assert np.abs(gauss - picture[::8, ::8]).max() > 2 * error
+
+
+@pytest.mark.parametrize("profile", [gaussian, disc])
+def test_a_profile_is_a_blur_of_its_covariance(profile: Profile) -> None:
+    """Its share within m is 1 in the end and grows by its density, and m has the mean 2 of two dimensions."""
+    m = torch.linspace(1e-6, 60, 600_001, dtype=torch.float64)
+    less, density = profile(m.clone())
+    assert float(less[-1]) == pytest.approx(-1, abs=1e-12)
+    torch.testing.assert_close(torch.gradient(-less, spacing=(m,))[0][1:-1], 0.5 * density[1:-1], rtol=0, atol=1e-5)
+    assert float(torch.trapezoid(0.5 * density * m, m)) == pytest.approx(2, abs=0.02)
+
+
+@pytest.mark.parametrize("profile", [gaussian, disc])
+def test_derivatives(profile: Profile) -> None:
     g = torch.Generator().manual_seed(0)
     center = torch.randn(3, 2, generator=g, dtype=torch.float64)
     entries = torch.tensor([[5.0, 1, 3], [4, -0.5, 2.5], [7, 2, 6]], dtype=torch.float64)
@@ -50,7 +85,7 @@ def test_derivatives() -> None:
 
     def both(center: Tensor, entries: Tensor, scale: Tensor, blur: Tensor) -> tuple[Tensor, Tensor]:
         shape = entries[:, (0, 1, 1, 2)].unflatten(-1, (2, 2))
-        return blurred_ellipse(xy, center, shape, scale, blur, 200)
+        return blurred_ellipse(xy, center, shape, scale, blur, 400, profile)
 
     parameters = (center, entries, scale, blur)
     step, columns = 1e-5, []

@@ -126,6 +126,21 @@ def test_reduced_matrix(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
         assert 0.01 < row["lateral"] < 20, row
 
 
+@pytest.mark.parametrize("number", [9, 11])
+def test_small_rings_out_of_focus_are_named_rightly(number: int) -> None:
+    """A disc of 5 px over rings of 12 to 16: with a Gaussian the codes of frame 9 are a step too high."""
+    camera = tp.Camera.load(statistics.CAMERA)
+    shot = corruptions.view(number, 1, camera, "small", "none")
+    row = statistics.measure(
+        tp.PoseEstimator(camera, tp.Target.load("quad40")),
+        *corruptions.shoot(shot, CORRUPTIONS["defocus"], 5.0, 1_000_003 + number),
+    )
+    assert row["status"] == "ok"
+    assert row["markers"] == 4
+    assert max(abs(e) / s for e, s in zip(row["error"], row["claimed"], strict=True)) < 5
+    assert max(abs(e) for e in row["error"][:2]) < 0.01
+
+
 def test_a_frame_without_a_pose_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A black plate in the dark has no rings to find."""
     dark = replace(CORRUPTIONS["under-exposure"], values=(0.0,))

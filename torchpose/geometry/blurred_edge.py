@@ -34,6 +34,7 @@ BLUR = 3  # numbers of a blur
 # (convention; what the second order leaves: tests/geometry/test_blur.py)
 HOLDS = 0.4
 LEAST, MOST = 0.3, 12.0  # px, standard deviations: a pixel alone has 0.289; beyond the widest band nothing is left
+LONG = 1.7  # of the variances of a blur's axes: a motion of 2 px, from which on it may be a line (derived)
 _NODES_A_SIGMA = 1.1  # Gauss-Legendre nodes a half length in narrow Gaussians: an edge to 1e-3
 _MOST_NODES = 40
 _ON_CPU = torch.zeros(0, dtype=torch.float64)  # nodes are numbers

@@ -120,7 +120,8 @@ def rough_marks(candidates: Candidates, camera: Camera, ratio: float) -> Rings:
     blur = blurs.isotropic(_START_BLUR * one)
     clipped = torch.zeros_like(candidates.polarity, dtype=torch.bool)
     seen = torch.ones(len(outer), SECTORS, dtype=torch.bool, device=outer.device)
-    return Rings(candidates.frame, candidates.polarity, outer, seen_inner, first, second, blur, clipped, seen)
+    known = (blur, clipped, seen, torch.zeros_like(clipped))
+    return Rings(candidates.frame, candidates.polarity, outer, seen_inner, first, second, *known)
 
 
 def _poses(

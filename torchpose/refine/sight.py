@@ -14,6 +14,7 @@ from torchpose.camera import Camera
 from torchpose.detect.reduce import only_reduced
 from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
+from torchpose.geometry.blurred_edge import KINDS
 from torchpose.geometry.least_squares import Pose, PosePrior
 from torchpose.geometry.robust import LEAST_KEPT as LEAST_KEPT
 from torchpose.geometry.rows import Rows, shared
@@ -64,6 +65,7 @@ class Sight(Rows):
         reduction: of the frames, by block means: their rounding counts for less.
         seen: sectors of every ring in which it was seen so far, see `geometry.sectors`; None where nothing is known.
         look: of an earlier fit, with which to begin.
+        disc: whether the blur of most rings was seen to be a disc's; None where nothing is known.
     """
 
     frame: Int[Tensor, " N"]
@@ -79,6 +81,7 @@ class Sight(Rows):
     reduction: int = shared(1)
     seen: Bool[Tensor, "N M 48"] | None = None
     look: Look | None = None
+    disc: Bool[Tensor, " N"] | None = None
 
     @classmethod
     def of(cls, frames: Tensor, camera: Camera, target: Target, frame: Tensor, rings: Tensor) -> Self:
@@ -110,6 +113,7 @@ class Sight(Rows):
             scene.camera,
             blur.view(*evidence.mask.shape, 3),
             seen=ring.seen.view(*evidence.mask.shape, -1),
+            disc=2 * (ring.disc.view_as(evidence.mask) & evidence.mask).sum(-1) > evidence.mask.sum(-1),
         )
 
     @property
@@ -125,6 +129,12 @@ class Sight(Rows):
             return blurs.isotropic(start.expand(len(self)))
         median = torch.where(self.mask[..., None], self.blur, torch.nan).nanmedian(1).values
         return torch.where(median.isnan(), blurs.isotropic(start), median)
+
+    @property
+    def told(self) -> Int[Tensor, " N"]:
+        """The kind of blur that the rings tell, its number in `geometry.blurred_edge.KINDS`."""
+        known = torch.zeros_like(self.frame) if self.disc is None else self.disc.to(self.frame)
+        return known * KINDS.index("disc")
 
     def displaced(self, by: Float[Tensor, "N M 5"]) -> Self:
         """The same rows with places of their markers beside those they have, as `Poses.place`."""
@@ -162,7 +172,7 @@ def refined_by_blur(
         factor: for rows without a look.
     """
     known = None if prior is None else PosePrior(prior, start)
-    kind = doubt = torch.zeros_like(factor)
+    kind, doubt = sight.told, torch.zeros_like(factor)
     if sight.look is not None:
         factor, kind, doubt = sight.look.reduction, sight.look.kind, sight.look.doubt.long()
     each = torch.stack([factor, kind, doubt], -1)

@@ -54,6 +54,7 @@ class Rings(Rows):
         blur: of the ring's edges, px^2, see `geometry.blur`.
         clipped: whether the lighter side of the edges is clipped, which moves them all towards the darker side.
         seen: sectors in which its edges were measured, see `geometry.sectors`.
+        disc: whether its blur was seen to be a disc's, that of a frame out of focus.
     """
 
     frame: Int[Tensor, " K"]
@@ -65,6 +66,7 @@ class Rings(Rows):
     blur: Float[Tensor, "K 3"]
     clipped: Bool[Tensor, " K"]
     seen: Bool[Tensor, "K 48"]
+    disc: Bool[Tensor, " K"]
 
     @property
     def ratio(self) -> Tensor:
@@ -124,7 +126,7 @@ def rough_rings(circles: Circles, camera: Camera) -> Rings:
     ideal = mapped(torch.cat([outer, inner]), lambda points: ideal_pixels(camera, points))
     first, second = (EllipseFit(ellipses, covariance, _ROUGH * one, one) for ellipses in ideal.split(len(outer)))
     inside = circles.inside
-    known = (inside.blur, inside.clipped, inside.seen)
+    known = (inside.blur, inside.clipped, inside.seen, torch.zeros_like(inside.clipped))
     return Rings(circles.outer.frame, circles.outer.polarity, outer, inner, first, second, *known)
 
 
@@ -147,7 +149,7 @@ def _no_rings(candidates: Candidates) -> Rings:
     frame, polarity, none = candidates.frame, candidates.polarity, candidates.ellipse
     fit = EllipseFit(none, none.new_empty(0, 5, 5), polarity, polarity)
     seen = (frame > 0)[:, None].expand(-1, SECTORS)
-    return Rings(frame, polarity, none, none, fit, fit, none[:, :3], frame > 0, seen)
+    return Rings(frame, polarity, none, none, fit, fit, none[:, :3], frame > 0, seen, frame > 0)
 
 
 @checked
@@ -172,7 +174,12 @@ def measure_exactly(frames: Tensor, rings: Rings, camera: Camera) -> tuple[Rings
 
     Also which of the rings each is.
     """
-    blurred = blurs.axes(rings.blur)[1].sqrt() > BLURRED * rings.inner_raw[:, 3]
+    if len(rings) == 0:
+        return rings, rings.frame
+    # a ring that reads its own blur too narrow is told by those beside it
+    own = blurs.axes(rings.blur)[1].sqrt()
+    usual = segment_mean(own, rings.frame, int(rings.frame.max()) + 1)[rings.frame]
+    blurred = own.maximum(usual) > BLURRED * rings.inner_raw[:, 3]
     left, index = (part.nonzero()[:, 0] for part in (~blurred, blurred))
     some = rings[index]
     if len(some) == 0:
@@ -321,7 +328,7 @@ def _by_edges(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
     blur = blurs.limited(blur - blurs.pixel(blur), LEAST**2, MOST**2)[index]  # less that of the mask
     frame, polarity = candidates.frame[index], candidates.polarity[index]
     follows = marked((edges.ring * SECTORS + sector)[keep], 2 * count * SECTORS).view(2, count, SECTORS)[0, index]
-    known = (blur, inside.clipped[index], clear[index] & follows)
+    known = (blur, inside.clipped[index], clear[index] & follows, torch.zeros_like(inside.clipped[index]))
     return Rings(frame, polarity, raw[index], raw[second], fit[index], fit[second], *known), index
 
 
@@ -378,6 +385,7 @@ def _as_a_whole(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> 
         found.blur[index],
         circles.inside.clipped[index],
         found.seen[index],
+        found.disc[index],
     )
     return rings, index
 

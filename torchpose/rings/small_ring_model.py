@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchpose.geometry import blur as blurs
 from torchpose.geometry.blurred_edge import HOLDS, Spread
-from torchpose.geometry.blurred_ellipse import blurred_ellipse, nodes_needed
+from torchpose.geometry.blurred_ellipse import Profile, blurred_ellipse, gaussian, nodes_needed
 
 RING = 8  # parameters
 MOST_NODES = 120  # of the exact integral: enough for a semi-major axis of 19 blurs
@@ -73,15 +73,15 @@ def first_order(theta: Tensor, spread: Spread, x: Tensor, y: Tensor) -> tuple[Te
     return step[1] - step[0], torch.cat([ring, -own, -blur], 1)
 
 
-def exact(theta: Tensor, spread: Spread, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """The same as exact integrals, in float64."""
+def exact(theta: Tensor, spread: Spread, x: Tensor, y: Tensor, profile: Profile = gaussian) -> tuple[Tensor, Tensor]:
+    """The same as exact integrals, in float64, of a blur of any profile."""
     xy, blur = torch.stack([x, y], -1), spread.covariance
     ellipses, ratio = outer_ellipses(theta)[0], theta[:, 5]
     shape, least = theta[:, (2, 3, 3, 4)].unflatten(-1, (2, 2)), blurs.axes(blur)[0].sqrt()
 
     def blurred(center: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
         nodes = min(nodes_needed(ellipses[:, 2] * scale, least), MOST_NODES)
-        return blurred_ellipse(xy, center, shape, scale, blur, nodes)
+        return blurred_ellipse(xy, center, shape, scale, blur, nodes, profile)
 
     outer, by_outer = blurred(theta[:, :2], torch.ones_like(ratio))
     inner, by_inner = blurred(theta[:, :2] + theta[:, 6:8], ratio)

@@ -7,7 +7,9 @@ measurement. The whole ring as one model has no such limit:
 
 E(s) the blurred indicator of the ellipse scaled by s, q the ratio of the radii. To first order in the distance it is
 that of a curved edge (`geometry.blurred_edge`). Where the blur is more than a third of the inner circle, that misreads
-codes, and the ring is fitted once more with the exact integral (`geometry.blurred_ellipse`).
+codes, and the ring is fitted once more with the exact integral (`geometry.blurred_ellipse`). Where even that leaves
+residuals with a shape, the blur is none of a Gaussian's: out of focus it is a disc, under which ratio and contrast are
+others. It has several minima, so it is begun from a small hole and from a large one, and the best fit is kept.
 The circles share their shape; perspective parts their centres by about a^2 (1 - q^2) / f at most (a the semi-major
 axis, f the focal length, px), the standard deviation of a prior at zero. What covers a part of the ring, or touches it,
 is left out by robust weights.
@@ -17,7 +19,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple, cast
 
 import torch
@@ -28,8 +31,8 @@ from torchpose.detect import Candidates
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
-from torchpose.geometry.blurred_edge import BLUR, MOST, Spread
-from torchpose.geometry.blurred_ellipse import nodes_of_each
+from torchpose.geometry.blurred_edge import BLUR, LONG, MOST, Spread
+from torchpose.geometry.blurred_ellipse import disc, nodes_of_each
 from torchpose.geometry.least_squares import (
     Block,
     Normal,
@@ -42,7 +45,7 @@ from torchpose.geometry.least_squares import (
 from torchpose.geometry.robust import CUT, LEAST_KEPT, RATIO_RANGE, of_chance
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.sectors import SECTORS, sector_of
-from torchpose.geometry.segments import values_at
+from torchpose.geometry.segments import segment_mean, values_at
 from torchpose.rings.inner_circles import InnerCircles
 from torchpose.rings.small_ring_model import MOST_NODES, RING, depth, exact, first_order, outer_ellipses
 
@@ -58,6 +61,10 @@ BLURRED = 0.33
 _BLURRED_MARGIN = 2.5  # blurs around the outer ellipse
 # of the variance of grey around the ring: noise of half of the contrast's deviation remains (convention)
 _LEAST_EXPLAINED = 0.75
+# variance of a ring's residuals over that of white noise with the same third differences: mean of a frame's rings under
+# a Gaussian up to 1.1, under a disc 1.6 to 1.9 (measured: decisions/0053)
+_WHITE = 1.25
+_BEGINNINGS = (0.35, 0.65)  # ratios: from one of them any code is reached (measured: docs/tried.md)
 _PART = 400_000  # pixels times nodes at a time
 _FEW = 10_000  # pixels: the calls of a part cost as much, so fewer are padded to one size (measured: docs/tried.md)
 _UNEVEN = 2.0  # most pixels of a window over the least, of those that are padded to one size
@@ -78,6 +85,7 @@ class SmallRings(Rows):
         blur: px^2, see `geometry.blur`.
         good: whether the model explains what is seen.
         promising: whether it is that of a blur too wide for it, and the exact one may explain more.
+        disc: whether a round disc explains its blur, and a Gaussian does not.
         seen: sectors in which it does.
     """
 
@@ -86,6 +94,7 @@ class SmallRings(Rows):
     blur: Float[Tensor, "K 3"]
     good: Bool[Tensor, " K"]
     promising: Bool[Tensor, " K"]
+    disc: Bool[Tensor, " K"]
     seen: Bool[Tensor, "K 48"]
 
 
@@ -93,13 +102,14 @@ class _Stage(NamedTuple):
     """Some steps, and how they weigh the pixels.
 
     held: the ring stays where it is. sectors: those that contradict the model do not count. hard: every pixel counts
-    or not, instead of by a smooth weight.
+    or not, instead of by a smooth weight. even: every pixel counts.
     """
 
     steps: int
     held: bool = False
     sectors: bool = True
     hard: bool = False
+    even: bool = False
 
 
 class _Scheme(NamedTuple):
@@ -114,6 +124,9 @@ class _Scheme(NamedTuple):
 _ROUGH = _Scheme(first_order, 1e-3, (_Stage(2, held=True, sectors=False), _Stage(6), _Stage(3, hard=True)))
 # blur, width and contrast of a ring much blurred are hard to tell apart: no step is to be shortened
 _PRECISE = _Scheme(exact, 1e-5, (_Stage(6), _Stage(4, hard=True)))
+_GLANCE = _PRECISE._replace(stages=(_Stage(3), _Stage(1, hard=True)))  # enough to see that a Gaussian will not do
+# from afar a weight would leave out what contradicts the beginning
+_OUT_OF_FOCUS = _Scheme(partial(exact, profile=disc), 1e-5, (_Stage(4, sectors=False, even=True), _Stage(2, hard=True)))
 
 
 def fit_small_rings(
@@ -134,21 +147,58 @@ def fit_small_rings(
         begun: circles and blur are those of such a fit, which the exact integral continues; by the first one alone
             codes of rings of a wide blur may be off by a fifth of their tolerance.
     """
-    frame, outer, ratio, scheme = candidates.frame, candidates.ellipse, inside.ratio, _PRECISE if begun else _ROUGH
+    outer, ratio = candidates.ellipse, inside.ratio
     shape = conics.shape_matrix(outer)
     start = [outer[:, :2], shape[:, 0, :1], shape[:, 0, 1:], shape[:, 1, 1:], ratio[:, None]]
     apart = inside.ellipse[:, :2] - outer[:, :2] if begun else torch.zeros_like(outer[:, :2])
     parted = (outer[:, 2].square() * (1 - ratio.square()) / focal).clamp_min(_LEAST_PARTED)
     spread = Spread(blurs.limited(inside.blur, _START_SIGMA**2, MOST**2))
     first = _Start(torch.cat([*start, apart], -1), spread, inside.seen, parted, inside.clipped)
-    least, most = (axis.sqrt() for axis in blurs.axes(spread.values))
-    margin = (_BLURRED_MARGIN * most).clamp_min(_MARGIN) if begun else torch.full_like(ratio, _MARGIN)
-    nodes = nodes_of_each(outer[:, 2], least).clamp_max(MOST_NODES) if begun else None
+    if not begun:
+        return _judged(_fitted_all(frames, candidates, first, _ROUGH), outer, candidates.polarity)
+    fit = _fitted_all(frames, candidates, first, _GLANCE)
+    frame, number = candidates.frame, int(candidates.frame.max()) + 1
+    odd = (segment_mean(fit.variance / fit.noise, frame, number)[frame] > _WHITE).nonzero()[:, 0]
+    if odd.numel():
+        fit = fit.replaced(odd, _out_of_focus(frames, candidates[odd], first[odd], fit[odd]))
+    left = (~(fit.disc & (fit.variance < _WHITE**2 * fit.noise))).nonzero()[:, 0]
+    if left.numel():
+        fit = replace(fit, variance=fit.variance.where(fit.disc, torch.inf))  # a glance is no fit
+        fit = fit.bettered(left, _fitted_all(frames, candidates[left], first[left], _PRECISE))
+    return _judged(fit, outer, candidates.polarity)
+
+
+def _fitted_all(frames: Tensor, candidates: Candidates, first: _Start, scheme: _Scheme) -> _Fit:
+    """Fits of K rings by one scheme."""
+    outer, exactly = candidates.ellipse, scheme is not _ROUGH
+    least, most = (axis.sqrt() for axis in blurs.axes(first.spread.values))
+    margin = (_BLURRED_MARGIN * most).clamp_min(_MARGIN) if exactly else torch.full_like(most, _MARGIN)
+    nodes = nodes_of_each(outer[:, 2], least).clamp_max(MOST_NODES) if exactly else None
     fit = _no_fit(first)
     for part in _parts(_pixels(outer, margin), nodes):
-        window = _windows(frames, frame[part], outer[part], margin[part])
+        window = _windows(frames, candidates.frame[part], outer[part], margin[part])
         fit = fit.replaced(part, _fitted(window, first[part], scheme))
-    return _judged(fit, outer, candidates.polarity)
+    return fit
+
+
+def _out_of_focus(frames: Tensor, candidates: Candidates, first: _Start, fit: _Fit) -> _Fit:
+    """The best of the K fits and those under a disc, of the blur that the rings of the frame have on average."""
+    frame, number = candidates.frame, int(candidates.frame.max()) + 1
+    size = 0.5 * (fit.blur[:, 0] + fit.blur[:, 2])
+    usual = segment_mean(size, frame, number)[frame]
+    spread = Spread(blurs.limited(blurs.isotropic(usual.sqrt()), _START_SIGMA**2, MOST**2))
+    begun = replace(first, spread=spread)
+    left = torch.arange(len(frame), device=frame.device)
+    for ratio in _BEGINNINGS:
+        theta = torch.cat([begun.theta[:, :5], torch.full_like(usual, ratio)[:, None], begun.theta[:, 6:]], -1)
+        other = _fitted_all(frames, candidates[left], replace(begun, theta=theta)[left], _OUT_OF_FOCUS)
+        fit = fit.bettered(left, other)
+        told = fit.variance.minimum(fit.noise)  # a ring that fits tells the noise of all
+        least = told.new_full((number,), math.inf).scatter_reduce(0, frame, told, "amin")[frame]
+        left = left[fit.variance[left] > _WHITE**2 * least[left]]  # twice beyond chance, as both have some
+        if left.numel() == 0:
+            break
+    return fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,8 +227,9 @@ class _Start(Rows):
 @dataclass(frozen=True, eq=False)
 class _Fit(Rows):
     """K fits: parameters, blur and the covariance of both, contrast, residual variance, number of pixels kept and their
-    share, the share of the grey values' variance that is explained, whether the window is on the frame and the data
-    determine all parameters, and the sectors that follow the model."""
+    share, the share of the grey values' variance that is explained, the variance of white
+    noise that has their residuals' third differences, whether the blur is a disc's, whether the window is on the frame
+    and the data determine all parameters, and the sectors that follow the model."""
 
     theta: Float[Tensor, "K 8"]
     blur: Float[Tensor, "K 3"]
@@ -188,15 +239,28 @@ class _Fit(Rows):
     pixels: Float[Tensor, " K"]
     kept: Float[Tensor, " K"]
     explained: Float[Tensor, " K"]
+    noise: Float[Tensor, " K"]
+    disc: Bool[Tensor, " K"]
     sound: Bool[Tensor, " K"]
     seen: Bool[Tensor, "K 48"]
+
+    @property
+    def loss(self) -> Tensor:
+        """(K,): mean squares of the residuals, those left out with the least that they have."""
+        return self.variance * (self.kept + CUT**2 * (1 - self.kept))
+
+    def bettered(self, index: Tensor, others: _Fit) -> _Fit:
+        """With those of the others, of the rings ``index``, that leave less."""
+        better = (others.sound & (others.loss < self.loss[index])).nonzero()[:, 0]
+        return self.replaced(index[better], others[better])
 
 
 def _no_fit(begun: _Start) -> _Fit:
     """Of rings of which nothing is known yet."""
     none = torch.zeros_like(begun.theta[:, 0])
     covariance = none.new_zeros(len(none), RING + BLUR, RING + BLUR)
-    return _Fit(begun.theta, begun.spread.values, covariance, none, none, none, none, none, none > 0, begun.seen)
+    numbers, marks = [none] * 6, [none > 0] * 2
+    return _Fit(begun.theta, begun.spread.values, covariance, *numbers, *marks, begun.seen)
 
 
 def _pixels(outer: Tensor, margin: Tensor) -> Tensor:
@@ -261,6 +325,8 @@ def _fitted(window: _Window, begun: _Start, scheme: _Scheme) -> _Fit:
         number,
         kept,
         explained,
+        _noise(pixels.residual, weight),
+        torch.full_like(sound, scheme is _OUT_OF_FOCUS),
         sound,
         pixels.followed(),
     )
@@ -294,7 +360,8 @@ class _Pixels:
             mean = (self.weight * residual.square()).sum(-1) / self.weight.sum(-1)
             self.spread = mean.sqrt()
         agrees = self._agreeing(residual) if stage.sectors else 1.0
-        self.weight = self.clear * agrees * _weights(residual / self.spread[:, None], keep=stage.hard)
+        fitting = 1.0 if stage.even else _weights(residual / self.spread[:, None], keep=stage.hard)
+        self.weight = self.clear * agrees * fitting
         columns = torch.cat([derivative.to(basis) * self.levels[:, 3:, None], basis, residual[:, None]], 1)
         weighted = columns[:, :-1] * (self.weight / self.spread.square()[:, None])[:, None]
         sums = weighted @ columns.mT
@@ -353,13 +420,16 @@ def _judged(fit: _Fit, outer: Tensor, polarity: Tensor) -> SmallRings:
     inner = torch.cat([params[:, :2] + theta[:, 6:], params[:, 2:4] * ratio[:, None], params[:, 4:]], -1)
     # a first fit may leave twice as much
     may = shape_ok & fit.sound & (fit.contrast * polarity < 0) & (1 - fit.explained < 2 * (1 - _LEAST_EXPLAINED))
-    promising = may & (blurs.axes(fit.blur)[1].sqrt() > BLURRED * ratio * params[:, 3])
+    least, most = blurs.axes(fit.blur)
+    promising = may & (most.sqrt() > BLURRED * ratio * params[:, 3])
     # both circles tell the same shape and nearly the same centre: as independent ones each has twice the variance
     fits = [
         EllipseFit(p, 2 * j @ covariance @ j.mT, fit.variance.sqrt(), fit.pixels)
         for p, j in ((params, outer_jacobian), (inner, inner_jacobian))
     ]
-    return SmallRings(fits[0], fits[1], fit.blur, good, promising, fit.seen)
+    round_ = most < LONG * least
+    disc = fit.disc & round_ & (fit.variance < _WHITE**2 * fit.noise)
+    return SmallRings(fits[0], fits[1], fit.blur, good, promising, disc, fit.seen)
 
 
 class _Window(NamedTuple):
@@ -410,6 +480,16 @@ def _levels(basis: Tensor, grey: Tensor, weight: Tensor) -> Tensor:
     weighted = basis * weight[:, None]
     right = (weighted @ grey[..., None]).squeeze(-1)
     return solve_scaled(weighted @ basis.mT, right).nan_to_num(nan=0.0)
+
+
+def _noise(residual: Tensor, weight: Tensor) -> Tensor:
+    """Variance (K,) of the white noise that has the third differences of residuals (K, P), in the order of rows."""
+    last = residual.shape[1] - 3
+    difference, whole = torch.zeros_like(residual[:, 3:]), torch.ones_like(residual[:, 3:])
+    for at, factor in enumerate((-1.0, 3.0, -3.0, 1.0)):
+        difference = difference + factor * residual[:, at : at + last]
+        whole = whole * weight[:, at : at + last]
+    return (whole * difference.square()).sum(-1) / (20 * whole.sum(-1))
 
 
 def _to_axes(ellipses: Tensor) -> Tensor:

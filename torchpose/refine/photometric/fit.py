@@ -23,7 +23,7 @@ from torch import Tensor
 from torchpose.detect.reduce import reduction_for
 from torchpose.geometry import blur as blurs
 from torchpose.geometry.arguments import checked
-from torchpose.geometry.blurred_edge import KINDS, LEAST, MOST, Spread
+from torchpose.geometry.blurred_edge import KINDS, LEAST, LONG, MOST, Spread
 from torchpose.geometry.least_squares import (
     Block,
     Eliminated,
@@ -85,8 +85,6 @@ class _Stage(NamedTuple):
     tempered: bool = False
 
 
-# variance along the major axis over the minor one: a motion of 2 px, from which on it may be a line (derived)
-_LONG = 1.7
 # of the contrast, RMS at the edges: that of a disc of 2 px, which costs a tenth in the covariance (measured:
 # `scripts/corruption_statistics.py --only defocus`)
 _MATTERS = 0.004
@@ -183,7 +181,8 @@ class _Fits:
     def __init__(self, sight: Sight, start: Pose, known: PosePrior | None) -> None:
         self.sight, self.start, self.known = sight, start, known
         blur, look = blurs.limited(sight.common_blur, LEAST**2, MOST**2), sight.look
-        self.spread = Spread(blur) if look is None else Spread(look.blur, KINDS[int(look.kind[:1].sum())])
+        kind = KINDS[int((sight.told if look is None else look.kind)[:1].sum())]
+        self.spread = Spread.of(blur, kind) if look is None else Spread(look.blur, kind)
         self.band = band_width(self.spread) if look is None else look.band
         self.fit = _Fit(sight, self.band, known, _MOST_COARSE)
         self.ends: list[tuple[_Fit, Minimum]] = []
@@ -224,7 +223,7 @@ class _Fits:
         """With the kind of blur that explains misshapen ones of the rows (N,) bool better, where there is one."""
         least, most = blurs.axes(result.spread)
         # where a ring is all edge, none stand out: what contradicts the model there may be its blur
-        long, rows = most > _LONG * least, rows & (result.misshapen | result.doubt) & (result.look.kind == 0)
+        long, rows = most > LONG * least, rows & (result.misshapen | result.doubt) & (result.look.kind == 0)
         for kind, some in ((1, rows & long), (2, rows & ~long)):
             if not bool(some.any()):
                 continue
