@@ -506,7 +506,8 @@ def remaining_of(normals: MarkerNormals, known: Tensor, excess: Tensor, count: i
     """
     matrix, right = assembled(normals, torch.cat([known, excess], -1))
     k = known.shape[-1]
-    matrix.diagonal(dim1=-2, dim2=-1)[:, k - count : k] += 1
+    if count:
+        matrix.diagonal(dim1=-2, dim2=-1)[:, k - count : k] += 1
     both = torch.cat([matrix[:, :k, k:], right[:, :k, None]], -1)
     taken = matrix[:, k:, :k] @ solve_scaled(matrix[:, :k, :k], both)
     return matrix[:, k:, k:] - taken[..., :-1], right[:, k:] - taken[..., -1]
@@ -522,6 +523,8 @@ def assembled(normals: MarkerNormals, columns: Tensor) -> tuple[Tensor, Tensor]:
 
 def among(by: Tensor, n: int) -> Tensor:
     """Columns (N, M, n, L) of pose and gain (N, M, 7, L), with 0 for what stands between."""
+    if by.shape[-1] == 0:
+        return by.new_zeros(*by.shape[:2], n, 0)
     between = by.new_zeros(*by.shape[:2], n - POSE - 1, by.shape[-1])
     return torch.cat([by[:, :, :POSE], between, by[:, :, POSE:]], 2)
 
