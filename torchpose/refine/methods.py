@@ -127,7 +127,10 @@ def _start(rows: Solutions, seen: Evidence, camera: Camera) -> tuple[Pose, Tenso
     place = torch.cat([place[..., :4], rows.larger[:, None, None].expand_as(place[..., 4:])], -1)
     freedom = (2 * seen.mask.sum(-1) - start.size).clamp_min(1)
     # what noise explains is found on the grey values, if it is there
-    off = ((rows.rms > BESIDE) & (rows.chi2 > freedom * of_chance(freedom))).nonzero()[:, 0]
+    amiss = rows.chi2 > freedom * of_chance(freedom)
+    if seen.by_target.shape[-1]:  # and not what an uncertain print explains, too
+        amiss |= (seen.placed > BESIDE**2).flatten(1).any(-1)
+    off = ((rows.rms > BESIDE) & amiss).nonzero()[:, 0]
     if off.numel() == 0:
         return start, place
     found, joint = _by_centers(rows[off], seen[off], camera)
