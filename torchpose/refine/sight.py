@@ -136,6 +136,9 @@ class Sight(Rows):
         if self.blur is None:
             return torch.ones_like(self.mask[:, 0])
         smallest = torch.where(self.radii[..., 1] < 0, self.rings[..., 0, 3], self.rings[..., 1, 3])
+        may = self.mask & (self.blur[..., 0] + self.blur[..., 2] > (HOLDS * smallest).square())
+        if not bool(may.any()):
+            return torch.ones_like(self.mask[:, 0])
         share = torch.where(self.mask, blurs.axes(self.blur)[1].sqrt() / smallest, torch.nan)
         return ~(share.nanquantile(0.5, -1) > HOLDS)
 
