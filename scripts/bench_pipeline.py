@@ -14,6 +14,11 @@ machine stands beside: frames/s say nothing where others work.
 counts dispatched tensor operations instead, of a batch of each size, by the functions of the package in which they are
 made and those that called these: counts do not depend on the load. `syncs` are those after which a GPU would be waited
 for: numbers read, sizes that depend on values.
+
+    python scripts/bench_pipeline.py --one [--rounds 15]
+
+times single frames of 2 MP beside ArUco's detector on the same frames: searched, searched with compiled small problems,
+and near a pose that is 12 px and a degree off (`PoseEstimator`, ``near``).
 """
 
 from __future__ import annotations
@@ -309,6 +314,10 @@ class Operations(TorchDispatchMode):
         self.kinds: Counter[str] = Counter()
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        with self:  # in inference mode compound operations arrive whole
+            parts = func.decompose(*args, **(kwargs or {}))
+        if parts is not NotImplemented:
+            return parts
         chain, frame = [], sys._getframe(1)
         while frame is not None:
             if (name := _function(frame.f_code)) is not None:
@@ -368,6 +377,47 @@ def bench_operations(batches: list[int], least: int, report: list[str]) -> None:
         report += [f"Most: {kinds}.", ""]
 
 
+MOVE_PX, TURN_RAD = 12.0, 0.017  # of the poses that frames are looked for near
+
+
+def bench_one(rounds: int, report: list[str]) -> None:
+    """CPU of frames alone beside ArUco's detector: the median of the ratios of all frames and rounds, and the ratio of
+    the means of each frame's quickest round, which what else the machine does reaches least."""
+    camera, target = camera_of(*SIZES["2 MP"]), tp.Target.load("quad40")
+    frames, R, t = make_frames(camera, target)
+    aruco = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
+    plain, compiled = (tp.PoseEstimator(camera, target, compile=on) for on in (False, True))
+    turn = rotations.exp(torch.tensor([0.0, TURN_RAD, 0.0], dtype=torch.float64))
+    along = torch.tensor([0.6, -0.8, 0.0], dtype=torch.float64)
+    near = turn @ R, t + MOVE_PX * t[:, 2:] / camera.matrix[0, 0] * along
+    works: dict[str, Callable[[int], object]] = {
+        "ArUco": lambda i: aruco.detectMarkers(frames[i].numpy()),
+        "searched": lambda i: plain(frames[i]),
+        "searched, compiled": lambda i: compiled(frames[i]),
+        "near the last pose": lambda i: plain(frames[i], near=(near[0][i][None, None], near[1][i][None, None])),
+    }
+    times: dict[str, list[list[float]]] = {name: [] for name in works}
+    for work in works.values():
+        work(0)  # warms up
+    for _ in range(rounds):
+        for name in works:
+            times[name].append([])
+        for i in range(FRAMES):  # one after the other on each frame: what else the machine does meets all alike
+            for name, work in works.items():
+                times[name][-1].append(cpu(lambda work=work, i=i: work(i)))  # type: ignore[misc]
+    ms = {name: 1e3 * np.array(spent) for name, spent in times.items()}
+    report += ["| one frame | CPU ms | of ArUco, median | of ArUco, quickest rounds |", "|---|---|---|---|"]
+    for name, spent in ms.items():
+        of, least = np.median(spent / ms["ArUco"]), spent.min(0).mean() / ms["ArUco"].min(0).mean()
+        report += [f"| {name} | {np.median(spent):.1f} | {of:.2f} | {least:.2f} |"]
+    counts = []
+    for name in ("searched", "near the last pose"):
+        with Operations() as operations:
+            works[name](0)
+        counts.append(f"{operations.total} {name}")
+    report += ["", f"Operations of the first one: {', '.join(counts)}. {loaded()}", ""]
+
+
 def loaded() -> str:
     return f"Load of the machine (1 minute): {os.getloadavg()[0]:.1f}."
 
@@ -377,13 +427,17 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--out", type=Path, help="also write the report to this Markdown file")
     parser.add_argument("--operations", type=int, nargs="*", metavar="BATCH", help="count operations of such batches")
+    parser.add_argument("--one", action="store_true", help="only time single frames beside ArUco")
     parser.add_argument("--least", type=int, default=100, help="operations of a function that is listed")
     options = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    if options.operations is not None:
+    if options.operations is not None or options.one:
         lines: list[str] = []
-        bench_operations(options.operations or [1], options.least, lines)
+        if options.one:
+            bench_one(options.rounds, lines)
+        if options.operations is not None:
+            bench_operations(options.operations or [1], options.least, lines)
         print("\n".join(lines))
         return
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
@@ -401,6 +455,7 @@ def main() -> None:
             bench_size(label, options.rounds, folder, report)
             bench_decoders(folder, options.rounds, report)
             bench_command(label, min(3, options.rounds), folder, report)
+    bench_one(options.rounds, report)
     bench_operations([1, FRAMES], _LISTED, report)
     bench_start(min(3, options.rounds), report)
     bench_reduction(options.rounds, report)

@@ -27,6 +27,7 @@ from torchpose.detect import (
 )
 from torchpose.errors import ArgumentError, ConfigError, FrameError
 from torchpose.geometry import blur as blurs
+from torchpose.geometry.arguments import own_calls
 from torchpose.geometry.grey import FRAME_TYPES, as_frames
 from torchpose.geometry.segments import marked
 from torchpose.identify import (
@@ -36,6 +37,8 @@ from torchpose.identify import (
     Scene,
     Views,
     beside_another,
+    by_codes,
+    confirmed,
     find_near,
     identify,
     identify_boards,
@@ -43,6 +46,7 @@ from torchpose.identify import (
     indistinguishable,
     look_again,
     named,
+    outlines,
 )
 from torchpose.kernels import find_compiler
 from torchpose.moments import Moments, Start, View, begin, joined, refine_moments
@@ -208,7 +212,6 @@ class PoseEstimator(nn.Module):
         names = ", ".join(t.name for t in self.targets)
         return f"camera={self.camera.width}x{self.camera.height}, targets=[{names}]"
 
-    @torch.no_grad()
     def forward(self, frames: Tensor | NDArray[Any], near: Near | None = None) -> Poses:
         """Poses of every target in every frame.
 
@@ -229,13 +232,15 @@ class PoseEstimator(nn.Module):
         Raises:
             FrameError: wrong shape, size or dtype. ConfigError: ``near`` is of other targets.
         """
-        frames = self._checked(frames)
-        scene = Scene.of(frames, self.camera.to(frames.device), self.table.to(frames.device))
-        scene, found, tried = self._found(scene, near)
-        again = self._second_look(scene, found, tried)
-        if len(again[0]) > len(found.rings):
-            found = self._solved(scene, *again)
-        return self._finished(scene, found)
+        with torch.inference_mode(), own_calls():
+            frames = self._checked(frames)
+            scene = Scene.of(frames, self.camera.to(frames.device), self.table.to(frames.device))
+            scene, found, tried = self._found(scene, near)
+            again = self._second_look(scene, found, tried)
+            if len(again[0]) > len(found.rings):
+                found = self._solved(scene, *again)
+            poses = self._finished(scene, found)
+        return _ordinary(poses)
 
     def _finished(self, scene: Scene, found: Found) -> Poses:
         """Rows of solutions, refined."""
@@ -274,15 +279,20 @@ class PoseEstimator(nn.Module):
             return scene, found, found.rings
         there = None if near is None else find_near(scene, *_placed(scene, near))
         if there is not None:
-            rings, _ = measure_predicted(frames, *there, scene.camera, correct=self._recipe.correct)
-            first = self._read(scene, rings)
+            rings, of = measure_predicted(frames, *outlines(scene, there), scene.camera, correct=self._recipe.correct)
+            first = self._named(scene, rings, confirmed(scene, there, rings, of), near=True)
+            first = first or self._read(scene, rings)
             settled = self._settled(*first)
             if bool(settled.all()):
                 return *first, rings
             return self._found_elsewhere(scene, first, settled, rings)
         coarse = find_coarse(frames, wanted=wanted, float_range=255.0)
         rings, copies, tried = self._likely(scene, coarse)
-        first = self._read(scene, rings, copies)
+        table = scene.table
+        # nothing else is to tell where the others begin
+        planes = bool((table.coplanar & (table.valid.sum(1) > MIN_MARKERS)).all())
+        first = self._named(scene, rings, by_codes(scene, rings), copies) if planes else None
+        first = first or self._read(scene, rings, copies)
         settled = self._settled(*first)
         if bool(settled.all()):
             return *first, tried.rings
@@ -407,6 +417,23 @@ class PoseEstimator(nn.Module):
         tried = _Tried(blurred.outer[of], known, exact)
         return Rings.cat([others, known[chosen[len(rough) :]]]), likely.copies, tried
 
+    def _named(
+        self,
+        scene: Scene,
+        rings: Rings,
+        identified: Identified | None,
+        copies: Tensor | None = None,
+        *,
+        near: bool = False,
+    ) -> tuple[Scene, Found] | None:
+        """As `_read`, of rings that are named without a question, where all of them then agree on poses."""
+        if identified is None:
+            return None
+        if copies is not None:
+            identified = replace(identified, copies=identified.copies.maximum(copies))
+        found = self._solved(scene, rings, identified, near=near)
+        return (scene, found) if bool(self._settled(scene, found, whole=True).all()) else None
+
     def _read(
         self, scene: Scene, rings: Rings, copies: Tensor | None = None, marks: Candidates | None = None
     ) -> tuple[Scene, Found]:
@@ -429,20 +456,25 @@ class PoseEstimator(nn.Module):
             found = right_way_round(scene, found, solve)
         return best_copies(scene, found, self.instances)
 
-    def _solved(self, scene: Scene, rings: Rings, identified: Identified) -> Found:
-        """The evidence of every row, and the solutions of those rows that have enough of it."""
+    def _solved(self, scene: Scene, rings: Rings, identified: Identified, *, near: bool = False) -> Found:
+        """The evidence of every row, and the solutions of those rows that have enough of it.
+
+        ``near``: the rows' poses are those of frames not long before.
+        """
         gain = scene.stated_gain(identified.gain)
         markers = replace(scene.table[scene.target], radii=scene.printed_radii(gain))
         evidence = gather_evidence(rings, identified.ring, markers, scene.camera, self._recipe.locate)
         evidence = replace(evidence, gain=gain)
         solvable = (evidence.mask.sum(-1) >= MIN_MARKERS).nonzero()[:, 0]
         rough = identified.R[solvable], identified.t[solvable]
-        return Found(
-            rings, identified, evidence, solvable, solve_poses(evidence[solvable], rough, compile=self.solves_compiled)
-        )
+        solutions = solve_poses(evidence[solvable], rough, near=near, compile=self.solves_compiled)
+        return Found(rings, identified, evidence, solvable, solutions)
 
     def _second_look(self, scene: Scene, found: Found, tried: Rings) -> tuple[Rings, Identified]:
         """Looks for missing markers where the solutions put them, or the rough pose where there is none."""
+        seen = found.evidence.mask | ~scene.table.valid[scene.target]
+        if bool(seen.all()) and bool(found.solutions.mask.sum() == found.evidence.mask.sum()):
+            return found.rings, found.identified
         known = found.rings, found.identified, _views(found), _much_blurred(tried)
         return look_again(scene, *known, correct=self._recipe.correct)
 
@@ -530,7 +562,6 @@ class RigEstimator(PoseEstimator):
     def extra_repr(self) -> str:
         return f"cameras={', '.join(self.rig.names)}, targets=[{', '.join(t.name for t in self.targets)}]"
 
-    @torch.no_grad()
     def forward(self, frames: Sequence[Tensor | NDArray[Any]], seen: Tensor | None = None) -> Poses:  # type: ignore[override]
         """Poses of every target at every moment, in the axes of the first camera.
 
@@ -544,6 +575,12 @@ class RigEstimator(PoseEstimator):
         Raises:
             FrameError: wrong shape, size or dtype, or not one tensor for each camera.
         """
+        with torch.inference_mode(), own_calls():
+            poses = self._of_moments(frames, seen)
+        return _ordinary(poses)
+
+    def _of_moments(self, frames: Sequence[Tensor | NDArray[Any]], seen: Tensor | None) -> Poses:
+        """`forward`, arguments as they come."""
         if isinstance(frames, Tensor) or len(frames) != len(self.rig):
             raise FrameError(f"frames: give a sequence of {len(self.rig)} tensors, one for each camera")
         every = [self._of(k)._checked(of_camera) for k, of_camera in enumerate(frames)]
@@ -648,6 +685,11 @@ class RigEstimator(PoseEstimator):
         return parts
 
 
+def _ordinary(poses: Poses) -> Poses:
+    """Poses made in inference mode, which saves a sixth of a frame's CPU, as tensors that autograd may save."""
+    return poses if torch.is_inference_mode_enabled() else poses.clone()
+
+
 def _legible(blur: Tensor) -> Tensor:
     """Rings (K,) bool of these blurs (K, 3) whose profile tells their code."""
     return blurs.axes(blur)[1] <= _LEGIBLE**2
@@ -730,10 +772,12 @@ def _check_boards(targets: Sequence[Target], method: str, instances: int) -> Non
 def _doubted(scene: Scene, found: Found) -> Solutions:
     """Rejects poses from three markers that put a fourth across a ring."""
     solutions, row = found.solutions, found.solvable
+    three = (solutions.mask.sum(-1) == MIN_MARKERS) & solutions.solved
+    if not bool(three.any()):
+        return solutions
     markers, matrix = scene.table[scene.target[row]], scene.camera.matrix
     across = crossed_out(found.rings, scene.frame[row], solutions.R, solutions.t, markers, solutions.mask, matrix)
-    bad = across & (solutions.mask.sum(-1) == MIN_MARKERS) & solutions.solved
-    return solutions.marked(bad, Status.REJECTED, Reason.RESIDUAL)
+    return solutions.marked(across & three, Status.REJECTED, Reason.RESIDUAL)
 
 
 def _tensors(owner: Camera | MarkerTable) -> dict[str, Tensor]:

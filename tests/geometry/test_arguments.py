@@ -6,6 +6,7 @@ import inspect
 import re
 import types
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
@@ -18,7 +19,7 @@ from torch import Tensor
 
 import torchpose as tp
 from torchpose.geometry import arguments
-from torchpose.geometry.arguments import checked
+from torchpose.geometry.arguments import checked, own_calls
 
 ROOMS = (
     "analysis", "calibration", "design", "detect", "ellipse", "identify", "pose", "refine", "rings", "sim",
@@ -152,3 +153,27 @@ def test_windows_that_leave_the_frame_are_refused() -> None:
             tp.zernike.locate(frames, frame, torch.tensor([pixel]))
     with pytest.raises(tp.ArgumentError, match="frame: goes from 2"):
         tp.zernike.locate(frames, frame + 2, torch.tensor([[5, 5]]))
+
+
+def test_own_calls_are_not_checked() -> None:
+    """Within a pipeline nothing is asked; outside of it again, after an error too, and in other threads always."""
+
+    @checked
+    def length(x: Float[Tensor, " N"]) -> int:
+        return x.ndim
+
+    square = torch.zeros(2, 2)
+    with own_calls():
+        assert length.__wrapped__(square) == 2  # type: ignore[attr-defined]
+        assert length(square) == 2
+        with ThreadPoolExecutor(1) as other, pytest.raises(tp.ArgumentError):
+            other.submit(length, square).result()
+        with own_calls():
+            pass
+        assert length(square) == 2
+    with pytest.raises(tp.ArgumentError):
+        length(square)
+    with pytest.raises(ValueError, match="inside"), own_calls():
+        raise ValueError("inside")
+    with pytest.raises(tp.ArgumentError):
+        length(square)

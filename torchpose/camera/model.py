@@ -217,6 +217,11 @@ class Camera:
         return self.model == "kannala_brandt" or self.distortion.requires_grad or self._any_coefficient
 
     @property
+    def lens_stated(self) -> bool:
+        """Whether the covariance is that of the distortion, too."""
+        return self.covariance is not None and len(self.covariance) > 4
+
+    @property
     def _any_coefficient(self) -> bool:
         """Whether one is not zero; looked at anew only where the tensor was written to: a GPU would be waited for."""
         version, known = self.__dict__.get("_coefficients", (None, False))
@@ -249,6 +254,13 @@ class Camera:
         focal, center = self._intrinsics(xy)
         return torch.stack(self._warp(*xy.unbind(-1), slopes=False), -1) * focal + center
 
+    def linearised(self, xy: Tensor) -> tuple[Tensor, Tensor]:
+        """`distort` and `J_distort` at once."""
+        focal, center = self._intrinsics(xy)
+        u, v, j_xx, j_xy, j_yy = self._warp(*xy.unbind(-1))
+        jacobian = torch.stack([j_xx, j_xy, j_xy, j_yy], -1).unflatten(-1, (2, 2)) * focal[:, None]
+        return torch.stack([u, v], -1) * focal + center, jacobian
+
     def J_distort(self, xy: Tensor) -> Tensor:
         """Jacobian (..., 2, 2) of `distort`: d(u, v)/d(x, y), px per unit of normalised coordinates."""
         return torch.stack(self.slopes(*xy.unbind(-1)), -1).unflatten(-1, (2, 2))
@@ -270,13 +282,28 @@ class Camera:
         xy_distorted = (uv - center) / focal
         if not self.distorts:
             return xy_distorted
-        u, v = xy_distorted.unbind(-1)
+        x, y, *_ = self._undistorted(*xy_distorted.unbind(-1))
+        return torch.stack([x, y], -1)
+
+    def rays(self, uv: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor, Tensor]]:
+        """Undistorted x, y (...) of pixels (..., 2), see `undistort_points`, and `slopes` there, which cost nothing."""
+        focal, center = self._intrinsics(uv)
+        (fx, fy), (x, y) = focal, ((uv - center) / focal).unbind(-1)
+        if not self.distorts:
+            none = torch.zeros_like(x)
+            return x, y, (fx.expand_as(x), none, none, fy.expand_as(x))
+        x, y, j_xx, j_xy, j_yy = self._undistorted(x, y)
+        return x, y, (j_xx * fx, j_xy * fx, j_xy * fy, j_yy * fy)
+
+    def _undistorted(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Undistorted x, y of distorted ones, and xx, xy, yy of the Jacobian within a last step of there."""
         with torch.no_grad():
             x, y = self._invert(u.detach().contiguous(), v.detach().contiguous())
         # one more Newton step, differentiable: d(x, y) = J^-1 (d(u, v) - what the coefficients move)
         x_distorted, y_distorted, *jacobian = self._warp(x, y)
-        dx, dy = _newton_step(x_distorted - u, y_distorted - v, *(j.detach() for j in jacobian))
-        return torch.stack([x - dx, y - dy], -1)
+        j_xx, j_xy, j_yy = (j.detach() for j in jacobian)
+        dx, dy = _newton_step(x_distorted - u, y_distorted - v, j_xx, j_xy, j_yy)
+        return x - dx, y - dy, j_xx, j_xy, j_yy
 
     def _invert(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         """Undistorted x, y of distorted ones, to within the last step that `undistort_points` makes."""

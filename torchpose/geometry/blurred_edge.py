@@ -15,9 +15,8 @@ order, k^3 (X^2 Y^2 / 2 - Y^4 / 8), is counted there by its mean: of 12 px besid
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, Self, get_args
+from typing import Literal, NamedTuple, Protocol, Self, get_args
 
 import torch
 from jaxtyping import Float
@@ -119,9 +118,12 @@ class Spread(Rows):
         core = self.values[:, 0]
         return wanted.maximum(core / 4).minimum(4 * core).clamp(LEAST**2, MOST**2)
 
-    def at(self, row: Tensor, nu: Tensor, nv: Tensor) -> Callable[[Tensor, Tensor], Edge]:
-        """Edges, of distances and curvatures (..., K, P), under the blurs of rows (K,) where the normals are nu, nv."""
-        values = self.values[row].float()
+    def at(self, row: Tensor, nu: Tensor, nv: Tensor, dims: int = 1) -> Edges:
+        """Edges, of distances and curvatures (..., K, P), under the blurs of rows (K,) where the normals are nu, nv.
+
+        ``dims``: of P.
+        """
+        values = self.values.index_select(0, row).float().view(-1, *[1] * (dims - 1), BLUR)
         if self.kind == "gauss":
             return _Gauss(values, nu, nv)
         return _Line(values, nu, nv) if self.kind == "line" else _Disc(values)
@@ -151,28 +153,44 @@ class _Gauss:
         self.square = (1 - 2 * uv.square()) * _SQUARE
 
     def __call__(self, distance: Tensor, bend: Tensor) -> Edge:
-        half, bend2 = 0.5 * bend, bend.square()
-        variance = (self.across + bend2 * self.more).maximum(_LEAST_SHARE * self.across)
+        half, bend2 = 0.5 * bend, bend * bend
+        variance = torch.addcmul(self.across, bend2, self.more).maximum(_LEAST_SHARE * self.across)
         over2 = variance.reciprocal()
         over = over2.sqrt()
-        z = ((distance + half * self.along) * over).clamp(-_FAR, _FAR)
-        z2 = z.square()
-        density = torch.exp(-0.5 * z2) * (1 / math.sqrt(2 * math.pi))
+        z = (torch.addcmul(distance, half, self.along) * over).clamp_(-_FAR, _FAR)
+        z2 = z * z
+        density = torch.exp(z2 * -0.5) * (1 / math.sqrt(2 * math.pi))
         third = self.third * bend * over2 * over
-        fourth = (self.fourth * bend2 - self.square) * over2.square()
+        fourth = torch.addcmul(self.square, self.fourth, bend2, value=-1) * over2 * over2  # times -1
+        # Edgeworth's series by Hermite's polynomials; He5 = z He4 - 4 He3, He6 = z He5 - 5 He4
         he3, he4 = z * (z2 - 3), z2 * (z2 - 6) + 3
-        correction, change = third * (z2 - 1) - fourth * he3, fourth * he4 - third * he3
-        sixth = 0.5 * third.square()
-        correction = correction - sixth * (z * he4 - 4 * he3)
-        change = change + sixth * (z2 * he4 - 4 * z * he3 - 5 * he4)
-        step = 0.5 * torch.erfc(-z * math.sqrt(0.5)) + density * correction
-        slope = density * (1 + change) * over
+        he5 = torch.sub(z * he4, he3, alpha=4)
+        sixth = third * third * 0.5
+        correction = torch.addcmul(torch.addcmul(third * (z2 - 1), fourth, he3), sixth, he5, value=-1)
+        change = torch.addcmul(
+            torch.addcmul(fourth * he4, third, he3), sixth, torch.sub(z * he5, he4, alpha=5), value=-1
+        )  # times -1
+        step = torch.addcmul(0.5 * torch.erfc(z * -math.sqrt(0.5)), density, correction)
+        slope = torch.addcmul(density, density, change, value=-1) * over
         by_across = slope * z * over * -0.5
         by_along = half * slope
         # the variance along is the trace less that across
         change = by_across - by_along
-        by_blur = (change * self.uu + by_along, change * self.uv2, change * self.vv + by_along)
+        by_blur = (
+            torch.addcmul(by_along, change, self.uu),
+            change * self.uv2,
+            torch.addcmul(by_along, change, self.vv),
+        )
         return Edge(step, slope, by_blur)
+
+
+class Edges(Protocol):
+    """Edges, of distances and curvatures; ``across`` is the blur's variance across them, None where it is not kept."""
+
+    @property
+    def across(self) -> Tensor | None: ...
+
+    def __call__(self, distance: Tensor, bend: Tensor, /) -> Edge: ...
 
 
 class _Nodes(NamedTuple):
@@ -239,6 +257,8 @@ class _Averaged:
 class _Line:
     """A line of the vector m: displaced evenly from -m / 2 to m / 2."""
 
+    across: Tensor | None = None
+
     def __init__(self, values: Tensor, nu: Tensor, nv: Tensor) -> None:
         core, mu, mv = values.split(1, -1)
         self.nu, self.nv, self.along = nu, nv, nu * mv - nv * mu
@@ -256,6 +276,8 @@ class _Line:
 
 class _Disc:
     """A disc of a radius r: chords across the normal, of mean square (r^2 - x^2) / 3 along it."""
+
+    across: Tensor | None = None
 
     def __init__(self, values: Tensor) -> None:
         core, self.radius, _ = values.split(1, -1)

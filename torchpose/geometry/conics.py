@@ -33,19 +33,20 @@ def from_matrix(matrix: Matrix) -> Conic:
 
 def ellipse_from_conic(conic: Conic) -> Ellipse:
     """Ellipses of conic coefficients; NaN where the conic is no real ellipse."""
-    a, b, c, d, e, f = conic.unbind(-1)
-    disc = 4 * a * c - b * b
-    center_x, center_y = (b * e - 2 * c * d) / disc, (b * d - 2 * a * e) / disc
-    trace = a + c
-    side = trace.sign()  # of the inside; the conic is taken so that this is negative
-    level = (f + 0.5 * (d * center_x + e * center_y)) * -side  # less its value at the centre
+    # the sign of the inside; the conic is taken so that this is negative
+    a, b, c, d, e, f = (conic * (conic[..., :1] + conic[..., 2:3]).sign()).unbind(-1)
+    half, square = 2 * a, 2 * c
+    disc = half * square - b * b
+    center_x, center_y = (b * e - square * d) / disc, (b * d - half * e) / disc
+    level = -f - 0.5 * (d * center_x + e * center_y)  # less its value at the centre
     # the smaller eigenvalue as a quotient: mean - diff cancels for slender ellipses; rounding must not exchange a and b
-    large = 0.5 * (trace.abs() + torch.hypot(a - c, b))
+    large = 0.5 * (a + c + torch.hypot(a - c, b))
     small = torch.minimum(0.25 * disc / large, large)
-    theta = torch.remainder(0.5 * torch.atan2(b * -side, (c - a) * side), torch.pi)
+    theta = torch.remainder(0.5 * torch.atan2(-b, c - a), torch.pi)
     # remainder may round a tiny negative angle up to pi itself
     theta = theta.masked_fill(theta >= torch.pi, 0.0)
-    ellipse = torch.stack([center_x, center_y, (level / small).sqrt(), (level / large).sqrt(), theta], -1)
+    axes = (level / torch.stack([small, large])).sqrt()
+    ellipse = torch.stack([center_x, center_y, *axes, theta], -1)
     valid = (disc > 0) & (level > 0) & ((0 * ellipse).sum(-1) == 0)
     return ellipse.masked_fill(~valid[..., None], torch.nan)
 
@@ -80,9 +81,9 @@ def rescaled(ellipses: Float[Tensor, "*batch 5"], factor: float) -> Float[Tensor
 def shape_matrix(ellipse: Ellipse) -> Float[Tensor, "*N 2 2"]:
     """Symmetric S = R diag(a, b) R^T: the ellipse is centre + S (cos s, sin s). Smooth also at a circle."""
     _, _, a, b, theta = ellipse.unbind(-1)
-    mean, diff = 0.5 * (a + b), 0.5 * (a - b)
-    c, s = diff * (2 * theta).cos(), diff * (2 * theta).sin()
-    return torch.stack([mean + c, s, s, mean - c], -1).unflatten(-1, (2, 2))
+    twice, total, diff = 2 * theta, a + b, a - b
+    c, s = diff * twice.cos(), diff * twice.sin()
+    return torch.stack([total + c, s, s, total - c], -1).unflatten(-1, (2, 2)) * 0.5
 
 
 def points_on(ellipse: Ellipse, angle: Scalar) -> Float[Tensor, "*N 2"]:
@@ -158,9 +159,24 @@ def circle_image(rotation: Matrix, center: Vector, normal: Vector, radius: Scala
 def circle_ellipse(
     matrix: Float[Tensor, "3 3"], rotation: Matrix, center: Vector, normal: Vector, radius: Scalar
 ) -> Ellipse:
-    """Ellipses in px of circles seen by a pinhole of this matrix; the rest as for `circle_image`."""
-    to_ray = torch.linalg.inv(matrix)
-    return ellipse_from_conic(from_matrix(to_ray.mT @ circle_image(rotation, center, normal, radius) @ to_ray))
+    """Ellipses in px of circles seen by a pinhole of this matrix; the rest as for `circle_image`.
+
+    By their dual conics, r^2 (1 - n n') - c c' in space, about the image of the centre (derived). NaN where the circle
+    reaches behind the camera.
+    """
+    n = (rotation @ normal[..., None])[..., 0]
+    seen = center @ matrix.mT
+    at = seen[..., :2] / seen[..., 2:]
+    # from space to homogeneous pixels about the image of the centre: the centre itself comes to (0, 0, depth)
+    first, last = matrix[:2] - at[..., None] * matrix[2], matrix[2]
+    turned, ahead = (first @ n[..., None])[..., 0], (n * last).sum(-1, keepdim=True)
+    square = radius.square()[..., None]
+    whole = square * ((last * last).sum() - ahead.square()) - seen[..., 2:].square()  # below 0 in front of the camera
+    side = square * ((first @ last[:, None])[..., 0] - ahead * turned) / whole
+    outer = first @ first.mT - turned[..., :, None] * turned[..., None, :]
+    spread = side[..., :, None] * side[..., None, :] - (square / whole)[..., None] * outer
+    ellipse = torch.cat([at + side, axes_of(spread)], -1)
+    return torch.where(whole < 0, ellipse, torch.nan)
 
 
 def circle_poses(conic: Matrix, radius: Scalar) -> tuple[Float[Tensor, "*N 2 3"], Float[Tensor, "*N 2 3"]]:

@@ -21,12 +21,13 @@ def exp(rotation_vector: Tensor) -> Tensor:
     Sines and versines are divided through ``sinc``, so value and gradient hold at zero.
     """
     # a tiny constant keeps the gradient of the square root finite at zero without touching the value
-    angle = (rotation_vector.square().sum(-1) + torch.finfo(rotation_vector.dtype).tiny).sqrt()
-    a = torch.sinc(angle / torch.pi)[..., None, None]
-    b = 0.5 * torch.sinc(0.5 * angle / torch.pi).square()[..., None, None]
+    angle = (rotation_vector.square().sum(-1) + torch.finfo(rotation_vector.dtype).tiny).sqrt()[..., None, None]
+    half = torch.sinc(angle * (0.5 / torch.pi))
     k = skew(rotation_vector)
+    # sin(w) / w = cos(w / 2) sin(w / 2) / (w / 2), and the versine's quotient is half of the square of the latter
+    a = torch.cos(0.5 * angle) * half
     eye = torch.eye(3, dtype=rotation_vector.dtype, device=rotation_vector.device)
-    return eye + a * k + b * (k @ k)
+    return eye + a * k + (0.5 * half * half) * (k @ k)
 
 
 def quaternion(rotation: Tensor) -> Tensor:

@@ -25,7 +25,9 @@ class Rows:
     """Base of frozen dataclasses of tensors that share their first dimension; the first field has it for certain."""
 
     def __len__(self) -> int:
-        return len(getattr(self, _fields(type(self))[0][0]))  # type: ignore[arg-type]  # classes are hashable
+        first = getattr(self, _fields(type(self))[0][0])  # type: ignore[arg-type]  # classes are hashable
+        # torch's own length of a tensor takes ten times as long, and it is asked for some hundred times a frame
+        return first.shape[0] if isinstance(first, Tensor) else len(first)
 
     def __getitem__(self, index: Any) -> Self:
         """The rows selected by a mask, a slice or an index tensor."""
@@ -74,6 +76,10 @@ class Rows:
 
         return self._each(moved, with_shared=True)
 
+    def clone(self) -> Self:
+        """Copies of every tensor; outside of inference mode they are ordinary ones, whatever these are."""
+        return self._each(lambda value: value.clone(), with_shared=True)
+
     def cpu(self) -> Self:
         return self.to("cpu")
 
@@ -109,14 +115,14 @@ def _rows(index: Tensor, count: int) -> Tensor | None:
     if index.ndim != 1:
         return None
     if index.dtype == torch.bool:  # where it is True is asked once, not for every field
-        return positions(index) if len(index) == count else None
+        return positions(index) if index.shape[0] == count else None
     known = as_array(index) if index.dtype == torch.int64 else None
     return index if known is not None and (known.size == 0 or known.min() >= 0) else None
 
 
 def _all_of(rows: Tensor, count: int) -> bool:
     """Whether these are all of ``count`` rows in their order: of few frames every row is often right."""
-    known = as_array(rows) if len(rows) == count else None
+    known = as_array(rows) if rows.shape[0] == count else None
     return known is not None and bool((known == np.arange(count)).all())
 
 

@@ -2,10 +2,11 @@
 
 from torchpose.identify.alike import indistinguishable
 from torchpose.identify.boards import identify_boards
+from torchpose.identify.by_codes import by_codes
 from torchpose.identify.company import beside_another, in_company, named
 from torchpose.identify.copies import MIN_MARKERS
 from torchpose.identify.markers import Identified, identify
-from torchpose.identify.near import find_near
+from torchpose.identify.near import confirmed, find_near, outlines
 from torchpose.identify.scene import MarkerTable, Scene, drawn_radii
 from torchpose.identify.second_look import Views, look_again
 
@@ -16,6 +17,8 @@ __all__ = [
     "Scene",
     "Views",
     "beside_another",
+    "by_codes",
+    "confirmed",
     "drawn_radii",
     "find_near",
     "identify",
@@ -24,4 +27,5 @@ __all__ = [
     "indistinguishable",
     "look_again",
     "named",
+    "outlines",
 ]

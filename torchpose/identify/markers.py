@@ -112,7 +112,7 @@ def identify(rings: Rings, table: MarkerTable, camera: Camera, frames: int, inst
     return result
 
 
-def _gain(codes: Codes, told: Tensor, pose: Tensor, scale: Tensor) -> Tensor:
+def likely_gain(codes: Codes, told: Tensor, pose: Tensor, scale: Tensor) -> Tensor:
     """The likeliest edge gain (H,) under every pose, mm, by the codes of its rings.
 
     Args:
@@ -179,7 +179,7 @@ def _weighed(tried: Hypotheses, one: Assignments, table: MarkerTable, size: tupl
     per_marker = torch.full((len(tried.R) * markers,), torch.inf, dtype=cost.dtype, device=cost.device)
     per_marker.scatter_reduce_(0, slot, cost, "amin")
     chosen = (cost == per_marker[slot]) & cost.isfinite()
-    gain = _gain(codes, chosen & ~one.clipped[member], pose, table.gain_scale[one.target[tried.origin]])
+    gain = likely_gain(codes, chosen & ~one.clipped[member], pose, table.gain_scale[one.target[tried.origin]])
     per_marker = per_marker.view(-1, markers)
     found = per_marker.isfinite()
     count = found.sum(-1)

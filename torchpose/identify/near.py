@@ -2,11 +2,12 @@
 
 Edges are looked for within a few pixels, and targets move by more. So each marker is drawn as the last pose shows it,
 and found again by correlation within what it may have moved; the shifts of a target's markers correct its pose by one
-step. What is measured where the pose then puts the rings is named by its code as any ring is: a ring that is another
-one, or none, makes no pose.
+step. Where every marker has a ring of its place and code alone, nothing else need be asked; all others are named by
+their codes as any ring is.
 """
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -18,8 +19,11 @@ from torchpose.geometry.arguments import checked
 from torchpose.geometry.least_squares import solve_scaled
 from torchpose.geometry.projection import by_pose, image_by_point
 from torchpose.geometry.segments import segment_sum, values_at
+from torchpose.identify.by_codes import by_codes
+from torchpose.identify.markers import Identified
 from torchpose.identify.scene import Scene
-from torchpose.identify.second_look import predicted
+from torchpose.identify.second_look import near_place, predicted
+from torchpose.rings import Rings
 
 MOST_MOVE = 20.0  # px between two frames (convention): 0.1 m/s at 1 m, 50 frames/s and a 12 mm lens
 _AROUND = 1.25  # of the outer circle: the ground that belongs to its picture (convention)
@@ -27,45 +31,78 @@ _ACROSS = 3  # cells across the ring, or its hole, at which it is still told fro
 _TURN = 0.1  # rad between two frames, as a deviation: what shifts of centres hardly tell stays as it was (convention)
 
 
-class _Places(NamedTuple):
-    """P markers in view: row and number (P,), outer and inner ellipse (P, 2, 5) in pixels of the frame."""
+class Places(NamedTuple):
+    """P markers in view: row and number (P,), ellipses (P, 2, 5), outer and inner one, in pixels of the frame and in
+    ideal ones; under poses R (N, 3, 3), t (N, 3) of all rows."""
 
     row: Tensor
     marker: Tensor
     raw: Tensor
+    ideal: Tensor
+    R: Tensor
+    t: Tensor
 
 
 @checked
-def find_near(scene: Scene, R: Tensor, t: Tensor) -> tuple[Candidates, Tensor] | None:
-    """Outer circles where the markers must be, and the inner ellipses (M, 5); None where no pose is known.
+def find_near(scene: Scene, R: Tensor, t: Tensor) -> Places | None:
+    """Where the markers must be; None where no pose is known.
 
     Args:
         scene: a row for every frame and target.
         R: (N, 3, 3), the last pose of each row, NaN where it is not known.
         t: (N, 3), the same, mm.
     """
-    last = _places(scene, R, t)
+    last = _places(scene, R, t, rough=True)
     if last.row.numel() == 0:
         return None
     shift = _shifts(scene, last)
     if shift is None:
         return None
-    now = _places(scene, *_corrected(scene, R, t, last, shift))
-    polarity = scene.table.polarity[scene.target][now.row]
-    return Candidates.unscored(scene.frame[now.row], now.raw[:, 0], polarity), now.raw[:, 1]
+    return _places(scene, *_corrected(scene, R, t, last, shift))
 
 
-def _places(scene: Scene, R: Tensor, t: Tensor) -> _Places:
+@checked
+def outlines(scene: Scene, there: Places) -> tuple[Candidates, Tensor]:
+    """Places as candidates, and their inner ellipses (P, 5)."""
+    polarity = scene.table.polarity[scene.target][there.row]
+    return Candidates.unscored(scene.frame[there.row], there.raw[:, 0], polarity), there.raw[:, 1]
+
+
+@checked
+def confirmed(scene: Scene, there: Places, rings: Rings, of: Tensor) -> Identified | None:
+    """The rings by marker where every marker of every row has the one that lies in its place, None otherwise.
+
+    Args:
+        scene: a row for every frame and target.
+        there: where the markers must be.
+        rings: K, measured there.
+        of: (K,), the place of each.
+    """
+    named = by_codes(scene, rings)
+    if named is None:
+        return None
+    wanted = there.ideal[of, 0]
+    miss = torch.linalg.vector_norm(rings.outer.params[:, :2] - wanted[:, :2], dim=-1)
+    own = named.ring[there.row[of], there.marker[of]] == torch.arange(len(of), device=of.device)
+    if not bool((own & (miss < near_place(wanted))).all()):
+        return None
+    return replace(named, R=there.R, t=there.t)
+
+
+def _places(scene: Scene, R: Tensor, t: Tensor, *, rough: bool = False) -> Places:
+    """``rough``: circles have the shapes that a camera without distortion would see."""
     markers, camera = scene.table[scene.target], scene.camera
     row, marker = (markers.valid & t.isfinite().all(1)[:, None]).nonzero().unbind(-1)
-    _, raw, depth = predicted(markers, camera, R[row], t[row], (row, marker))
+    ideal, raw, depth = predicted(markers, camera, R[row], t[row], (row, marker), rough=rough)
     outer, limit = raw[:, 0], raw.new_tensor([camera.width - 1, camera.height - 1])
     seen = ((outer[:, :2] > 0) & (outer[:, :2] < limit)).all(-1) & (outer[:, 2] < limit.amin()) & (depth > 0)
     seen &= raw.isfinite().flatten(1).all(1)
-    return _Places(row[seen], marker[seen], raw[seen])
+    if bool(seen.all()):
+        return Places(row, marker, raw, ideal, R, t)
+    return Places(row[seen], marker[seen], raw[seen], ideal[seen], R, t)
 
 
-def _shifts(scene: Scene, at: _Places) -> Tensor | None:
+def _shifts(scene: Scene, at: Places) -> Tensor | None:
     """By how many px (P, 2) each marker has moved; None where the frame is too small to look so far."""
     frames = scene.frames
     height, width = frames.shape[-2:]
@@ -82,9 +119,10 @@ def _shifts(scene: Scene, at: _Places) -> Tensor | None:
     windows = values_at(frames, first[:, None, None] + along[:, None] * width + along)
     cells = torch.nn.functional.avg_pool2d(windows[None].nan_to_num(nan=0.0), cell)
     drawn = _drawn(at.raw, cell, reach) * scene.table.polarity[scene.target][at.row][:, None, None]
-    score = torch.nn.functional.conv2d(cells, drawn.to(cells)[:, None], groups=len(drawn))[0]
+    size, count = cells.shape[-2:], cells.shape[-1] - drawn.shape[-1] + 1
+    here, wanted = (torch.fft.rfft2(part, s=size) for part in (cells[0], drawn.to(cells)))
+    score = torch.fft.irfft2(here * wanted.conj(), s=size)[:, :count, :count]  # further shifts go round the edges
     best = score.flatten(1).argmax(1)
-    count = score.shape[-1]
     found = torch.stack([best % count, best // count], -1)
     return corner + (found + reach) * cell + 0.5 * (cell - 1) - outer[:, :2]
 
@@ -94,7 +132,8 @@ def _drawn(raw: Tensor, cell: int, reach: int) -> Tensor:
     along = torch.arange(-reach, reach + 1, dtype=raw.dtype, device=raw.device) * cell
     xy = torch.stack(torch.meshgrid(along, along, indexing="xy")).flatten(1)
     offset = (raw[:, :, :2] - raw[:, :1, :2])[..., None]
-    rho = torch.linalg.vector_norm(torch.linalg.inv(conics.shape_matrix(raw)) @ (xy - offset), dim=2)  # (P, 2, k k)
+    u, v = (torch.linalg.inv(conics.shape_matrix(raw)) @ (xy - offset)).unbind(2)  # (P, 2, k k)
+    rho = torch.addcmul(u * u, v, v).sqrt_()
     # cells on a rim belong to both sides
     steep = raw[:, :, 3:4] / cell
     inside, hole = ((1 - rho) * steep + 0.5).clamp(0, 1).unbind(1)
@@ -104,7 +143,7 @@ def _drawn(raw: Tensor, cell: int, reach: int) -> Tensor:
     return share.sum(1).unflatten(1, (2 * reach + 1, -1))
 
 
-def _corrected(scene: Scene, R: Tensor, t: Tensor, at: _Places, shift: Tensor) -> tuple[Tensor, Tensor]:
+def _corrected(scene: Scene, R: Tensor, t: Tensor, at: Places, shift: Tensor) -> tuple[Tensor, Tensor]:
     """The poses after one step to where their markers have moved."""
     row, focal = at.row, scene.camera.matrix.diagonal()[:2]
     arm = (R[row] @ scene.table.centers[scene.target[row], at.marker][..., None]).squeeze(-1)

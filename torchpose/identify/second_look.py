@@ -77,7 +77,7 @@ def look_again(
     clipping = _clipping(rings, identified.ring, scene)[row]
     codes = Codes.of(found, Marks.of(scene.table, scene.target[row], marker))
     off = codes.under(torch.where(found.clipped, clipping, identified.gain[row]))
-    good = (miss < _near(measured)) & (off < 1)
+    good = (miss < near_place(measured)) & (off < 1)
     # of several poses of a row, the one that was nearest
     slot = row * identified.ring.shape[1] + marker
     nearest = torch.full((identified.ring.numel(),), torch.inf, dtype=miss.dtype, device=miss.device)
@@ -113,14 +113,14 @@ def _occupied(scene: Scene, there: _Missing, rings: Rings) -> Tensor:
     if len(rings) == 0 or there.row.numel() == 0:
         return none
     frame, outer = scene.frame[there.row], rings.outer.params
-    i, j = near_pairs(there.ideal[:, :2], outer[:, :2], _near(there.ideal), (frame, rings.frame))
+    i, j = near_pairs(there.ideal[:, :2], outer[:, :2], near_place(there.ideal), (frame, rings.frame))
     size = outer[j, 2] / there.ideal[i, 2]
     alike = (size < SIZE_TOLERANCE) & (size > 1 / SIZE_TOLERANCE)
     alike &= rings.polarity[j] == scene.table.polarity[scene.target][there.row[i]]
     return none.index_fill(0, i[alike], True)
 
 
-def _near(ellipse: Tensor) -> Tensor:
+def near_place(ellipse: Tensor) -> Tensor:
     """px, how far from their places rings (K, 5) may be: half of what is allowed for a pose that is guessed."""
     px, of_size, _ = PLACE_TOLERANCE
     return 0.5 * (px + of_size * ellipse[:, 2])
@@ -143,11 +143,23 @@ def _clipping(rings: Rings, ring: Tensor, scene: Scene) -> Tensor:
 
 
 def predicted(
-    markers: MarkerTable, camera: Camera, R: Tensor, t: Tensor, at: tuple[Tensor, Tensor]
+    markers: MarkerTable, camera: Camera, R: Tensor, t: Tensor, at: tuple[Tensor, Tensor], *, rough: bool = False
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Ellipses (P, 2, 5) of both circles, ideal and raw pixels, and depths (P,), of markers ``at`` (row, number)."""
+    """Ellipses (P, 2, 5) of both circles, ideal and raw pixels, and depths (P,), of markers ``at`` (row, number).
+
+    ``rough``: the raw ones are the ideal ones moved to where the lens has their centres.
+    """
     center, k = (R @ markers.centers[at][..., None]).squeeze(-1) + t, camera.matrix
     normal = markers.normals[at][:, None]
     ideal = conics.circle_ellipse(k, R[:, None], center[:, None], normal, markers.radii[at])
-    raw = mapped(ideal.flatten(0, 1), lambda points: camera.distort((points - k[:2, 2]) / k.diagonal()[:2]))
-    return ideal, raw.view_as(ideal), center[:, 2]
+
+    def seen(points: Tensor) -> Tensor:
+        return camera.distort((points - k[:2, 2]) / k.diagonal()[:2])
+
+    if not camera.distorts:
+        raw = ideal
+    elif rough:
+        raw = torch.cat([seen(ideal[..., :2]), ideal[..., 2:]], -1)
+    else:
+        raw = mapped(ideal.flatten(0, 1), seen).view_as(ideal)
+    return ideal, raw, center[:, 2]

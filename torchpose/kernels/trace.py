@@ -34,7 +34,6 @@ def trace(
     Raises:
         NotImplementedError: the function looks at numbers, or does what no lines here are for.
     """
-    examples = [torch.empty((*layout.shape, 1), dtype=layout.dtype) for layout in inputs]
     structures: list[TreeSpec | None] = []
 
     def flat(*tensors: Tensor) -> list[Tensor]:
@@ -44,6 +43,7 @@ def trace(
         return leaves
 
     with torch.inference_mode(False), torch.no_grad():
+        examples = [torch.empty((*layout.shape, 1), dtype=layout.dtype) for layout in inputs]
         whole = torch.func.functionalize(flat, remove="mutations")
         try:
             graph = make_fx(whole, decomposition_table=_DECOMPOSED, tracing_mode="fake")(*examples)

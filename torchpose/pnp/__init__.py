@@ -3,14 +3,17 @@
 from torchpose.pnp.candidates import Candidates
 from torchpose.pnp.dlt import dlt
 from torchpose.pnp.epnp import epnp
+from torchpose.pnp.few import MOST as FEW
 from torchpose.pnp.lines import lines
 from torchpose.pnp.p3p import p3p
+from torchpose.pnp.pairs import pair_minima
 from torchpose.pnp.planar import planar
 from torchpose.pnp.posit import posit
 from torchpose.pnp.result import PnPCode, PnPError, PnPResult
 from torchpose.pnp.solve import Method, solve
 
 __all__ = [
+    "FEW",
     "Candidates",
     "Method",
     "PnPCode",
@@ -20,6 +23,7 @@ __all__ = [
     "epnp",
     "lines",
     "p3p",
+    "pair_minima",
     "planar",
     "posit",
     "solve",

@@ -45,11 +45,20 @@ class Few(NamedTuple):
 
     def normal(self, pose: Tensor, *, newton: bool) -> Tensor:
         """`normal_equations` (28, K) at poses (3, 4, K)."""
-        pose = pose.permute(2, 0, 1)
-        x = torch.bmm(self.points, pose.mT)
-        z = x[..., 2:]
-        uv = x[..., :2] / z
-        seen = (self.root * uv[:, :, None]).sum(-1)
+        whole, ahead = self.whole(pose.permute(2, 0, 1), newton=newton)
+        packed = whole.flatten(1).index_select(1, _triangle(whole.device)).mT
+        packed[27] = torch.where(ahead, packed[27], torch.inf)
+        return packed
+
+    def seen(self, pose: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Depths (K, N, 1) under poses (K, 3, 4), image points (K, N, 2), and these whitened."""
+        uv, z = torch.bmm(self.points, pose.mT).split([2, 1], -1)
+        uv = uv / z
+        return z, uv, (self.root * uv[:, :, None]).sum(-1)
+
+    def whole(self, pose: Tensor, *, newton: bool) -> tuple[Tensor, Tensor]:
+        """[J r]^T [J r] (K, 7, 7) at poses (K, 3, 4), and whether all points lie in front (K,)."""
+        z, _, seen = self.seen(pose)
         slope = torch.cat([self.root, -seen[..., None]], -1) / z[..., None]
         moved = torch.bmm(slope.flatten(1, 2), pose[..., :3])  # by a translation along the object's axes
         residual = (seen - self.aimed).flatten(1)[..., None]
@@ -57,9 +66,7 @@ class Few(NamedTuple):
         whole = torch.bmm(rows.mT, rows)
         if newton:
             whole[:, :6, :6] += self._bent(pose, z, rows[..., :6] * residual)
-        packed = whole.flatten(1).index_select(1, _triangle(whole.device)).mT
-        packed[27] = torch.where(z.amin((1, 2)) > 0, packed[27], torch.inf)
-        return packed
+        return whole, z.amin((1, 2)) > 0
 
     def _bent(self, pose: Tensor, z: Tensor, gradient: Tensor) -> Tensor:
         """What second derivatives times residuals add (K, 6, 6): of u along two motions -(du dz' + du' dz) / z, and of
@@ -71,6 +78,16 @@ class Few(NamedTuple):
         outer = torch.bmm(points.mT, gradient[..., :3]).flatten(1) @ _of_turns(z.device, z.dtype)
         half = outer.unflatten(1, (6, 6)) - torch.bmm(gradient.mT, depth)
         return half + half.mT
+
+
+def stepped(pose: Tensor, step: Tensor) -> Tensor:
+    """Poses (K, 3, 4) after steps (K, 6), see `normal_equations.moved`."""
+    half = torch.nn.functional.pad(0.5 * step[:, 3:], (1, 0), value=1.0)  # the quaternion of Cayley's rotation
+    turn = (half[:, :, None] * half[:, None]).flatten(1) @ _of_quaternion(step.device, step.dtype).mT
+    turn = (turn[:, :9] / turn[:, 9:]).view(-1, 3, 3)
+    result = torch.bmm(pose[..., :3], torch.cat([turn, step[:, :3, None]], -1))
+    result[..., 3] += pose[..., 3]
+    return result
 
 
 def moved_few(pose: Tensor, step: Tensor) -> Tensor:

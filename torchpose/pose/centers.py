@@ -83,5 +83,8 @@ def raw_centers(camera: Camera, ideal: Tensor, covariance: Tensor) -> tuple[Tens
     k = camera.matrix
     focal = k.diagonal()[:2]
     xy = (ideal - k[:2, 2]) / focal
-    jacobian = camera.J_distort(xy) / focal
-    return camera.distort(xy), jacobian @ covariance @ jacobian.mT
+    if not camera.distorts:
+        return ideal, covariance
+    at, jacobian = camera.linearised(xy)
+    jacobian = jacobian / focal
+    return at, jacobian @ covariance @ jacobian.mT

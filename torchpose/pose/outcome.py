@@ -15,6 +15,23 @@ from torchpose.pose.solutions import Solutions
 from torchpose.results import Detections, Misfit, Poses, Reason, Status
 from torchpose.rings import Rings
 
+# fields of `Solutions` that `Poses` has of every row
+_OF_SOLUTIONS = (
+    "R",
+    "t",
+    "covariance",
+    "noise",
+    "systematic",
+    "place",
+    "residual_chi2",
+    "rms",
+    "chi2",
+    "R_alt",
+    "t_alt",
+    "rms_alt",
+    "chi2_alt",
+)
+
 
 class Found(NamedTuple):
     """What the stages found in a scene of N rows: rings of all frames, which markers they are, and what these tell.
@@ -47,26 +64,15 @@ def outcome(scene: Scene, found: Found) -> Poses:
     few = ~awarded & (proposed < MIN_MARKERS)
     few_status = torch.where(proposed == 0, int(Status.NO_TARGET), int(Status.TOO_FEW_MARKERS))
 
+    whole = bool(awarded.all())  # each has a solution then
+
     def spread(values: Tensor) -> Tensor:
+        if whole:
+            return values
         out = torch.full((rows, *values.shape[1:]), torch.nan, dtype=values.dtype, device=device)
         kept = awarded.view(-1, *[1] * (values.ndim - 1))
         return torch.where(kept, out.index_copy(0, solvable, values), torch.nan)
 
-    names = (
-        "R",
-        "t",
-        "covariance",
-        "noise",
-        "systematic",
-        "place",
-        "residual_chi2",
-        "rms",
-        "chi2",
-        "R_alt",
-        "t_alt",
-        "rms_alt",
-        "chi2_alt",
-    )
     # no row is sure of its pose without a covariance that is one
     unknown = (status == Status.OK) & ~_positive(spread(solutions.covariance))
     status = torch.where(unknown, int(Status.REJECTED), status)
@@ -87,7 +93,7 @@ def outcome(scene: Scene, found: Found) -> Poses:
         },
         detections=detections_of(scene, found, mask),
         of_camera=found.evidence.of_camera,
-        **{name: spread(getattr(solutions, name)) for name in names},
+        **{name: spread(getattr(solutions, name)) for name in _OF_SOLUTIONS},
     )
     return every if rows == scene.groups else _numbered(scene, every, awarded)
 

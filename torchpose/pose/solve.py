@@ -6,6 +6,8 @@ centres by their covariances, and the shapes of the rings' own ellipses, which d
 seen.
 """
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -22,7 +24,9 @@ _ITERATIONS = 60  # of the solver, at most: rows that have converged rest
 
 
 @checked
-def solve_poses(evidence: Evidence, rough: tuple[Tensor, Tensor], *, compile: bool = False) -> Solutions:
+def solve_poses(
+    evidence: Evidence, rough: tuple[Tensor, Tensor], *, near: bool = False, compile: bool = False
+) -> Solutions:
     """Pose, alternative, covariance and status of N rows with three markers or more.
 
     A row whose centres contradict each other is solved again without each of its markers in turn; if one of these fits,
@@ -31,16 +35,18 @@ def solve_poses(evidence: Evidence, rough: tuple[Tensor, Tensor], *, compile: bo
     Args:
         evidence: N rows.
         rough: R (N, 3, 3), t (N, 3) to start from.
+        near: the rough poses are within pixels of the true ones: none is sought without them.
         compile: as for `pnp.solve`.
     """
     if len(evidence) == 0:
         return _no_solutions(evidence, *rough)
-    solved = _solve(evidence, rough, compile)
+    solved = _solve(evidence, _starts(evidence, rough, near), compile)
     bad = (solved.status == Status.REJECTED) & (evidence.mask.sum(-1) >= 4)
     row, marker = (bad[:, None] & evidence.mask).nonzero().unbind(-1)
     if row.numel() == 0:
         return solved
-    retry = _solve(evidence[row].without(marker), (rough[0][row], rough[1][row]), compile)
+    rest = evidence[row].without(marker)
+    retry = _solve(rest, _starts(rest, (rough[0][row], rough[1][row]), near), compile)
     # of the subsets that fit, the one with the least chi-squared
     cost = torch.where(retry.status == Status.REJECTED, torch.inf, retry.chi2.nan_to_num(nan=torch.inf))
     least = torch.full(bad.shape, torch.inf, dtype=cost.dtype, device=cost.device).scatter_reduce(0, row, cost, "amin")
@@ -48,25 +54,17 @@ def solve_poses(evidence: Evidence, rough: tuple[Tensor, Tensor], *, compile: bo
     return solved.replaced(row[winner], retry[winner])
 
 
-def _solve(evidence: Evidence, rough: tuple[Tensor, Tensor], compile: bool) -> Solutions:
-    result = pnp.solve(
-        evidence.points,
-        torch.where(evidence.mask[..., None], evidence.center, 0.0),
-        evidence.matrix,
-        covariances=visible(evidence.covariance + evidence.placed, evidence.mask),
-        mask=evidence.mask,
-        initial=_starts(evidence, rough),
-        max_iterations=_ITERATIONS,
-        compile=compile,
-    )
+def _solve(evidence: Evidence, starts: tuple[Tensor, Tensor], compile: bool) -> Solutions:
+    R, t, rms, of_centers, behind, degenerate = _minima(evidence, starts, compile)
     # both minima of the centres, weighed again with the rings' shapes
-    R, t = torch.stack([result.R, result.R_alt], 1), torch.stack([result.t, result.t_alt], 1)
-    rms, of_centers = torch.stack([result.rms, result.rms_alt], 1), torch.stack([result.chi2, result.chi2_alt], 1)
     circles = predicted_circles(evidence, R, t)
     of_shapes = misfit_of_shapes(evidence, circles)
     chi2, best = (of_centers + of_shapes).nan_to_num(nan=torch.inf).sort(1)  # NaN: no such minimum
     row = torch.arange(len(best), device=best.device)[:, None]
     R, t, rms, of_centers, of_shapes = (x[row, best] for x in (R, t, rms, of_centers, of_shapes))
+    # shapes that contradict the better pose as well tell less by as much
+    over = (of_shapes[:, 0] / (4 * evidence.mask.sum(-1))).clamp_min(1.0)
+    ahead = of_centers[:, 1] - of_centers[:, 0] + (of_shapes[:, 1] - of_shapes[:, 0]) / over
     shift, larger = sizes_beyond(evidence, circles[row[:, 0], best[:, 0]])
     covariance, determined = pose_covariance(evidence, R[:, 0], t[:, 0])
     chi2_alt = torch.where(chi2[:, 1].isfinite(), chi2[:, 1], torch.nan)
@@ -77,13 +75,13 @@ def _solve(evidence: Evidence, rough: tuple[Tensor, Tensor], compile: bool) -> S
     solvable = chi2[:, 0].isfinite()
     reason = torch.full_like(seen, Reason.NONE)
     for condition, why in (
-        (chi2_alt - chi2[:, 0] < AMBIGUOUS_CHI2, Reason.TWO_SOLUTIONS),
+        (ahead < AMBIGUOUS_CHI2, Reason.TWO_SOLUTIONS),
         (of_shapes[:, 0] > CUT**2 * 4 * seen, Reason.RING_SHAPE),
         (contradicts, Reason.RESIDUAL),
         (_from_behind(evidence, R[:, 0], t[:, 0]), Reason.MIRRORED),
         (~solvable, Reason.NOT_CONVERGED),
-        (result.code == pnp.PnPCode.BEHIND_CAMERA, Reason.BEHIND_CAMERA),
-        ((result.code == pnp.PnPCode.DEGENERATE) | (solvable & ~determined), Reason.DEGENERATE),
+        (behind, Reason.BEHIND_CAMERA),
+        (degenerate | (solvable & ~determined), Reason.DEGENERATE),
     ):
         reason = torch.where(condition, int(why), reason)  # the last that holds
     status = torch.where(reason == Reason.NONE, int(Status.OK), int(Status.REJECTED))
@@ -95,6 +93,37 @@ def _solve(evidence: Evidence, rough: tuple[Tensor, Tensor], compile: bool) -> S
     unasked = torch.full_like(chi2[:, 0], torch.nan)
     rest = (evidence.mask, one[1].new_zeros(*evidence.mask.shape, PLACE), none, unasked, none, larger)
     return Solutions(one[0], one[1], *parts, one[2], chi2[:, 0], *two, chi2_alt, status, reason, *rest)
+
+
+class _Minima(NamedTuple):
+    """Of the centres alone: as `pnp.pairs.Pairs`, and which rows (N,) have no problem that makes sense."""
+
+    R: Tensor
+    t: Tensor
+    rms: Tensor
+    chi2: Tensor
+    behind: Tensor
+    degenerate: Tensor
+
+
+def _minima(evidence: Evidence, starts: tuple[Tensor, Tensor], compile: bool) -> _Minima:
+    given = (evidence.points, torch.where(evidence.mask[..., None], evidence.center, 0.0), evidence.matrix)
+    covariances = visible(evidence.covariance + evidence.placed, evidence.mask)
+    if not compile and 2 * len(evidence) <= pnp.FEW:
+        found = pnp.pair_minima(*given, covariances, evidence.mask, starts, _ITERATIONS)
+        return _Minima(*found, ~starts[0].isfinite().flatten(1).all(1))
+    result = pnp.solve(
+        *given,
+        covariances=covariances,
+        mask=evidence.mask,
+        initial=starts,
+        max_iterations=_ITERATIONS,
+        compile=compile,
+    )
+    R, t = torch.stack([result.R, result.R_alt], 1), torch.stack([result.t, result.t_alt], 1)
+    rms, chi2 = torch.stack([result.rms, result.rms_alt], 1), torch.stack([result.chi2, result.chi2_alt], 1)
+    behind, degenerate = (result.code == code for code in (pnp.PnPCode.BEHIND_CAMERA, pnp.PnPCode.DEGENERATE))
+    return _Minima(R, t, rms, chi2, behind, degenerate)
 
 
 def _from_behind(evidence: Evidence, R: Tensor, t: Tensor) -> Tensor:
@@ -112,8 +141,11 @@ def _no_solutions(evidence: Evidence, R: Tensor, t: Tensor) -> Solutions:
     return Solutions(R, t, *parts, one, one, R, t, one, one, code, code, *rest)
 
 
-def _starts(evidence: Evidence, rough: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """Two poses (N, 2, 3, 3), (N, 2, 3) to start from: both planar solutions, or the rough pose and its mirror."""
+def _starts(evidence: Evidence, rough: tuple[Tensor, Tensor], near: bool = False) -> tuple[Tensor, Tensor]:
+    """Two poses (N, 2, 3, 3), (N, 2, 3) to start from: both planar solutions, or the rough pose and its mirror.
+
+    ``near``: the latter for all rows.
+    """
     R, t = rough
     # depth mirrored along the line of sight, the plane turned back on itself: the same weak-perspective image
     weight = evidence.mask.double() / evidence.mask.sum(-1, keepdim=True)
@@ -123,13 +155,16 @@ def _starts(evidence: Evidence, rough: tuple[Tensor, Tensor]) -> tuple[Tensor, T
     normal = evidence.normals[torch.arange(first.numel(), device=first.device), first]
     mirrored = _reflection(at) @ R @ _reflection(normal)
     mirrored_t = at - (mirrored @ middle[..., None]).squeeze(-1)
+    given = torch.stack([R, mirrored], 1), torch.stack([t, mirrored_t], 1)
+    if near:
+        return given
     focal, principal = evidence.matrix.diagonal()[:2], evidence.matrix[:2, 2]
     xy = torch.where(evidence.mask[..., None], (evidence.center - principal) / focal, 0.0)
     flat = pnp.planar(evidence.points, xy, mask=evidence.mask)
     both = flat.R.isfinite().all(-1).all(-1).all(-1)  # else a marker behind the camera, or no plane
     planar = (evidence.coplanar & (evidence.mask.sum(-1) >= 4) & both)[:, None]
-    start_r = torch.where(planar[..., None, None], flat.R, torch.stack([R, mirrored], 1))
-    start_t = torch.where(planar[..., None], flat.t, torch.stack([t, mirrored_t], 1))
+    start_r = torch.where(planar[..., None, None], flat.R, given[0])
+    start_t = torch.where(planar[..., None], flat.t, given[1])
     return start_r, start_t
 
 

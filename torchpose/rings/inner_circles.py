@@ -48,7 +48,9 @@ class InnerCircles(Rows):
     clipped: Bool[Tensor, " M"]
 
 
-def find_inner(frames: Tensor, candidates: Candidates, camera: Camera | None = None) -> InnerCircles:
+def find_inner(
+    frames: Tensor, candidates: Candidates, camera: Camera | None = None, known: Tensor | None = None
+) -> InnerCircles:
     """The circle inside each candidate, from the mean radial profile of grey.
 
     The profile is taken along radii scaled by the candidate's own ellipse, so it averages over the whole ring: an inner
@@ -59,13 +61,14 @@ def find_inner(frames: Tensor, candidates: Candidates, camera: Camera | None = N
 
     Args:
         camera: for d; without one the centres are taken to coincide.
+        known: (M, 5), the inner circles, about, where they are known.
     """
     height, width = frames.shape[-2:]
     device = frames.device
     rho = torch.linspace(_INNERMOST, _OUTERMOST, _RADII, dtype=torch.float64, device=device)
     angle = sectors.middles(device)
     circle = torch.stack([angle.cos(), angle.sin()])
-    own, apart = _planes(candidates, camera)
+    own, apart = _planes(candidates, camera) if known is None else _plane(candidates, known)
     outer = candidates.ellipse[own]
     shape = conics.shape_matrix(outer)
     shift = (1 - rho.square()).clamp_min(0) * apart[..., None]  # (P, 2, R)
@@ -78,6 +81,10 @@ def find_inner(frames: Tensor, candidates: Candidates, camera: Camera | None = N
     far = int((at <= RATIO_RANGE[1]).sum())
     edge = ((grey[:, far + 2 :] - grey[:, far:-2]) * polarity[:, None, None].float()).amax(1)
     seen = edge > 0.5 * edge.nanmedian(-1, keepdim=True).values
+    if known is not None:
+        ratio = _ratio(known, outer)
+        blur, some = _edge_blur(grey, seen, outer, ratio, at), torch.ones_like(candidates.frame, dtype=torch.bool)
+        return InnerCircles(ratio, some, known, seen, blur, _clipped(grey, seen, candidates.frame))
     profile = _mean_profile(grey, seen, frames.is_floating_point())
     rise = (profile[:, 2:] - profile[:, :-2]) * polarity[:, None]
     outermost = rise.masked_fill(at < RATIO_RANGE[1], -torch.inf).amax(-1)
@@ -145,6 +152,18 @@ def _mean_profile(grey: Tensor, seen: Tensor, gaps: bool) -> Tensor:
     if gaps:
         return torch.where(seen[:, None], grey, torch.nan).nanmean(-1).double()
     return (grey @ seen[..., None].float()).squeeze(-1).double() / seen.sum(-1, keepdim=True)
+
+
+def _ratio(inner: Tensor, outer: Tensor) -> Tensor:
+    """(M,), of the radii."""
+    return (inner[:, 2:4].prod(-1) / outer[:, 2:4].prod(-1)).sqrt()
+
+
+def _plane(candidates: Candidates, known: Tensor) -> tuple[Tensor, Tensor]:
+    """As `_planes`, one for each candidate, by its inner circle (M, 5)."""
+    outer = candidates.ellipse
+    apart = (known[:, :2] - outer[:, :2]) / (1 - _ratio(known, outer).square())[:, None]
+    return torch.arange(len(outer), device=outer.device), apart
 
 
 def _planes(candidates: Candidates, camera: Camera | None) -> tuple[Tensor, Tensor]:

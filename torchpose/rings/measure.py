@@ -157,7 +157,7 @@ def measure_predicted(
     frames: Tensor, candidates: Candidates, inner: Tensor, camera: Camera, *, correct: bool = True
 ) -> tuple[Rings, Tensor]:
     """The same where the inner ellipses (M, 5) are known, about; also which candidate each ring is of, (K,) int64."""
-    inside = replace(find_inner(frames, candidates, camera), ellipse=inner)
+    inside = find_inner(frames, candidates, camera, inner)
     return _both(frames, Circles(candidates, inside), camera, correct)
 
 
@@ -178,6 +178,8 @@ def measure_exactly(frames: Tensor, rings: Rings, camera: Camera) -> tuple[Rings
         return rings, rings.frame
     # a ring that reads its own blur too narrow is told by those beside it
     own = blurs.axes(rings.blur)[1].sqrt()
+    if not bool((own.max() > BLURRED * rings.inner_raw[:, 3]).any()):
+        return rings, torch.arange(len(rings), device=own.device)
     usual = segment_mean(own, rings.frame, int(rings.frame.max()) + 1)[rings.frame]
     blurred = own.maximum(usual) > BLURRED * rings.inner_raw[:, 3]
     left, index = (part.nonzero()[:, 0] for part in (~blurred, blurred))
@@ -185,7 +187,7 @@ def measure_exactly(frames: Tensor, rings: Rings, camera: Camera) -> tuple[Rings
     if len(some) == 0:
         return rings, left
     candidates = Candidates.unscored(some.frame, some.outer_raw, some.polarity)
-    inside = replace(find_inner(frames, candidates, camera), ellipse=some.inner_raw, blur=some.blur)
+    inside = replace(find_inner(frames, candidates, camera, some.inner_raw), blur=some.blur)
     again, of = _measured(frames, Circles(candidates, inside), camera, _How(correct=True, begun=True))
     return Rings.cat([rings[left], again]), torch.cat([left, index[of]])
 

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from torchpose.errors import ArgumentError
 from torchpose.geometry import blur as blurs
-from torchpose.geometry.arguments import checked, expect_index
+from torchpose.geometry.arguments import checked, expect_index, unasked
 from torchpose.geometry.least_squares import solve_scaled
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import segment_sum, values_at
@@ -68,6 +68,11 @@ def kernels(size: int = MASK, orders: tuple[tuple[int, int], ...] = ORDERS) -> T
     """
     if size < 3 or size % 2 == 0:
         raise ValueError(f"Zernike mask size must be odd and at least 3, not {size}")
+    with torch.inference_mode(False):  # kept, and used where gradients are wanted
+        return _kernels(size, orders)
+
+
+def _kernels(size: int, orders: tuple[tuple[int, int], ...]) -> Tensor:
     n = size * _SUBSAMPLES
     axis = (torch.arange(n, dtype=torch.float64) + 0.5) * (2.0 / n) - 1.0
     y, x = axis[:, None], axis[None, :]
@@ -146,7 +151,7 @@ def moments_at(
 def _expect_inside(frames: Tensor, frame: Tensor, pixels: Tensor, half: int) -> None:
     """Raises ArgumentError where a window leaves its frame: it would hold pixels of the next line or frame."""
     expect_index("frame", frame, len(frames))
-    if pixels.numel():
+    if pixels.numel() and not unasked():
         low, high = pixels.aminmax(dim=0)
         size = torch.tensor([frames.shape[-1], frames.shape[-2]], device=pixels.device)
         if bool((low < half).any() | (high >= size - half).any()):

@@ -41,7 +41,6 @@ from torchpose.geometry.segments import marked, segment_mean, segment_sum
 from torchpose.pose import MarkerNormals
 from torchpose.refine.photometric.band import band_width
 from torchpose.refine.photometric.grey_levels import (
-    TILE,
     columns_of,
     first_levels,
     inliers,
@@ -378,8 +377,8 @@ class _Fit:
 
     def __init__(self, sight: Sight, band: Tensor, prior: PosePrior | None, most_coarse: int | None = None) -> None:
         self.mask, self.band, self.by = sight.mask, band, sight.reduction
-        self.blocks = gather_pixels(sight, band, TILE)
-        self.coarse = self.blocks.every(_COARSE, most_coarse, whole=TILE)
+        self.blocks = gather_pixels(sight, band)
+        self.coarse = self.blocks.every(_COARSE, most_coarse)
         self.focal = sight.camera.matrix.diagonal()[:2]
         self.prior = prior
         self.gain = prior is not None and prior.more
@@ -402,7 +401,7 @@ class _Fit:
         )
         blocks = self.blocks[number[self.blocks.row] >= 0]
         fit.blocks = replace(blocks, row=number[blocks.row])
-        fit.coarse = fit.blocks.every(_COARSE, whole=TILE)
+        fit.coarse = fit.blocks.every(_COARSE)
         fit.prior = None if self.prior is None else self.prior[rows]
         fit.mask, fit.band, fit.variance, fit.least = (
             x[rows] for x in (self.mask, self.band, self.variance, self.least)

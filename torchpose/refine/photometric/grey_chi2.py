@@ -9,7 +9,6 @@ from torchpose.geometry.robust import CUT
 from torchpose.geometry.segments import segment_sum
 from torchpose.refine.photometric.band import band_width
 from torchpose.refine.photometric.grey_levels import (
-    TILE,
     columns_of,
     first_levels,
     inliers,
@@ -38,7 +37,7 @@ def grey_chi2(sight: Sight, one: Refined, two: Refined) -> tuple[Tensor, Tensor,
     rows = len(sight.frame)
     spreads = [Spread(pose.spread) for pose in (one, two)]
     band = torch.maximum(*(band_width(spread) for spread in spreads))
-    blocks = gather_pixels(sight, band, TILE)
+    blocks = gather_pixels(sight, band)
     squares, weights, variances, misfits, there, explained = [], [], [], [], [], []
     for pose, spread in zip((one, two), spreads, strict=True):
         model = ring_model(blocks, pose.R, pose.t, spread, check=True)

@@ -12,9 +12,8 @@ from torch import Tensor
 from torchpose.geometry.least_squares import geman_mcclure, solve_scaled
 from torchpose.geometry.robust import CUT
 from torchpose.refine.photometric.light import LEVELS
-from torchpose.refine.photometric.ring_model import PixelBlocks, RingModel
+from torchpose.refine.photometric.ring_model import TILE, PixelBlocks, RingModel
 
-TILE = 256  # pixels summed in float32 at a time; sums of tiles are float64, so padding changes no digit that counts
 _CLEAR_OF_LIMITS = 3.0  # deviations from where noise is clipped: its mean is off by 0.0004 of one there (derived)
 _MISFIT = 0.02  # of the contrast: what a point-spread function that is not Gaussian leaves at the edges of quiet frames
 _MOST_SPREAD = 1.5  # of a marker's residuals, in those of the best marker of its frame
@@ -27,9 +26,9 @@ def first_levels(blocks: PixelBlocks, model: RingModel) -> Tensor:
 
     A third of a ring may be covered: a least-squares fit of gradients would bend towards the cover and stay there.
     """
-    columns = _tiled((*_basis(model), blocks.grey))
-    none = torch.zeros_like(model.fraction[:, 0])
-    ring, paper = _pure_levels(blocks, model.fraction)
+    columns = torch.stack([*_basis(model), tiled(blocks.grey)], 2)
+    ring, paper = _pure_levels(blocks, model.fraction.flatten(1))
+    none = torch.zeros_like(ring)
     levels = torch.stack([ring, none, none, paper, none, none], -1).nan_to_num(0.0, 0.0, 0.0).double()
     for _ in range(_FIRST_STEPS):
         predicted = (levels.float()[:, None, :, None] * columns[:, :, :LEVELS]).sum(2).flatten(1)
@@ -62,19 +61,20 @@ def columns_of(blocks: PixelBlocks, model: RingModel, levels: Tensor) -> tuple[T
 
     Also the derivative by the distance from the edges (K, P).
     """
-    a0, ax, ay, p0, px, py, *curved = (v[:, None].float() for v in levels.unbind(-1))
-    ring, paper = a0 + ax * model.x + ay * model.y, p0 + px * model.x + py * model.y
+    a0, ax, ay, p0, px, py, *curved = levels.float()[..., None, None].unbind(1)
+    x, y = model.x, model.y
+    ring, paper = (torch.addcmul(torch.addcmul(c, cx, x), cy, y) for c, cx, cy in ((a0, ax, ay), (p0, px, py)))
     if curved:
         axx, axy, ayy, pxx, pxy, pyy = curved
-        ring = ring + axx * model.x.square() + axy * model.x * model.y + ayy * model.y.square()
-        paper = paper + pxx * model.x.square() + pxy * model.x * model.y + pyy * model.y.square()
+        ring = ring + axx * x.square() + axy * x * y + ayy * y.square()
+        paper = paper + pxx * x.square() + pxy * x * y + pyy * y.square()
     contrast = paper - ring
     by_d = contrast * model.by_d
-    residual = blocks.grey - (ring + contrast * model.fraction)
+    residual = tiled(blocks.grey) - torch.addcmul(ring, contrast, model.fraction)
     basis = _basis(model, bool(curved))
     by_blur = (contrast * v for v in model.by_blur)
-    by_pose = (by_d * model.by_pose).unbind(0)
-    return _tiled((*by_pose, *by_blur, *basis, residual, contrast * model.by_gain)), by_d
+    by_pose = (by_d[:, :, None] * model.by_pose).unbind(2)
+    return torch.stack([*by_pose, *by_blur, *basis, residual, contrast * model.by_gain], 2), by_d.flatten(1)
 
 
 def _basis(model: RingModel, curved: bool = False) -> tuple[Tensor, ...]:
@@ -87,9 +87,9 @@ def _basis(model: RingModel, curved: bool = False) -> tuple[Tensor, ...]:
     return (*flat, *(ring * p for p in squares), *(paper * p for p in squares))
 
 
-def _tiled(planes: tuple[Tensor, ...]) -> Tensor:
-    """Planes (K, P) as (K, P / 256, planes, 256)."""
-    return torch.stack([p.unflatten(1, (-1, TILE)) for p in planes], 2)
+def tiled(plane: Tensor) -> Tensor:
+    """A plane (K, P) as (K, P / 256, 256)."""
+    return plane.view(plane.shape[0], plane.shape[1] // TILE, TILE)
 
 
 def sum_products(columns: Tensor, weight: Tensor) -> Tensor:
@@ -113,7 +113,7 @@ def inliers(
     low, high = blocks.limits[:, :1], blocks.limits[:, 1:]
     usable = blocks.valid * ((predicted > low + margin) & (predicted < high - margin))
     if model.sound is not None:
-        usable = usable * model.sound
+        usable = usable * model.sound.flatten(1)
     return usable, usable * (residual.abs() < CUT * spread + misfit[:, None])
 
 

@@ -18,9 +18,7 @@ from torchpose.pose import MarkerNormals
 
 # unknowns of a frame (translation, rotation, blur) and of a marker, at least (derived: they are counted)
 POSE, LEVELS = 6 + BLUR, 6
-_GRADIENTS = (1, 2, 4, 5)  # among the levels
-_PLANE = 3  # levels of ring, then of paper; curvatures in the same order
-_CURVATURES = (6, 7, 8, 9, 10, 11)  # where there are any
+_PLANE = 3  # levels of ring, then of paper, each with its gradient; curvatures in the same order where there are any
 _BLUR_KNOWN = 1e-4  # information about each number of a blur, px^-4: a disc has two, so that the third is open
 _LEAST_WIDTH = 0.01  # variance of the prior over that of a gradient's noise: as good as none
 _RIDGE = 1e-9  # of a marker's information: sums in float32 make up as much
@@ -48,25 +46,26 @@ def normal_equations(
         prior: information (N, 9, 9) about the pose, and how far the pose is from the prior's (N, 9).
         gain: the edge gain is an unknown of the frame, too, the tenth; the prior is about it as well.
     """
-    rows, chosen = len(least), _chosen(sums) if gain else [*range(POSE)]
-    count = torch.bincount(owner, minlength=rows)
-    chi2 = segment_sum(sums[:, -2, -2], owner, rows)
-    freedom = segment_sum(used, owner, rows) - len(chosen) - levels.shape[1] * count
-    variance = (chi2 / freedom.clamp_min(1)).maximum(least)
-    sums = sums / variance[owner, None, None]
-    own, mixed, of_levels = sums[:, chosen][:, :, chosen], sums[:, chosen, POSE:-2], sums[:, POSE:-2, POSE:-2]
-    ridge = (_RIDGE * of_levels.diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)).expand(levels.shape)
-    part = Eliminated(mixed, of_levels + torch.diag_embed(ridge), sums[:, POSE:-2, -2], owner)
-    own = segment_sum(own, owner, rows)
+    rows, chosen = len(least), POSE + gain
+    each = torch.stack([sums[:, -2, -2], used - levels.shape[1]], -1)
+    chi2, freedom = segment_sum(each, owner, rows).unbind(-1)
+    variance = (chi2 / (freedom - chosen).clamp_min(1)).maximum(least)
+    sums = sums / variance.index_select(0, owner)[:, None, None]
+    by_own = torch.cat([sums[:, :POSE], sums[:, -1:]], 1) if gain else sums[:, :POSE]
+    of_levels = sums[:, POSE:-2, POSE:-2].clone()
+    diagonal = of_levels.diagonal(dim1=-2, dim2=-1)
+    diagonal += _RIDGE * diagonal.mean(-1, keepdim=True)
+    part = Eliminated(by_own[..., POSE:-2], of_levels, sums[:, POSE:-2, -2], owner)
+    # of pose and blur, and of the gain behind the residual
+    own = segment_sum(torch.cat([by_own[..., :POSE], by_own[..., -2:]], -1), owner, rows)
+    right, own = own[..., POSE], torch.cat([own[..., :POSE], own[..., POSE + 1 :]], -1) if gain else own[..., :POSE]
     own.diagonal(dim1=-2, dim2=-1)[:, POSE - BLUR : POSE] += _BLUR_KNOWN
-    normal = Normal(own, segment_sum(sums[:, chosen, -2], owner, rows), chi2 / variance, part)
+    normal = Normal(own, right, chi2 / variance, part)
     normal = normal if prior is None else normal.with_prior(*prior)
     precision = _precision(normal, part, levels)
-    held = replace(
-        part,
-        information=part.information + torch.diag_embed(precision),
-        right=part.right - precision * levels,
-    )
+    information = of_levels.clone()
+    information.diagonal(dim1=-2, dim2=-1).add_(precision)
+    held = replace(part, information=information, right=torch.addcmul(part.right, precision, levels, value=-1))
     return replace(normal, eliminated=held), variance
 
 
@@ -117,11 +116,12 @@ def _precision(normal: Normal, part: Eliminated, levels: Tensor) -> Tensor:
     """Information (K, L) of the prior about the levels, from those that the data alone give."""
     rows, owner = len(normal), part.owner
     free = normal.solve(variances=True)
-    precision = torch.zeros_like(levels)
-    for group in (_GRADIENTS, _CURVATURES) if levels.shape[1] > LEVELS else (_GRADIENTS,):
-        gradients = (levels + free.eliminated)[:, group]
-        mean_noise = segment_mean(free.variances[:, group].mean(-1), owner, rows)
-        excess = segment_mean(gradients.square().mean(-1), owner, rows) - mean_noise
-        width2 = excess.clamp_min(_LEAST_WIDTH * mean_noise).clamp_min(1e-12)
-        precision[:, group] = width2.reciprocal()[owner, None]
-    return precision
+    # which levels are of which group: its means are sums of these
+    groups = torch.zeros(2, levels.shape[1], dtype=levels.dtype, device=levels.device)
+    groups[0, 1:_PLANE] = groups[0, _PLANE + 1 : LEVELS] = 1.0
+    groups[1, LEVELS:] = 1.0
+    groups = groups[: 1 + (levels.shape[1] > LEVELS)]
+    both = torch.stack([(levels + free.eliminated).square(), free.variances], 1) @ (groups / groups.sum(1, True)).mT
+    square, mean_noise = segment_mean(both, owner, rows).unbind(1)  # (N, G)
+    width2 = (square - mean_noise).maximum(_LEAST_WIDTH * mean_noise).clamp_min(1e-12)
+    return width2.reciprocal().index_select(0, owner) @ groups

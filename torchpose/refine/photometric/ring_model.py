@@ -30,26 +30,26 @@ from torchpose.refine.sight import Sight
 # blur's variance over the squared radius of curvature: nearer to its centre edges are on all sides (measured: with 0.16
 # a third of the pixels of a covered ring under 2.5 px of blur is lost, tests/refine/test_sectors.py)
 _CURVED = 0.2
+# pixels summed in float32 at a time; sums of tiles are float64, so padding changes no digit that counts (convention)
+TILE = 256
 
 
 @dataclass(frozen=True, eq=False)
 class PixelBlocks(Rows):
-    """Pixels of K markers, padded to P; one plane of numbers for every component.
+    """Pixels of K markers, padded to P, a multiple of `TILE`.
 
     Attributes:
         row: whose marker it is.
-        origin: a ray near each marker, on the plane z = 1.
-        ray_x: the pixels' rays from there.
-        ray_y: the same.
-        warp: d(ray)/d(pixel), row by row.
+        origin: a ray near each marker, on the plane z = 1, as (x, y, 1).
+        rays: the pixels' rays from there, x, y and 1, by tiles.
+        warp: by tiles d(ray)/d(pixel), row by row, and the size of its determinant.
         grey: values of the pixels.
         valid: 1 or 0.
         sector: of the ring, see `geometry.sectors`.
         seen: 1 or 0, whether the ring was seen there so far; 1 all around where that is less than half of it.
         size: pixels of each marker; what follows in its row repeats the last one and is not valid.
         rings: ellipses of its two circles, outer one first.
-        center: of the marker, target frame.
-        normal: the same.
+        frame: two axes of the marker's plane, its normal and its centre as columns, target frame.
         radii: outer and inner.
         polarity: as in `Sight`.
         limits: the grey levels at which the frame's noise is clipped, -inf and inf where it is not.
@@ -57,18 +57,16 @@ class PixelBlocks(Rows):
     """
 
     row: Int[Tensor, " K"]
-    origin: Float[Tensor, "K 2"]
-    ray_x: Float[Tensor, "K P"]
-    ray_y: Float[Tensor, "K P"]
-    warp: tuple[Tensor, Tensor, Tensor, Tensor]
+    origin: Float[Tensor, "K 3 1"]
+    rays: Float[Tensor, "K T 3 S"]
+    warp: Float[Tensor, "K T 5 S"]
     grey: Float[Tensor, "K P"]
     valid: Float[Tensor, "K P"]
     sector: Int[Tensor, "K P"]
     seen: Float[Tensor, "K P"]
     size: Int[Tensor, " K"]
     rings: Float[Tensor, "K 2 5"]
-    center: Float[Tensor, "K 3"]
-    normal: Float[Tensor, "K 3"]
+    frame: Float[Tensor, "K 3 4"]
     radii: Float[Tensor, "K 2"]
     polarity: Float[Tensor, " K"]
     limits: Float[Tensor, "K 2"]
@@ -79,31 +77,39 @@ class PixelBlocks(Rows):
         grown = (self.polarity * gain[self.row])[:, None] * gain.new_tensor([1.0, -1.0])
         return replace(self, radii=self.radii + grown)
 
-    def every(self, nth: int, most: int | None = None, whole: int = 0) -> PixelBlocks:
-        """The same with one pixel of ``nth``, or as many fewer as leave ``most`` of a marker; all of up to ``whole``.
+    @property
+    def center(self) -> Float[Tensor, "K 3"]:
+        """Of the marker, target frame."""
+        return self.frame[..., 3]
 
-        The padded length is a multiple of ``whole``.
+    def every(self, nth: int, most: int | None = None) -> PixelBlocks:
+        """The same with one pixel of ``nth``, or as many fewer as leave ``most`` of a marker; all of up to a tile.
 
         Of a marker 6 px wide a sixth of its pixels would not tell its 15 unknowns.
         """
-        grain = max(1, whole)
-        count = -(-self.grey.shape[1] // (nth * grain)) * grain
+        count = -(-self.grey.shape[1] // (nth * TILE)) * TILE
         count = count if most is None else min(count, most)
         i = torch.arange(count, device=self.row.device)
-        stretched = torch.where(self.size <= min(whole, count), count, self.size.clamp_min(nth * count))
+        stretched = torch.where(self.size <= TILE, count, self.size.clamp_min(nth * count))
         index = i * stretched[:, None] // count
         inside = index < self.size[:, None]
         index = index.minimum((self.size[:, None] - 1).clamp_min(0))
-        planes = {n: getattr(self, n).gather(1, index) for n in ("ray_x", "ray_y", "grey", "valid", "sector", "seen")}
+        planes = {name: getattr(self, name).gather(1, index) for name in ("grey", "valid", "sector", "seen")}
         planes["valid"] *= inside
-        w00, w01, w10, w11 = (w.gather(1, index) for w in self.warp)
-        return replace(self, **planes, warp=(w00, w01, w10, w11))
+        tile = torch.div(index, TILE, rounding_mode="floor") * TILE  # places of a plane of all tiles of a marker
+        for name in ("rays", "warp"):
+            old = getattr(self, name)
+            n = old.shape[2]
+            place = (n * tile + index - tile)[:, None] + torch.arange(0, n * TILE, TILE, device=index.device)[:, None]
+            new = old.flatten(1).gather(1, place.flatten(1)).view(len(old), n, count // TILE, TILE)
+            planes[name] = new.transpose(1, 2).contiguous()
+        return replace(self, **planes)
 
 
 class RingModel(NamedTuple):
-    """Prediction and derivatives at one pose; planes (K, P) in float32.
+    """Prediction and derivatives at one pose; planes (K, T, S) in float32.
 
-    fraction: of paper, F. by_d: dF/dd through both circles. by_blur: 3 planes. by_pose: (6, K, P), derivative of d.
+    fraction: of paper, F. by_d: dF/dd through both circles. by_blur: 3 planes. by_pose: (K, T, 6, S), derivative of d.
     by_gain: dF/d(edge gain), 1/mm.
     x, y: plane coordinates over the outer radius. sound: bool, False where the expansions below do not hold: deep in
     a hole that is small for its blur, or where it is flat; None if not asked for.
@@ -119,11 +125,8 @@ class RingModel(NamedTuple):
     sound: Tensor | None
 
 
-def gather_pixels(sight: Sight, band: Tensor, grain: int) -> PixelBlocks:
-    """The pixels within ``band`` (N,) px of either circle of every marker seen.
-
-    ``grain``: the padded length P is a multiple of it.
-    """
+def gather_pixels(sight: Sight, band: Tensor) -> PixelBlocks:
+    """The pixels within ``band`` (N,) px of either circle of every marker seen."""
     frames, camera, frame = sight.frames, sight.camera, sight.frame
     height, width = frames.shape[-2:]
     row, marker = sight.mask.nonzero().unbind(-1)
@@ -133,50 +136,53 @@ def gather_pixels(sight: Sight, band: Tensor, grain: int) -> PixelBlocks:
         block, u, v = (torch.zeros(min(1, row.numel()), dtype=torch.int64, device=frames.device) for _ in range(3))
     count = row.numel()
     size = torch.bincount(block, minlength=count)
-    most = (int(size.max()) // grain + 1) * grain if count else grain
+    most = (int(size.max()) // TILE + 1) * TILE if count else TILE
     first = size.cumsum(0) - size
     place = torch.arange(most, device=block.device)
-    inside = place < size[:, None]
-    index = (first[:, None] + torch.minimum(place, (size[:, None] - 1).clamp_min(0))).clamp_max(block.numel() - 1)
-
-    def padded(values: Tensor) -> Tensor:
-        return values.float().index_select(0, index.flatten()).view_as(index)
+    inside, last = place < size[:, None], (size[:, None] - 1).clamp_min(0)
+    index = (first[:, None] + torch.minimum(place, last)).clamp_max(block.numel() - 1).flatten()
 
     of = row.index_select(0, block)
     grey = values_at(frames, (frame.index_select(0, of) * height + v) * width + u)
-    limits = _clipping(grey, of, frame.numel())[row]
-    low, high = (limit.contiguous().index_select(0, block) for limit in limits.unbind(-1))
-    xy = camera.undistort_points(torch.stack([u, v]).double().mT)
-    x, y = xy.unbind(-1)
+    limits = _clipping(grey, of, frame.numel()).index_select(0, row)
+    low, high = limits.mT.contiguous().index_select(1, block)
+    x, y, slopes = camera.rays(torch.stack([u, v]).double().mT)
     # what is clipped is no measurement
     sound = (x + y).isfinite() & grey.isfinite() & (grey > low) & (grey < high)
     # rays count from that of the marker's middle pixel; what is not sound gets one of the marker, too, and stays finite
-    origin = xy.index_select(0, (first + size // 2).clamp_max(block.numel() - 1)).nan_to_num(nan=0.0)
-    x0, y0 = (o.contiguous().index_select(0, block) for o in origin.unbind(-1))
-    aside = (both[:, 0, 2] / camera.matrix[0, 0].to(x)).index_select(0, block)
-    x, y = (torch.where(sound, ray - start, aside) for ray, start in ((x, x0), (y, y0)))
-    j00, j01, j10, j11 = camera.slopes((x0 + x).float(), (y0 + y).float())
-    det = j00 * j11 - j01 * j10
-    sector = sector_about(u, v, both[:, 0], block).index_select(0, index.flatten()).view_as(index)
+    xy = torch.stack([x, y])
+    origin = xy.index_select(1, (first + size // 2).clamp_max(block.numel() - 1)).nan_to_num(nan=0.0)
+    aside = (both[:, 0, 2] / camera.matrix[0, 0]).to(xy).index_select(0, block)
+    xy = torch.where(sound, xy - origin.index_select(1, block), aside).index_select(1, index).view(2, count, most)
+    j00, j01, j10, j11 = (torch.where(sound, j.float(), s) for j, s in zip(slopes, (1.0, 0.0, 0.0, 1.0), strict=True))
+    det = (j00 * j11 - j01 * j10).reciprocal()
+    warp = (j11 * det, -j01 * det, -j10 * det, j00 * det, det.abs())
+    flat = torch.stack([*warp, torch.where(sound, grey, 0.0), sound.float()])
+    *warp, grey, valid = flat.index_select(1, index).view(len(flat), count, most)
+    sector = sector_about(u, v, both[:, 0], block).index_select(0, index).view(count, most)
+    normal = sight.normals[row, marker]
     return PixelBlocks(
         row,
-        origin,
-        padded(x),
-        padded(y),
-        (padded(j11 / det), padded(-j01 / det), padded(-j10 / det), padded(j00 / det)),
-        padded(torch.where(sound, grey, 0.0)),
-        padded(sound) * inside,
+        torch.nn.functional.pad(origin, (0, 0, 0, 1), value=1.0).mT[..., None],
+        _tiled(*xy, torch.ones_like(xy[0])),
+        _tiled(*warp),
+        grey,
+        valid * inside,
         sector,
         _seen(sight, row, marker).gather(1, sector),
         size,
         both,
-        sight.centers[row, marker],
-        sight.normals[row, marker],
+        torch.stack([*plane_axes(normal), normal, sight.centers[row, marker]], -1),
         sight.radii[row, marker],
         sight.polarity[row, marker],
         limits,
         sight.quantisation,
     )
+
+
+def _tiled(*planes: Tensor) -> Tensor:
+    """(K, T, n, S) of n planes (K, P)."""
+    return torch.stack([plane.view(len(plane), plane.shape[1] // TILE, TILE) for plane in planes], 2)
 
 
 def _seen(sight: Sight, row: Tensor, marker: Tensor) -> Tensor:
@@ -197,59 +203,68 @@ def _clipping(grey: Tensor, row: Tensor, rows: int) -> Tensor:
 
 
 class _Foot(NamedTuple):
-    """Where the ray of every pixel meets the marker's plane; planes (K, P) or (K, 1), float32.
+    """Where the ray of every pixel meets the marker's plane; planes (K, T, S), float32.
 
-    x, y: mm, about the circles' centre. radius: their length. outer, inner: less that of the circle. toward: growth of
-    the depth with the ray's angle, 1 / (n . ray). depth: of the point over that of the plane's foot.
-    axes: (4, 3, K, 1), of the plane, its normal and the arm of the marker, camera axes. one_c, two_c: the circles'
-    centre along the axes. away: distance of the plane, over which it is 1 / away.
+    place: (K, T, 2, S), x and y in mm, about the circles' centre. radius: their length. past: (2, K, T, S), less that
+    of the outer and the inner circle. toward: growth of the depth with the ray's angle, 1 / (n . ray). depth: of the
+    point over that of the plane's foot. normal: (K, 3, 1), of the plane, camera axes.
+    lever: (K, 5, 3), from (x, y, 1) to the point about the target's origin. by_foot: (K, 7, 3), from the direction of
+    (x, y) and the radius to m, and to the first two of h, see `_rims`. Of both the first two come once more after the
+    third, so that a cross product is two products of slices.
     """
 
-    x: Tensor
-    y: Tensor
+    place: Tensor
     radius: Tensor
-    outer: Tensor
-    inner: Tensor
+    past: Tensor
     toward: Tensor
     depth: Tensor
-    axes: Tensor
-    one_c: Tensor
-    two_c: Tensor
-    over_away: Tensor
+    normal: Tensor
+    lever: Tensor
+    by_foot: Tensor
 
 
 def _feet(blocks: PixelBlocks, R: Tensor, t: Tensor) -> _Foot:
     """The radius in the plane is formed in float64, what is small beside it in float32."""
     # the arm: marker's centre about the target's origin, camera axes
-    normal, arm = torch.bmm(R[blocks.row], torch.stack([blocks.normal, blocks.center], -1)).unbind(-1)
-    center = arm + t[blocks.row]
-    one, two = plane_axes(normal)
+    frame = torch.bmm(R.index_select(0, blocks.row), blocks.frame)
+    plane, normal, arm = frame.split([2, 1, 1], -1)
+    center = arm + t.index_select(0, blocks.row)[..., None]
+    away = (normal * center).sum(1, keepdim=True)
+    # a displacement w of the ray's foot, or of the plane against it, changes x and y by these times w
+    axes = (plane - normal * torch.bmm(center.mT, plane) / away).mT
     # the ray of the pixel meets the plane at depth * ray; coordinates there, about the circle's centre, are quotients
     # of linear functions of the ray, which counts from a ray near the marker, so that float32 holds it
-    away = (normal * center).sum(-1, keepdim=True)
-    near = torch.nn.functional.pad(blocks.origin, (0, 1), value=1.0)
-    over = (normal * near).sum(-1, keepdim=True)
+    linear = torch.cat([normal.mT, away * axes], 1)
+    linear = torch.cat([linear[..., :2], torch.bmm(linear, blocks.origin)], -1)
+    planes = by_tiles(linear, blocks.rays)
+    toward = planes[:, :, 0].reciprocal()
+    place = planes[:, :, 1:] * toward[:, :, None]
+    x, y = place.unbind(2)
+    radius = torch.addcmul(x * x, y, y).sqrt_().clamp_min_(1e-9)
+    past = (radius - blocks.radii.mT[..., None, None]).float()
+    toward = toward.float()
+    first = torch.cat([axes.mT, normal / -away], -1)
+    across = torch.nn.functional.pad(torch.stack([axes[:, 1, :2], -axes[:, 0, :2]], -1), (0, 1))
+    by_foot = torch.cat([first, first[:, :2], across], 1).float()
+    lever = torch.cat([plane, arm], -1)
+    lever = torch.cat([lever, lever[:, :2]], 1).float()
+    depth = toward * away.float()
+    return _Foot(place.float(), radius.float(), past, toward, depth, normal.float(), lever, by_foot)
 
-    one_c, two_c = (one * center).sum(-1, keepdim=True), (two * center).sum(-1, keepdim=True)
-    linear = torch.stack([normal, away * one - one_c * normal, away * two - two_c * normal]) / over
-    at_x, at_y, _ = linear.split(1, -1)
-    planes = (linear * near).sum(-1, keepdim=True) + at_x * blocks.ray_x + at_y * blocks.ray_y
-    toward = planes[0].reciprocal()
-    x, y = (planes[1:] * toward).unbind(0)
-    radius = (x * x + y * y).sqrt().clamp_min(1e-9)
-    outer, inner = (radius - blocks.radii.mT[..., None]).float().unbind(0)
-    x, y, radius, toward = (v.float() for v in (x, y, radius, toward / over))
-    axes = torch.stack([one, two, normal, arm]).float().mT.unsqueeze(-1)
-    depth, over_away = away.float() * toward, 1 / away.float()
-    return _Foot(x, y, radius, outer, inner, toward, depth, axes, one_c.float(), two_c.float(), over_away)
+
+def by_tiles(matrix: Tensor, planes: Tensor) -> Tensor:
+    """Matrices (K, n, m) times the planes (K, T, m, S) of every tile."""
+    count, tiles, _, size = planes.shape
+    each = matrix[:, None].expand(-1, tiles, -1, -1).flatten(0, 1)
+    return torch.bmm(each, planes.flatten(0, 1)).view(count, tiles, -1, size)
 
 
 class _Rim(NamedTuple):
-    """Image of the circles through every pixel; planes (K, P) float32.
+    """Image of the circles through every pixel; planes (K, T, S) float32.
 
     per_mm: px for a mm of radius. bend: curvature of the circle's image, 1/px. second: to second order in the distance,
     half the second over the first derivative of the radius, 1/px. normal: (nu, nv) of the image. by_pose: derivatives
-    (6, K, P) of the distance. turn: by how much the normal at the edge is turned against that in the pixel, rad a px
+    (K, T, 6, S) of the distance. turn: by how much the normal at the edge is turned against that in the pixel, rad a px
     between them, where it is asked for.
     """
 
@@ -262,38 +277,40 @@ class _Rim(NamedTuple):
 
 
 def _rims(blocks: PixelBlocks, foot: _Foot, *, turning: bool) -> _Rim:
-    x, y, radius, toward, depth = foot.x, foot.y, foot.radius, foot.toward, foot.depth
-    one, two, normal, arm = foot.axes.unbind(0)
-    ex, ey = x / radius, y / radius
-    # a displacement w of the ray's foot, or of the plane against it, changes the radius by m . w
-    s = (radius + ex * foot.one_c + ey * foot.two_c) * foot.over_away
-    m = ex * one + ey * two - s * normal
-    w00, w01, w10, w11 = blocks.warp
-    gu, gv = m[0] * w00 + m[1] * w10, m[0] * w01 + m[1] * w11  # gradient of the radius in the image, over the depth
-    flat = (gu.square() + gv.square()).clamp_min(1e-30).rsqrt()
+    radius, toward, depth, warp = foot.radius, foot.toward, foot.depth, blocks.warp
+    # a displacement w of the ray's foot, or of the plane against it, changes the radius by m . w; h is as m, but across
+    both = by_tiles(foot.by_foot, torch.cat([foot.place / radius[:, :, None], radius[:, :, None]], 2))
+    m, h0, h1 = both[:, :, :3], both[:, :, 5], both[:, :, 6]
+    w00, w01, w10, w11, area = warp.unbind(2)
+    gu, gv = torch.addcmul(m[:, :, 0] * w00, m[:, :, 1], w10), torch.addcmul(m[:, :, 0] * w01, m[:, :, 1], w11)
+    # gradient of the radius in the image, over the depth
+    flat = torch.addcmul(gu * gu, gv, gv).clamp_min_(1e-30).rsqrt_()
     per_mm = flat / depth
-    area = depth.square() * (w00 * w11 - w01 * w10).abs() * toward.abs()  # of a pixel in the plane, mm^2
-    bend = area.square() * per_mm.pow(3) / radius
+    square = depth * depth
+    area = square * area * toward  # of a pixel in the plane, mm^2, but for its sign
+    bend = area * area * per_mm.pow(3) / radius
     # along the image's normal the radius bends where that normal is oblique in the plane, and by perspective
     nu, nv = gu * flat, gv * flat
-    side = (ex * foot.two_c - ey * foot.one_c) * foot.over_away
-    h = ex * two[:2] - ey * one[:2] - side * normal[:2]  # as m, but across the radius
-    ray_u, ray_v = w00 * nu + w01 * nv, w10 * nu + w11 * nv
-    oblique = h[0] * ray_u + h[1] * ray_v
-    recede = (normal[0] * ray_u + normal[1] * ray_v) * toward
-    second = 0.5 * oblique.square() * depth * flat / radius - recede
-    by_pose = torch.cat([m, torch.linalg.cross(x * one + y * two + arm, m, dim=0)]) * -per_mm
+    ray_u, ray_v = torch.addcmul(w00 * nu, w01, nv), torch.addcmul(w10 * nu, w11, nv)
+    oblique = torch.addcmul(h0 * ray_u, h1, ray_v)
+    n0, n1 = foot.normal[:, :2, None].unbind(1)
+    recede = torch.addcmul(n0 * ray_u, n1, ray_v) * toward
+    steep = square * per_mm / radius
+    second = torch.addcmul(-recede, oblique * oblique, steep, value=0.5)
+    at = by_tiles(foot.lever, torch.nn.functional.pad(foot.place, (0, 0, 0, 1), value=1.0))
+    turned = torch.addcmul(at[:, :, 1:4] * both[:, :, 2:5], at[:, :, 2:], both[:, :, 1:4], value=-1)
+    by_pose = torch.cat([m, turned], 2) * -per_mm[:, :, None]
     turn = None
     if turning:  # the mixed second derivative of the radius, along the normal and across it, over the first
         along_u, along_v = w01 * nu - w00 * nv, w11 * nu - w10 * nv
-        across = h[0] * along_u + h[1] * along_v
-        turn = oblique * across * depth.square() * per_mm / radius
-        turn = turn - (normal[0] * along_u + normal[1] * along_v) * toward
+        across = h0 * along_u + h1 * along_v
+        turn = oblique * across * steep
+        turn = turn - (n0 * along_u + n1 * along_v) * toward
     return _Rim(per_mm, bend, second, (nu, nv), by_pose, turn)
 
 
 def _normals(rim: _Rim, distance: Tensor) -> tuple[Tensor, Tensor]:
-    """Normals (nu, nv) of the edges at these distances (2, K, P): what a blur with a direction does depends on them."""
+    """Normals (nu, nv) of the edges at distances (2, K, T, S): what a blur with a direction does depends on them."""
     nu, nv = rim.normal
     if rim.turn is None:
         return nu, nv
@@ -306,19 +323,22 @@ def ring_model(blocks: PixelBlocks, R: Tensor, t: Tensor, spread: Spread, *, che
     """Predicts every pixel at poses (N, 3, 3), (N, 3) and N blurs, and with ``check`` says where that is sound."""
     foot = _feet(blocks, R, t)
     rim = _rims(blocks, foot, turning=spread.kind == "line")
-    straight = foot.inner * rim.per_mm
-    d_outer, d_inner = (d + rim.second * d.square() for d in (foot.outer * rim.per_mm, straight))
+    straight = foot.past * rim.per_mm
+    distance = torch.addcmul(straight, straight * straight, rim.second)
+    edges = spread.at(blocks.row, *_normals(rim, distance), dims=2)
     sound = None
     if check:
         blur = spread.covariance[blocks.row].float()
-        most = blurs.axes(blur)[1][:, None]
-        near = (rim.bend.square() * most < _CURVED) & ((rim.second * straight).abs() < HOLDS)
-        sound = near | (d_inner.square() > CUT**2 * blurs.across(blur[:, None], *rim.normal))
-    distance = torch.stack([d_outer, d_inner])
-    both = spread.at(blocks.row, *_normals(rim, distance))(distance, rim.bend)
+        most, across = blurs.axes(blur)[1][:, None, None], edges.across
+        if across is None:
+            across = blurs.across(blur[:, None, None], *rim.normal)
+        near = (rim.bend.square() * most < _CURVED) & ((rim.second * straight[1]).abs() < HOLDS)
+        sound = near | (distance[1].square() > CUT**2 * across)
+    both = edges(distance, rim.bend)
     by_blur = tuple(one - other for one, other in both.by_blur)
-    size = blocks.radii[:, :1].float()
+    place = foot.place / blocks.radii[:, :1, None, None].float()
     fraction, by_d = both.fraction[0] + 1 - both.fraction[1], both.by_distance[0] - both.by_distance[1]
     # dark edges move outwards: those of a dark ring away from each other
-    by_gain = -blocks.polarity[:, None].float() * both.by_distance.sum(0) * rim.per_mm
-    return RingModel(fraction, by_d, by_blur, rim.by_pose, by_gain, foot.x / size, foot.y / size, sound)
+    by_gain = both.by_distance.sum(0) * rim.per_mm * -blocks.polarity[:, None, None].float()
+    x, y = place.unbind(2)
+    return RingModel(fraction, by_d, by_blur, rim.by_pose, by_gain, x, y, sound)

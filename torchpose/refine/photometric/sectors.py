@@ -74,7 +74,7 @@ def sum_sectors(
 ) -> Sectors:
     """Sums of residuals (K, P) with derivatives by the edge ``slope``, and weights, of which ``usable`` is the most."""
     middle = 0.5 * (1 + blocks.radii[:, 1] / blocks.radii[:, 0])
-    outer = torch.hypot(model.x, model.y) > middle[:, None].float()
+    outer = torch.hypot(model.x, model.y).flatten(1) > middle[:, None].float()
     count = len(blocks.row)
     block = torch.arange(count, device=blocks.row.device)[:, None]
     cell = (2 * block + outer) * SECTORS + blocks.sector
@@ -83,11 +83,10 @@ def sum_sectors(
     slope = slope.masked_fill(weight == 0, 0.0)  # padded pixels have none
     pull = weight * slope
     planes = (usable, weight, weighted * residual, pull * residual, pull * slope)
-    sums = [torch.zeros(2 * SECTORS * count, dtype=weight.dtype, device=weight.device) for _ in planes]
-    total, used, square, pulls, hold = (
-        total.scatter_add_(0, flat, plane.flatten()).view(count, 2 * SECTORS)
-        for total, plane in zip(sums, planes, strict=True)
-    )
+    sums = torch.zeros(len(planes), 2 * SECTORS * count, dtype=weight.dtype, device=weight.device).unbind(0)
+    for of_sectors, plane in zip(sums, planes, strict=True):
+        of_sectors.scatter_add_(0, flat, plane.flatten())
+    total, used, square, pulls, hold = (of_sectors.view(count, 2 * SECTORS) for of_sectors in sums)
     return Sectors(total, used, square, pulls, hold, cell)
 
 
