@@ -90,7 +90,8 @@ class PixelBlocks(Rows):
         count = -(-self.grey.shape[1] // (nth * TILE)) * TILE
         count = count if most is None else min(count, most)
         i = torch.arange(count, device=self.row.device)
-        stretched = torch.where(self.size <= TILE, count, self.size.clamp_min(nth * count))
+        more = (self.size - 1) // TILE  # tiles beyond the first one
+        stretched = torch.where(more > 0, self.size.clamp_min(nth * count), count)
         index = i * stretched[:, None] // count
         inside = index < self.size[:, None]
         index = index.minimum((self.size[:, None] - 1).clamp_min(0))
@@ -256,7 +257,7 @@ def by_tiles(matrix: Tensor, planes: Tensor) -> Tensor:
     """Matrices (K, n, m) times the planes (K, T, m, S) of every tile."""
     count, tiles, _, size = planes.shape
     each = matrix[:, None].expand(-1, tiles, -1, -1).flatten(0, 1)
-    return torch.bmm(each, planes.flatten(0, 1)).view(count, tiles, -1, size)
+    return torch.bmm(each, planes.flatten(0, 1)).view(count, tiles, matrix.shape[1], size)
 
 
 class _Rim(NamedTuple):
