@@ -14,6 +14,13 @@ begun with the intrinsics that cv2.calibrateCamera gives from all views of each.
 
 Frames of the built-in target quad40 instead (blur 0.7 px, noise 2, 8 bit) and all of `torchpose calibrate` but the
 files; nothing of OpenCV's.
+
+    python scripts/rig_calibration_statistics.py --robot tool --cameras 2 3 --sets 60 --markdown
+
+No camera sees the plate at a moment of another one: moments are shared out in turns, and the poses of a robot tie the
+cameras together, whose noise is 0.05 mm and 0.1 mrad along and about every axis (`--robot base`: the cameras stand
+still, and the plate is on the tool). `robot mm` and `robot rad`: the noise found over the true one. Nothing of OpenCV's
+here either.
 """
 
 from __future__ import annotations
@@ -31,7 +38,8 @@ from torch import Tensor
 
 import torchpose as tp
 from torchpose.calibration import Views, calibrate_intrinsics
-from torchpose.calibration.rig_session import OneCamera, calibrate_cameras
+from torchpose.calibration.hand_eye import Mount
+from torchpose.calibration.rig_session import OneCamera, RobotPoses, calibrate_cameras
 from torchpose.calibration.several import Located, RigCalibration, calibrate_rig
 from torchpose.camera import LINEAR
 from torchpose.geometry import rotations
@@ -43,6 +51,7 @@ AWAY, SIGMA, TURNED = 170.0, 0.05, 50.0  # mm, px, degrees
 BORDER = 10.0  # px
 LENS = "brown4"
 NOISE = 2.0  # grey levels, of rendered frames
+ROBOT = (0.05, 1e-4)  # mm, rad
 LEAST = 4  # moments of a pair for cv2.stereoCalibrate
 METRE = 1000.0  # mm
 STOP = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-12)
@@ -112,6 +121,28 @@ def views_of(scene: Drawn, number: int, seed: int, sigma: float = SIGMA) -> View
         SIGMA**2 * torch.eye(2, dtype=F64).expand(n * m, 2, 2),
         tuple(f"{k}.png" for k in seen.tolist()),
     )
+
+
+def shared_out(views: list[Views]) -> list[Views]:
+    """Of each camera its own moments only, in turns."""
+    count = len(views)
+    return [
+        own.of_views(torch.tensor([int(name.removesuffix(".png")) % count == k for name in own.names]))
+        for k, own in enumerate(views)
+    ]
+
+
+def robot_poses(scene: Drawn, mount: Mount, seed: int, noise: tuple[float, float] = ROBOT) -> RobotPoses:
+    """base_from_tool at every moment, with noise: of cameras on the tool and a plate in the cell, or the reverse."""
+    X = rotations.exp(torch.tensor([0.02, -0.03, 1.5], dtype=F64)), torch.tensor([10.0, -60, 40], dtype=F64)
+    Z = rotations.exp(torch.tensor([math.pi - 0.1, 0.05, 0.02], dtype=F64)), torch.tensor([450.0, -100, 20], dtype=F64)
+    R, t = rotations.compose(*rotations.compose(*Z, *rotations.inverse(scene.R, scene.t)), *rotations.inverse(*X))
+    if mount == "base":
+        R, t = rotations.inverse(R, t)
+    g = torch.Generator().manual_seed(2000 * seed + 1)
+    off = torch.tensor(noise, dtype=F64).repeat_interleave(3) * torch.randn(len(t), 6, dtype=F64, generator=g)
+    said = torch.cat([t + off[:, :3], rotations.log(rotations.exp(off[:, 3:]) @ R)], -1)
+    return {f"{k}.png": tuple(pose) for k, pose in enumerate(said.tolist())}
 
 
 def located(scene: Drawn, views: list[Views]) -> list[Located]:
@@ -230,6 +261,19 @@ def drawn_set(cameras: int, moments: int, seed: int, *, compare: bool = True) ->
     return Row(found, off, nees, tuple(None if rig is None else errors(rig, scene.rig).flatten() for rig in theirs))
 
 
+def tied_set(cameras: int, moments: int, seed: int, *, mount: Mount) -> Row:
+    scene = drawn(cameras, moments, seed)
+    views = shared_out([views_of(scene, number, seed) for number in range(cameras)])
+    found = calibrate_rig(located(scene, views), lens=LENS, robot=robot_poses(scene, mount, seed))
+    return row_of_set(found, scene)
+
+
+def row_of_set(found: RigCalibration, scene: Drawn) -> Row:
+    off = errors(found.rig, scene.rig).flatten()
+    assert found.rig.covariance is not None
+    return Row(found, off, float(off @ torch.linalg.solve(found.rig.covariance, off)))
+
+
 def rendered_set(cameras: int, moments: int, seed: int) -> Row:
     """From grey values on; the lenses are looked for from the true ones."""
     scene, target = drawn(cameras, moments, seed), tp.Target.load("quad40")
@@ -241,14 +285,14 @@ def rendered_set(cameras: int, moments: int, seed: int) -> Row:
         frames = add_noise(clean, NOISE, seed=1000 * seed + number)
         names = [f"{k}.png" for k in facing.tolist()]
         several.append(OneCamera(f"cam{number}", partial(list, [(names, frames)]), camera, guess=False))
-    found = calibrate_cameras(several, target, lens=LENS, tone=LINEAR)
-    off = errors(found.rig, scene.rig).flatten()
-    assert found.rig.covariance is not None
-    return Row(found, off, float(off @ torch.linalg.solve(found.rig.covariance, off)))
+    return row_of_set(calibrate_cameras(several, target, lens=LENS, tone=LINEAR), scene)
 
 
-def row_of(cameras: int, moments: int, sets: int, *, rendered: bool = False) -> dict[str, Any]:
-    rows = [(rendered_set if rendered else drawn_set)(cameras, moments, seed) for seed in range(sets)]
+def row_of(
+    cameras: int, moments: int, sets: int, *, rendered: bool = False, mount: Mount | None = None
+) -> dict[str, Any]:
+    made = rendered_set if rendered else drawn_set if mount is None else partial(tied_set, mount=mount)
+    rows = [made(cameras, moments, seed) for seed in range(sets)]
     freedom = 6 * (cameras - 1)
     whitened = []
     for row in rows:
@@ -263,6 +307,9 @@ def row_of(cameras: int, moments: int, sets: int, *, rendered: bool = False) -> 
     def rms(values: Tensor) -> float:
         return float(values.square().nanmean().sqrt())
 
+    fits = [fit for row in rows if (fit := row.found.hand_eye) is not None]
+    noise = [[fit.robot_sigma_mm / ROBOT[0], fit.robot_sigma_rad / ROBOT[1]] for fit in fits] or [[math.nan] * 2]
+    mm, rad = torch.tensor(noise).mean(0).tolist()
     return {
         "cameras": cameras,
         "pairs apart": apart,
@@ -277,11 +324,14 @@ def row_of(cameras: int, moments: int, sets: int, *, rendered: bool = False) -> 
         "chain rotation / claimed": rms(chain[..., 3:]),
         "multiview translation / claimed": rms(multiview[..., :3]),
         "multiview rotation / claimed": rms(multiview[..., 3:]),
+        "robot mm": mm,
+        "robot rad": rad,
     }
 
 
 def print_rows(rows: Sequence[Mapping[str, float]], *, markdown: bool) -> None:
-    """Prints rows of one set of columns, as a table for the documentation or one a line."""
+    """Prints rows of one set of columns, as a table for the documentation or one a line; without columns of nothing."""
+    rows = [{k: v for k, v in row.items() if any(not math.isnan(one[k]) for one in rows)} for row in rows]
     if markdown:
         print("| " + " | ".join(rows[0]) + " |\n|" + " ---: |" * len(rows[0]))
         print("\n".join("| " + " | ".join(f"{value:.3g}" for value in row.values()) + " |" for row in rows))
@@ -296,10 +346,14 @@ def main() -> None:
     parser.add_argument("--sets", type=int, default=40)
     parser.add_argument("--moments", type=int, default=60)
     parser.add_argument("--rendered", action="store_true", help="from rendered frames")
+    parser.add_argument(
+        "--robot", choices=["base", "tool"], help="cameras apart, tied by a robot, and what they are on"
+    )
     parser.add_argument("--markdown", action="store_true", help="a table for the documentation")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    rows = [row_of(n, options.moments, options.sets, rendered=options.rendered) for n in options.cameras]
+    how = {"rendered": options.rendered, "mount": options.robot}
+    rows = [row_of(n, options.moments, options.sets, **how) for n in options.cameras]
     print_rows(rows, markdown=options.markdown)
 
 

@@ -14,7 +14,8 @@ import torchpose as tp
 from scripts import rig_calibration_statistics as statistics
 from torchpose.calibration import Views
 from torchpose.calibration.lenses import moved_camera
-from torchpose.calibration.several import Located, RigCalibration, calibrate_rig, check_connected
+from torchpose.calibration.several import Located, RigCalibration, calibrate_rig
+from torchpose.calibration.ties import check_connected
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from pathlib import Path
 from typing import Any
 
@@ -126,6 +127,59 @@ def test_known_cameras_are_held_and_the_target_is_measured(shots: Path, true: tp
     sigma = target.covariance.diagonal()[:-1].sqrt().view(-1, 3)
     assert float(((target.centers - nominal.centers) / sigma.clamp_min(1e-5)).abs().max()) < 5
     assert float(sigma.max()) < 0.01
+
+
+@pytest.fixture(scope="module")
+def session(scene: statistics.Drawn, true: tp.CameraRig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A manifest of two cameras on a robot that see the target in turns, and what is known of their lenses."""
+    folder = tmp_path_factory.mktemp("session")
+    (folder / "images").mkdir()
+    at = statistics.Drawn(true, scene.points, scene.R, 1.1 * scene.t)
+    robot = statistics.robot_poses(at, "tool", 1)
+    records: list[dict[str, Any]] = [{"record": "session", "units": {"length": "mm"}}]
+    for number, camera in enumerate(true.cameras):
+        camera.save(folder / f"{number}.yaml")
+        R, t = true.seen_by(number, at.R, at.t)
+        frames = add_noise(render(camera, tp.Target.load("hexa50"), R, t), 1.0, seed=number)
+        for k in range(MOMENTS):
+            image = f"images/{k}_cam{number}.png"
+            seen = frames[k] if k % 2 == number else torch.full_like(frames[k], 200)
+            cv2.imwrite(str(folder / image), seen.numpy())
+            record = {"record": "frame", "id": f"{number}-{k}", "image": image, "camera": f"cam{number}"}
+            records.append(record | {"robot_pose": robot[f"{k}.png"]})
+    (folder / "manifest.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
+    return folder
+
+
+def test_cameras_that_never_see_the_target_together_are_tied_by_the_robot(
+    session: Path, true: tp.CameraRig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    known = ("--cameras", session / "0.yaml", "--cameras", session / "1.yaml")
+    out, hand_eye, plots = tmp_path / "rig.yaml", tmp_path / "handeye.yaml", tmp_path / "plots"
+    words = ("--target", "hexa50", *known, "--cameras-out", out, "-q")
+    more = ("--hand-eye-out", hand_eye, "--plots", plots)
+    assert run("calibrate", session / "manifest.jsonl", *words, *more) == 0
+    said = capsys.readouterr().out
+    assert "cam0 | cam1: tied by the robot, cameras on its tool" in said
+    assert "robot noise" in said
+    rig = tp.CameraRig.load(out)
+    assert rig.covariance is not None
+    off = statistics.errors(rig, true).flatten()
+    assert float(off @ torch.linalg.solve(rig.covariance, off)) < 40  # noise of 12 poses, and of 1 in 10^5 sets
+    assert 0.01 < float(rig.covariance.diagonal()[:3].sqrt().max()) < 0.2
+    assert tp.HandEye.load(hand_eye).mount == "tool"
+    assert "robot.png" in {path.name for path in plots.iterdir()}
+    # the same pictures without the robot
+    for number in range(2):
+        (tmp_path / "shots" / f"cam{number}").mkdir(parents=True)
+        for path in (session / "images").glob(f"*_cam{number}.png"):
+            (tmp_path / "shots" / f"cam{number}" / path.name.replace(f"_cam{number}", "")).symlink_to(path)
+    assert run("calibrate", tmp_path / "shots", *words) == 2
+    said = capsys.readouterr().err
+    assert "cameras cam0 | cam1 are apart" in said
+    assert "robot poses of these moments in a capture manifest would tie them" in said
+    assert run("calibrate", tmp_path / "shots", *words, "--hand-eye-out", hand_eye) == 2
+    assert "robot_pose: missing; --hand-eye-out needs a manifest with robot poses" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,10 @@ from typing import Any
 import cv2
 import pytest
 
+from torchpose.analysis import with_second
+from torchpose.camera import Camera
 from torchpose.cli.main import main
+from torchpose.design import Imaging, WorkingVolume, predict_volume
 from torchpose.target import Target
 
 CAMERA = """
@@ -27,6 +31,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFi
     """Runs the command in a folder of its own with a camera file; gives exit code, stdout and stderr."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "camera.yaml").write_text(CAMERA)
+    with_second(Camera.load(tmp_path / "camera.yaml"), 150.0, 0.7).save(tmp_path / "rig.yaml")
 
     def call(*words: float | str) -> tuple[str | int | None, str, str]:
         with pytest.raises(SystemExit) as ended:
@@ -86,6 +91,23 @@ def test_the_precision_of_an_existing_target(run: Callable[..., Any], tmp_path: 
     assert all(float(row["middle"]) > 0 for row in rows)
 
 
+def test_a_second_camera_at_an_angle(run: Callable[..., Any], tmp_path: Path) -> None:
+    words = ("--target", "quad40", "--distance", 150, "--camera", "camera.yaml", "--second-camera", 40)
+    code, out, err = run(*words, "--out", "made")
+    assert (code, err) == (0, "")
+    assert "cam1: counts with 100 % of the rings" in out
+    with (tmp_path / "made" / "quad40_precision.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    rig = with_second(Camera.load(tmp_path / "camera.yaml"), 150.0, math.radians(40))
+    promised = predict_volume(rig, Target.load("quad40"), WorkingVolume((150.0, 150.0)), Imaging())
+    assert [float(row["worst"]) for row in rows] == pytest.approx(promised.worst.tolist())
+    assert float(rows[2]["worst_first_camera_alone"]) > 2.5 * float(rows[2]["worst"])
+    with (tmp_path / "made" / "second_camera.csv").open(newline="") as file:
+        angles = {float(row["angle deg"]): float(row["z um"]) for row in csv.DictReader(file)}
+    assert 0.98 < float(rows[2]["middle"]) / angles[40.0] < 1.2  # the bound
+    assert (tmp_path / "made" / "second_camera.png").is_file()
+
+
 def test_a_print_class_is_counted_and_stated(run: Callable[..., Any], tmp_path: Path) -> None:
     words = ("--camera", "camera.yaml", *GOOD, "--markers", 4, "--name", "mine")
     code, out, err = run(*words, "--print", "plotter", "--out", "made")
@@ -143,6 +165,12 @@ def test_a_print_class_is_counted_and_stated(run: Callable[..., Any], tmp_path: 
         (["--target", "quad40", "--plate", "20x70"], "does not hold the rings of quad40"),
         (["--target", "quad40", "--name", "x"], "leave --name, --markers and --print-gain out"),
         (["--target", "quad40", "--distance", "100"], "--camera: is missing"),
+        (["--cameras", "rig.yaml", "--camera", "camera.yaml", *GOOD], "--camera: stands beside --cameras"),
+        (["--cameras", "rig.yaml", "--second-camera", "40", *GOOD], "--second-camera: stands beside --cameras"),
+        (["--second-camera", "40", *GOOD], "--camera: is missing"),
+        (["--camera", "camera.yaml", "--second-camera", "90", *GOOD], "--second-camera: 90 degrees; give an angle"),
+        (["--cameras", "none.yaml", *GOOD], "none.yaml: file: does not exist"),
+        (["--cameras", "rig.yaml", "--target", "quad40", "--distance", "60"], "leave the frame"),
         (["--target", "quad40", "--camera", "camera.yaml", "--distance", "60"], "leave the frame"),
     ],
 )

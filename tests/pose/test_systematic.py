@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from functools import partial
 
 import pytest
@@ -24,11 +25,20 @@ from torchpose.pose import (
     on_print,
     solve_poses,
 )
-from torchpose.pose.excess import OF_CAMERA, OF_EDGES, OF_MARKER, SURE, Picture, excess_of
+from torchpose.pose.excess import OF_CAMERA, OF_EDGES, OF_MARKER, SURE, Picture, excess_of, may_be_off
+from torchpose.refine.centers import refine_centers
 from torchpose.results import Misfit
 from torchpose.target import Target
 
 CAMERA_FILE = pinhole()
+# the same, with a lens that is known to have no distortion
+KNOWN_LENS = tp.Camera(
+    width=CAMERA_FILE.width,
+    height=CAMERA_FILE.height,
+    matrix=CAMERA_FILE.matrix,
+    distortion=torch.zeros(4, dtype=F64),
+    covariance=torch.zeros(8, 8, dtype=F64),
+)
 MARKERS = 2  # of `problem`
 ALONG = OF_MARKER * MARKERS + OF_EDGES
 QUAD = Target.load("quad40")
@@ -72,7 +82,7 @@ def test_places_are_unknowns_with_their_prior() -> None:
     target = uncertain(0.02, 0.0)
     e = evidence(target, r, t, 0.01)
     normals = center_normals(e, r, t)
-    joint = on_print(normals, Setting(e, r, t, CAMERA_FILE, False), torch.zeros(1, 4, PLACE, dtype=F64))
+    joint = on_print(normals, Setting(e, r, t, KNOWN_LENS, False), torch.zeros(1, 4, PLACE, dtype=F64))
     assert target.covariance is not None
     step, covariance = by_hand(normals, r, target.covariance[:-1, :-1])
     torch.testing.assert_close(joint.step[0], step, rtol=1e-6, atol=1e-10)
@@ -237,6 +247,25 @@ def test_rings_that_shift_more_than_they_scatter() -> None:
     assert (still < 0.02).all()
 
 
+def test_centres_that_shift_leave_the_pose_where_it_is() -> None:
+    """Both circles of a ring by 0.1 px, and by 0.02 px apart: what they are apart does not tell the pose instead."""
+    r, t = random_poses(100, 40, (140, 190))
+    g = torch.Generator().manual_seed(5)
+    ellipses = exact_ellipses(QUAD, CAMERA_FILE, r, t)
+    ellipses[..., :2] += 0.1 * torch.randn(100, 4, 1, 2, dtype=F64, generator=g)
+    ellipses[..., :2] += 0.02 * torch.randn(100, 4, 2, 2, dtype=F64, generator=g)
+    rings = rings_of(ellipses.flatten(0, 1), torch.arange(100).repeat_interleave(4), 0.05)
+    table = MarkerTable.of([QUAD])[torch.zeros(100, dtype=torch.int64)]
+    e = gather_evidence(rings, torch.arange(400).view(100, 4), table, CAMERA_FILE)
+    s = solve_poses(e, (r, t))
+    found = refine_centers(e, s.R, s.t)
+    setting = Setting(e, found.R, found.t, CAMERA_FILE, False)
+    joint = on_print(found.normals, setting, torch.zeros(100, 4, PLACE, dtype=F64))
+    assert (joint.misfit == Misfit.SCATTER).sum() > 20
+    before = found.t - t
+    assert (before + joint.step[:, :3]).square().mean() < 1.5 * before.square().mean()
+
+
 def test_one_thing_of_a_camera_is_seen_where_the_sum_is_no_surprise() -> None:
     """k1 off by 4.5 deviations of what 30 residuals tell of it: a camera, also where chi-squared of all is usual."""
     number = ALONG + 5
@@ -247,6 +276,52 @@ def test_one_thing_of_a_camera_is_seen_where_the_sum_is_no_surprise() -> None:
     usual = found.chi2 < quantile(found.freedom, SURE)
     assert usual.double().mean() > 0.2
     assert (found.misfit[usual] == Misfit.CAMERA).double().mean() > 0.4
+
+
+@pytest.mark.parametrize("deviations", [0.0, 2.5, 4.0])
+def test_a_number_that_may_be_off_counts_by_its_share(deviations: float) -> None:
+    """Against sums over the number itself: a hundred thousand of it under every deviation that it may have."""
+    told = torch.tensor([0.04, 1.0, 25.0], dtype=F64)
+    found = may_be_off(told, deviations * told.sqrt())
+    sizes = torch.logspace(-3, math.log10(300), 16, dtype=F64)[:, None, None]
+    unit = torch.linspace(-12, 12, 100_001, dtype=F64)
+    prior = torch.softmax(-0.5 * unit.square(), 0)
+    number = sizes * unit  # (16, 1, n)
+    likelihood = prior * (deviations * told.sqrt()[:, None] * number - 0.5 * told[:, None] * number.square()).exp()
+    evidence = likelihood.sum(-1)
+    share = evidence / (
+        3 * 6 * 16 + evidence.sum(0)
+    )  # nothing as likely as three families, k1 one of six of the camera
+    mean = (likelihood * number).sum(-1) / evidence
+    torch.testing.assert_close(found, (share * mean.square()).sum(0), rtol=1e-3, atol=1e-12)
+
+
+def test_what_residuals_do_not_tell_of_a_lens_is_not_counted() -> None:
+    nothing, zero = torch.tensor([0.0, 1e-9, 4.0], dtype=F64), torch.zeros(3, dtype=F64)
+    assert (may_be_off(nothing, zero) == 0).all()
+
+
+def test_rows_of_a_lens_that_bends_a_little_more_cover_more_of_their_errors() -> None:
+    """k1 off by few deviations of what a row tells of it, and the pose by a dozen of its own; a lens that is known."""
+    target = Target.load("hexa50")
+    r, t = random_poses(200, 30, (120, 140))
+    exact = evidence(target, r, t, 0.02)
+    nees = {}
+    for k1 in (0.0, 0.002):
+        true = dataclasses.replace(KNOWN_LENS, distortion=torch.tensor([k1, 0.0, 0.0, 0.0], dtype=F64))
+        xy = (exact.center - exact.matrix[:2, 2]) / exact.matrix.diagonal()[:2]
+        e = dataclasses.replace(exact, center=true.distort(xy))
+        s = solve_poses(e, (r, t))
+        for camera in (CAMERA_FILE, KNOWN_LENS):
+            setting = Setting(e, s.R, s.t, camera, False)
+            joint = on_print(center_normals(e, s.R, s.t), setting, torch.zeros(200, len(target), PLACE, dtype=F64))
+            turned = rotations.exp(joint.step[:, 3:]) @ s.R
+            error = torch.cat([s.t + joint.step[:, :3] - t, rotations.log(turned @ r.mT)], -1)
+            nees[k1, camera.lens_stated] = (
+                error[:, None] @ torch.linalg.solve(joint.covariance, error[..., None])
+            ).mean()
+    assert nees[0.002, False] < nees[0.002, True] / 3
+    assert 5.3 < nees[0.0, False] < 6.2  # and little is lost where the lens is as its file says
 
 
 def test_what_no_print_may_have_is_not_explained() -> None:
@@ -301,7 +376,7 @@ def test_an_uncertain_scale_is_an_uncertain_distance() -> None:
     target = dataclasses.replace(QUAD, scale_sigma=1e-3)
     r, t = random_poses(1, 30, (150, 190))
     e = evidence(target, r, t, 1e-3)
-    joint = on_print(center_normals(e, r, t), Setting(e, r, t, CAMERA_FILE, False), torch.zeros(1, 4, PLACE, dtype=F64))
+    joint = on_print(center_normals(e, r, t), Setting(e, r, t, KNOWN_LENS, False), torch.zeros(1, 4, PLACE, dtype=F64))
     assert joint.systematic.shape[-1] == 1
     torch.testing.assert_close(joint.systematic[0, :3, 0].abs(), 1e-3 * t[0].abs(), rtol=1e-4, atol=1e-7)
     assert joint.systematic[0, 3:].abs().max() < 1e-8

@@ -76,6 +76,17 @@ def test_rings_beside_their_places_are_counted(method: str, stated: bool) -> Non
         assert (poses.misfit == Misfit.PRINT).sum() >= FRAMES - 1
 
 
+def test_rings_of_a_rough_print_are_looked_for_where_they_are() -> None:
+    """50 um, a third of a px, as stated: as precise as places off by that leave it, and not what centres alone tell."""
+    target = tp.Target.load("quad40")
+    r, t = random_poses(FRAMES, 40, (140, 180), seed=13)
+    poses = tp.PoseEstimator(CAMERA, known(target, 0.05, 0.0))(frames_of(off(target, 0.05, FRAMES), r, t))
+    assert poses.ok.all()
+    assert nees(poses, r, t).sum() < 67
+    # depth by four rings whose places along the axis are off alike in the mean: half of one's, 0.025 mm
+    assert (poses.std[:, 2] < 0.03).all()
+
+
 def test_places_come_out() -> None:
     """As far as a frame tells them: the places found lie on those of the print once both are laid over each other."""
     target = tp.Target.load("quad40")

@@ -3,7 +3,7 @@
 from torchpose.analysis.crlb import pose_crlb, rig_crlb
 from torchpose.analysis.errors import PoseErrors, pose_errors, rms
 from torchpose.analysis.monte_carlo import simulate_frames, simulate_points
-from torchpose.analysis.placing import second_camera_crlb
+from torchpose.analysis.placing import second_camera_crlb, with_second
 from torchpose.analysis.sensitivity import ErrorBudget, Uncertainty, edge_noise, propagate
 
 __all__ = [
@@ -19,4 +19,5 @@ __all__ = [
     "second_camera_crlb",
     "simulate_frames",
     "simulate_points",
+    "with_second",
 ]

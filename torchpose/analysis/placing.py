@@ -9,11 +9,25 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.analysis.crlb import pose_crlb
-from torchpose.camera import Camera
+from torchpose.camera import Camera, CameraRig
 from torchpose.geometry import rotations
 from torchpose.geometry.arguments import checked
 from torchpose.geometry.least_squares import scaled_inverse
 from torchpose.target import Target
+
+
+def _turns(angle: Tensor) -> Tensor:
+    """By angles (A,), rad, about the vertical of the picture (A, 3, 3)."""
+    return rotations.exp(angle[:, None] * angle.new_tensor([0.0, 1.0, 0.0]))
+
+
+@checked
+def with_second(camera: Camera, distance: float, angle: float) -> CameraRig:
+    """A camera and a second one like it, turned by ``angle`` (rad) about the vertical through the point of the first
+    one's axis that is ``distance`` mm away. Their places are exact."""
+    t = camera.matrix.new_tensor([0.0, 0.0, distance])
+    turn = _turns(t.new_tensor([angle]))[0]
+    return CameraRig([camera, camera], torch.stack([torch.eye(3).to(t), turn]), torch.stack([0 * t, t - turn @ t]))
 
 
 @checked
@@ -31,7 +45,7 @@ def second_camera_crlb(
         angle: between the cameras, rad.
         conditions: as of `pose_crlb`.
     """
-    turn = rotations.exp(angle[:, None] * t.new_tensor([0.0, 1.0, 0.0]))
+    turn = _turns(angle)
     bound = pose_crlb(camera, target, torch.cat([R[None], turn @ R]), t.expand(len(angle) + 1, 3), **conditions)
     there = bound.isfinite().flatten(1).all(1)
     fisher, known = scaled_inverse(torch.where(there[:, None, None], bound, torch.eye(6).to(bound)))

@@ -12,7 +12,9 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchpose.calibration import lenses
+from torchpose.calibration.hand_eye import Transform
 from torchpose.calibration.plate import Plate
+from torchpose.calibration.robot import CHAIN, Closure, Settled, WithoutRobot, shown_noise
 from torchpose.calibration.views import Views
 from torchpose.camera import Camera, CameraRig
 from torchpose.errors import ConfigError
@@ -47,7 +49,8 @@ class Places(Rows):
 @dataclass(frozen=True, eq=False)
 class Bundle:
     """Least-squares estimate of n intrinsics (of each camera fx, fy, cx, cy, then the distortion), of the places of the
-    other cameras of a rig (6 each), of k unknowns of the plate, and of N poses.
+    other cameras of a rig (6 each), of X and Z of a robot's chain (12) where there is one, of k unknowns of the plate,
+    and of N poses.
 
     Poses are target to (first) camera. What is said of the intrinsics is said whether they were unknown or not; k is 0
     where the plate is known.
@@ -58,7 +61,7 @@ class Bundle:
     t: Float[Tensor, "N 3"]  # mm
     residual: Float[Tensor, "K 2"]  # seen - predicted, px
     chi2: Float[Tensor, " K"]  # in the covariances of the points
-    # about these u = n + 6 (C - 1) + k unknowns, the poses being unknown, with what is known
+    # about these u = n + 6 (C - 1) + k (+ 12) unknowns, the poses being unknown, with what is known
     information: Float[Tensor, "u u"]
     pose_covariance: Float[Tensor, "N 6 6"]  # translation (mm), rotation about the camera axes; for exact intrinsics
     gain: Float[Tensor, "N 6 u"]  # d pose / d intrinsics and plate at the optimum
@@ -67,6 +70,7 @@ class Bundle:
     # of what is predicted, by the fit alone: of the pixels (d = 2), or of what the rims tell (d = 7)
     predicted: Float[Tensor, "K d d"]
     rims: Float[Tensor, "K r"]  # what rims tell less what is predicted (r = 7); none where they were not asked
+    robot: Settled | None = None
 
     @property
     def camera(self) -> Camera:
@@ -87,7 +91,7 @@ def adjust(
     """Levenberg-Marquardt over intrinsics, places, plate and poses, the last eliminated; residuals are whitened.
 
     Args:
-        views: with regular covariances.
+        views: with regular covariances; with a robot its chain closes, too.
         camera: to start from; its model and number of coefficients stay. Of a rig the places of the others are unknown.
         R: (N, 3, 3), to start from.
         t: (N, 3), to start from, mm.
@@ -98,11 +102,13 @@ def adjust(
     Raises:
         ConfigError: the start puts points behind the camera, or the points of a view leave its pose open.
     """
-    rig = camera if isinstance(camera, CameraRig) else CameraRig.alone(camera)
+    rig = CameraRig.of(camera)
     problem, count = _Problem(views, rig, plate, free), lenses.count(rig.cameras)
-    own: dict[str, Vector | Places] = {"intrinsics": Vector(views.pixels.new_zeros(1, count))} if free else {}
+    own: dict[str, Vector | Places | Pose] = {"intrinsics": Vector(views.pixels.new_zeros(1, count))} if free else {}
     if len(rig) > 1:
         own["places"] = Places(rig.R[None, 1:], rig.t[None, 1:])
+    if views.robot is not None:
+        own |= {name: Pose(x[0][None], x[1][None]) for name, x in (("x", views.robot.x), ("z", views.robot.z))}
     if plate is not None:
         own["plate"] = Vector((plate.known.new_zeros(len(plate)) if start is None else start)[None])
     first = Unknowns(own, {"pose": Pose(R, t)}, views.view.new_zeros(len(views)))
@@ -127,7 +133,8 @@ def adjust(
     found_at = (moved, pose.R, pose.t, residual, chi2, information, covariance, gain, converged)
     unknown = 0 if free else count
     predicted = problem.predicted(unknowns, moved, information, covariance, gain, unknown)
-    return Bundle(*found_at, z, predicted, problem.of_rims(unknowns, moved, placed))
+    robot = problem.settled(unknowns, normal, unknown)
+    return Bundle(*found_at, z, predicted, problem.of_rims(unknowns, moved, placed), robot)
 
 
 class Placed(NamedTuple):
@@ -148,7 +155,7 @@ class _Problem:
 
     def __init__(self, views: Views, rig: CameraRig, plate: Plate | None, free: bool) -> None:
         self.views, self.plate, self.free, self.lens = views, plate, free, views.lens
-        self.start = rig
+        self.start, self.robot = rig, views.robot
         self.point = views.point if plate is None else plate.index(views.point)
         self.rims = views.rims if plate is not None and plate.rims else None
         if self.rims is None:
@@ -232,11 +239,59 @@ class _Problem:
                 views.view.new_zeros(len(views)),
             ),
         )
+        normal = self._with_robot(normal, unknowns)
         if self.plate is None:
             return normal
         before = own.shape[-1] - len(self.plate)
         prior, moved = (pad(values, (before, 0)) for values in (self.plate.known, unknowns.values("plate")))
         return normal.with_prior(torch.diag(prior)[None], moved)
+
+    def _x_and_z(self, unknowns: Unknowns) -> tuple[Transform, Transform]:
+        x, z = (cast(Pose, unknowns.own[name]) for name in ("x", "z"))
+        return (x.R[0], x.t[0]), (z.R[0], z.t[0])
+
+    def _chain(self, unknowns: Unknowns, normal: Normal) -> tuple[Closure, Tensor]:
+        """The robot's chain, and derivatives (N, 6, n) of the predicted poses by the own unknowns of the equations."""
+        assert self.robot is not None
+        closure = self.robot.closed(*self._x_and_z(unknowns), unknowns.pose.R, unknowns.pose.t)
+        after = 0 if self.plate is None else len(self.plate)
+        return closure, pad(closure.by_chain, (normal.right.shape[-1] - after - CHAIN, after))
+
+    def _with_robot(self, normal: Normal, unknowns: Unknowns) -> Normal:
+        """With the residuals of the robot's chain, where there is one."""
+        if self.robot is None:
+            return normal
+        (closure, by_own), part = self._chain(unknowns, normal), normal.eliminated
+        assert part is not None
+        weighted, residual = closure.weight[..., None], closure.residual[..., None]
+        by_view = weighted * closure.by_view
+        return replace(
+            normal,
+            information=normal.information + (by_own.mT @ (weighted * by_own)).sum(0),
+            right=normal.right + (by_own.mT @ (weighted * residual)).sum(0)[None, :, 0],
+            cost=normal.cost + (closure.weight * closure.residual.square()).sum(),
+            eliminated=replace(
+                part,
+                mixed=part.mixed + by_own.mT @ by_view,
+                information=part.information + closure.by_view.mT @ by_view,
+                right=part.right + (by_view.mT @ residual)[..., 0],
+            ),
+        )
+
+    def settled(self, unknowns: Unknowns, normal: Normal, known: int) -> Settled | None:
+        """The robot's chain as it was found, where there is one; the first intrinsics were held."""
+        if self.robot is None:
+            return None
+        closure, by_own = self._chain(unknowns, normal)
+        part = normal.eliminated
+        assert part is not None
+        weighted = closure.weight[..., None] * closure.by_view
+        own = normal.information[0] - (by_own.mT @ (closure.weight[..., None] * by_own)).sum(0)
+        mixed, views = part.mixed - by_own.mT @ weighted, part.information - closure.by_view.mT @ weighted
+        rest = WithoutRobot(own[known:, known:], mixed[:, known:], views)
+        x, z = self._x_and_z(unknowns)
+        shown = shown_noise(self.robot, closure, by_own[..., known:], rest)
+        return Settled(replace(self.robot, x=x, z=z), closure.residual, shown)
 
     def predicted(
         self, unknowns: Unknowns, rig: CameraRig, information: Tensor, poses: Tensor, gain: Tensor, known: int
@@ -252,6 +307,8 @@ class _Problem:
         """Residuals (K, d), derivatives of what is predicted by the pose; by intrinsics, places and plate."""
         of = self._by_rims if self.rims is not None else self._by_pixels
         residual, by_pose_seen, columns = of(unknowns, rig, placed)
+        if self.robot is not None:  # whose chain pixels tell nothing of
+            columns.insert(1, residual.new_zeros(*residual.shape, CHAIN))
         if len(rig) == 1:
             return residual, by_pose_seen, columns
         turn = rig.R[self.lens]

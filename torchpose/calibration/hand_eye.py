@@ -5,6 +5,7 @@ Both mounts are one equation, A_i X B_i = Z: B_i is the target in the camera, X 
 - camera on the base: A_i = tool_from_base, X = base_from_camera, Z = tool_from_target (the target is on the tool).
 """
 
+import math
 from dataclasses import dataclass
 from typing import Literal, cast
 
@@ -15,7 +16,7 @@ from torch import Tensor
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.geometry.arguments import checked
-from torchpose.geometry.least_squares import Minimum, Normal, Pose, Unknowns, minimise
+from torchpose.geometry.least_squares import Minimum, Normal, Pose, Unknowns, minimise, scaled_inverse
 from torchpose.geometry.projection import by_pose
 from torchpose.handeye import HandEye
 
@@ -23,9 +24,12 @@ MIN_POSES = 4
 _ITERATIONS = 50
 _RELATIVE = 1e-12  # decrease that a step must promise, of the cost
 _LEAST_TURN_DEG = 1.0  # RMS rotation about an axis, below which the robot has not turned about it
-_START_NOISE = (0.05, 2e-4)  # mm, rad of the robot, until the residuals tell
-_NOISE_ROUNDS = 8
-_LEAST_NOISE = (1e-6, 1e-9)  # mm, rad: where an estimate of none ends
+START_NOISE = (0.05, 2e-4)  # mm, rad of the robot, until the residuals tell
+_NOISE_ROUNDS, _NOISE_STEPS = 8, 100
+_SETTLED = 1e-6  # relative change of a variance in a step: far below what residuals tell of it
+LEAST_NOISE = (1e-6, 1e-9)  # mm, rad: where an estimate of none ends
+
+_MOST_NOISE = (5.0, 0.05)  # mm, rad: a robot that is farther off was not there when the frames were taken
 
 Mount = Literal["base", "tool"]
 Transform = tuple[Tensor, Tensor]
@@ -47,6 +51,13 @@ class HandEyeFit:
     degrees: int  # of freedom of the fit
     robot_sigma_mm: float  # standard deviation of the robot's position, per axis, given or estimated
     robot_sigma_rad: float  # the same of its orientation
+
+    @property
+    def shown(self) -> Noise:
+        """The noise that the residuals show, if it is in proportion as it was given."""
+        # of a fit that is lost, as that of the wrong mount may be, even the sum of squares is
+        over = (self.chi2 / max(self.degrees, 1)) ** 0.5 if self.chi2 >= 0 else math.inf
+        return over * self.robot_sigma_mm, over * self.robot_sigma_rad
 
 
 @checked
@@ -81,7 +92,7 @@ def calibrate_hand_eye(
     moments = _Moments(robot if mount == "tool" else rotations.inverse(*robot), target, covariance, mount)
     x, z = linear_start(moments.a, target)
     unknowns = Unknowns({name: Pose(r[None], t[None]) for name, (r, t) in (("x", x), ("z", z))})
-    noise = robot_sigma or _START_NOISE
+    noise = robot_sigma or START_NOISE
     for _ in range(_NOISE_ROUNDS if robot_sigma is None else 0):
         unknowns = moments.fit(unknowns, noise).unknowns
         noise = _estimate_noise(moments, unknowns, noise)
@@ -96,6 +107,33 @@ def calibrate_hand_eye(
     (r, t), z = _transforms(found.unknowns)
     hand_eye = HandEye(mount, r, t, covariance=spread[:6, :6])
     return HandEyeFit(hand_eye, *z, spread, residual, float(found.normal.cost), 6 * len(covariance) - 12, *noise)
+
+
+def calibrate_mount(
+    robot: Transform,
+    target: Transform,
+    covariance: Tensor,
+    *,
+    robot_sigma: Noise | None = None,
+    intrinsics: tuple[Tensor, Tensor] | None = None,
+) -> HandEyeFit:
+    """`calibrate_hand_eye` where the mount is not known: it follows from the poses.
+
+    Raises:
+        ConfigError: as there, or poses of robot and target that have nothing to do with each other.
+    """
+    mounts: tuple[Mount, Mount] = ("base", "tool")
+    fits = [
+        calibrate_hand_eye(robot, target, covariance, mount, robot_sigma=robot_sigma, intrinsics=intrinsics)
+        for mount in mounts
+    ]
+    fit = min(fits, key=lambda one: one.shown[0])
+    if fit.shown[0] > _MOST_NOISE[0] or fit.shown[1] > _MOST_NOISE[1]:
+        raise ConfigError(
+            f"robot_pose: robot and target poses disagree by {fit.shown[0]:.1f} mm and {fit.shown[1]:.2g} rad; check "
+            "the units and that each pose was read when its frame was taken"
+        )
+    return fit
 
 
 def check_motion(rotation: Tensor) -> None:
@@ -194,25 +232,51 @@ def _transforms(unknowns: Unknowns) -> tuple[Transform, Transform]:
 
 
 def _estimate_noise(moments: _Moments, unknowns: Unknowns, start: Noise) -> Noise:
-    """Noise of the robot (mm, rad) of greatest restricted likelihood for the residuals of the last fit."""
+    """Noise of the robot (mm, rad) that the residuals of the last fit show."""
     x, _ = _transforms(unknowns)
     residual, jacobian, _ = moments.linearised(unknowns, start)
     units: tuple[Noise, Noise] = ((1.0, 0.0), (0.0, 1.0))
-    by_position, by_turn = (moments.robot_covariance(x, moments.b, unit) for unit in units)
-    log = residual.new_tensor(start).clamp_min(_LEAST_NOISE[1]).log().requires_grad_()
-    optimiser = torch.optim.LBFGS([log], max_iter=50, line_search_fn="strong_wolfe")
+    parts = torch.stack([moments.robot_covariance(x, moments.b, unit) for unit in units])
+    nothing = jacobian.new_zeros(jacobian.shape[-1], jacobian.shape[-1] + 1)
+    return restricted_noise(residual, jacobian, moments.covariance, parts, nothing, start)
 
-    @torch.enable_grad()
-    def closure() -> Tensor:
-        optimiser.zero_grad()
-        variance = (2 * log).exp()
-        spread = moments.covariance + variance[0] * by_position + variance[1] * by_turn
-        white = torch.linalg.solve(spread, torch.cat([jacobian, residual[..., None]], -1))
-        information = (jacobian.mT @ white[..., :-1]).sum(0)
-        cost = spread.logdet().sum() + (residual * white[..., -1]).sum() + information.logdet()
-        cost.backward()
-        return cost
 
-    optimiser.step(closure)
-    sigma_t, sigma_r = log.detach().exp().tolist()
-    return max(sigma_t, _LEAST_NOISE[0]), max(sigma_r, _LEAST_NOISE[1])
+def restricted_noise(
+    residual: Float[Tensor, "N 6"],
+    columns: Float[Tensor, "N 6 u"],
+    covariance: Float[Tensor, "N 6 6"],
+    parts: Float[Tensor, "2 N 6 6"],
+    known: Float[Tensor, "u v"],
+    start: Noise,
+) -> Noise:
+    """Noise of the robot (mm, rad) of greatest restricted likelihood (Patterson and Thompson 1971).
+
+    Residuals y that u unknowns move by X have the covariance S, of the poses and of the parts D_k of the noise. At the
+    maximum y^T P D_k P y = tr P D_k with P = S^-1 - S^-1 X (A + X^T S^-1 X)^-1 X^T S^-1, A being what else is known of
+    the unknowns: a step makes both equal as if P stayed, and never leads to less than nothing.
+
+    Args:
+        residual: seen less predicted.
+        columns: derivatives of the predicted by the unknowns.
+        covariance: of the residuals without the noise.
+        parts: of their covariance by noise of 1 mm, and of 1 rad.
+        known: A, and last the right side (v = u + 1) that belongs to it.
+        start: from above it is found in few steps.
+    """
+    y, information, right = residual[..., None], known[:, :-1], known[:, -1:]
+    variance, least = y.new_tensor(start).square(), y.new_tensor(LEAST_NOISE).square()
+    for _ in range(_NOISE_STEPS):
+        weight = torch.linalg.inv(covariance + (variance[:, None, None, None] * parts).sum(0))
+        pulled = columns.mT @ weight
+        inverse, determined = scaled_inverse((information + (pulled @ columns).sum(0))[None])
+        if not bool(determined):
+            break
+        own = inverse[0] @ (right + (pulled @ y).sum(0))
+        left = weight @ (y - columns @ own)
+        outer = weight - pulled.mT @ inverse @ pulled
+        over = (left.mT @ parts @ left).sum((1, 2, 3)) / (outer * parts).sum((1, 2, 3))
+        before, variance = variance, torch.maximum(variance * over, least)
+        if bool(((variance / before).log().abs() < _SETTLED).all()):
+            break
+    mm, rad = variance.sqrt().tolist()
+    return mm, rad

@@ -240,7 +240,7 @@ class Common(NamedTuple):
 def weigh(views: Views, bundle: Bundle, unknowns: int, plate: Plate | None = None) -> tuple[Views, Bundle, Common]:
     """Views without contradicting points, their fit, weighted, of n unknown intrinsics, and the common error.
 
-    ``bundle`` is a `first_fit`: with equal weights.
+    ``bundle`` is a `first_fit`: with equal weights. The noise of a robot is what its residuals show.
     """
     # with wrong places residuals tell nothing of the noise: the first fit that moves them goes by the covariances alone
     told = plate is not None and bool(views.covariance.any())
@@ -254,6 +254,8 @@ def weigh(views: Views, bundle: Bundle, unknowns: int, plate: Plate | None = Non
     for number in range(_ROUNDS + (0 if plate is None else _PLATE_ROUNDS)):
         if number:
             common = _common(views, bundle, common)
+        if number and bundle.robot is not None:
+            views = replace(views, robot=bundle.robot.again())
         bundle = fit(bundle, views, common)
         keep = _agree(bundle.chi2, _OUTLIER, _MEDIAN)
         keep &= _agree(_rim_chi2(views, bundle, common), _RIM_OUTLIER, _RIM_MEDIAN)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import torch
+
+from torchpose.calibration.hand_eye import HandEyeFit, calibrate_mount
 from torchpose.calibration.intrinsics import first_fit
 from torchpose.calibration.measured import check_seen, measured_plate, poorly_known, scale_sigma
 from torchpose.calibration.plate import free_plate, stated_plate
@@ -21,7 +24,11 @@ from torchpose.calibration.views import Views
 from torchpose.camera import LINEAR, Camera, Tone
 from torchpose.config import within
 from torchpose.errors import ConfigError
+from torchpose.geometry import rotations
 from torchpose.target import Target
+
+RobotPoses = Mapping[str, Sequence[float]]
+"""base_from_tool by name of the moment: x, y, z in mm, rotation vector in rad."""
 
 _MEASURED = 2  # times that the grey values are fitted, as with one camera
 
@@ -49,7 +56,12 @@ class RigMeasurement:
 
 
 def calibrate_cameras(
-    several: Sequence[OneCamera], shown: Shown, *, lens: str | None = "brown5", tone: Tone | None = None
+    several: Sequence[OneCamera],
+    shown: Shown,
+    *,
+    lens: str | None = "brown5",
+    tone: Tone | None = None,
+    robot: RobotPoses | None = None,
 ) -> RigCalibration:
     """Places of cameras, and their intrinsics unless they are held, from frames of a target or a board.
 
@@ -60,6 +72,7 @@ def calibrate_cameras(
         shown: what the frames show.
         lens: a name of `LENS_MODELS`; None: the cameras are held as they are.
         tone: see `calibrate_camera`.
+        robot: see `calibrate_rig`.
 
     Raises:
         ConfigError: as `calibrate_camera` for one of the cameras, or as `calibrate_rig`.
@@ -68,7 +81,7 @@ def calibrate_cameras(
     if isinstance(shown, Target) and shown.covariance is not None:
         plate = stated_plate(shown.ids, shown.centers, shown.covariance[:-1, :-1])
     located = [_alone(one, shown, lens, tone) for one in several]
-    return calibrate_rig(located, lens=lens, plate=plate)
+    return calibrate_rig(located, lens=lens, plate=plate, robot=robot)
 
 
 def _alone(one: OneCamera, shown: Shown, lens: str | None, tone: Tone | None) -> Located:
@@ -81,25 +94,46 @@ def _alone(one: OneCamera, shown: Shown, lens: str | None, tone: Tone | None) ->
 
 
 def measure_with_cameras(
-    several: Sequence[OneCamera], target: Target, *, lens: str | None = "brown5", tone: Tone | None = None
+    several: Sequence[OneCamera],
+    target: Target,
+    *,
+    lens: str | None = "brown5",
+    tone: Tone | None = None,
+    robot: RobotPoses | None = None,
 ) -> RigMeasurement:
     """The same with places, edge gain and sizes of the target's rings unknown, see `measure_target`.
 
     Correlations of the target with the cameras are in the joint covariance, and in no file.
     """
-    cameras = calibrate_cameras(several, target, lens=lens, tone=tone).rig.cameras
+    cameras = calibrate_cameras(several, target, lens=lens, tone=tone, robot=robot).rig.cameras
     known = target
     for _ in range(_MEASURED):
         located = [_rims(one, camera, known) for one, camera in zip(several, cameras, strict=True)]
         _check_seen(located, target)
         plate = free_plate(target.ids, target.centers, known.normals, discs=target.discs)
-        found = calibrate_rig(located, lens=lens, plate=plate)
+        found = calibrate_rig(located, lens=lens, plate=plate, robot=robot)
         of_plate = found.joint[-len(plate) :, -len(plate) :]
         measured = measured_plate(plate, found.bundle.plate, of_plate, known)
         known = replace(measured, scale_sigma=scale_sigma(target, None))
         cameras = found.rig.cameras
     doubts = poorly_known(plate, found.bundle.plate, of_plate, target)
     return RigMeasurement(replace(found, warnings=[*found.warnings, *doubts]), target, known)
+
+
+def hand_eye_of(found: RigCalibration, robot: RobotPoses) -> HandEyeFit:
+    """Hand-eye transform of the first camera of a rig, from the poses of all moments of which the robot's is known.
+
+    Raises:
+        ConfigError: as `calibrate_mount`.
+    """
+    if found.hand_eye is not None:
+        return found.hand_eye
+    bundle, there = found.bundle, torch.tensor([name in robot for name in found.views.names])
+    tool = bundle.t.new_tensor([robot[name] for name in found.views.names if name in robot]).view(-1, 6)
+    shift, seen = (bundle.gain[there], found.joint), (bundle.R[there], bundle.t[there])
+    return calibrate_mount(
+        (rotations.exp(tool[:, 3:]), tool[:, :3]), seen, bundle.pose_covariance[there], intrinsics=shift
+    )
 
 
 def _rims(one: OneCamera, camera: Camera, target: Target) -> Located:

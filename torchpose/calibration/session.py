@@ -10,7 +10,7 @@ from torch import Tensor
 from torchpose.calibration.boards import Board, find_corners
 from torchpose.calibration.bundle import Bundle
 from torchpose.calibration.grids import Grid, Marks, find_marks, measure_marks, nominal_board, sizes_of_marks
-from torchpose.calibration.hand_eye import HandEyeFit, Mount, calibrate_hand_eye
+from torchpose.calibration.hand_eye import HandEyeFit, calibrate_mount
 from torchpose.calibration.intrinsics import (
     Calibration,
     calibrate_intrinsics,
@@ -46,7 +46,6 @@ Shown = Target | Board | Grid
 
 _MEASURED = 2  # times that the grey values are fitted: the second changes places by less than their deviation
 _SAMPLE = 16  # frames that the tone is judged by
-_MOST_NOISE = (5.0, 0.05)  # mm, rad: a robot that is farther off was not there when the frames were taken
 
 
 def parse_board(text: str) -> Board | Grid:
@@ -280,12 +279,4 @@ def calibrate_robot(
     tool = bundle.t.new_tensor([robot[name] for name in views.names])
     poses, seen = (rotations.exp(tool[:, 3:]), tool[:, :3]), (bundle.R, bundle.t)
     shift = None if intrinsics is None else (bundle.gain[..., : len(intrinsics)], intrinsics)
-    mounts: tuple[Mount, Mount] = ("base", "tool")
-    fits = [calibrate_hand_eye(poses, seen, bundle.pose_covariance, mount, intrinsics=shift) for mount in mounts]
-    fit = min(fits, key=lambda one: one.robot_sigma_mm)
-    if fit.robot_sigma_mm > _MOST_NOISE[0] or fit.robot_sigma_rad > _MOST_NOISE[1]:
-        raise ConfigError(
-            f"robot_pose: robot and target poses disagree by {fit.robot_sigma_mm:.1f} mm and "
-            f"{fit.robot_sigma_rad:.2g} rad; check the units and that each pose was read when its frame was taken"
-        )
-    return fit
+    return calibrate_mount(poses, seen, bundle.pose_covariance, intrinsics=shift)

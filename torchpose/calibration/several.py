@@ -1,13 +1,13 @@
 """Several cameras calibrated together: which of them see the target at one time, and one adjustment of all.
 
-Not all cameras need to see the target at once. Moments tie those together that do; a chain of ties is enough.
+Not all cameras need to see the target at once. Moments tie those together that do; a chain of ties is enough, and where
+there is none the poses of a robot are (`calibration.ties`): then its chain is part of the adjustment.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import compress
 from typing import NamedTuple
 
 import torch
@@ -17,6 +17,7 @@ from torch.nn.functional import pad
 
 from torchpose.calibration import lenses
 from torchpose.calibration.bundle import Bundle, adjust
+from torchpose.calibration.hand_eye import HandEyeFit
 from torchpose.calibration.intrinsics import (
     carried,
     channels,
@@ -31,15 +32,27 @@ from torchpose.calibration.intrinsics import (
     widened,
 )
 from torchpose.calibration.plate import Plate
+from torchpose.calibration.robot import CHAIN, Settled
+from torchpose.calibration.ties import (
+    check_connected,
+    common_moments,
+    first_places,
+    group_of_moments,
+    groups_of,
+    names_of,
+    tied_by_robot,
+)
 from torchpose.calibration.views import Views
 from torchpose.camera import Camera, CameraRig
 from torchpose.camera.rig import POSE
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.geometry.segments import segment_sum
+from torchpose.handeye import HandEye
 
 _FEW_TIES = 3  # moments that tie a camera to the others (convention): fewer leave a false one unseen
 _START_SIGMA = 1.0  # px (convention): of every point, for the start
+_ORDINARY_SIGMA = 0.01  # px: of the centres of rings in the end (docs/precision.md)
 _LOST = 27.6  # chi-squared of a point that a start does not explain (derived: one good one in 10^6 has more)
 _NAMED = 3  # moments in a sentence (convention)
 
@@ -61,8 +74,8 @@ class RigCalibration:
 
     Attributes:
         rig: cameras and places, each with its covariance.
-        joint: covariance of the intrinsics of all cameras, of the places of all but the first (6 each), and of the
-            unknowns of the plate.
+        joint: covariance of the intrinsics of all cameras, of the places of all but the first (6 each), of X and Z of a
+            robot (12) where one ties the cameras, and of the unknowns of the plate.
         names: of the intrinsics and the places.
         views: the points that were used, by moment.
         bundle: poses and residuals of these.
@@ -72,6 +85,8 @@ class RigCalibration:
         common_sigma_px: as in `Calibration`.
         common: in how many moments two cameras see the target, and each by itself.
         plate: what was unknown of the target.
+        hand_eye: of the first camera, where a robot ties the cameras together; its residuals are the robot's pose, said
+            less predicted, along and about the axes of its base.
         warnings: what makes the result doubtful, one sentence each.
     """
 
@@ -86,6 +101,7 @@ class RigCalibration:
     common_sigma_px: float
     common: Int[Tensor, "C C"]
     plate: Plate | None = None
+    hand_eye: HandEyeFit | None = None
     warnings: list[str] = field(default_factory=list)
 
     @property
@@ -116,7 +132,11 @@ class Together(NamedTuple):
 
 
 def calibrate_rig(
-    located: Sequence[Located], *, lens: str | None = "brown5", plate: Plate | None = None
+    located: Sequence[Located],
+    *,
+    lens: str | None = "brown5",
+    plate: Plate | None = None,
+    robot: Mapping[str, Sequence[float]] | None = None,
 ) -> RigCalibration:
     """Maximum-likelihood places of cameras, their intrinsics, and the poses of all moments, in one adjustment.
 
@@ -126,24 +146,30 @@ def calibrate_rig(
         located: the cameras; the first is the one that places count from.
         lens: a name of `LENS_MODELS`, of all cameras; None: intrinsics are held, and their covariances carried through.
         plate: what is unknown of the target beside its poses; None where its points are exact.
+        robot: base_from_tool by name of the moment, x y z in mm, rotation vector in rad: ties cameras together that no
+            chain of common moments does, and is left alone where one does.
 
     Raises:
-        ConfigError: cameras that no moments tie together, views that do not determine what is asked, or no convergence.
+        ConfigError: cameras that neither moments nor the robot tie together, views that do not determine what is asked,
+            or no convergence.
     """
-    together, free = _started(located, free=lens is not None), lens is not None
+    together, free = _started(located, robot or {}), lens is not None
     cameras, before = together.rig.cameras, len(together.views.view)
     equal = replace(together.views, covariance=widened(torch.zeros_like(together.views.covariance), _START_SIGMA))
+    if equal.robot is not None:  # in proportion: else views would follow the robot
+        equal = replace(equal, robot=equal.robot.coarser(_START_SIGMA / _ORDINARY_SIGMA))
     start = adjust(equal, together.rig, together.R, together.t, free=free)
     views, bundle, common = weigh(together.views, start, lenses.count(cameras) if free else 0, plate)
     names = tuple(one.name for one in located)
     ties = common_moments(views, len(cameras))
-    check_connected(names, ties)
+    check_connected(names, ties, robot=views.robot is not None)
     if not bundle.converged:
         raise ConfigError("INPUT: calibration did not converge; use a simpler --model or more varied views")
     for number in range(len(cameras)):
         own = views.lens == number
         check_residuals(views.of_lens(number), bundle.residual[own], int((together.views.lens == number).sum()))
-    places = tuple(f"{name} {what}" for name in names[1:] for what in ("x", "y", "z", "rx", "ry", "rz"))
+    more = () if bundle.robot is None else ("hand-eye", "target on the robot")
+    places = tuple(f"{name} {what}" for name in (*names[1:], *more) for what in ("x", "y", "z", "rx", "ry", "rz"))
     known = tuple(f"{name} {what}" for name in names for what in ("fx", "fy", "cx", "cy", *_coefficients(lens)))
     if free:
         joint = covariance_of(bundle.information, known + places)
@@ -163,6 +189,7 @@ def calibrate_rig(
         common.px,
         ties,
         plate,
+        None if bundle.robot is None else _hand_eye(bundle.robot, joint, rig),
     )
     return replace(found, warnings=_warnings(found, together.views, free=free))
 
@@ -186,29 +213,23 @@ def _stated(rig: CameraRig, joint: Tensor, names: tuple[str, ...], known: tuple[
     return CameraRig(cameras, rig.R, rig.t, joint[places, places] if len(rig) > 1 else None, names)
 
 
-def common_moments(views: Views, cameras: int) -> Int[Tensor, "C C"]:
-    """In how many moments each two cameras see the target."""
-    seen = torch.zeros(cameras, len(views), dtype=torch.int64, device=views.view.device)
-    seen[views.lens, views.view] = 1
-    return seen @ seen.mT
+def _hand_eye(robot: Settled, joint: Tensor, rig: CameraRig) -> HandEyeFit:
+    """The first camera in its mount, with the covariance that it has in the adjustment."""
+    first = lenses.count(rig.cameras) + POSE * (len(rig) - 1)
+    (x, z), spread = (robot.robot.x, robot.robot.z), joint[first : first + CHAIN, first : first + CHAIN]
+    mounted = HandEye(robot.robot.mount, *x, covariance=spread[:POSE, :POSE])
+    known = robot.robot.known
+    scale = robot.residual.new_tensor(robot.robot.noise).repeat_interleave(3)
+    chi2 = float((robot.residual / scale)[known].square().sum())
+    degrees = POSE * int(known.sum()) - CHAIN
+    return HandEyeFit(mounted, *z, spread, robot.residual[known], chi2, degrees, *robot.robot.noise)
 
 
-def check_connected(names: Sequence[str], common: Int[Tensor, "C C"]) -> None:
+def _started(located: Sequence[Located], robot: Mapping[str, Sequence[float]]) -> Together:
+    """All views by moment, the cameras where most common moments put them, and the poses that explain most points.
+
+    With the robot that ties them together, where common moments do not.
     """
-    Raises:
-        ConfigError: cameras that no chain of common moments ties to the first one.
-    """
-    reached = torch.linalg.matrix_power((common > 0).double(), len(names)) > 0
-    groups = dict.fromkeys(" and ".join(compress(names, row)) for row in reached.tolist())
-    if len(groups) > 1:
-        raise ConfigError(
-            f"INPUT: cameras {' | '.join(groups)} are apart: the target is seen by one of each at no moment; add "
-            "moments in which it is, or calibrate each by itself"
-        )
-
-
-def _started(located: Sequence[Located], *, free: bool) -> Together:
-    """All views by moment, the cameras where most common moments put them, and the poses that explain most points."""
     names = list(dict.fromkeys(name for one in located for name in one.views.names))
     number = {name: k for k, name in enumerate(names)}
     cameras = tuple(one.camera for one in located)
@@ -221,9 +242,15 @@ def _started(located: Sequence[Located], *, free: bool) -> Together:
     shared = tuple(names)
     views = Views.joined([replace(part, names=shared) for part in parts])
     common = common_moments(views, len(cameras))
-    check_connected([one.name for one in located], common)
-    rig = _first_places(cameras, torch.stack(R), torch.stack(t), common)
-    return Together(views, rig, *_first_poses(views, rig, torch.stack(R), torch.stack(t)))
+    rig = first_places(cameras, torch.stack(R), torch.stack(t), common)
+    poses = _first_poses(views, rig, torch.stack(R), torch.stack(t))
+    if int(groups_of(common).amax()) == 0:
+        return Together(views, rig, *poses)
+    of_cameras = [one.name for one in located]
+    check_connected(of_cameras, common, robot=bool(robot.keys() & set(names)))
+    tool = torch.tensor([robot.get(name, [torch.nan] * POSE) for name in names], dtype=t[0].dtype)
+    tied = tied_by_robot(of_cameras, views, rig, poses, tool)
+    return Together(replace(views, robot=tied.robot), tied.rig, tied.R, tied.t)
 
 
 def _part(views: Views, moment: Tensor, names: tuple[str, ...], number: int, cameras: tuple[Camera, ...]) -> Views:
@@ -234,33 +261,6 @@ def _part(views: Views, moment: Tensor, names: tuple[str, ...], number: int, cam
         after = lenses.count(cameras) - before - rims.by_camera.shape[-1]
         rims = replace(rims, by_camera=pad(rims.by_camera, (before, after)), cameras=cameras)
     return replace(views, view=moment, names=names, camera=torch.full_like(moment, number), rims=rims)
-
-
-def _first_places(cameras: tuple[Camera, ...], R: Tensor, t: Tensor, common: Tensor) -> CameraRig:
-    """Places from the poses (C, N, 3, 3), (C, N, 3), NaN where there is none, along the ties of most moments."""
-    count = len(cameras)
-    eye = torch.eye(3, dtype=R.dtype)
-    turns, shifts = [eye] * count, [torch.zeros(3, dtype=R.dtype)] * count
-    placed = torch.zeros(count, dtype=torch.bool)
-    placed[0] = True
-    for _ in range(count - 1):
-        open_ties = torch.where(placed[:, None] & ~placed, common, 0)
-        known, new = divmod(int(open_ties.argmax()), count)
-        back = rotations.inverse(R[known], t[known])
-        turn, shift = _most_agreed(*rotations.compose(R[new], t[new], *back))
-        turns[new], shifts[new] = rotations.compose(turn, shift, turns[known], shifts[known])
-        placed[new] = True
-    return CameraRig(cameras, torch.stack(turns), torch.stack(shifts))
-
-
-def _most_agreed(R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-    """That of some transforms (N, 3, 3), (N, 3) of the least median distance to all; NaN are none."""
-    there = t.isfinite().all(-1)
-    R, t = R[there], t[there]
-    turned = rotations.log(R[:, None] @ R.mT).norm(dim=-1)
-    moved = (t[:, None] - t).norm(dim=-1) / t.norm(dim=-1).median().clamp_min(1.0)
-    best = int((turned + moved).median(-1).values.argmin())
-    return R[best], t[best]
 
 
 def _first_poses(views: Views, rig: CameraRig, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
@@ -292,17 +292,50 @@ def _warnings(found: RigCalibration, seen: Views, *, free: bool) -> list[str]:
         if free and camera.covariance is not None:
             doubts = doubts_of(own, camera, turns, camera.covariance, found.common_sigma_px)
             told += [f"{names[number]}: {text}" for text in doubts]
-    ties = found.common - torch.diag(found.common.diagonal())
-    for number, most in enumerate(ties.amax(1).tolist()):
-        if most < _FEW_TIES:
-            told.append(
-                f"{names[number]} is tied to the others by {most} moments only; add some, so that a false one shows"
-            )
+    told += _few_ties(found)
+    told += _lost_poses(views, seen)
     rest = [name for name in seen.names if name not in views.names]
     if rest:
-        some = ", ".join(rest[:_NAMED]) + (" and others" if len(rest) > _NAMED else "")
         told.append(
-            f"{len(rest)} moments ({some}) contradict the others: the target moved between their pictures, or a camera "
-            "in its place"
+            f"{_moments(len(rest))} ({_some(rest)}) contradict the others: the target moved between their pictures, "
+            "or a camera in its place"
         )
     return told
+
+
+def _lost_poses(views: Views, seen: Views) -> list[str]:
+    """Robot poses that were left out."""
+    if views.robot is None or seen.robot is None:
+        return []
+    before, after = (dict(zip(v.names, v.robot.known.tolist(), strict=True)) for v in (seen, views) if v.robot)
+    lost = [name for name, known in after.items() if before[name] and not known]
+    if not lost:
+        return []
+    return [
+        f"robot poses of {_moments(len(lost))} ({_some(lost)}) contradict the others and were left out: check that "
+        "each was read when its pictures were taken"
+    ]
+
+
+def _moments(count: int) -> str:
+    return f"{count} moment{'' if count == 1 else 's'}"
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:_NAMED]) + (" and others" if len(names) > _NAMED else "")
+
+
+def _few_ties(found: RigCalibration) -> list[str]:
+    """Cameras that few moments tie to the others, and groups that the robot ties in few."""
+    names, common, group = found.rig.names, found.common, groups_of(found.common)
+    members = torch.bincount(group)
+    most = (common - torch.diag(common.diagonal())).amax(1).tolist()
+    ties = [(name, "by", most[n]) for n, name in enumerate(names) if int(members[group[n]]) > 1]
+    if (robot := found.views.robot) is not None:
+        moments = torch.bincount(group_of_moments(found.views, group)[robot.known], minlength=len(members)).tolist()
+        ties += [(names_of(names, group, k), "by the robot in", count) for k, count in enumerate(moments)]
+    return [
+        f"{name} is tied to the others {by} {_moments(count)} only; add some, so that a false one shows"
+        for name, by, count in ties
+        if count < _FEW_TIES
+    ]

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchpose.calibration.robot import Robot
 from torchpose.camera import Camera
 from torchpose.geometry.rows import Rows, shared
 from torchpose.geometry.segments import rank_in_group
@@ -96,6 +97,7 @@ class Views(Rows):
         names: of the N views (of the frames).
         rims: of the rings, where they were measured.
         camera: number of the camera that saw each point, where there are several.
+        robot: where the robot stood at each view, where that counts.
     """
 
     view: Int[Tensor, " K"]
@@ -106,6 +108,7 @@ class Views(Rows):
     names: tuple[str, ...] = shared()
     rims: Rims | None = None
     camera: Int[Tensor, " K"] | None = None
+    robot: Robot | None = shared(None)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -142,7 +145,9 @@ class Views(Rows):
     def of_views(self, keep: Tensor) -> Self:
         """Some of the views, a mask (N,), numbered anew."""
         rest = self[keep[self.view]]
-        return replace(rest, names=tuple(compress(self.names, keep.tolist())), view=(keep.cumsum(0) - 1)[rest.view])
+        robot = None if self.robot is None else self.robot[keep]
+        names = tuple(compress(self.names, keep.tolist()))
+        return replace(rest, names=names, view=(keep.cumsum(0) - 1)[rest.view], robot=robot)
 
     def padded(self) -> tuple[Tensor, Tensor, Tensor]:
         """By view: points (N, M, 3), pixels (N, M, 2) and mask (N, M), M the most points of a view."""

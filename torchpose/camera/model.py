@@ -217,6 +217,11 @@ class Camera:
         return self.model == "kannala_brandt" or self.distortion.requires_grad or self._any_coefficient
 
     @property
+    def lens_stated(self) -> bool:
+        """Whether the covariance is that of the distortion, too."""
+        return self.covariance is not None and len(self.covariance) > 4
+
+    @property
     def _any_coefficient(self) -> bool:
         """Whether one is not zero; looked at anew only where the tensor was written to: a GPU would be waited for."""
         version, known = self.__dict__.get("_coefficients", (None, False))

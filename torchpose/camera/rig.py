@@ -86,6 +86,11 @@ class CameraRig:
         return cls((camera,), torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3, dtype=torch.float64))
 
     @classmethod
+    def of(cls, camera: Camera | CameraRig) -> CameraRig:
+        """The rig itself, or one of one camera."""
+        return camera if isinstance(camera, CameraRig) else cls.alone(camera)
+
+    @classmethod
     def load(cls, path: str | os.PathLike[str]) -> CameraRig:
         """Reads a rig, see `torchpose.camera.formats.rig.load`."""
         from torchpose.camera.formats import rig

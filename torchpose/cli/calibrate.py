@@ -44,7 +44,7 @@ _BOARD = (
 )
 _HAND_EYE_OUT = (
     "Hand-eye file to write; needs a manifest with robot poses. Which of camera and target is on the tool is found "
-    "from the poses."
+    "from the poses. With --cameras-out that of the first camera."
 )
 _MEASURE_TARGET = (
     "Target file to write: places, edge gain and radii of the target's markers as the frames show them, with their "
@@ -96,8 +96,8 @@ def calibrate(
     if cameras_out is not None or cameras:
         from torchpose.cli.calibrate_rig import Request, calibrate_rig
 
-        single = {"--out": out, "--camera": camera, "--hand-eye-out": hand_eye_out, "--distance": distance}
-        outs = (cameras_out, target_out, plots)
+        single = {"--out": out, "--camera": camera, "--distance": distance}
+        outs = (cameras_out, target_out, hand_eye_out, plots)
         shown = Target.load(target) if target is not None else parse_board(board or "")
         return calibrate_rig(Request(inputs, shown, model, cameras or [], *outs, tone, threads, quiet), single)
     _check_files(out, hand_eye_out, camera, target_out)
@@ -150,7 +150,7 @@ def _run(
                 save(calibration.camera, out.camera, "--out")
             if out.hand_eye is not None:
                 fit = _hand_eye(frames, shown, calibration, start)
-                _show_hand_eye(fit)
+                show_hand_eye(fit)
                 save(fit.hand_eye, out.hand_eye, "--hand-eye-out")
             if out.plots is not None:
                 from torchpose.report.calibration import save_calibration
@@ -354,7 +354,8 @@ def _show_intrinsics(found: Calibration) -> None:
         say(f"{name:>3} {value:14.{digits}f} +- {sigma:.2g}{' px' if name[0] in 'fc' else ''}")
 
 
-def _show_hand_eye(fit: HandEyeFit) -> None:
+def show_hand_eye(fit: HandEyeFit) -> None:
+    """The transform with its standard deviations, and the robot's noise."""
     from torchpose.geometry import rotations
 
     found = fit.hand_eye

@@ -11,6 +11,7 @@ from torchpose.cli.common import cores, ended, interrupted, read_tone, say
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:
+    from torchpose.calibration.hand_eye import HandEyeFit
     from torchpose.calibration.rig_session import RigMeasurement
     from torchpose.calibration.session import Shown
     from torchpose.calibration.several import RigCalibration
@@ -29,6 +30,7 @@ class Request:
     cameras: Sequence[Path]
     cameras_out: Path | None
     target_out: Path | None
+    hand_eye_out: Path | None
     plots: Path | None
     tone: str | None
     threads: int | None
@@ -42,7 +44,7 @@ def calibrate_rig(asked: Request, single: Mapping[str, Any]) -> int:
         asked: what is asked for.
         single: options of one camera, which are refused.
     """
-    from torchpose.calibration.rig_session import OneCamera, calibrate_cameras, measure_with_cameras
+    from torchpose.calibration.rig_session import OneCamera, calibrate_cameras, hand_eye_of, measure_with_cameras
     from torchpose.cli.calibrate import CameraFrames, first_size
     from torchpose.cli.terminal import native_stderr_silenced
     from torchpose.target import Target
@@ -65,17 +67,22 @@ def calibrate_rig(asked: Request, single: Mapping[str, Any]) -> int:
         frames.append(batches)
         several.append(OneCamera(name, batches, given or _of_size(*first_size(sources)), guess=given is None))
     lens = asked.model if known is None else None
+    robot = {moment.name: pose for moment in moments if (pose := moment.first.robot_pose) is not None}
+    if asked.hand_eye_out is not None and not robot:
+        raise ConfigError(f"{asked.inputs[0]}: robot_pose: missing; --hand-eye-out needs a manifest with robot poses")
+    how: dict[str, Any] = {"lens": lens, "tone": tone, "robot": robot}
     measured = None
     try:
         with native_stderr_silenced():
             if asked.target_out is not None:
                 assert isinstance(asked.shown, Target)  # checked with the options
-                measured = measure_with_cameras(several, asked.shown, lens=lens, tone=tone)
+                measured = measure_with_cameras(several, asked.shown, **how)
                 found = measured.calibration
             else:
-                found = calibrate_cameras(several, asked.shown, lens=lens, tone=tone)
+                found = calibrate_cameras(several, asked.shown, **how)
         _show(found, len(moments))
-        _write(asked, found, measured)
+        fit = found.hand_eye if asked.hand_eye_out is None else hand_eye_of(found, robot)
+        _write(asked, found, measured, fit)
     except KeyboardInterrupt:
         return interrupted("nothing was written; run again")
     return ended(_unreadable(names, frames))
@@ -96,7 +103,8 @@ def _check(asked: Request, single: Mapping[str, Any]) -> None:
         )
     if asked.target_out is not None and not isinstance(asked.shown, Target):
         raise ConfigError("--measure-target: with several cameras measures a target; give --target")
-    check_places({"--cameras-out": asked.cameras_out, "--measure-target": asked.target_out})
+    outs = {"--measure-target": asked.target_out, "--hand-eye-out": asked.hand_eye_out}
+    check_places({"--cameras-out": asked.cameras_out, **outs})
 
 
 def _known(files: Sequence[Path]) -> CameraRig | None:
@@ -157,6 +165,7 @@ def _with_tone(camera: Camera, tone: Any) -> Camera:
 
 def _show(found: RigCalibration, moments: int) -> None:
     """Every camera: what it was computed from, its focal length, and where it is."""
+    from torchpose.calibration.ties import apart
     from torchpose.geometry import rotations
 
     rig = found.rig
@@ -175,6 +184,8 @@ def _show(found: RigCalibration, moments: int) -> None:
         say("  " + ", ".join(f"{a} {v:.4f} +- {s:.2g}" for a, v, s in zip("xyz", shift, sigmas, strict=False)) + " mm")
         turned = zip("xyz", turn, sigmas[3:], strict=True)
         say("  " + ", ".join(f"r{a} {v:.7f} +- {s:.2g}" for a, v, s in turned) + " rad")
+    if found.hand_eye is not None:
+        say(f"{apart(rig.names, found.common)}: tied by the robot, cameras on its {found.hand_eye.hand_eye.mount}")
     left_out = f", {found.left_out} points left out" if found.left_out else ""
     say(f"{len(found.views)} of {moments} moments, {len(found.views.view)} points{left_out}")
     if found.common_sigma_px:
@@ -183,14 +194,19 @@ def _show(found: RigCalibration, moments: int) -> None:
         say(f"warning: {warning}", err=True)
 
 
-def _write(asked: Request, found: RigCalibration, measured: RigMeasurement | None) -> None:
-    from torchpose.cli.calibrate import save, show_places
+def _write(asked: Request, found: RigCalibration, measured: RigMeasurement | None, hand_eye: HandEyeFit | None) -> None:
+    from torchpose.cli.calibrate import save, show_hand_eye, show_places
 
     assert asked.cameras_out is not None  # checked with the options
     save(found.rig, asked.cameras_out, "--cameras-out")
     if measured is not None and asked.target_out is not None:
         show_places(measured.target, measured.nominal)
         save(measured.target, asked.target_out, "--measure-target")
+    if hand_eye is not None:
+        say(f"{found.rig.names[0]} by the robot:")
+        show_hand_eye(hand_eye)
+        if asked.hand_eye_out is not None:
+            save(hand_eye.hand_eye, asked.hand_eye_out, "--hand-eye-out")
     if asked.plots is not None:
         from torchpose.report.rig_calibration import save_rig_calibration
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,11 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchpose.cli.common import say
-from torchpose.cli.options import camera_option, folder_option, target_option
+from torchpose.cli.options import MOST_ANGLE, camera_option, folder_option, target_option
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:  # imported where they are used: torch takes more than a second, which --help need not wait for
-    from torchpose.camera import Camera
+    from torchpose.camera import Camera, CameraRig
     from torchpose.design import Imaging, Need, Precision, WorkingVolume
     from torchpose.target import Target
 
@@ -40,11 +41,20 @@ _PAPER = (
     "Also the sheet on office paper: one page, or tiles with marks to join them, each with bars to verify its scale."
 )
 _TONE = "Tone around the rings: dark rings on light, or the reverse."
+_CAMERAS = (
+    "File of several cameras instead of --camera: the accuracy is that of one pose from all of them, the volume as the "
+    "first one has it."
+)
+_SECOND = (
+    "A second camera like --camera, turned by so many degrees about the vertical through the middle of the volume."
+)
 
 
 def design(
     out: Annotated[Path, folder_option("Folder for target file, print sheet, table and map.")],
     camera: Annotated[str | None, camera_option("Camera file, as for estimate.")] = None,
+    cameras: Annotated[Path | None, typer.Option(metavar="RIG", help=_CAMERAS)] = None,
+    second_camera: Annotated[float | None, typer.Option(metavar="ANGLE", help=_SECOND)] = None,
     target: Annotated[str | None, target_option(_TARGET)] = None,
     distance: Annotated[float | None, typer.Option(help="Distance of the target, mm.")] = None,
     distance_range: Annotated[tuple[float, float] | None, typer.Option(metavar="NEAR FAR", help=_RANGE)] = None,
@@ -78,18 +88,16 @@ def design(
     sides = None if plate is None else _sides(plate)
     _check({"--plate": plate, "--accuracy-um": accuracy_um}, target, (name, markers, print_gain))
     existing, scene = None if target is None else Target.load(target), None
-    if existing is None or camera is not None or distance is not None or distance_range is not None:
+    if existing is None or any(x is not None for x in (camera, cameras, second_camera, distance, distance_range)):
         volume = _volume(distance, distance_range, tilt, roll, offset)
-        scene = _Scene(_camera(camera), volume, _imaging(volume, blur, noise, levels, f_number, focal_length))
+        rig = _rig(camera, cameras, second_camera, volume)
+        scene = _Scene(rig, volume, _imaging(volume, blur, noise, levels, f_number, focal_length), second_camera)
     made = None if printing is None else print_of(printing)
     need = None if accuracy_um is None else Need(*accuracy_um, *(() if accuracy_deg is None else (accuracy_deg,)))
     make_folder(out, "--out")
     promise: _Promise | None
     written: list[Path] = []
     if existing is None:
-        assert scene
-        assert need
-        assert sides
         gain = None if print_gain is None else print_gain / 1e3
         choice = {"name": name, "background": background, "markers": markers, "printing": made, "print_gain": gain}
         chosen, promise, written = _new_target(scene, sides, need, out, choice)
@@ -125,9 +133,15 @@ def _check(needed: dict[str, object], target: str | None, chosen: tuple[object, 
 
 @dataclass(frozen=True)
 class _Scene:
-    camera: Camera
+    rig: CameraRig
     volume: WorkingVolume
     imaging: Imaging
+    angle: float | None = None  # to a second camera that is not there yet, degrees
+
+    @property
+    def camera(self) -> Camera:
+        """The one there is, or the first."""
+        return self.rig.cameras[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,18 +156,29 @@ class _Promise:
         from torchpose.design import measured, predict_volume
 
         setting = scene.volume, scene.imaging
-        printed = predict_volume(scene.camera, target, *setting)
+        printed = predict_volume(scene.rig, target, *setting)
         if target.covariance is None:
             return cls(printed, None)
-        return cls(printed, predict_volume(scene.camera, measured(scene.camera, target, *setting), *setting))
+        return cls(printed, predict_volume(scene.rig, measured(scene.camera, target, *setting), *setting))
 
 
-def _camera(name: str | None) -> Camera:
-    from torchpose.camera import Camera
+def _rig(camera: str | None, cameras: Path | None, second: float | None, volume: WorkingVolume) -> CameraRig:
+    """The cameras of the options; one where there is one."""
+    from torchpose.analysis import with_second
+    from torchpose.camera import Camera, CameraRig
 
-    if name is None:
-        raise ConfigError("--camera: is missing; give the camera file")
-    return Camera.load(name)
+    if cameras is not None:
+        for option, given in (("--camera", camera), ("--second-camera", second)):
+            if given is not None:
+                raise ConfigError(f"{option}: stands beside --cameras; give one of them")
+        return CameraRig.load(cameras)
+    if camera is None:
+        raise ConfigError("--camera: is missing; give the camera file, or --cameras with that of several")
+    if second is None:
+        return CameraRig.alone(Camera.load(camera))
+    if not 0 < abs(second) <= MOST_ANGLE:
+        raise ConfigError(f"--second-camera: {second:g} degrees; give an angle up to {MOST_ANGLE:g} that is not 0")
+    return with_second(Camera.load(camera), float(volume.middle[1][0, 2]), math.radians(second))
 
 
 def _volume(
@@ -196,12 +221,15 @@ def _sides(text: str) -> tuple[float, float]:
 
 
 def _new_target(
-    scene: _Scene, plate: tuple[float, float], need: Need, out: Path, choice: dict[str, Any]
+    scene: _Scene | None, plate: tuple[float, float] | None, need: Need | None, out: Path, choice: dict[str, Any]
 ) -> tuple[Target, _Promise, list[Path]]:
     """The designed target, its precision and its file; its rings are told."""
     from torchpose.design import design_target
 
-    made = design_target(scene.camera, scene.volume, plate, need, scene.imaging, **choice)
+    assert scene  # checked with the options
+    assert need
+    assert plate
+    made = design_target(scene.rig, scene.volume, plate, need, scene.imaging, **choice)
     ratios = ", ".join(f"{ratio:.2f}" for ratio in sorted(made.target.codes.sqrt().tolist()))
     say(
         f"{len(made.target)} rings of {2 * made.radius:g} mm, semi-minor axis at least {made.semi_minor:.0f} px; "
@@ -215,19 +243,43 @@ def _new_target(
 def _tell_precision(target: Target, scene: _Scene, promise: _Promise, need: Need | None, out: Path) -> list[Path]:
     """Tells the predicted precision of a target; paths of its table and map."""
     from torchpose.cli.terminal import print_table
-    from torchpose.design import precision_map
+    from torchpose.design import precision_map, predict_volume
     from torchpose.io.writers import write_rows
     from torchpose.report.design import save_plot
 
-    rows = promise.printed.rows(need, promise.measured)
+    setting, alone = (target, scene.volume, scene.imaging), None
+    if len(scene.rig) > 1:
+        alone = predict_volume(scene.camera, *setting)
+        for line in _seen(scene, target):
+            say(line)
+    rows = promise.printed.rows(need, promise.measured, alone)
     columns = [column.replace("_", " ") for column in rows[0]]
     print_table(f"{target.name}: predicted standard deviations", columns, [list(row.values()) for row in rows])
     say(_print_told(target, promise, need))
     say(_focus(scene))
     table, picture = out / f"{target.name}_precision.csv", out / f"{target.name}_map.png"
     write_rows(table, rows, {column: str if column in ("axis", "unit") else float for column in rows[0]})
-    save_plot(precision_map(scene.camera, target, scene.volume, scene.imaging), target.name, picture, scene.volume)
-    return [table, picture]
+    save_plot(precision_map(scene.rig, *setting), target.name, picture, scene.volume)
+    return [table, picture, *(() if scene.angle is None else _angles(scene, target, out))]
+
+
+def _angles(scene: _Scene, target: Target, out: Path) -> list[Path]:
+    """What a second camera tells by its angle, in the middle of the volume: table and plot."""
+    from torchpose.cli.sensitivity_rig import Setting, second_camera
+
+    imaging, middle = scene.imaging, scene.volume.middle[1][:, 2]
+    seen = {"psf_sigma": float(imaging.blur(scene.camera, middle)), "noise_sigma": imaging.noise}
+    setting = Setting(middle, 0.0, seen | {"dark": imaging.dark, "light": imaging.light})
+    return second_camera(scene.camera, target, setting).save(out)
+
+
+def _seen(scene: _Scene, target: Target) -> Iterator[str]:
+    """How much of the target each camera but the first has where the volume ends."""
+    from torchpose.design import share_that_counts
+
+    for number, name in enumerate(scene.rig.names[1:], 1):
+        share = share_that_counts(scene.rig, number, target, scene.volume)
+        yield f"{name}: counts with {100 * share:.0f} % of the rings over the borders of the volume"
 
 
 def _print_told(target: Target, promise: _Promise, need: Need | None) -> str:

@@ -21,6 +21,7 @@ _CAMERAS = (
     "camera_info with tf_static.yaml. INPUT has one folder a camera (cam0, cam1, ...), or is a capture manifest "
     "(docs/rigs.md)."
 )
+MOST_ANGLE = 80.0  # degrees between two cameras (convention): a flat target is seen from less than 90
 _METHODS = "photometric|edges|centers|paper"  # torchpose.pipeline.Method, which takes a second to import
 _METHOD = "Last stage: grey values (the default), edge points, ring centres, or the paper's own chain."
 _HAND_EYE = "Calibrated camera-to-base or camera-to-tool transform; adds the poses in the robot base."

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchpose.cli.common import say
+from torchpose.cli.options import MOST_ANGLE
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from torchpose.studies.study import StudyResult
     from torchpose.target import Target
 
-_MOST_ANGLE, _STEP = 80.0, 5.0  # degrees between the cameras (convention): a flat target is seen from less than 90
+_STEP = 5.0  # degrees between the cameras (convention)
 _NOISE = 2.0  # grey levels (convention): where --noise is not given
 _CLEAR = 1.05  # an angle is as good as the best one where its depth error is within 5 % of it (convention)
 
@@ -53,8 +54,8 @@ def predict(rig: CameraRig | None, camera: Camera, target: Target, setting: Sett
     result = StudyResult()
     if rig is not None:
         _together(result, rig, target, setting)
-    _second(result, camera, target, setting)
-    for path in result.save(out):
+    second = second_camera(camera, target, setting)
+    for path in (*result.save(out), *second.save(out)):
         say(str(path))
     return 0
 
@@ -96,16 +97,16 @@ def _together(result: StudyResult, rig: CameraRig, target: Target, setting: Sett
     _print("cameras alone and together: standard deviations in the axes of the first", rows, len(bounds))
 
 
-def _second(result: StudyResult, camera: Camera, target: Target, setting: Setting) -> None:
-    """A second camera like the first, at angles from the first, at the middle distance."""
+def second_camera(camera: Camera, target: Target, setting: Setting) -> StudyResult:
+    """A second camera like the first, at angles from the first, at the middle distance; shows what it tells."""
     import torch
 
     from torchpose.analysis import pose_crlb, second_camera_crlb
     from torchpose.report.placing import plot_angles
-    from torchpose.studies.study import Picture, Table
+    from torchpose.studies.study import Picture, StudyResult, Table
 
     R, t = (values[len(values) // 2] for values in setting.poses())
-    degrees = torch.arange(_STEP, _MOST_ANGLE + 1, _STEP, dtype=torch.float64)
+    degrees = torch.arange(_STEP, MOST_ANGLE + 1, _STEP, dtype=torch.float64)
     alone = pose_crlb(camera, target, R[None], t[None], **setting.conditions)
     if not bool(alone.isfinite().all()):
         raise ConfigError(
@@ -116,10 +117,10 @@ def _second(result: StudyResult, camera: Camera, target: Target, setting: Settin
     rows += [
         {"angle deg": angle, "cameras": 2, **_cells(own)} for angle, own in zip(degrees.tolist(), bound, strict=True)
     ]
-    result.tables.append(Table("second_camera", "A second camera at an angle", rows))
-    result.pictures.append(
-        Picture("second_camera", "A second camera at an angle", plot_angles(degrees, bound, alone[0], float(t[2])))
-    )
+    result, title = StudyResult(), "A second camera at an angle"
+    result.tables.append(Table("second_camera", title, rows))
+    picture = plot_angles(degrees, bound, alone[0], float(t[2]))
+    result.pictures.append(Picture("second_camera", title, picture))
     _print(f"a second camera like the first, target at {float(t[2]):g} mm: standard deviations", rows, 1)
     depth = bound[:, 2, 2].sqrt()
     enough = degrees[depth <= _CLEAR * depth[depth.isfinite()].min()]
@@ -129,6 +130,7 @@ def _second(result: StudyResult, camera: Camera, target: Target, setting: Settin
         f"{float(enough[-1]):g} degrees: {first / best:.3g} times less; two at one place would make it "
         f"{math.sqrt(2):.3g} times less"
     )
+    return result
 
 
 def _print(title: str, rows: list[Row], block: int) -> None:

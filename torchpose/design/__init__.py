@@ -1,6 +1,14 @@
 """Target design: from camera, working volume and accuracy to a target, its predicted precision and a print sheet."""
 
-from torchpose.design.precision import Need, Precision, PrecisionMap, precision_map, predict_volume, surroundings
+from torchpose.design.precision import (
+    Need,
+    Precision,
+    PrecisionMap,
+    precision_map,
+    predict_volume,
+    share_that_counts,
+    surroundings,
+)
 from torchpose.design.predict import (
     Imaging,
     best_focus,
@@ -40,6 +48,7 @@ __all__ = [
     "print_of",
     "save_tiles",
     "scale_deviation",
+    "share_that_counts",
     "sharp_range",
     "surroundings",
     "tile_sheet",

@@ -10,8 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.analysis.evaluation import AXES, UNITS
-from torchpose.camera import Camera
-from torchpose.design.predict import Imaging, deviations, edge_covariance, in_view, outlines, predicted_covariance
+from torchpose.camera import Camera, CameraRig
+from torchpose.design.predict import Imaging, deviations, edge_covariance, predicted_covariance
+from torchpose.design.view import FRAME_MARGIN_PX, in_view, outlines, rings_that_count
 from torchpose.design.volume import Offsets, Poses, WorkingVolume
 from torchpose.errors import ConfigError
 from torchpose.geometry.arguments import checked
@@ -19,7 +20,6 @@ from torchpose.geometry.rows import Rows
 from torchpose.io.rows import Row
 from torchpose.target import Target
 
-FRAME_MARGIN_PX = 10.0  # between rings and the border of the frame
 _TILTS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the largest one
 _DIRECTIONS = 8  # of the tilt, and turns about the axis, among which the weakest pose is searched
 _STEPS = 4  # of distance and tilt in a map
@@ -30,7 +30,7 @@ _SHOWN_TILT = math.radians(30)
 _SHOWN_STEPS, _SHOWN_DIRECTIONS = 3, 4
 _PLACES = 3  # across the offset, along x and y
 _COLUMNS = ["axis", "unit", "needed", "middle", "worst", "worst_x_mm", "worst_y_mm", "worst_z_mm", "worst_tilt_deg"]
-_MEASURED = "worst_measured"
+_MEASURED, _ALONE = "worst_measured", "worst_first_camera_alone"
 
 
 @dataclass(frozen=True)
@@ -67,18 +67,22 @@ class Precision(Rows):
     R: Float[Tensor, "6 3 3"]  # where it was found
     t: Float[Tensor, "6 3"]
 
-    def rows(self, need: Need | None = None, measured: Precision | None = None) -> list[Row]:
+    def rows(
+        self, need: Need | None = None, measured: Precision | None = None, alone: Precision | None = None
+    ) -> list[Row]:
         """One row an axis: what is needed, the deviation in the middle, the largest one, and where that is.
 
-        With the precision of the same target once its print is measured, its largest deviation, too.
+        With the precision of the same target once its print is measured its largest deviation, too; and with that of
+        the first camera alone.
         """
         tilt = self.R[:, 2, 2].clamp(max=1).acos().rad2deg()
         columns = (self.middle, self.worst, *self.t.unbind(1), tilt)
         needed = [None] * len(AXES) if need is None else need.allowed
         rows = zip(AXES, UNITS, needed, *(column.tolist() for column in columns), strict=True)
         made: list[Row] = [dict(zip(_COLUMNS, row, strict=True)) for row in rows]
-        if measured is not None:
-            made = [row | {_MEASURED: worst} for row, worst in zip(made, measured.worst.tolist(), strict=True)]
+        for column, other in ((_MEASURED, measured), (_ALONE, alone)):
+            if other is not None:
+                made = [row | {column: worst} for row, worst in zip(made, other.worst.tolist(), strict=True)]
         return made
 
 
@@ -95,13 +99,16 @@ class PrecisionMap:
 
 
 @checked
-def predict_volume(camera: Camera, target: Target, volume: WorkingVolume, imaging: Imaging) -> Precision:
+def predict_volume(camera: Camera | CameraRig, target: Target, volume: WorkingVolume, imaging: Imaging) -> Precision:
     """Predicted standard deviations of a target in the middle and where each of them is largest.
+
+    Of several cameras the volume is that of the first, which sees all rings; the others have what they see of them.
 
     Raises:
         ConfigError: a ring leaves the frame somewhere in the volume.
     """
-    if not in_view(camera, outlines(target), *on_device(volume.extremes(), camera), FRAME_MARGIN_PX):
+    first, extremes = CameraRig.of(camera).cameras[0], on_device(volume.extremes(), camera)
+    if not in_view(first, outlines(target), *extremes, FRAME_MARGIN_PX):
         raise ConfigError(
             f"{target.name}: rings leave the frame within the working volume; narrow offset, tilt or roll, or keep "
             "farther away"
@@ -120,7 +127,7 @@ def predict_volume(camera: Camera, target: Target, volume: WorkingVolume, imagin
 
 
 @checked
-def precision_map(camera: Camera, target: Target, volume: WorkingVolume, imaging: Imaging) -> PrecisionMap:
+def precision_map(camera: Camera | CameraRig, target: Target, volume: WorkingVolume, imaging: Imaging) -> PrecisionMap:
     """Maps of the predicted deviations over distance and tilt, and over the offset; the roll is 0.
 
     Of a volume with one distance or without tilt the first map shows more than the volume: the surroundings of that
@@ -151,6 +158,13 @@ def precision_map(camera: Camera, target: Target, volume: WorkingVolume, imaging
 
 
 @checked
+def share_that_counts(rig: CameraRig, number: int, target: Target, volume: WorkingVolume) -> float:
+    """Share of the rings that count in a camera of several, over the extremes of the volume."""
+    R, t = rig.seen_by(number, *on_device(volume.extremes(), rig))
+    return float(rings_that_count(rig.cameras[number], target, R, t).double().mean())
+
+
+@checked
 def surroundings(volume: WorkingVolume) -> WorkingVolume:
     """The volume, with a range of distance where it has a single one, and tilts where it has none."""
     near, far = volume.distance
@@ -162,6 +176,7 @@ def _steps(low: float, high: float, count: int = _STEPS) -> Tensor:
     return torch.linspace(low, high, count if high > low else 1, dtype=torch.float64, device="cpu")
 
 
-def on_device(poses: Poses, camera: Camera) -> Poses:
+def on_device(poses: Poses, camera: Camera | CameraRig) -> Poses:
     """Poses where the camera is."""
-    return poses[0].to(camera.matrix), poses[1].to(camera.matrix)
+    like = CameraRig.of(camera).cameras[0].matrix
+    return poses[0].to(like), poses[1].to(like)

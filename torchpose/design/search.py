@@ -8,11 +8,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpose.camera import Camera
+from torchpose.camera import Camera, CameraRig
 from torchpose.design.layout import ARRANGEMENTS, Limits, Size, assign_codes, largest
-from torchpose.design.precision import FRAME_MARGIN_PX, Need, Precision, on_device, predict_volume
-from torchpose.design.predict import Imaging, deviations, edge_covariance, in_view, outlines
+from torchpose.design.precision import Need, Precision, on_device, predict_volume
+from torchpose.design.predict import Imaging, deviations, edge_covariance
 from torchpose.design.printing import PrintClass, measured
+from torchpose.design.view import FRAME_MARGIN_PX, in_view, outlines
 from torchpose.design.volume import WorkingVolume
 from torchpose.errors import ConfigError
 from torchpose.geometry.arguments import checked
@@ -85,7 +86,7 @@ class Choice:
 class _Task:
     """What a target is searched for."""
 
-    camera: Camera
+    rig: CameraRig
     volume: WorkingVolume
     plate: Size
     need: Need
@@ -98,8 +99,13 @@ class _Task:
         """Numbers of rings that are tried, rising."""
         return list(ARRANGEMENTS) if self.choice.markers is None else [self.choice.markers]
 
+    @property
+    def camera(self) -> Camera:
+        """The one there is, or the first: it sees all of the target all over the volume."""
+        return self.rig.cameras[0]
+
     def precision(self, target: Target) -> Precision:
-        return predict_volume(self.camera, target, self.volume, self.imaging)
+        return predict_volume(self.rig, target, self.volume, self.imaging)
 
     def excess(self, precision: Precision) -> float:
         return float(self.need.excess(precision.worst).nan_to_num(nan=math.inf))
@@ -110,7 +116,7 @@ class _Task:
 
 @checked
 def design_target(
-    camera: Camera, volume: WorkingVolume, plate: Size, need: Need, imaging: Imaging, **choice: Any
+    camera: Camera | CameraRig, volume: WorkingVolume, plate: Size, need: Need, imaging: Imaging, **choice: Any
 ) -> Design:
     """The target with the fewest rings whose predicted standard deviations meet the need everywhere in the volume.
 
@@ -120,6 +126,8 @@ def design_target(
     measured.
 
     Args:
+        camera: or several, whose poses together are to meet the need; the volume is that of the first, which also sets
+            what the stages ask of the rings.
         plate: width and height, mm.
         choice: fields of `Choice`: ``name``, ``background``, ``markers``, ``printing``, ``print_gain``.
 
@@ -129,11 +137,11 @@ def design_target(
     """
     if not all(0 < side < math.inf for side in plate):
         raise ConfigError(f"plate: {plate[0]:g} x {plate[1]:g} mm; give two positive lengths")
-    chosen = Choice(**choice)
-    made = chosen.made
+    chosen, rig = Choice(**choice), CameraRig.of(camera)
+    camera, made = rig.cameras[0], chosen.made
     gain = 0.0 if made is None else made.most_gain
     limits = Limits.of(camera, volume.least_scale(camera, (plate[0] / 2, plate[1] / 2)), gain)
-    task = _Task(camera, volume, plate, need, imaging, chosen, limits)
+    task = _Task(rig, volume, plate, need, imaging, chosen, limits)
     found = _fewest(task, lambda target: target)
     if found is None:
         raise _no_room(camera, volume, plate, limits, task.counts[0])
@@ -178,7 +186,7 @@ def _best(task: _Task, count: int, as_used: Callable[[Target], Target]) -> Targe
     some = slice(None, None, 7)  # 7 and the turns of the volume have no common factor: all of them are met
 
     def excess(target: Target) -> float:
-        found = edge_covariance(task.camera, as_used(target), R[some], t[some], task.imaging)
+        found = edge_covariance(task.rig, as_used(target), R[some], t[some], task.imaging)
         return float(task.need.excess(deviations(found)).max())
 
     seen = (one for one in _targets(task, count) if in_view(task.camera, outlines(one), R, t, FRAME_MARGIN_PX))

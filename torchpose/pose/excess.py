@@ -21,6 +21,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose.geometry.arguments import checked
 from torchpose.geometry.least_squares import LEAST_DIRECTION
 from torchpose.geometry.robust import of_chance, quantile
 from torchpose.geometry.rows import Rows
@@ -49,6 +50,7 @@ _GRID = 16  # values, logarithmic, apart by a factor of 1.5, of a camera 2.3, wh
 _COARSE = 10  # of each of three: 2.3
 _FEW_FACTORS = 4  # of ten, of the scatter beside a print or a camera (convention)
 _SCATTER = int(Misfit.SCATTER) - 1  # among the explanations
+_AS_NOTHING = _SCATTER + 1  # how many explanations are together as likely beforehand as that there is nothing
 _AT_ONCE = 10_000_000  # numbers: 80 MB
 
 
@@ -179,7 +181,7 @@ def _explanations(modes: _Modes, none: Excess, even: Tensor | None) -> tuple[Ten
     some, silent = _Modes(*(x[row] for x in modes)).existing(), torch.zeros_like(none.chi2)
     # beforehand as likely as all three; where noise is known to be more than that of independent pixels, as each
     expected = torch.ones_like(none.explained) if even is None else even > 0
-    nothing = math.log(_SCATTER + 1) * expected[row].to(some.residual) - 0.5 * some.residual.square().sum(-1)
+    nothing = math.log(_AS_NOTHING) * expected[row].to(some.residual) - 0.5 * some.residual.square().sum(-1)
     camera = _beside_scatter(_camera, some)
     kept = (none.chi2[row] > quantile(none.freedom[row].clamp_min(1), SURE)) | (camera.evidence > nothing)
     kept |= ~none.explained[row]
@@ -247,7 +249,7 @@ def _beside_scatter(explain: Callable[[_Modes], _Family], modes: _Modes) -> _Fam
 
     The more of it, the less likely beforehand: nothing tells small errors and scatter from scatter alone.
     """
-    factors = _values(_SCALE, modes, _FEW_FACTORS)
+    factors = _values(_SCALE, modes.residual, _FEW_FACTORS)
     root, rows = factors.sqrt().repeat(len(modes.residual))[:, None], modes.residual.repeat_interleave(_FEW_FACTORS, 0)
     by, there = (x.repeat_interleave(_FEW_FACTORS, 0) for x in (modes.by, modes.there))
     found = explain(_Modes(rows / root, by / root[..., None], there))
@@ -262,7 +264,7 @@ def _print(modes: _Modes) -> _Family:
     """A print bends by no less than it stretches: across it the variance of the places along it counts, and more."""
     markers, edges, camera = by_kind(modes.by)
     markers = markers.unflatten(-1, (-1, OF_MARKER))
-    values = _values(_PRINT, modes, _COARSE).square()
+    values = _values(_PRINT, modes.residual, _COARSE).square()
     places = torch.cartesian_prod(values, values)  # along, across
     parts = tuple(zip((markers[..., :3].flatten(-2), markers[..., 2:].flatten(-2)), places.T, strict=True))
     off = values.new_tensor(_EDGES_OFF)
@@ -288,7 +290,7 @@ def _between(chi2: Tensor, freedom: Tensor, values: Tensor) -> Tensor:
 
 def _camera(modes: _Modes) -> _Family:
     """One thing may be off, or all: of another focal length alone the mean over all tells too little."""
-    variance = _values(_CAMERA, modes).square()
+    variance = _values(_CAMERA, modes.residual).square()
     off = variance.new_tensor(_OFF)
     every = (off[:, None] * variance[:, None]).flatten(0, 1)  # (S G, OF_CAMERA)
     evidence, weight, chi2 = _weighed(modes, by_kind(modes.by)[2], off, variance)
@@ -297,9 +299,30 @@ def _camera(modes: _Modes) -> _Family:
     return _Family(evidence, deviation, torch.ones_like(evidence), chi2)
 
 
+@checked
+def may_be_off(told: Float[Tensor, " N"], pull: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
+    """Mean square (N,) of what residuals say of one number of a camera, where nothing is likelier to be amiss.
+
+    Two or three deviations of it are no evidence: most often they are noise. But a number that is off by so little may
+    move the pose by many of its deviations. So it counts by how likely it is to be off, next to nothing. What residuals
+    do not tell of it is not in here: that a file states, or it counts as known.
+
+    Args:
+        told: information about it, all else being unknown.
+        pull: its right side.
+    """
+    variance = _values(_CAMERA, told).square()
+    more = 1 + told[:, None] * variance
+    found = variance * pull[:, None] / more
+    likelihood = 0.5 * (found * pull[:, None] - more.log())
+    nothing = torch.full_like(likelihood[:, :1], math.log(_AS_NOTHING * len(_OFF) * _GRID))
+    share = torch.softmax(torch.cat([likelihood, nothing], -1), -1)[:, :-1]
+    return (share * found.square()).sum(-1)
+
+
 def _scatter(modes: _Modes, even: Tensor) -> _Family:
     """Of ``even`` (N,) other residuals the mean square is 1: they speak against it, and not of how large it is."""
-    factor, freedom = _values(_SCALE, modes), modes.there.sum(-1, keepdim=True)
+    factor, freedom = _values(_SCALE, modes.residual), modes.there.sum(-1, keepdim=True)
     square = modes.residual.square().sum(-1, keepdim=True)
     likelihood = -0.5 * (square / factor + freedom * factor.log())
     mean = (torch.softmax(likelihood, -1) * factor).sum(-1)
@@ -320,7 +343,7 @@ def _displaced(picture: Picture) -> Tensor:
     by = torch.einsum("nrma,nfmab->nfrmb", by, fields).flatten(-2)
     values, vectors = torch.linalg.eigh(by @ by.mT)
     square = (vectors.mT @ modes.residual[:, None, :, None]).square()  # (N, F, r, 1)
-    sizes = _values(_FIELD, modes).square()
+    sizes = _values(_FIELD, modes.residual).square()
     held = 1 + values.clamp_min(0.0)[..., None] * sizes
     likelihood = -0.5 * (square / held + held.log()).sum(2)
     weight = torch.softmax(likelihood.flatten(1), -1).view_as(likelihood)
@@ -373,8 +396,7 @@ def _likelihood(
     return -0.5 * (square + gain.log().sum(-1).flatten(2)) - alone, square
 
 
-def _values(ends: tuple[float, float], modes: _Modes, count: int = _GRID) -> Tensor:
-    like = modes.residual
+def _values(ends: tuple[float, float], like: Tensor, count: int = _GRID) -> Tensor:
     least, most = (math.log10(value) for value in ends)
     return torch.logspace(least, most, count, dtype=like.dtype, device=like.device)
 

@@ -62,6 +62,9 @@ def _solve(evidence: Evidence, starts: tuple[Tensor, Tensor], compile: bool) -> 
     chi2, best = (of_centers + of_shapes).nan_to_num(nan=torch.inf).sort(1)  # NaN: no such minimum
     row = torch.arange(len(best), device=best.device)[:, None]
     R, t, rms, of_centers, of_shapes = (x[row, best] for x in (R, t, rms, of_centers, of_shapes))
+    # shapes that contradict the better pose as well tell less by as much
+    over = (of_shapes[:, 0] / (4 * evidence.mask.sum(-1))).clamp_min(1.0)
+    ahead = of_centers[:, 1] - of_centers[:, 0] + (of_shapes[:, 1] - of_shapes[:, 0]) / over
     shift, larger = sizes_beyond(evidence, circles[row[:, 0], best[:, 0]])
     covariance, determined = pose_covariance(evidence, R[:, 0], t[:, 0])
     chi2_alt = torch.where(chi2[:, 1].isfinite(), chi2[:, 1], torch.nan)
@@ -72,7 +75,7 @@ def _solve(evidence: Evidence, starts: tuple[Tensor, Tensor], compile: bool) -> 
     solvable = chi2[:, 0].isfinite()
     reason = torch.full_like(seen, Reason.NONE)
     for condition, why in (
-        (chi2_alt - chi2[:, 0] < AMBIGUOUS_CHI2, Reason.TWO_SOLUTIONS),
+        (ahead < AMBIGUOUS_CHI2, Reason.TWO_SOLUTIONS),
         (of_shapes[:, 0] > CUT**2 * 4 * seen, Reason.RING_SHAPE),
         (contradicts, Reason.RESIDUAL),
         (_from_behind(evidence, R[:, 0], t[:, 0]), Reason.MIRRORED),

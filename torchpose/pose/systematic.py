@@ -37,8 +37,10 @@ from torchpose.pose.excess import (
     beyond_chance,
     by_kind,
     excess_of,
+    may_be_off,
     no_excess,
 )
+from torchpose.pose.solutions import PLACE
 from torchpose.results import Misfit
 
 POSE = 6
@@ -166,19 +168,14 @@ def on_print(
     by_camera, by_target = motions_by_camera(setting), motions_by_target(setting)
     stated = torch.cat([by_camera, by_target], -1)
     known = torch.cat([own, among(stated, n)], -1)
-    excess, further = _excess(normals, known, stated.shape[-1], setting, even)
+    excess, further, bent = _excess(normals, known, stated.shape[-1], setting, even)
     printed, lens = by_target, by_camera
     if further is not None:
         beside = further * excess.deviation[:, None, None]
         printed = torch.cat([by_target, beside[..., :-OF_CAMERA]], -1)
         lens = torch.cat([by_camera, beside[..., -OF_CAMERA:]], -1)
-    noisy = normals.over(excess.factor)
-    moving = (excess.field > 0).any(-1).nonzero()[:, 0]
-    if moving.numel():
-        fields = excess.field[moving].sqrt()[:, :, None, None, None] * _fields(setting.of_rows(moving))
-        shifts = among(fields.movedim(1, -2).flatten(-2), n)
-        some = noisy[moving]
-        noisy = noisy.replaced(moving, some.scattered(some.by_motions(shifts)))
+    lens = torch.cat([lens, bent], -1)
+    noisy = normals if further is None else _scattered(normals, setting, excess)
     joint = JointSolution.of(noisy, own, among(printed, n), among(lens, n), estimate)
     place = look = places_of(printed, joint, setting, excess.deviation)
     other = ((excess.misfit == Misfit.CAMERA) | (excess.misfit == Misfit.SCATTER)).nonzero()[:, 0]
@@ -197,11 +194,25 @@ def on_print(
     return OnPrint(*found, excess.misfit, excess.explained, excess.chi2, excess.freedom, sure)
 
 
+def _scattered(normals: MarkerNormals, setting: Setting, excess: Excess) -> MarkerNormals:
+    """Normal equations of the noise that the residuals show, and of displacements of the picture."""
+    noisy = normals.over(excess.factor)
+    moving = (excess.field > 0).any(-1).nonzero()[:, 0]
+    if moving.numel() == 0:
+        return noisy
+    fields = excess.field[moving].sqrt()[:, :, None, None, None] * _fields(setting.of_rows(moving))
+    shifts = among(fields.movedim(1, -2).flatten(-2), normals.right.shape[-1])
+    some = noisy[moving]
+    return noisy.replaced(moving, some.scattered(some.by_motions(shifts)))
+
+
 def places_of(printed: Tensor, joint: JointSolution, setting: Setting, deviation: Tensor) -> Tensor:
     """Places (N, M, 5) of markers moved by the numbers of a solution, by their motions (N, M, 7, L).
 
     Where these go beyond what is stated, the last ones are those of edges, see `excess.OF_EDGES`.
     """
+    if printed.shape[-1] == 0:
+        return printed.new_zeros(*printed.shape[:2], PLACE)
     # a motion turns about the target's origin: what it does to a centre is both of its parts
     arm = setting.arms[..., None].expand_as(printed[:, :, 3:POSE])
     aside = printed[:, :, :3] + torch.linalg.cross(printed[:, :, 3:POSE], arm, dim=-2)
@@ -245,9 +256,12 @@ class JointSolution(NamedTuple):
         by_lens = columns.flatten(1, 2).mT @ (normals.information @ by_camera).flatten(1, 2)
         k = own.shape[-1]
         alone, known = scaled_inverse(matrix[:, :k, :k])
-        shift = alone @ matrix[:, :k, k:]  # of the own unknowns, found without the numbers, by these
         both = torch.cat([right[..., None], by_lens], -1)
-        step = alone @ both[:, :k]
+        step, noise = alone @ both[:, :k], alone[:, :POSE, :POSE]
+        if by_print.shape[-1] == 0:
+            step, lens, none = step[:, :POSE, 0] * float(estimate), step[:, :POSE, 1:], right[:, k:]
+            return cls(step, none, noise + lens @ lens.mT, noise, lens[..., :0], lens, known)
+        shift = alone @ matrix[:, :k, k:]  # of the own unknowns, found without the numbers, by these
         told = matrix[:, k:, k:] - matrix[:, k:, :k] @ shift
         finite = told.isfinite().all(-1).all(-1)
         told = torch.where(finite[:, None, None], 0.5 * (told + told.mT), 0.0)
@@ -257,7 +271,7 @@ class JointSolution(NamedTuple):
         numbers = both[:, k:] - matrix[:, k:, :k] @ step
         numbers = vectors / (1 + values) @ (vectors.mT @ numbers) * float(estimate)
         step = (step - shift @ numbers)[:, :POSE]
-        noise = alone[:, :POSE, :POSE] + (held * values) @ held.mT
+        noise = noise + (held * values) @ held.mT
         lens = step[..., 1:]
         covariance = noise + held @ held.mT + lens @ lens.mT
         step = step[..., 0] * float(estimate)
@@ -273,18 +287,20 @@ class JointSolution(NamedTuple):
 
 def _excess(
     normals: MarkerNormals, known: Tensor, count: int, setting: Setting, even: Tensor | None
-) -> tuple[Excess, Tensor | None]:
+) -> tuple[Excess, Tensor | None, Tensor]:
     """What the residuals show beyond the ``known`` columns, and the motions (N, M, 7, E) of what may be behind it.
 
-    Without them where the markers agree: then each of them alone, free to move, would not move far.
+    Without them where the markers agree: then each of them alone, free to move, would not move far. And the motions
+    (N, M, 7, 1 or 0) by what the lens may bend where nothing is behind it.
     """
     rows, markers, n = known.shape[:3]
     alone = torch.eye(markers * (POSE + 1), dtype=known.dtype, device=known.device).unflatten(0, (markers, -1))
     together = remaining_of(normals, known, among(alone.expand(rows, -1, -1, -1), n), count)
     excess = no_excess(*together)
     odd = (~excess.explained).nonzero()[:, 0]
+    bent = _bent(setting, *together)
     if odd.numel() == 0:
-        return excess, None
+        return excess, None, bent
     some = setting.of_rows(odd)
     shifts = torch.cat([print_shifts(some), _camera_shifts(some)], -1)
     remaining = remaining_of(normals[odd], known[odd], among(shifts, n), count)
@@ -294,11 +310,37 @@ def _excess(
         information, right = (x[odd[which]] for x in together)
         return Picture(information, right, _fields(some.of_rows(which)))
 
-    again = excess_of(*remaining, None if even is None else even[odd], picture, refuted)
+    # centres alone do not tell how a displacement bends a ring: there its scatter is that of all noise
+    seen = picture if setting.on_rims else None
+    again = excess_of(*remaining, None if even is None else even[odd], seen, refuted)
     every = shifts.new_zeros(rows, *shifts.shape[1:]).index_copy(0, odd, shifts)
     nothing = shifts.new_zeros(rows, shifts.shape[-1])
     excess = replace(excess, deviation=nothing, printed=nothing, field=shifts.new_zeros(rows, again.field.shape[1]))
-    return excess.replaced(odd, replace(again, chi2=excess.chi2[odd], freedom=excess.freedom[odd])), every
+    excess = excess.replaced(odd, replace(again, chi2=excess.chi2[odd], freedom=excess.freedom[odd]))
+    return excess, every, torch.where((excess.misfit == Misfit.NONE)[:, None, None, None], bent, 0.0)
+
+
+def _bent(setting: Setting, information: Tensor, right: Tensor) -> Tensor:
+    """Motions (N, M, 7, 1) of markers by what a lens may bend more than its file says, by what residuals tell of it.
+
+    Of all that may be off of a camera one frame tells this best beside what it does to the pose; a focal length that is
+    off by what the frame tells of it moves the pose by hundreds of its deviations, and only many frames show it. A file
+    that states what it knows of its lens is taken at its word (0 numbers) until residuals contradict it.
+
+    Args:
+        setting: the rows.
+        information: of the motions of all markers, each alone, (N, 7 M, 7 M).
+        right: its right side (N, 7 M).
+    """
+    camera = setting.camera
+    if camera.lens_stated:
+        return setting.t.new_zeros(*setting.evidence.mask.shape, POSE + 1, 0)
+    jacobian, xy, weight = (_rim_jacobian if setting.on_rims else _center_jacobian)(*setting[:3])
+    at = xy / _reach(camera)
+    by = _least_squares(setting, jacobian, weight, (at * at.square().sum(-1, keepdim=True))[..., None])
+    column = by.flatten(1)
+    told = ((information @ column[..., None])[..., 0] * column).sum(-1)
+    return by * may_be_off(told, (column * right).sum(-1)).sqrt()[:, None, None, None]
 
 
 def motions_by_target(setting: Setting) -> Tensor:
@@ -306,7 +348,10 @@ def motions_by_target(setting: Setting) -> Tensor:
 
     A target that is larger as a whole looks like the same one that is nearer: all markers move towards the camera.
     """
-    moved, scale = displaced(setting.R, setting.arms, setting.evidence.by_target), setting.evidence.scale_sigma
+    by, scale = setting.evidence.by_target, setting.evidence.scale_sigma
+    if by.shape[-1] == 0:
+        return by
+    moved = displaced(setting.R, setting.arms, by)
     if not bool((scale > 0).any()):
         return moved
     nearer = moved.new_zeros(*moved.shape[:3])
@@ -349,9 +394,7 @@ def motions_by_camera(setting: Setting) -> Tensor:
 
 def _camera_shifts(setting: Setting) -> Tensor:
     """The same of what a camera may be off by (`excess.OF_CAMERA`), each by 1 px at the frame's corner."""
-    camera = setting.camera
-    focal = camera.matrix.diagonal()[:2]
-    reach = 0.5 * math.hypot(camera.width, camera.height) / float(focal.mean())
+    reach = _reach(setting.camera)
 
     def by(xy: Tensor) -> Tensor:
         eye = torch.eye(2, dtype=xy.dtype, device=xy.device).expand(*xy.shape, 2)
@@ -360,10 +403,14 @@ def _camera_shifts(setting: Setting) -> Tensor:
         square = at.square().sum(-1)
         linear = torch.stack([at, torch.stack([x, -y], -1), torch.stack([y, x], -1)], -1)
         tangential = square[..., None, None] * eye + 2 * at[..., :, None] * at[..., None, :]
-        bent = torch.cat([(square[..., None] * at)[..., None], tangential / 3], -1)
-        return torch.cat([linear, eye, bent], -1)
+        return torch.cat([linear, eye, (square[..., None] * at)[..., None], tangential / 3], -1)
 
     return _as_motions(setting, by)
+
+
+def _reach(camera: Camera) -> float:
+    """Of the frame's corner on the plane z = 1."""
+    return 0.5 * math.hypot(camera.width, camera.height) / float(camera.matrix.diagonal()[:2].mean())
 
 
 def print_shifts(setting: Setting) -> Tensor:
@@ -394,7 +441,7 @@ def _fields(setting: Setting) -> Tensor:
     By 1 px along u and along v, alike over each of F lengths. Rings are so far apart that each is displaced by itself.
     """
     evidence = setting.evidence
-    jacobian, xy, weight = (_rim_jacobian if setting.on_rims else _center_jacobian)(evidence, setting.R, setting.t)
+    jacobian, xy, weight = _rim_jacobian(evidence, setting.R, setting.t)
     markers = evidence.mask.shape[1]
     weighted = (jacobian.mT @ weight).unflatten(1, (markers, -1))  # (N, M, P, 7, 2)
     held = (weighted @ jacobian.unflatten(1, (markers, -1))).sum(2)
@@ -439,8 +486,8 @@ def _as_motions(setting: Setting, by: Callable[[Tensor], Tensor]) -> Tensor:
 
     Measured are the pixels of the frame: a changed camera moves the ideal pixels made of them.
     """
-    evidence, camera = setting.evidence, setting.camera
-    jacobian, xy, weight = (_rim_jacobian if setting.on_rims else _center_jacobian)(evidence, setting.R, setting.t)
+    camera = setting.camera
+    jacobian, xy, weight = (_rim_jacobian if setting.on_rims else _center_jacobian)(*setting[:3])
     ideal = camera.matrix.diagonal()[:2, None] * torch.linalg.inv(camera.J_distort(xy))
     return _least_squares(setting, jacobian, weight, ideal @ by(xy))
 
@@ -459,7 +506,8 @@ def remaining_of(normals: MarkerNormals, known: Tensor, excess: Tensor, count: i
     """
     matrix, right = assembled(normals, torch.cat([known, excess], -1))
     k = known.shape[-1]
-    matrix.diagonal(dim1=-2, dim2=-1)[:, k - count : k] += 1
+    if count:
+        matrix.diagonal(dim1=-2, dim2=-1)[:, k - count : k] += 1
     both = torch.cat([matrix[:, :k, k:], right[:, :k, None]], -1)
     taken = matrix[:, k:, :k] @ solve_scaled(matrix[:, :k, :k], both)
     return matrix[:, k:, k:] - taken[..., :-1], right[:, k:] - taken[..., -1]
@@ -475,6 +523,8 @@ def assembled(normals: MarkerNormals, columns: Tensor) -> tuple[Tensor, Tensor]:
 
 def among(by: Tensor, n: int) -> Tensor:
     """Columns (N, M, n, L) of pose and gain (N, M, 7, L), with 0 for what stands between."""
+    if by.shape[-1] == 0:
+        return by.new_zeros(*by.shape[:2], n, 0)
     between = by.new_zeros(*by.shape[:2], n - POSE - 1, by.shape[-1])
     return torch.cat([by[:, :, :POSE], between, by[:, :, POSE:]], 2)
 
@@ -489,20 +539,19 @@ def _rim_jacobian(evidence: Evidence, R: Tensor, t: Tensor) -> tuple[Tensor, Ten
     cos, sin = angle.cos()[:, None], angle.sin()[:, None]
     radii = evidence.radii[..., None, None]
     outward = cos * one + sin * two
-    points = (evidence.points[:, :, None, None] + radii * outward).flatten(1, 3)
-    along = (radii * (cos * two - sin * one)).flatten(1, 3)
+    points = evidence.points[:, :, None, None] + radii * outward
+    along = radii * (cos * two - sin * one)
     side = evidence.polarity[:, None, None, None, None] * t.new_tensor([1.0, -1.0])[:, None, None]
-    grows = (side * outward).flatten(1, 3)
-    arm = points @ R.mT
+    seen_from = torch.stack([points, along, side * outward], -1).flatten(1, 3)
+    arm, *moved = (R[:, None] @ seen_from).unbind(-1)
     by_point, xy = derivative(arm + t[:, None], evidence.matrix)
-    tangent = (by_point @ (along @ R.mT)[..., None]).squeeze(-1)  # px per rad
+    tangent, by_gain = (by_point @ torch.stack(moved, -1)).unbind(-1)  # px per rad, px per mm
     length = torch.linalg.vector_norm(tangent, dim=-1)
     normal = torch.stack([-tangent[..., 1], tangent[..., 0]], -1) / length[..., None]
     # of a disc the inner edge is nowhere
     seen = (evidence.mask[..., None] & (evidence.radii > 0)).flatten(1).repeat_interleave(_RIM_POINTS, 1)
     weight = normal[..., :, None] * normal[..., None, :] * (length * seen)[..., None, None]
-    by_gain = by_point @ (grows @ R.mT)[..., None]
-    return torch.cat([by_pose(by_point, arm), by_gain], -1), xy, weight
+    return torch.cat([by_pose(by_point, arm), by_gain[..., None]], -1), xy, weight
 
 
 def _center_jacobian(evidence: Evidence, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -14,7 +14,7 @@ from torchpose.camera import Camera
 from torchpose.detect.reduce import only_reduced
 from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
-from torchpose.geometry.blurred_edge import KINDS
+from torchpose.geometry.blurred_edge import HOLDS, KINDS
 from torchpose.geometry.least_squares import Pose, PosePrior
 from torchpose.geometry.robust import LEAST_KEPT as LEAST_KEPT
 from torchpose.geometry.rows import Rows, shared
@@ -129,6 +129,18 @@ class Sight(Rows):
             return blurs.isotropic(start.expand(len(self)))
         median = torch.where(self.mask[..., None], self.blur, torch.nan).nanmedian(1).values
         return torch.where(median.isnan(), blurs.isotropic(start), median)
+
+    @property
+    def resolved(self) -> Bool[Tensor, " N"]:
+        """Whether most of the rings that are seen are larger than their blur, so that a pixel sees one edge of them."""
+        if self.blur is None:
+            return torch.ones_like(self.mask[:, 0])
+        smallest = torch.where(self.radii[..., 1] < 0, self.rings[..., 0, 3], self.rings[..., 1, 3])
+        may = self.mask & (self.blur[..., 0] + self.blur[..., 2] > (HOLDS * smallest).square())
+        if not bool(may.any()):
+            return torch.ones_like(self.mask[:, 0])
+        share = torch.where(self.mask, blurs.axes(self.blur)[1].sqrt() / smallest, torch.nan)
+        return ~(share.nanquantile(0.5, -1) > HOLDS)
 
     @property
     def told(self) -> Int[Tensor, " N"]:

@@ -69,21 +69,21 @@ def _plot_scatter(panel: Any, calibration: Calibration) -> None:
     panel.set_title(f"RMS {calibration.rms_px:.3g} px; circles: 1, 2, 3 sigma of the points", fontsize=10)
 
 
-def plot_hand_eye(fit: HandEyeFit) -> Figure:
-    """Residuals of the target's pose in the camera, pose by pose."""
+def plot_hand_eye(fit: HandEyeFit, of: str = "camera", what: str = "target seen - predicted from the robot") -> Figure:
+    """Residuals, pose by pose: of the target's pose in the camera, or of what else the fit has them, by whose axes."""
     figure, ((position,), (rotation,)) = subplots(2, 1, (11, 6), sharex=True)
     for panel, values, label in (
         (position, 1e3 * fit.residual[:, :3], "position, um"),
         (rotation, fit.residual[:, 3:].rad2deg() * 1e3, "rotation, mdeg"),
     ):
         for k, axis in enumerate("xyz"):
-            panel.plot(values[:, k], "o-", ms=3, lw=0.8, color=COLOURS[k], label=f"{axis} of the camera")
+            panel.plot(values[:, k], "o-", ms=3, lw=0.8, color=COLOURS[k], label=f"{axis} of the {of}")
         panel.axhline(0, color=GREY, lw=0.6)
         panel.set_ylabel(label)
     legend_below(figure, [position], 3)
     rotation.set_xlabel("pose")
     figure.suptitle(
-        f"target seen - predicted from the robot; robot noise {fit.robot_sigma_mm * 1e3:.3g} um, "
+        f"{what}; robot noise {fit.robot_sigma_mm * 1e3:.3g} um, "
         f"{math.degrees(fit.robot_sigma_rad) * 1e3:.3g} mdeg per axis",
         fontsize=11,
     )

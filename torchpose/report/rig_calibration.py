@@ -13,6 +13,7 @@ from torch import Tensor
 from torchpose.calibration.several import RigCalibration
 from torchpose.geometry import rotations
 from torchpose.io.writers import write_rows
+from torchpose.report.calibration import plot_hand_eye
 from torchpose.report.figures import COLOURS, GREY, legend_below, subplots
 from torchpose.report.files import make_folder, save_figures
 
@@ -125,6 +126,8 @@ def save_rig_calibration(found: RigCalibration, folder: Path) -> list[Path]:
     """Writes plots and tables; the paths. ConfigError: the folder cannot be written."""
     make_folder(folder, "--plots")
     figures = {"rig.png": plot_rig(found), "residuals.png": plot_cameras(found), "ties.png": plot_ties(found)}
+    if found.hand_eye is not None:
+        figures["robot.png"] = plot_hand_eye(found.hand_eye, "robot's base", "robot's pose, as said - as seen")
     return [*_tables(found, folder), *save_figures(figures, folder)]
 
 

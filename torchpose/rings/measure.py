@@ -178,6 +178,8 @@ def measure_exactly(frames: Tensor, rings: Rings, camera: Camera) -> tuple[Rings
         return rings, rings.frame
     # a ring that reads its own blur too narrow is told by those beside it
     own = blurs.axes(rings.blur)[1].sqrt()
+    if not bool((own.max() > BLURRED * rings.inner_raw[:, 3]).any()):
+        return rings, torch.arange(len(rings), device=own.device)
     usual = segment_mean(own, rings.frame, int(rings.frame.max()) + 1)[rings.frame]
     blurred = own.maximum(usual) > BLURRED * rings.inner_raw[:, 3]
     left, index = (part.nonzero()[:, 0] for part in (~blurred, blurred))
