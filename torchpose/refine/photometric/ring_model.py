@@ -90,7 +90,7 @@ class PixelBlocks(Rows):
         count = -(-self.grey.shape[1] // (nth * TILE)) * TILE
         count = count if most is None else min(count, most)
         i = torch.arange(count, device=self.row.device)
-        more = (self.size - 1) // TILE  # tiles beyond the first one
+        more = torch.div(self.size - 1, TILE, rounding_mode="floor")  # tiles beyond the first one
         stretched = torch.where(more > 0, self.size.clamp_min(nth * count), count)
         index = i * stretched[:, None] // count
         inside = index < self.size[:, None]
