@@ -257,7 +257,7 @@ def by_tiles(matrix: Tensor, planes: Tensor) -> Tensor:
     """Matrices (K, n, m) times the planes (K, T, m, S) of every tile."""
     count, tiles, _, size = planes.shape
     each = matrix[:, None].expand(-1, tiles, -1, -1).flatten(0, 1)
-    return torch.bmm(each, planes.flatten(0, 1)).view(count, tiles, matrix.shape[1], size)
+    return torch.bmm(each, planes.flatten(0, 1)).view(count, tiles, matrix.shape[-2], size)
 
 
 class _Rim(NamedTuple):
