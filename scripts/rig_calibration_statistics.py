@@ -19,8 +19,8 @@ files; nothing of OpenCV's.
 
 No camera sees the plate at a moment of another one: moments are shared out in turns, and the poses of a robot tie the
 cameras together, whose noise is 0.05 mm and 0.1 mrad along and about every axis (`--robot base`: the cameras stand
-still, and the plate is on the tool). `robot mm` and `robot rad`: the noise found over the true one. Nothing of OpenCV's
-here either.
+still, and the plate is on the tool). `robot mm` and `robot rad`: the noise found over the true one. `--known`: lenses
+are known. Nothing of OpenCV's here either.
 """
 
 from __future__ import annotations
@@ -261,11 +261,21 @@ def drawn_set(cameras: int, moments: int, seed: int, *, compare: bool = True) ->
     return Row(found, off, nees, tuple(None if rig is None else errors(rig, scene.rig).flatten() for rig in theirs))
 
 
-def tied_set(cameras: int, moments: int, seed: int, *, mount: Mount) -> Row:
+def with_lenses(scene: Drawn, views: list[Views]) -> list[Located]:
+    """Every camera as it is."""
+    found = []
+    for number, own in enumerate(views):
+        at = [int(name.removesuffix(".png")) for name in own.names]
+        seen = scene.rig.seen_by(number, scene.R[at], scene.t[at])
+        found.append(Located(f"cam{number}", scene.rig.cameras[number], own, *seen))
+    return found
+
+
+def tied_set(cameras: int, moments: int, seed: int, *, mount: Mount, known: bool) -> Row:
     scene = drawn(cameras, moments, seed)
     views = shared_out([views_of(scene, number, seed) for number in range(cameras)])
-    found = calibrate_rig(located(scene, views), lens=LENS, robot=robot_poses(scene, mount, seed))
-    return row_of_set(found, scene)
+    made, lens = (with_lenses, None) if known else (located, LENS)
+    return row_of_set(calibrate_rig(made(scene, views), lens=lens, robot=robot_poses(scene, mount, seed)), scene)
 
 
 def row_of_set(found: RigCalibration, scene: Drawn) -> Row:
@@ -289,9 +299,9 @@ def rendered_set(cameras: int, moments: int, seed: int) -> Row:
 
 
 def row_of(
-    cameras: int, moments: int, sets: int, *, rendered: bool = False, mount: Mount | None = None
+    cameras: int, moments: int, sets: int, *, rendered: bool = False, mount: Mount | None = None, known: bool = False
 ) -> dict[str, Any]:
-    made = rendered_set if rendered else drawn_set if mount is None else partial(tied_set, mount=mount)
+    made = rendered_set if rendered else drawn_set if mount is None else partial(tied_set, mount=mount, known=known)
     rows = [made(cameras, moments, seed) for seed in range(sets)]
     freedom = 6 * (cameras - 1)
     whitened = []
@@ -349,10 +359,11 @@ def main() -> None:
     parser.add_argument(
         "--robot", choices=["base", "tool"], help="cameras apart, tied by a robot, and what they are on"
     )
+    parser.add_argument("--known", action="store_true", help="with --robot: lenses are known")
     parser.add_argument("--markdown", action="store_true", help="a table for the documentation")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    how = {"rendered": options.rendered, "mount": options.robot}
+    how = {"rendered": options.rendered, "mount": options.robot, "known": options.known}
     rows = [row_of(n, options.moments, options.sets, **how) for n in options.cameras]
     print_rows(rows, markdown=options.markdown)
 

@@ -118,7 +118,7 @@ def test_one_tracked_frame_takes_fewer(sample: tuple[tp.PoseEstimator, Tensor], 
 def test_autograd_takes_poses(poses: tp.Poses) -> None:
     """The pipeline runs in inference mode, whose own tensors autograd refuses to save."""
     scale = torch.ones((), dtype=F64, requires_grad=True)
-    (scale * poses.t).square().sum().backward()  # type: ignore[no-untyped-call]  # of torch
+    (scale * poses.t).square().sum().backward()
     assert scale.grad is not None
     assert torch.allclose(scale.grad, 2 * poses.t.square().sum())
 

@@ -39,7 +39,7 @@ FLOW = [
 LEVEL = {room: level for level, rooms in enumerate(FLOW) for room in rooms}
 MODULES = sorted(ROOT.rglob("*.py"))
 LOOSE = 8  # files beside __init__.py
-MOST_THRESHOLDS = 81  # named numbers of the stages that decide, see scripts/count_thresholds.py
+MOST_THRESHOLDS = 80  # named numbers of the stages that decide, see scripts/count_thresholds.py
 LONGEST, MOST_PARAMETERS = 60, 7  # of a function: lines, and parameters outside pnp/ and the command line
 
 

@@ -117,6 +117,7 @@ class PoseEstimator(nn.Module):
             taken back to linear ones first: edges are half-way in linear grey, so encoded frames that are taken as
             linear ones shift them (docs/precision.md).
         compile: solve small problems in compiled loops (`torchpose.kernels`), on the CPU; the first call takes seconds.
+            Of one frame that saves 2 %: it pays for many poses.
 
     Raises:
         ConfigError: intrinsics that no camera of such frames has; no target, two of one name, or two that cannot be

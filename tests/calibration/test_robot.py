@@ -257,6 +257,7 @@ def test_what_is_unknown_of_the_plate_stands_beside_the_chain() -> None:
     cameras, robot = held(scene, statistics.shared_out(views)), statistics.robot_poses(scene, "base", 3)
     count = len(scene.points)
     plate = stated_plate(torch.arange(count), scene.points, 1e-8 * torch.eye(3 * count, dtype=F64))
+    assert plate is not None
     one, other = (calibrate_rig(cameras, lens=None, plate=known, robot=robot) for known in (plate, None))
     assert one.joint.shape[0] == 2 * 8 + 6 + 12 + len(plate)
     assert one.hand_eye is not None

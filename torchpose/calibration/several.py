@@ -155,10 +155,7 @@ def calibrate_rig(
     """
     together, free = _started(located, robot or {}), lens is not None
     cameras, before = together.rig.cameras, len(together.views.view)
-    equal = replace(together.views, covariance=widened(torch.zeros_like(together.views.covariance), _START_SIGMA))
-    if equal.robot is not None:  # in proportion: else views would follow the robot
-        equal = replace(equal, robot=equal.robot.coarser(_START_SIGMA / _ORDINARY_SIGMA))
-    start = adjust(equal, together.rig, together.R, together.t, free=free)
+    start = adjust(_equal(together.views), together.rig, together.R, together.t, free=free)
     views, bundle, common = weigh(together.views, start, lenses.count(cameras) if free else 0, plate)
     names = tuple(one.name for one in located)
     ties = common_moments(views, len(cameras))
@@ -192,6 +189,12 @@ def calibrate_rig(
         None if bundle.robot is None else _hand_eye(bundle.robot, joint, rig),
     )
     return replace(found, warnings=_warnings(found, together.views, free=free))
+
+
+def _equal(views: Views) -> Views:
+    """With the same weight of all points, and a robot in proportion: else the views would follow it."""
+    robot = None if views.robot is None else views.robot.coarser(_START_SIGMA / _ORDINARY_SIGMA)
+    return replace(views, covariance=widened(torch.zeros_like(views.covariance), _START_SIGMA), robot=robot)
 
 
 def _coefficients(lens: str | None) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Arcs of ellipses: joint fits to positions and directions, chaining across gaps, and following an ellipse on.
+"""Arcs of ellipses: joint fits to positions and directions, and chaining across gaps.
 
 Whole circles come out of region growing in one piece. Where something covers a ring, touches it or crosses it, the
 region breaks into arcs or runs on along the other edge. Arcs that belong to one ellipse are chained as in ELSDc
@@ -18,7 +18,6 @@ from torchpose.geometry.segments import positions, ragged_arange, segment_mean, 
 
 _TANGENT_PX = 2.0  # px of position error that weigh as much as a radian of direction error
 _LEAST_TURN = 0.25  # rad from end to end of an arc; less may be straight (measured: docs/tried.md, cost)
-_BAND = 2  # px to either side in which an ellipse is followed
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,24 +183,6 @@ def fit_scatter(sums: Float[Tensor, "M 6 6"], center: Tensor, scale: Tensor | No
     return torch.where(sound[:, None], params, torch.nan)
 
 
-def follow(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor, rounds: int = 3) -> Float[Tensor, "M 5"]:
-    """Refits ellipses to whatever edge lies along them, so that an arc grows round over gaps; NaN where none is left.
-
-    The polarity is +1 where the gradient points outwards.
-    """
-    largest = max(grad.shape[1:])
-    for _ in range(rounds if len(ellipses) else 0):
-        # a hairline fits an ellipse of any size: without a limit, its samples would fill the memory
-        ellipses = torch.where(ellipses[:, 2:3] <= largest, ellipses, torch.nan)
-        band = edge_band(grad, frame, polarity, perimeter_samples(ellipses), _BAND)
-        keep = positions(band.rise.flatten() > 0)
-        cells = (band.x, band.y, band.gx, band.gy, band.rise)
-        x, y, gx, gy, rise = (v.flatten().index_select(0, keep) for v in cells)
-        of = band.at.of.index_select(0, keep // band.x.shape[1])
-        ellipses = fit_joint(torch.stack([x, y], -1), torch.stack([gx, gy], -1), of, len(ellipses), rise)
-    return ellipses
-
-
 def perimeter_samples(ellipses: Float[Tensor, "M 5"], most: int | None = None, multiple: int = 2) -> Perimeter:
     """About one sample a pixel of perimeter, ``most`` at most, none of an ellipse that is NaN.
 
@@ -227,7 +208,7 @@ def cells_at(grad: Gradient, frame: Tensor, x: Tensor, y: Tensor) -> tuple[Tenso
 
 
 def edge_band(grad: Gradient, frame: Tensor, polarity: Tensor, at: Perimeter, reach: int) -> Band:
-    """Edges of the right direction up to ``reach`` cells to either side of samples of ellipses, as for `follow`."""
+    """Edges up to ``reach`` cells to either side of samples of ellipses; polarity +1 where grey rises outwards."""
     across = torch.arange(-reach, reach + 1, dtype=torch.float64, device=at.xy.device)
     planes = zip(at.xy.unbind(-1), at.normal.unbind(-1), strict=True)
     beside = (torch.addcmul(p[:, None], n[:, None], across) for p, n in planes)

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose import ellipse
-from torchpose.detect.arcs import chain_pairs, describe_arcs, fit_pairs, follow
+from torchpose.detect.arcs import chain_pairs, describe_arcs, fit_pairs
 from torchpose.detect.finer import MIN_ASPECT, MIN_SEMI_MINOR, SIDE, cut_outs, promising_places
 from torchpose.detect.partial import SETTLE, free_of_stumps
 from torchpose.detect.prospects import crests, rings, sorted_out
@@ -52,8 +52,6 @@ _MIN_CRESTS = 7  # of cells that are left where edges are thinned
 # of a region on its ellipse, a pixel of perimeter: an edge is two to three cells wide, of which one is enough with gaps
 # (convention; without it the same 656 of 658 rings, docs/tried.md)
 _MIN_CELLS = 0.35
-_ARC_ROUNDS = 3  # of following the ellipse of a pair of arcs
-_PART_ROUNDS = 2  # of following the ellipse of a region that is only a part of it
 _RING_SETTLE = 2  # fits of a ring to what agrees: its edges are measured later
 
 
@@ -243,27 +241,14 @@ def fit_regions(grad: Gradient, regions: Regions, wanted: Wanted = ANYTHING) -> 
     # a region that is not a whole ellipse runs along something else as well: only what lies along the ellipse counts
     beyond = edge < WHOLE * torch.bincount(regions.region, minlength=count)
     partial = (found.cover <= WHOLE) | beyond[good]
-    admitted = partial & asked_for(grad, found, wanted, partial)
-    lost = partial & ~admitted & (found.verdict == Verdict.ACCEPTED)
+    partial = partial & (found.verdict == Verdict.ACCEPTED)
+    lost = partial & ~asked_for(grad, found, wanted, partial)
     found = replace(found, verdict=torch.where(lost, int(Verdict.UNWANTED), found.verdict))
-    part = positions(admitted)
-    if part.numel():
-        again, sound = _followed(grad, found[part], _PART_ROUNDS)
-        found = found.replaced(part[sound], again)
     whole = marked(good[(found.verdict == Verdict.ACCEPTED) & (found.cover > WHOLE)], count)
     explained = along & whole.index_select(0, regions.region)
     bad = positions((verdict != Verdict.ACCEPTED) & params.isfinite().all(-1))
     rejected = Candidates.unscored(regions.frame[bad], params[bad], polarity[bad], verdict[bad])
     return Candidates.cat([found, rejected]), explained
-
-
-def _followed(grad: Gradient, found: Candidates, rounds: int) -> tuple[Candidates, Tensor]:
-    """Those that are still ellipses when they have been followed along their edge, and their indices (K,)."""
-    if len(found) == 0:
-        return found, found.frame
-    refit = follow(grad, found.frame, found.ellipse, found.polarity, rounds)
-    sound = positions(plausible(grad, refit) == Verdict.ACCEPTED)
-    return score(grad, found.frame[sound], refit[sound], found.polarity[sound]), sound
 
 
 def _on_ellipses(
@@ -281,7 +266,7 @@ def _on_ellipses(
 
 
 def fit_arcs(grad: Gradient, arcs: Regions, wanted: Wanted = ANYTHING) -> Candidates:
-    """Ellipses of pairs of arcs, followed along their whole perimeter."""
+    """Ellipses of pairs of arcs."""
     xy = grad.centers(arcs.cell)
     about = describe_arcs(arcs, xy)
     pair = chain_pairs(about, wanted.polarity)
@@ -303,8 +288,7 @@ def fit_arcs(grad: Gradient, arcs: Regions, wanted: Wanted = ANYTHING) -> Candid
     likely = likely[asked_for(grad, likely, wanted, glance(grad, likely, 0.5))]
     found = score(grad, likely.frame, likely.ellipse, likely.polarity)
     found = found[found.cover > 0.5]
-    found, _ = _followed(grad, merge_duplicates(found, 2 * SAME), _ARC_ROUNDS)
-    return accepted(found)
+    return accepted(merge_duplicates(found, 2 * SAME))
 
 
 def asked_for(grad: Gradient, found: Candidates, wanted: Wanted, among: Bool[Tensor, " M"]) -> Bool[Tensor, " M"]:

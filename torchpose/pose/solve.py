@@ -146,8 +146,22 @@ def _starts(evidence: Evidence, rough: tuple[Tensor, Tensor], near: bool = False
 
     ``near``: the latter for all rows.
     """
-    R, t = rough
-    # depth mirrored along the line of sight, the plane turned back on itself: the same weak-perspective image
+    if near:
+        return _mirrored(evidence, *rough)
+    focal, principal = evidence.matrix.diagonal()[:2], evidence.matrix[:2, 2]
+    xy = torch.where(evidence.mask[..., None], (evidence.center - principal) / focal, 0.0)
+    flat = pnp.planar(evidence.points, xy, mask=evidence.mask)
+    both = flat.R.isfinite().all(-1).all(-1).all(-1)  # else a marker behind the camera, or no plane
+    planar = evidence.coplanar & (evidence.mask.sum(-1) >= 4) & both
+    if bool(planar.all()):
+        return flat.R, flat.t
+    R, t = _mirrored(evidence, *rough)
+    return torch.where(planar[:, None, None, None], flat.R, R), torch.where(planar[:, None, None], flat.t, t)
+
+
+def _mirrored(evidence: Evidence, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+    """Poses and their mirror images (N, 2, 3, 3), (N, 2, 3): depth mirrored along the line of sight, the plane turned
+    back on itself, which is the same weak-perspective image."""
     weight = evidence.mask.double() / evidence.mask.sum(-1, keepdim=True)
     middle = (evidence.points * weight[..., None]).sum(1)
     at = (R @ middle[..., None]).squeeze(-1) + t
@@ -155,17 +169,7 @@ def _starts(evidence: Evidence, rough: tuple[Tensor, Tensor], near: bool = False
     normal = evidence.normals[torch.arange(first.numel(), device=first.device), first]
     mirrored = _reflection(at) @ R @ _reflection(normal)
     mirrored_t = at - (mirrored @ middle[..., None]).squeeze(-1)
-    given = torch.stack([R, mirrored], 1), torch.stack([t, mirrored_t], 1)
-    if near:
-        return given
-    focal, principal = evidence.matrix.diagonal()[:2], evidence.matrix[:2, 2]
-    xy = torch.where(evidence.mask[..., None], (evidence.center - principal) / focal, 0.0)
-    flat = pnp.planar(evidence.points, xy, mask=evidence.mask)
-    both = flat.R.isfinite().all(-1).all(-1).all(-1)  # else a marker behind the camera, or no plane
-    planar = (evidence.coplanar & (evidence.mask.sum(-1) >= 4) & both)[:, None]
-    start_r = torch.where(planar[..., None, None], flat.R, given[0])
-    start_t = torch.where(planar[..., None], flat.t, given[1])
-    return start_r, start_t
+    return torch.stack([R, mirrored], 1), torch.stack([t, mirrored_t], 1)
 
 
 def _reflection(direction: Tensor) -> Tensor:

@@ -210,8 +210,12 @@ def _measured(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
     by_blur = reduction_for(_in_common(blurs.axes(inside.blur)[1].sqrt(), candidates.frame), zernike.WIDEST)
     # a ring keeps a pixel more than the least has
     factor = by_blur.minimum(reduction_for(candidates.ellipse[:, 3], 2 * (_LEAST_SEMI_MINOR[0] + 1)))
-    rings, which = [], []
-    for value in factor.unique().tolist():
+    values, rings, which = factor.unique().tolist(), [], []
+    if values == [1]:
+        found, of = _measure(frames, circles, camera, how)
+        order = torch.argsort(of)
+        return found[order], of[order]
+    for value in values:
         index = (factor == value).nonzero()[:, 0]
         small, own, frame = only_reduced(frames, candidates.frame[index], value)
         outer, inner = (conics.rescaled(e[index], 1 / value) for e in (candidates.ellipse, inside.ellipse))

@@ -90,7 +90,8 @@ class PixelBlocks(Rows):
         count = -(-self.grey.shape[1] // (nth * TILE)) * TILE
         count = count if most is None else min(count, most)
         i = torch.arange(count, device=self.row.device)
-        stretched = torch.where(self.size <= TILE, count, self.size.clamp_min(nth * count))
+        more = torch.div(self.size - 1, TILE, rounding_mode="floor")  # tiles beyond the first one
+        stretched = torch.where(more > 0, self.size.clamp_min(nth * count), count)
         index = i * stretched[:, None] // count
         inside = index < self.size[:, None]
         index = index.minimum((self.size[:, None] - 1).clamp_min(0))
@@ -158,14 +159,14 @@ def gather_pixels(sight: Sight, band: Tensor) -> PixelBlocks:
     det = (j00 * j11 - j01 * j10).reciprocal()
     warp = (j11 * det, -j01 * det, -j10 * det, j00 * det, det.abs())
     flat = torch.stack([*warp, torch.where(sound, grey, 0.0), sound.float()])
-    *warp, grey, valid = flat.index_select(1, index).view(len(flat), count, most)
+    *warped, grey, valid = flat.index_select(1, index).view(len(flat), count, most)
     sector = sector_about(u, v, both[:, 0], block).index_select(0, index).view(count, most)
     normal = sight.normals[row, marker]
     return PixelBlocks(
         row,
         torch.nn.functional.pad(origin, (0, 0, 0, 1), value=1.0).mT[..., None],
         _tiled(*xy, torch.ones_like(xy[0])),
-        _tiled(*warp),
+        _tiled(*warped),
         grey,
         valid * inside,
         sector,
