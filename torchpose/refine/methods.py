@@ -79,19 +79,11 @@ def on_frames(refine: Callable[..., Refined]) -> Step:
     """The step that refines every pose on the frames themselves where that holds, and on the centres where not.
 
     Markers that sit beside their places are looked at where they are: what is found of the print moves them, and the
-    rows are refined again. Rows whose rings are not resolved keep what these tell as wholes: a model of edges is off by
-    several bounds there (0053).
+    rows are refined again. Rows whose rings are not resolved have what these tell as wholes, where they agree: a model
+    of edges is off by several bounds there (0053).
     """
 
     def step(rows: Solutions, seen: Evidence, sight: Sight) -> Solutions:
-        resolved = sight.resolved
-        if bool(resolved.all()):
-            return refined_rows(rows, seen, sight)
-        index, rest = resolved.nonzero()[:, 0], (~resolved).nonzero()[:, 0]
-        found = rows.replaced(rest, _by_centers(rows[rest], seen[rest], sight.camera)[0])
-        return found.replaced(index, refined_rows(rows[index], seen[index], sight[index])) if index.numel() else found
-
-    def refined_rows(rows: Solutions, seen: Evidence, sight: Sight) -> Solutions:
         start, place = _start(rows, seen, sight.camera)
         found, good = rows, torch.zeros_like(rows.status, dtype=torch.bool)
         active = torch.arange(len(rows), device=good.device)
@@ -116,9 +108,22 @@ def on_frames(refine: Callable[..., Refined]) -> Step:
             if active.numel() == 0:
                 break
         bad = (~good).nonzero()[:, 0]
-        return found.replaced(bad, _by_centers(rows[bad], seen[bad], sight.camera)[0]) if bad.numel() else found
+        if bad.numel():
+            found = found.replaced(bad, _by_centers(rows[bad], seen[bad], sight.camera)[0])
+        return _as_wholes(found, rows, seen, sight)
 
     return _on_solved(step)
+
+
+def _as_wholes(found: Solutions, rows: Solutions, seen: Evidence, sight: Sight) -> Solutions:
+    """The rows found, but by the rings as wholes where these are not resolved, and agree with each other."""
+    plain = sight.resolved if sight.look is None else sight.resolved | (sight.look.kind > 0)
+    index = (~plain).nonzero()[:, 0]
+    if index.numel() == 0:
+        return found
+    whole = _by_centers(rows[index], seen[index], sight.camera)[0]
+    agreed = (whole.misfit == 0).nonzero()[:, 0]
+    return found.replaced(index[agreed], whole[agreed])
 
 
 def _start(rows: Solutions, seen: Evidence, camera: Camera) -> tuple[Pose, Tensor]:

@@ -259,8 +259,8 @@ def _no_fit(begun: _Start) -> _Fit:
     """Of rings of which nothing is known yet."""
     none = torch.zeros_like(begun.theta[:, 0])
     covariance = none.new_zeros(len(none), RING + BLUR, RING + BLUR)
-    numbers, marks = [none] * 6, [none > 0] * 2
-    return _Fit(begun.theta, begun.spread.values, covariance, *numbers, *marks, begun.seen)
+    no = none > 0
+    return _Fit(begun.theta, begun.spread.values, covariance, none, none, none, none, none, none, no, no, begun.seen)
 
 
 def _pixels(outer: Tensor, margin: Tensor) -> Tensor:
