@@ -187,7 +187,7 @@ def test_the_budget_of_rings_is_what_estimate_states(name: str, place: float | t
     assert (stated / budget.std() - 1).abs().max() < 0.08
     noise = found.noise.diagonal(dim1=1, dim2=2).sqrt()
     # where the print decides all but everything, its weights do: a turn of 0.8 mrad by places has 6 or 24 urad of noise
-    assert ((noise - budget.std("image")).abs() < 0.12 * budget.std("image") + 0.03 * stated).all()
+    assert ((noise - budget.std("image")).abs() < 0.12 * budget.std("image") + 0.04 * stated).all()
 
 
 def test_rings_reach_the_cramer_rao_bound() -> None:

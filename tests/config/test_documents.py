@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 import time
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,9 @@ from torchpose.config import parse_json, parse_mapping, read_text, read_yaml
 from torchpose.config.documents import MOST_DEPTH, MOST_VALUES
 from torchpose.errors import ConfigError, TorchposeError
 
-LEAVES = st.one_of(
-    st.none(), st.booleans(), st.integers(-(2**62), 2**62), st.floats(allow_nan=False), st.text(max_size=20)
-)
+# 1e3 is a number here, as in YAML 1.2; PyYAML takes it for a text and writes it without quotes
+TEXTS = st.text(max_size=20).filter(lambda text: not re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+", text))
+LEAVES = st.one_of(st.none(), st.booleans(), st.integers(-(2**62), 2**62), st.floats(allow_nan=False), TEXTS)
 
 
 def _nested(inner: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
