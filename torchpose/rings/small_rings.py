@@ -64,7 +64,7 @@ _LEAST_EXPLAINED = 0.75
 # variance of a ring's residuals over that of white noise with the same third differences: mean of a frame's rings under
 # a Gaussian up to 1.1, under a disc 1.6 to 1.9 (measured: decisions/0053)
 _WHITE = 1.25
-_BEGINNINGS = (0.35, 0.65)  # ratios: from one of them any code is reached (measured: docs/tried.md)
+_BEGINNINGS = (0.35, 0.65)  # ratios: from one of them any code is reached (measured: decisions/0053)
 _PART = 400_000  # pixels times nodes at a time
 _FEW = 10_000  # pixels: the calls of a part cost as much, so fewer are padded to one size (measured: docs/tried.md)
 _UNEVEN = 2.0  # most pixels of a window over the least, of those that are padded to one size
@@ -163,7 +163,8 @@ def fit_small_rings(
         fit = fit.replaced(odd, _out_of_focus(frames, candidates[odd], first[odd], fit[odd]))
     left = (~(fit.disc & (fit.variance < _WHITE**2 * fit.noise))).nonzero()[:, 0]
     if left.numel():
-        fit = replace(fit, variance=fit.variance.where(fit.disc, torch.inf))  # a glance is no fit
+        # a glance is no fit
+        fit = replace(fit, sound=fit.sound & fit.disc, variance=fit.variance.where(fit.disc, torch.inf))
         fit = fit.bettered(left, _fitted_all(frames, candidates[left], first[left], _PRECISE))
     return _judged(fit, outer, candidates.polarity)
 
