@@ -117,6 +117,12 @@ def test_codes_of_rings_out_of_focus(radius: float) -> None:
     assert off[found.good].quantile(0.95) < 0.03
 
 
+def test_no_rings() -> None:
+    nothing = begun(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 5).double(), torch.zeros(0).double())
+    for again in (False, True):
+        assert len(fit_small_rings(torch.zeros(1, 9, 9), *nothing, FOCAL, begun=again).good) == 0
+
+
 def test_refuses_what_is_no_ring() -> None:
     frames = 128 + 20 * torch.randn(1, 80, 80, generator=torch.Generator().manual_seed(1))
     frames[0, 30:50, 30:50] = 20.0  # a square without a hole

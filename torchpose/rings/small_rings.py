@@ -154,7 +154,7 @@ def fit_small_rings(
     parted = (outer[:, 2].square() * (1 - ratio.square()) / focal).clamp_min(_LEAST_PARTED)
     spread = Spread(blurs.limited(inside.blur, _START_SIGMA**2, MOST**2))
     first = _Start(torch.cat([*start, apart], -1), spread, inside.seen, parted, inside.clipped)
-    if not begun:
+    if not begun or len(outer) == 0:
         return _judged(_fitted_all(frames, candidates, first, _ROUGH), outer, candidates.polarity)
     fit = _fitted_all(frames, candidates, first, _GLANCE)
     frame, number = candidates.frame, int(candidates.frame.max()) + 1
