@@ -146,6 +146,7 @@ def test_poses_on_the_edge_of_the_workspace_are_inside() -> None:
         assert robot.check([*corner, 0, 0, 1]) == (*corner, 0, 0, 1)
 
 
+@needs_ur_rtde
 def test_nobody_there() -> None:
     with fault_within(2.5, RobotReason.UNREACHABLE):
         Robot(settings("127.0.0.1", connect_timeout_s=1.0)).preflight()
