@@ -74,6 +74,13 @@ def true(scene: statistics.Drawn) -> tp.CameraRig:
     return tp.CameraRig(scene.rig.cameras, scene.rig.R, 1.1 * scene.rig.t)
 
 
+def chi_squared(rig: tp.CameraRig, true: tp.CameraRig) -> float:
+    """Of the places of the cameras, with 6 degrees of freedom."""
+    assert rig.covariance is not None
+    off = statistics.errors(rig, true).flatten()
+    return float(off @ torch.linalg.solve(rig.covariance, off))
+
+
 def test_a_folder_a_camera_gives_the_file_that_kalibr_reads(
     shots: Path, true: tp.CameraRig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -87,8 +94,7 @@ def test_a_folder_a_camera_gives_the_file_that_kalibr_reads(
     assert "12 of 12 moments" in said
     rig = tp.CameraRig.load(out)
     assert rig.covariance is not None
-    off = statistics.errors(rig, true).flatten()
-    assert float(off @ torch.linalg.solve(rig.covariance, off)) < 30  # of chi-squared with 6: one in 25,000
+    assert chi_squared(rig, true) < 30  # of chi-squared with 6: one in 25,000
     assert float(rig.covariance.diagonal()[:3].sqrt().max()) < 0.05
     for read, camera, number in zip(kalibr(out), rig.cameras, range(2), strict=True):
         assert camera.covariance is not None
@@ -120,8 +126,7 @@ def test_known_cameras_are_held_and_the_target_is_measured(shots: Path, true: tp
     assert rig.cameras[1].covariance is None
     torch.testing.assert_close(rig.cameras[1].matrix, true.cameras[1].matrix)
     assert rig.covariance is not None
-    off = statistics.errors(rig, true).flatten()
-    assert float(off @ torch.linalg.solve(rig.covariance, off)) < 30
+    assert chi_squared(rig, true) < 30
     nominal = tp.Target.load("hexa50")
     assert target.covariance is not None
     sigma = target.covariance.diagonal()[:-1].sqrt().view(-1, 3)
@@ -164,8 +169,7 @@ def test_cameras_that_never_see_the_target_together_are_tied_by_the_robot(
     assert "robot noise" in said
     rig = tp.CameraRig.load(out)
     assert rig.covariance is not None
-    off = statistics.errors(rig, true).flatten()
-    assert float(off @ torch.linalg.solve(rig.covariance, off)) < 40  # noise of 12 poses, and of 1 in 10^5 sets
+    assert chi_squared(rig, true) < 40  # noise of 12 poses, and of 1 in 10^5 sets
     assert 0.01 < float(rig.covariance.diagonal()[:3].sqrt().max()) < 0.2
     assert tp.HandEye.load(hand_eye).mount == "tool"
     assert "robot.png" in {path.name for path in plots.iterdir()}

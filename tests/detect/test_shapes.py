@@ -11,8 +11,9 @@ import torch
 
 from torchpose import ellipse
 from torchpose.detect import Verdict, find_candidates, find_shapes
-from torchpose.detect.arcs import fit_joint
+from torchpose.detect.arcs import fit_scatter, scatter_sums
 from torchpose.geometry import conics
+from torchpose.geometry.segments import segment_mean
 
 
 def polygon(center: tuple[int, int], radius: int, sides: int, turn: float = 0.2) -> np.ndarray:
@@ -43,6 +44,12 @@ def disc(u: int, v: int, a: int, b: int | None = None, theta: float = 0.0) -> np
     return np.stack([u + math.cos(theta) * x - math.sin(theta) * y, v + math.sin(theta) * x + math.cos(theta) * y], 1)
 
 
+def fit_joint(xy: torch.Tensor, gradient: torch.Tensor, index: torch.Tensor, count: int) -> torch.Tensor:
+    """Ellipses of points that weigh alike, about their means."""
+    center = segment_mean(xy, index, count)
+    return fit_scatter(scatter_sums(xy, gradient, index, center, torch.ones(len(xy))), center)
+
+
 @pytest.mark.parametrize("degrees", [60, 90, 150, 360])
 @pytest.mark.parametrize("theta", [0.0, 0.9])
 def test_joint_fit_of_arcs(degrees: int, theta: float) -> None:
@@ -53,7 +60,7 @@ def test_joint_fit_of_arcs(degrees: int, theta: float) -> None:
     normal = (xy - truth[0, :2]) @ (inverse @ inverse)
     index = torch.zeros(200, dtype=torch.int64)
     # the lengths of the gradients do not matter
-    found = fit_joint(xy, normal * (1 + angle[:, None]), index, 1, torch.ones(200))
+    found = fit_joint(xy, normal * (1 + angle[:, None]), index, 1)
     torch.testing.assert_close(found[:, :2], truth[:, :2], rtol=0, atol=1e-6)
     torch.testing.assert_close(conics.shape_matrix(found), conics.shape_matrix(truth), rtol=0, atol=1e-6)
 
@@ -65,7 +72,7 @@ def test_directions_hold_an_arc() -> None:
     normal = torch.stack([angle.cos(), angle.sin()], -1)
     xy = 100 + 30 * normal + 0.3 * torch.randn(4000, 2, dtype=torch.float64, generator=g)
     index = torch.arange(50).repeat_interleave(80)
-    found = fit_joint(xy, normal, index, 50, torch.ones(4000))
+    found = fit_joint(xy, normal, index, 50)
     positions = ellipse.fit(xy, index, 50)
     error, without = ((e[:, :2] - 100).norm(dim=-1).median() for e in (found, positions))
     assert error < 0.5 * without

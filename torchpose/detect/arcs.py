@@ -14,7 +14,7 @@ from torch import Tensor
 from torchpose.detect.regions import AGREE_COS, MOST_A_FRAME, Gradient, Regions
 from torchpose.geometry import conics, segments
 from torchpose.geometry.rows import Rows
-from torchpose.geometry.segments import positions, ragged_arange, segment_mean, segment_sum
+from torchpose.geometry.segments import positions, ragged_arange, segment_sum
 
 _TANGENT_PX = 2.0  # px of position error that weigh as much as a radian of direction error
 _LEAST_TURN = 0.25  # rad from end to end of an arc; less may be straight (measured: docs/tried.md, cost)
@@ -107,7 +107,7 @@ def chain_pairs(arcs: Arcs, polarity: float = 0.0) -> Int[Tensor, "Q 2"]:
 def fit_pairs(
     regions: Regions, about: Arcs, xy: Float[Tensor, "P 2"], pair: Int[Tensor, "Q 2"]
 ) -> Float[Tensor, "Q 5"]:
-    """`fit_joint` of the cells of pairs of arcs, each arc summed once however many pairs it is in."""
+    """Ellipses of the cells of pairs of arcs, each arc summed once however many pairs it is in."""
     arc, member = pair.flatten().unique(return_inverse=True)
     order = torch.arange(len(arc), device=pair.device)
     number = torch.full((len(about),), -1, device=pair.device).index_copy(0, arc, order)
@@ -122,17 +122,6 @@ def fit_pairs(
     center = (share[..., None] * mean[first]).sum(1)
     step = (middle[first] - center[:, None]).flatten(0, 1)
     return fit_scatter(moved_sums(sums[member], step).view(-1, 2, 6, 6).sum(1), center)
-
-
-def fit_joint(xy: Tensor, gradient: Tensor, index: Tensor, count: int, weights: Tensor) -> Float[Tensor, "M 5"]:
-    """Ellipses from positions (P, 2) and gradient directions (P, 2), NaN where the conic is no ellipse.
-
-    The smallest eigenvector of the scatter of two rows a point: the conic passes through the point, and its tangent
-    there is at right angles with the gradient (pole and polar). Directions hold arcs that positions alone leave open.
-    """
-    w = weights.double()
-    center = segment_mean(xy, index, count, w)
-    return fit_scatter(scatter_sums(xy, gradient, index, center, w), center)
 
 
 def scatter_sums(

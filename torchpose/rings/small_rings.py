@@ -161,7 +161,7 @@ def fit_small_rings(
     odd = (segment_mean(fit.variance / fit.noise, frame, number)[frame] > _WHITE).nonzero()[:, 0]
     if odd.numel():
         fit = fit.replaced(odd, _out_of_focus(frames, candidates[odd], first[odd], fit[odd]))
-    left = (~(fit.disc & (fit.variance < _WHITE**2 * fit.noise))).nonzero()[:, 0]
+    left = (~fit.explained_by_disc).nonzero()[:, 0]
     if left.numel():
         # a glance is no fit
         fit = replace(fit, sound=fit.sound & fit.disc, variance=fit.variance.where(fit.disc, torch.inf))
@@ -228,9 +228,9 @@ class _Start(Rows):
 @dataclass(frozen=True, eq=False)
 class _Fit(Rows):
     """K fits: parameters, blur and the covariance of both, contrast, residual variance, number of pixels kept and their
-    share, the share of the grey values' variance that is explained, the variance of white
-    noise that has their residuals' third differences, whether the blur is a disc's, whether the window is on the frame
-    and the data determine all parameters, and the sectors that follow the model."""
+    share, the share of the grey values' variance that is explained, the variance of white noise that has their
+    residuals' third differences, whether the blur is a disc's, whether the window is on the frame and the data
+    determine all parameters, and the sectors that follow the model."""
 
     theta: Float[Tensor, "K 8"]
     blur: Float[Tensor, "K 3"]
@@ -249,6 +249,11 @@ class _Fit(Rows):
     def loss(self) -> Tensor:
         """(K,): mean squares of the residuals, those left out with the least that they have."""
         return self.variance * (self.kept + CUT**2 * (1 - self.kept))
+
+    @property
+    def explained_by_disc(self) -> Tensor:
+        """(K,) bool: a disc leaves no more than noise."""
+        return self.disc & (self.variance < _WHITE**2 * self.noise)
 
     def bettered(self, index: Tensor, others: _Fit) -> _Fit:
         """With those of the others, of the rings ``index``, that leave less."""
@@ -326,7 +331,7 @@ def _fitted(window: _Window, begun: _Start, scheme: _Scheme) -> _Fit:
         number,
         kept,
         explained,
-        _noise(pixels.residual, weight),
+        torch.zeros_like(variance) if scheme is _ROUGH else _noise(pixels.residual, weight),  # only asked of the others
         torch.full_like(sound, scheme is _OUT_OF_FOCUS),
         sound,
         pixels.followed(),
@@ -428,9 +433,8 @@ def _judged(fit: _Fit, outer: Tensor, polarity: Tensor) -> SmallRings:
         EllipseFit(p, 2 * j @ covariance @ j.mT, fit.variance.sqrt(), fit.pixels)
         for p, j in ((params, outer_jacobian), (inner, inner_jacobian))
     ]
-    round_ = most < LONG * least
-    disc = fit.disc & round_ & (fit.variance < _WHITE**2 * fit.noise)
-    return SmallRings(fits[0], fits[1], fit.blur, good, promising, disc, fit.seen)
+    round_disc = fit.explained_by_disc & (most < LONG * least)
+    return SmallRings(fits[0], fits[1], fit.blur, good, promising, round_disc, fit.seen)
 
 
 class _Window(NamedTuple):
