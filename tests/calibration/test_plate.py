@@ -49,13 +49,14 @@ def test_places_move_in_their_best_frame_alone() -> None:
 def test_a_stated_covariance_is_that_of_its_plate() -> None:
     g = torch.Generator().manual_seed(2)
     root = torch.randn(12, 7, dtype=F64, generator=g)
-    nominal = tp.Target.load("quad40").centers
-    plate = stated_plate(torch.arange(4), nominal, root @ root.mT)
+    nominal, gain = tp.Target.load("quad40"), torch.full((1, 1), 1e-4, dtype=F64)
+    plate = stated_plate(replace(nominal, covariance=torch.block_diag(root @ root.mT, gain)))
     assert plate is not None
-    assert len(plate) == 7
+    assert len(plate) == 7 + 1 + 3 * 4  # and the gain, and a size and two tilts a ring
     columns = plate.places.flatten(0, 1)
     torch.testing.assert_close(columns @ columns.mT, root @ root.mT)
-    assert stated_plate(torch.arange(4), nominal, torch.zeros(12, 12, dtype=F64)) is None
+    assert float(plate.gain.norm()) == pytest.approx(0.01)
+    assert stated_plate(nominal) is None
 
 
 def seen_by_two(views: Views, camera: tp.Camera) -> tuple[Views, tp.CameraRig]:
@@ -240,7 +241,7 @@ def test_places_that_are_stated_only_widen_the_camera() -> None:
         )
         views = replace(statistics.drawn_views(scene, scene.views, torch.Generator().manual_seed(seed)), rims=None)
         assert scene.nominal.covariance is not None
-        plate = stated_plate(scene.nominal.ids, scene.nominal.centers, scene.nominal.covariance[:-1, :-1])
+        plate = stated_plate(scene.nominal)
         truth = statistics.intrinsics(scene.camera)
         for prior, every in ((plate, stated_nees), (None, exact_nees)):
             found = calibrate_intrinsics(views, [scene.start], lens="brown4", plate=prior)
@@ -255,7 +256,7 @@ def test_dot_gain_is_told_by_single_rings_and_moves_no_centre() -> None:
     target = tp.Target.load("quad40")
     pose = scenes.poses(camera, 4)
     frames = add_noise(render(camera, replace(target, edge_gain=0.015), *pose), 2.0)
-    views = measure_centers([str(k) for k in range(4)], frames, camera, target, rims=True)
+    views = measure_centers([str(k) for k in range(4)], frames, camera, target, tilts="open")
     assert views.rims is not None
     true = camera.project((pose[0][views.view] @ views.points[..., None])[..., 0] + pose[1][views.view])
     error = (views.pixels - true)[..., None]

@@ -15,7 +15,7 @@ from scripts import rig_calibration_statistics as statistics
 from tests.calibration.test_several import held, of_seed
 from torchpose.calibration import Views
 from torchpose.calibration.hand_eye import restricted_noise
-from torchpose.calibration.plate import stated_plate
+from torchpose.calibration.plate import Plate
 from torchpose.calibration.rig_session import RobotPoses, hand_eye_of
 from torchpose.calibration.robot import Robot
 from torchpose.calibration.several import RigCalibration, calibrate_rig
@@ -256,8 +256,10 @@ def test_what_is_unknown_of_the_plate_stands_beside_the_chain() -> None:
     scene, views = of_seed(2, 40, 3)
     cameras, robot = held(scene, statistics.shared_out(views)), statistics.robot_poses(scene, "base", 3)
     count = len(scene.points)
-    plate = stated_plate(torch.arange(count), scene.points, 1e-8 * torch.eye(3 * count, dtype=F64))
-    assert plate is not None
+    places = 1e-4 * torch.eye(3 * count, dtype=F64).unflatten(0, (count, 3))
+    none = torch.zeros_like(places)
+    numbers = (none[:, 0, 0], places, none[0, 0], none[:, 0], none, places.new_ones(3 * count))
+    plate = Plate(torch.arange(count), scene.points, *numbers)
     one, other = (calibrate_rig(cameras, lens=None, plate=known, robot=robot) for known in (plate, None))
     assert one.joint.shape[0] == 2 * 8 + 6 + 12 + len(plate)
     assert one.hand_eye is not None

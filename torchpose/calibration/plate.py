@@ -15,12 +15,16 @@ from typing import Self
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchpose.geometry import rotations
 from torchpose.geometry.rotations import plane_axes
 from torchpose.geometry.rows import Rows
+from torchpose.identify import drawn_radii
+from torchpose.target import Target
 
 _TURNED = 0.02  # rad, deviation of a ring's tilt against the plane of the file: a plate of 100 mm bent by 0.5 mm
+_GAIN = 0.1  # of the width of a ring, deviation of a gain that a file leaves open: enough for any print
 _NOTHING = 1e-12  # of the largest variance, below which a direction is as good as known
 
 
@@ -54,8 +58,8 @@ class Plate:
 
     @property
     def rims(self) -> bool:
-        """Whether sizes and tilts of the rings are among the unknowns, and the gain but for discs."""
-        return bool(self.sizes.any())
+        """Whether anything of the rims is among the unknowns: tilts, and gain or sizes."""
+        return bool(self.turns.any())
 
     def index(self, ids: Tensor) -> Tensor:
         """Which of the points each of these ids (K,) is."""
@@ -104,14 +108,23 @@ def free_plate(
     shape = torch.linalg.qr(motions(nominal), mode="complete").Q[:, 7:]
     parts = [shape]
     if normals is not None:
-        tilts = torch.stack(plane_axes(normals), -1) * _TURNED  # (M, 3, 2)
         # the gain, and the size of every ring
-        parts += [torch.eye(count + 1).to(shape)[:, int(discs) :], torch.block_diag(*tilts)]
+        parts += [torch.eye(count + 1).to(shape)[:, int(discs) :], _tilts(normals)]
+    known = [torch.full((part.shape[1],), float(k == 2)).to(shape) for k, part in enumerate(parts)]
+    return _plate(ids, nominal, parts, torch.cat(known))
+
+
+def _tilts(normals: Float[Tensor, "M 3"]) -> Float[Tensor, "T k"]:
+    """Turns of rings about two axes each, of the deviation that they have a priori."""
+    return torch.block_diag(*(torch.stack(plane_axes(normals), -1) * _TURNED))
+
+
+def _plate(ids: Tensor, nominal: Tensor, parts: Sequence[Tensor], known: Tensor) -> Plate:
+    """A plate of columns of places, and where they are asked for of gain and sizes, and of turns; none is shared."""
     places, *of_rims = _side_by_side(parts)
-    k = places.shape[1]
+    count, k = len(ids), places.shape[1]
     rims, turns = of_rims or (places.new_zeros(count + 1, k), places.new_zeros(3 * count, k))
     larger = torch.zeros_like(nominal[:, 0])
-    known = turns.any(0).to(places)
     return Plate(
         ids, nominal, larger, places.unflatten(0, (-1, 3)), rims[0], rims[1:], turns.unflatten(0, (-1, 3)), known
     )
@@ -122,13 +135,23 @@ def _side_by_side(parts: Sequence[Tensor]) -> list[Tensor]:
     return list(torch.block_diag(*parts).split([len(part) for part in parts]))
 
 
-def stated_plate(ids: Tensor, nominal: Float[Tensor, "M 3"], covariance: Float[Tensor, "D D"]) -> Plate | None:
-    """A plate whose places are known as well as a file states; None where it states that they are exact."""
-    values, vectors = torch.linalg.eigh(covariance)
-    some = values > _NOTHING * values[-1]
-    if not float(values[-1]) > 0:
+def stated_plate(target: Target) -> Plate | None:
+    """A plate whose places and edge gain are known as well as the target's file states; None where they are exact.
+
+    What a file that states its print leaves out is open: the tilts of rings, and the gain where it has no deviation.
+    """
+    if target.covariance is None:
         return None
-    places = (vectors * values.clamp_min(0).sqrt())[:, some].unflatten(0, (len(ids), 3))
-    k = places.shape[-1]
-    none = torch.zeros_like(places)
-    return Plate(ids, nominal, none[:, 0, 0], places, none[0, 0], none[:, 0], none, places.new_ones(k))
+    covariance, stated_gain = target.covariance[:-1, :-1], target.covariance[-1, -1].sqrt()
+    values, vectors = torch.linalg.eigh(covariance)
+    some = values > _NOTHING * values[-1].clamp_min(torch.finfo(values.dtype).tiny)
+    places = (vectors * values.clamp_min(0).sqrt())[:, some]
+    outer, inner = drawn_radii(target).unbind(-1)
+    gain = torch.where(stated_gain > 0, stated_gain, _GAIN * (outer - inner).mean())
+    # a disc of another gain is one of another size
+    of_gain = pad(gain / outer, (1, 0)) if target.discs else pad(gain[None], (0, len(outer)))
+    # a print that misplaces a ring misplaces its rims by as much
+    misplaced = (covariance.diagonal().view(-1, 3).sum(-1) / 3).sqrt() / outer
+    rims = torch.cat([of_gain[:, None], pad(torch.diag(misplaced), (0, 0, 1, 0))], 1)
+    parts = [places, rims, _tilts(target.normals)]
+    return _plate(target.ids, target.centers, parts, places.new_ones(sum(part.shape[1] for part in parts)))

@@ -77,9 +77,7 @@ def calibrate_cameras(
     Raises:
         ConfigError: as `calibrate_camera` for one of the cameras, or as `calibrate_rig`.
     """
-    plate = None
-    if isinstance(shown, Target) and shown.covariance is not None:
-        plate = stated_plate(shown.ids, shown.centers, shown.covariance[:-1, :-1])
+    plate = stated_plate(shown) if isinstance(shown, Target) else None
     located = [_alone(one, shown, lens, tone) for one in several]
     return calibrate_rig(located, lens=lens, plate=plate, robot=robot)
 
@@ -140,7 +138,7 @@ def _rims(one: OneCamera, camera: Camera, target: Target) -> Located:
     """What the rims tell a camera that is known about, with the poses of its views."""
     frames, linear = linear_frames(one.frames, camera.tone or LINEAR), replace(camera, tone=None)
     with within(f"{one.name}: "):
-        views = all_centers(frames, target, linear, rims=True)
+        views = all_centers(frames, target, linear, tilts="open")
         found = first_fit(views, linear, free=False) if len(views.view) else None
         if found is None:
             raise ConfigError("INPUT: no view has a pose; check the target and the frames")

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -62,7 +63,12 @@ def _grey(frames: Tensor) -> Tensor:
 
 
 def measure_centers(
-    names: Sequence[str], frames: Tensor, camera: Camera, target: Target, *, rims: bool = False
+    names: Sequence[str],
+    frames: Tensor,
+    camera: Camera,
+    target: Target,
+    *,
+    tilts: Literal["held", "open"] = "held",
 ) -> Views:
     """Views of a target by a camera that is known well: centres of single markers, fitted to the grey values.
 
@@ -72,8 +78,9 @@ def measure_centers(
     across one marker only.
 
     Args:
-        rims: what the rims tell is asked for, too, and the tilt of every marker is known to a few mrad only.
+        tilts: open: what the rims tell is asked for, too, and the tilt of every marker is known to a few mrad only.
     """
+    rims = tilts == "open"
     # a board's many centres tell its pose well enough to start from
     method: Method = "photometric" if target.grid is None else "centers"
     poses = PoseEstimator(camera, target.upright(), method=method)(frames)

@@ -65,11 +65,11 @@ def calibrate_camera(
     """Intrinsics from frames of a ring target or a board.
 
     A ring target, or a grid of discs or rings, is measured in two rounds: rough centres to calibrate the camera, with
-    which `measure_centers` or `measure_marks` fits the grey values.
-    The places of a target are unknowns with the covariance that its file states.
+    which `measure_centers` or `measure_marks` fits the grey values; those of a target twice.
+    The places and the edge gain of a target are unknowns with the covariance that its file states; tilts are open then.
 
     Args:
-        frames: read once for a board of squares, else twice.
+        frames: read once for a board of squares, else three times at most.
         guess: only the size of ``start`` is known; several focal lengths are tried.
         lens: a name of `torchpose.calibration.LENS_MODELS`.
         tone: of the frames; None: the one that their marks tell (`torchpose.calibration.tone`). The camera of the
@@ -89,11 +89,13 @@ def calibrate_camera(
         found = calibrate_intrinsics(_all_mark_centers(frames, shown, camera, marks), [camera], lens=lens)
         return replace(found, camera=replace(found.camera, tone=tone))
     camera, tone = _rough_camera(stored, shown, starts, lens, tone)
-    plate = None
-    if shown.covariance is not None:
-        plate = stated_plate(shown.ids, shown.centers, shown.covariance[:-1, :-1])
-    seen = all_centers(linear_frames(stored, tone), shown, camera)
-    found = calibrate_intrinsics(seen, [camera], lens=lens, plate=plate)
+    frames, plate = linear_frames(stored, tone), stated_plate(shown)
+    rough = calibrate_intrinsics(all_centers(frames, shown, camera, tilts="open"), [camera], lens=lens, plate=plate)
+    # poses by a rough camera have not the tilts of the rings, and what rims tell is linear in it;
+    # nor have those of a plate whose places are off
+    exact = plate is None and rough.common_sigma_px == 0.0
+    seen = all_centers(frames, shown, rough.camera, tilts="held" if exact else "open")
+    found = calibrate_intrinsics(seen, [rough.camera], lens=lens, plate=plate)
     return replace(found, camera=replace(found.camera, tone=tone))
 
 
@@ -157,7 +159,7 @@ def measure_target(
     target = nominal_board(_all_marks(frames, shown, camera), shown, camera) if isinstance(shown, Grid) else shown
     known = target
     for _ in range(_MEASURED):
-        views = all_centers(frames, known, camera, rims=True)
+        views = all_centers(frames, known, camera, tilts="open")
         if isinstance(shown, Grid):
             known, target = of_seen(known, views), of_seen(target, views)
             views = views[torch.isin(views.point, target.ids)]
@@ -260,8 +262,8 @@ def _all_mark_centers(frames: Frames, grid: Grid, camera: Camera, marks: Marks) 
     return Views.cat([measure_marks(names, part, some, grid, camera) for names, part, some in batches])
 
 
-def all_centers(frames: Frames, target: Target, camera: Camera, *, rims: bool = False) -> Views:
-    return Views.cat([measure_centers(names, part, camera, target, rims=rims) for names, part in frames()])
+def all_centers(frames: Frames, target: Target, camera: Camera, *, tilts: Literal["held", "open"] = "held") -> Views:
+    return Views.cat([measure_centers(names, part, camera, target, tilts=tilts) for names, part in frames()])
 
 
 def calibrate_robot(

@@ -321,7 +321,8 @@ def _show(found: Calibration, frames: int, *, held: bool = False) -> None:
     points = f"{len(found.views.view)} points{f', {found.left_out} points left out' if found.left_out else ''}"
     say(f"{len(found.views)} of {frames} views, {points}, residual RMS {found.rms_px:.3g} px")
     if found.common_sigma_px:
-        say(f"{found.common_sigma_px:.3g} px per axis, beyond the noise of the frames, in every point")
+        measure = "" if found.plate is not None else "; --measure-target takes what the print does out of it"
+        say(f"{found.common_sigma_px:.3g} px per axis, beyond the noise of the frames, in every point{measure}")
     if found.camera.tone is not None:
         say(f"tone {found.camera.tone}")
     for warning in found.warnings:
