@@ -91,7 +91,11 @@ def test_opencv_stereo(tmp_path: Path) -> None:
     storage.release()
     with pytest.raises(tp.ConfigError, match=r"stereo.yml: units: missing; write the unit of T, mm or m"):
         tp.CameraRig.load(path)
-    path.write_text(path.read_text() + "units: m\n")
+    text = path.read_text()
+    path.write_text(text + "units: [m]\n")
+    with pytest.raises(tp.ConfigError, match=r"stereo.yml: units: \['m'\]; write the unit of T, mm or m"):
+        tp.CameraRig.load(path)
+    path.write_text(text + "units: m\n")
     found = tp.CameraRig.load(path)
     torch.testing.assert_close(found.t, rig.t[:2], rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(found.R, rig.R[:2], rtol=0, atol=1e-14)

@@ -172,7 +172,7 @@ def _stereo(data: Mapping[str, Any]) -> CameraRig:
         if name not in data:
             raise ConfigError(f"{name}: is missing; write R and T of stereoCalibrate")
     units = data.get("units")
-    if units not in _MM:
+    if not isinstance(units, str) or units not in _MM:
         raise ConfigError(f"units: {'missing' if units is None else shown(units)}; write the unit of T, mm or m")
     turn, shift = numbers(data["R"], "R"), numbers(data["T"], "T").flatten()
     if turn.shape != (3, 3) or len(shift) != 3:
