@@ -93,7 +93,7 @@ def test_opencv_stereo(tmp_path: Path) -> None:
         tp.CameraRig.load(path)
     text = path.read_text()
     path.write_text(text + "units: [m]\n")
-    with pytest.raises(tp.ConfigError, match=r"stereo.yml: units: \['m'\]; write the unit of T, mm or m"):
+    with pytest.raises(tp.ConfigError, match=r"stereo.yml: units: a list of 1; write the unit of T, mm or m"):
         tp.CameraRig.load(path)
     path.write_text(text + "units: m\n")
     found = tp.CameraRig.load(path)
