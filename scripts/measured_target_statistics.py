@@ -18,7 +18,8 @@ NEES: squared errors in units of their covariance over their number, 1 is right:
 later frames (from their centres); lengths are in the scale of the nominal places. bound: that of the joint problem, all
 pixels along all rims with intrinsics, poses, places, tilts, sizes and edge gain unknown; its information is formed here
 by finite differences. claimed: the deviations that the files state over this bound; by_centers: those that the same
-adjustment of the centres alone, without sizes and tilts of the rings, would state.
+adjustment of the centres alone, without sizes and tilts of the rings, would state. stated: the camera alone, calibrated
+by the nominal file with what it states of the print.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from torchpose.calibration import Views, calibrate_intrinsics
 from torchpose.calibration.bundle import adjust
 from torchpose.calibration.lenses import moved_camera
 from torchpose.calibration.measured import measured_target
-from torchpose.calibration.plate import free_plate, motions
+from torchpose.calibration.plate import free_plate, motions, stated_plate
 from torchpose.calibration.rings import rim_derivatives, rims_by_camera
 from torchpose.calibration.session import measure_target
 from torchpose.calibration.views import Rims
@@ -327,7 +328,18 @@ def drawn_set(options: argparse.Namespace, seed: int) -> dict[str, float]:
         "gain_nees": float((target.edge_gain - scene.printed.edge_gain) ** 2 / target.covariance[-1, -1]),
         "seconds": seconds,
     }
-    return row | later_poses(scene, tests, target, camera, found.covariance)
+    return row | of_stated(scene, views) | later_poses(scene, tests, target, camera, found.covariance)
+
+
+def of_stated(scene: Scene, views: Views) -> dict[str, float]:
+    """The camera alone, calibrated by the nominal file with what it states of the print."""
+    found = calibrate_intrinsics(views, [scene.start], lens=LENS, plate=stated_plate(scene.nominal))
+    error = intrinsics(found.camera) - intrinsics(scene.camera)
+    return {
+        "stated_nees": nees(error, found.covariance),
+        "stated_focal_px2": float(error[:2].square().mean()),
+        "stated_claimed_px2": float(found.covariance.diagonal()[:2].mean()),
+    }
 
 
 def centers_alone(scene: Scene, views: Views) -> tuple[Tensor, Tensor]:
