@@ -24,6 +24,8 @@ _UNKNOWN = 9  # translation, rotation, the blur's S11, S12 and S22
 # derivatives by u and v and their factors: those of a blurred picture by the blur's S11, S12 and S22
 _HEAT = (((2, 0), 0.5), ((1, 1), 1.0), ((0, 2), 0.5))
 
+_REACH = 3.5  # standard deviations of the blur, of an edge's part in the information (tests/analysis/test_crlb.py)
+
 
 @dataclass(frozen=True, eq=False)
 class Conditions:
@@ -128,10 +130,13 @@ def _fisher(camera: Camera, target: Target, R: Tensor, t: Tensor, blur: Blur, co
     def image(rows: Tensor) -> Tensor:
         return rows.view(len(pair), height, width + 1, -1)[:, :, :width].flatten(1, 2)
 
-    c = image(boundary.fill(samples, boxes))[..., 0]
+    # what single precision and the tails cost is no digit of a bound; the sums over pixels are in double
+    samples = samples.to(torch.float32)
+    c = image(boundary.fill(samples, boxes, reach=_REACH))[..., 0].to(t)
     # by the pose, and by S11, S12 and S22 after the heat equation
-    by_blur = [scale * image(boundary.fill(samples, boxes, by)) for by, scale in _HEAT]
-    jacobian = torch.cat([image(boundary.fill_moved(samples, boxes)), *by_blur], -1)  # (P, h w, 9)
+    by_blur = [scale * image(boundary.fill(samples, boxes, by, reach=_REACH)) for by, scale in _HEAT]
+    by_pose = image(boundary.fill_moved(samples, boxes, reach=_REACH))
+    jacobian = torch.cat([by_pose, *by_blur], -1).to(t)  # (P, h w, 9)
     row, column = (torch.arange(n, device=t.device) for n in (height, width))
     use = (row[:, None] < own.size[:, 1, None, None]) & (column < own.size[:, 0, None, None])
     use = use.flatten(1).to(t)

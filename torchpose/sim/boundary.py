@@ -199,26 +199,29 @@ def boxes_around(
     return Boxes(first, (end - first).clamp(min=0))
 
 
-def fill(samples: Samples, boxes: Boxes, derivative: tuple[int, int] = (0, 0)) -> Float[Tensor, "H W"]:
+def fill(
+    samples: Samples, boxes: Boxes, derivative: tuple[int, int] = (0, 0), *, reach: float = REACH
+) -> Float[Tensor, "H W"]:
     """Blurred regions from their boundary samples: ``sum of - c(p_u - u) k(p_v - v) dv`` at every pixel p.
 
     Args:
         samples: of all regions.
         boxes: their windows.
         derivative: how often it is differentiated by p_u and by p_v, up to twice, per px or px^2.
+        reach: standard deviations at which the Gaussian is cut.
 
     Returns:
         (boxes.rows, boxes.stride), of the dtype of the samples; the rows of all windows one below the other, 0 to
         rounding behind their ends.
     """
     increments = samples.pixel.new_zeros(boxes.rows * boxes.stride)
-    for part, across, along, index in _patches(samples, boxes, derivative):
+    for part, across, along, index in _patches(samples, boxes, derivative, reach):
         across = across * -samples.dv[part, None]
         increments = accumulate(increments, index.view(-1), (across[:, :, None] * along[:, None]).view(-1))
     return increments.view(-1, boxes.stride).cumsum(1)
 
 
-def fill_moved(samples: Samples, boxes: Boxes) -> Float[Tensor, "H W M"]:
+def fill_moved(samples: Samples, boxes: Boxes, *, reach: float = REACH) -> Float[Tensor, "H W M"]:
     """How the regions of `fill` change with the M numbers that move their boundaries.
 
     By Reynolds' transport theorem that is the integral of the kernel along the boundary, times the area that each of
@@ -227,14 +230,14 @@ def fill_moved(samples: Samples, boxes: Boxes) -> Float[Tensor, "H W M"]:
     swept = samples.swept
     assert swept is not None
     increments = swept.new_zeros(boxes.rows * boxes.stride, swept.shape[1])
-    for part, across, along, index in _patches(samples, boxes, (1, 0)):
+    for part, across, along, index in _patches(samples, boxes, (1, 0), reach):
         patch = (across[:, :, None] * along[:, None])[..., None] * swept[part, None, None]
         increments.index_add_(0, index.view(-1), patch.flatten(0, 2))
     return increments.view(-1, boxes.stride, swept.shape[1]).cumsum(1)
 
 
 def _patches(
-    samples: Samples, boxes: Boxes, derivative: tuple[int, int]
+    samples: Samples, boxes: Boxes, derivative: tuple[int, int], reach: float
 ) -> Iterator[tuple[slice, Tensor, Tensor, Tensor]]:
     """What samples add to the windows, as products of a column (N, h) and a row (N, w) of differences from pixel to
     pixel along the rows, with the cells (N, h, w) that they belong to: chunk by chunk of the samples.
@@ -242,9 +245,9 @@ def _patches(
     pixel, chord = samples.pixel, samples.half_chord
     if len(pixel) == 0:
         return
-    beside, reach = (1.0 + REACH * samples.sigma.detach().amax(0)).tolist()
+    beside, above = (1.0 + reach * samples.sigma.detach().amax(0)).tolist()
     beside += 0.0 if chord is None else float(chord.detach().max())
-    rows = torch.arange(-math.floor(reach), math.floor(reach) + 1).to(pixel)
+    rows = torch.arange(-math.floor(above), math.floor(above) + 1).to(pixel)
     # the sum along a row ends where the kernel does, which is a pixel further right than left
     columns = torch.arange(-math.floor(beside), math.ceil(beside) + 1).to(pixel)
     corner, size, stride = boxes.corner[samples.shape], boxes.size[samples.shape], boxes.stride
