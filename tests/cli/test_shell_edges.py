@@ -94,6 +94,21 @@ def test_a_name_too_long_for_a_picture_is_told_before_anything_is_read(run: Call
     one_line(run(*ESTIMATE, "f", "--overlay", "pictures"), 2, "the name is too long for a picture's; shorten it")
 
 
+@pytest.mark.parametrize(("one", "two"), [("a.pgm", "a.pgm.png"), ("d/a.bmp", "d/a.bmp.png")])
+def test_two_frames_that_would_be_one_picture_are_told(run: Callable[..., Any], one: str, two: str) -> None:
+    png(f"f/{one}")
+    png(f"f/{two}")
+    png("f/other.png")
+    message = f"{one}: --overlay: would be the same picture as that of {two}, {Path(two).name}; rename one of both"
+    one_line(run(*ESTIMATE, "f", "--overlay", "pictures"), 2, message)
+    assert run(*ESTIMATE, "f")[0] == 0, "without pictures there is nothing in the way"
+
+
+def test_an_input_that_is_given_twice_is_called_so(run: Callable[..., Any]) -> None:
+    png("f/a.png")
+    one_line(run(*ESTIMATE, "f", "f/a.png"), 2, "a.png: INPUT: is given twice; name it once")
+
+
 def test_resume_does_again_what_was_replaced_or_could_not_be_used(
     run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:

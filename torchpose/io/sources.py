@@ -128,6 +128,12 @@ def find_sources(
         for source in found:
             twin = seen.setdefault(source.name, source)
             if twin is not source:
+                if (
+                    isinstance(source.path, Path)
+                    and isinstance(twin.path, Path)
+                    and real(source.path) == real(twin.path)
+                ):
+                    raise ConfigError(f"{source.path}: INPUT: is given twice; name it once")
                 raise ConfigError(
                     f"{source.path}: INPUT: has the same name in the results, {source.name!r}, as {twin.path}; "
                     "give a common parent folder or run them one by one"
