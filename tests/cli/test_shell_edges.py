@@ -99,7 +99,7 @@ def test_two_frames_that_would_be_one_picture_are_told(run: Callable[..., Any], 
     png(f"f/{one}")
     png(f"f/{two}")
     png("f/other.png")
-    message = f"{one}: --overlay: would be the same picture as that of {two}, {Path(two).name}; rename one of both"
+    message = f"{one}: --overlay: would be the same picture as that of {two}, {Path(two).name}; rename one"
     one_line(run(*ESTIMATE, "f", "--overlay", "pictures"), 2, message)
     assert run(*ESTIMATE, "f")[0] == 0, "without pictures there is nothing in the way"
 
@@ -240,6 +240,23 @@ def test_names_that_no_file_can_have_are_told_in_one_line(run: Callable[..., Any
         assert code in ((0, 2) if replaced else (2,)), where
         assert "Traceback" not in told, where
         assert told.count("\n") <= 1, where
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        ([*ESTIMATE, ""], "an argument"),
+        ([*ESTIMATE, "f", "--overlay", ""], "--overlay"),
+        ([*ESTIMATE, "f", "--hand-eye="], "--hand-eye"),
+        (["watch", "", "-c", "camera.yaml"], "an argument"),
+    ],
+)
+def test_an_empty_argument_is_no_folder(run: Callable[..., Any], words: list[str], name: str) -> None:
+    """As a path "" is the working folder: a variable without a value would have it measured, or written to."""
+    png("a.png")
+    png("f/a.png")
+    one_line(run(*words), 2, f"error: {name}: is empty; give a value, or leave it out")
+    assert not Path("p.csv").exists()
 
 
 def test_a_negative_deviation_is_called_so(run: Callable[..., Any]) -> None:

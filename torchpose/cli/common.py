@@ -143,7 +143,7 @@ def check_outputs(
         first = drawn.setdefault((source.root, path), source.name)  # cameras of a rig have a root and a folder each
         if first != source.name:
             raise ConfigError(
-                f"{first}: --overlay: would be the same picture as that of {source.name}, {path.name}; rename one of both"
+                f"{first}: --overlay: would be the same picture as that of {source.name}, {path.name}; rename one"
             )
 
 
