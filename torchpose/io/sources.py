@@ -122,6 +122,9 @@ def find_sources(
         read = ", ".join(FRAME_SUFFIXES if isinstance(given, Path) else IMAGE_SUFFIXES)
         if not found:
             also = f" but {_summary(passed)}" if passed.total() else ""
+            if given.suffix.lower() == MANIFEST_SUFFIX:
+                read = 'a line {"record": "frame", "id": 1, "image": "a.png"} for each'
+                raise ConfigError(f"{given}: INPUT: has no frame with an image{also}; write {read}")
             raise ConfigError(f"{given}: INPUT: holds no image{also}; give files that end in {read}")
         if passed.total():
             tell(f"{_text(str(given))}: passed over {_summary(passed)}; what is read ends in {read}")
