@@ -15,9 +15,10 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import typer
 
 from torchpose.camera import Camera
-from torchpose.cli.main import main
+from torchpose.cli.main import app, main
 from torchpose.io.films import Film, NoFrameError, frames_of_film
 from torchpose.io.images import UnreadableImageError
 from torchpose.sim import render
@@ -106,6 +107,18 @@ def test_a_reader_that_closes_its_pipe_ends_the_run_without_a_word(tmp_path: Pat
         child.stdout.close()
         assert child.stderr.read() == b""
     assert child.returncode == 141
+
+
+LETTERS = {"camera": "-c", "target": "-t", "out": "-o", "method": "-m", "threads": "-j", "detections": "-d"}
+LETTERS |= {"files_from": "-f", "quiet": "-q", "help": "-h"}
+
+
+def test_common_options_have_their_letter_in_every_command() -> None:
+    """As docs/shell.md has it."""
+    command: Any = typer.main.get_command(app)
+    found = [(name, option.name, option.opts) for name, one in command.commands.items() for option in one.params]
+    assert {"live", "capture"} <= {name for name, option, _ in found if option == "camera"}
+    assert [one for one in found if one[1] in LETTERS and LETTERS[one[1]] not in one[2]] == []
 
 
 @pytest.mark.parametrize("ends", ["\n", "\0", "\r\n", "\ufeff\n"])
