@@ -94,8 +94,8 @@ def find_moments(given: Path, rig: CameraRig, tell: Callable[[str], None] = lamb
     if sum(map(bool, pictures)) > 1 and sum(map(len, pictures)) == len(names):
         first, second = [next(iter(one)) for one in pictures if one][:2]
         tell(
-            f"{given}: no two cameras have a picture of one name ({first}, {second}), so every row is that of one camera "
-            "alone; give pictures of one moment the same name, its ending included"
+            f"{given}: no two cameras have a picture of one name ({first}, {second}), so every row is that of one "
+            "camera alone; give pictures of one moment the same name, its ending included"
         )
     return [Moment(name, tuple(one.get(name) for one in pictures)) for name in names]
 
