@@ -25,7 +25,6 @@ from torchpose.errors import ArgumentError
 P = ParamSpec("P")
 T = TypeVar("T")
 _thread = threading.local()
-_WIDEST = 8  # bytes of a number that torch has; np.longdouble has more
 
 
 @contextmanager
@@ -91,8 +90,8 @@ def checked_values(values: Mapping[str, Any], hints: Mapping[str, Any]) -> dict[
 def tensor_of(value: Any) -> Any:
     """A NumPy array as a tensor, anything else as it is."""
     if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
-        if value.dtype.itemsize > _WIDEST:
-            value = value.astype(np.float64)
+        if value.dtype.kind == "f" and value.dtype.itemsize > np.dtype(np.float64).itemsize:
+            value = value.astype(np.float64)  # np.longdouble, which torch has not
         native = np.ascontiguousarray(value.astype(value.dtype.newbyteorder("="), copy=False))
         return torch.from_numpy(native if native.flags.writeable else native.copy())  # torch warns of others
     return value
