@@ -54,6 +54,22 @@ def test_frames_are_taken_as_they_come(camera: tp.Camera) -> None:
         tp.PoseEstimator("camera.yaml", "quad40")  # type: ignore[arg-type]
 
 
+def test_frames_that_hold_no_pixels_or_colours_last_are_called_so(camera: tp.Camera) -> None:
+    assert IMAGE is not None
+    estimator = tp.PoseEstimator(camera, "quad40", method="centers")
+    tensor = torch.from_numpy(IMAGE)
+    colours = np.repeat(IMAGE[..., None], 3, -1)
+    for frames in (colours, colours[None], torch.from_numpy(colours)):
+        with pytest.raises(tp.FrameError, match=r"^frames: shape \(.*3\) has its colours last, as OpenCV"):
+            estimator(frames)
+    with pytest.raises(tp.FrameError, match=r"^frames: is sparse_coo; pass"):
+        estimator(tensor.to_sparse())
+    with pytest.raises(tp.FrameError, match=r"^frames: is on the device meta; pass"):
+        estimator(tensor.to("meta"))
+    wide = IMAGE.astype(np.longdouble) / 255
+    assert torch.equal(estimator(wide).t, estimator(tensor.double() / 255).t)
+
+
 def test_candidates_are_the_same_in_any_form_of_a_frame() -> None:
     assert IMAGE is not None
     tensor = torch.from_numpy(IMAGE)

@@ -84,6 +84,10 @@ TRAPS = {
         "base_from_camera: {rotation: [0, 0, 0, 1], translation: [1, 2, 3]}",
         r"base_from_camera\.rotation: has 4 entries; give 3",
     ),
+    "degrees": (
+        "base_from_camera: {rotation: [0, 180, 0], translation: [1, 2, 3]}",
+        r"base_from_camera\.rotation: turns by 180 rad, more than once around; write a rotation vector in rad, not deg",
+    ),
     "nan": ("base_from_camera: {rotation: [0, 0, .nan], translation: [1, 2, 3]}", r".*rotation\[2\]: is not finite; "),
     "3x4": (f"base_from_camera: {{matrix: {MATRIX[:3].tolist()}}}", "base_from_camera: matrix is not 4 x 4; "),
     "last row": (matrix_with(3, 0, 1.0), "base_from_camera: matrix has the last row "),

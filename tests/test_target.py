@@ -95,7 +95,7 @@ finite = st.floats(-1e3, 1e3)
 @given(
     offset=st.lists(finite, min_size=3, max_size=3),
     turn=st.lists(st.floats(-2, 2), min_size=3, max_size=3),
-    part=st.none() | st.tuples(*[st.lists(finite, min_size=3, max_size=3)] * 2),
+    part=st.none() | st.tuples(*(st.lists(st.floats(-m, m), min_size=3, max_size=3) for m in (3.6, 1e3))),
     dark=st.booleans(),
 )
 @settings(deadline=None, max_examples=60)
@@ -184,6 +184,10 @@ TRAPS = {
     "unknown pose key": (
         QUAD + "part_from_target: {rotation: [0, 0, 0], translatoin: [0, 0, 0]}\n",
         r"part_from_target\.translatoin: unknown key; did you mean translation\?",
+    ),
+    "part in degrees": (
+        QUAD + "part_from_target: {rotation: [0, 0, 90], translation: [0, 0, 0]}\n",
+        r"part_from_target\.rotation: turns by 90 rad, more than once around; write a rotation vector in rad",
     ),
     "no name": (replaced("name: plate\n", ""), "name: is missing; add it"),
     "no markers": (QUAD.split("markers")[0], "markers: is missing; add it"),

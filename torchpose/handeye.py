@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, model_validator
 from torch import Tensor
 
 from torchpose.config import format_list, read_yaml, validate, write_text
-from torchpose.config.kinds import Number
+from torchpose.config.kinds import Number, RotationVector
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.geometry.covariance import covariance_fault
@@ -22,7 +22,7 @@ _ORTHONORMAL = 1e-6  # largest entry of R^T R - I that a file may have
 
 class _Pose(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
-    rotation: Vector | None = None
+    rotation: RotationVector | None = None
     translation: Vector | None = None
     matrix: list[list[Number]] | None = None
     covariance: list[list[Number]] | None = None

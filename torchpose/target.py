@@ -14,7 +14,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat,
 from torch import Tensor
 
 from torchpose.config import format_list, format_number, quoted, read_yaml, validate, within, write_text
-from torchpose.config.kinds import Length, Number, Text
+from torchpose.config.kinds import Length, Number, RotationVector, Text, check_turn
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.geometry.covariance import covariance_fault
@@ -41,7 +41,7 @@ class RigidTransformFile(BaseModel):
     """A pose in a file: rotation vector in rad, translation in mm."""
 
     model_config = _FROZEN
-    rotation: Vector
+    rotation: RotationVector
     translation: Vector
 
 
@@ -150,6 +150,11 @@ class Target:
                 raise ConfigError(f"{field}: has shape {tuple(getattr(self, field).shape)}; give {shape}")
         if (self.part_rotation is None) != (self.part_translation is None):
             raise ConfigError("part_from_target: is half given; give both rotation and translation")
+        if self.part_rotation is not None:
+            try:
+                check_turn(self.part_rotation.tolist())
+            except ValueError as error:
+                raise ConfigError(f"part_from_target.rotation: {error}") from None
         self._check_markers()
         if self.covariance is not None:
             _check_covariance(self.covariance.detach(), 3 * m + 1)

@@ -99,6 +99,62 @@ def test_opencv_stereo(tmp_path: Path) -> None:
     found = tp.CameraRig.load(path)
     torch.testing.assert_close(found.t, rig.t[:2], rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(found.R, rig.R[:2], rtol=0, atol=1e-14)
+    text = path.read_text()
+    path.write_text(text + "fisheye: 1\n")
+    assert {camera.model for camera in tp.CameraRig.load(path).cameras} == {"kannala_brandt"}
+    path.write_text(text + "# stereo of two fisheyes\n")
+    with pytest.raises(tp.ConfigError, match=r"stereo.yml: camera 1: distortion_model: is missing, and the file"):
+        tp.CameraRig.load(path)
+    path.write_text(text.replace("1111.5,", "1.1115,"))
+    with pytest.raises(tp.ConfigError, match=r"stereo.yml: cam0.camera_matrix: .* an impossible field of view"):
+        tp.CameraRig.load(path)
+
+
+def test_lenses_without_rays_are_told_of_a_rig_too(tmp_path: Path) -> None:
+    camera = tp.Camera(640, 480, [[300.0, 0, 320], [0, 300, 240], [0, 0, 1]], [-0.9, 0, 0, 0])
+    rig = tp.CameraRig([tp.Camera.ideal(640, 480, 500.0), camera], torch.eye(3).expand(2, 3, 3), torch.zeros(2, 3))
+    rig.save(tmp_path / "rig.yaml")
+    with pytest.warns(UserWarning, match=r"rig.yaml: cam1.distortion_coefficients: no ray reaches \d+ % of the frame"):
+        tp.CameraRig.load(tmp_path / "rig.yaml")
+
+
+def moved(parent: str, child: str, x: float) -> dict[str, object]:
+    where = {"translation": {"x": x, "y": 0.0, "z": 0.0}, "rotation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
+    return {"header": {"frame_id": parent}, "child_frame_id": child, "transform": where}
+
+
+def ros_folder(folder: Path, frames: tuple[str, str], *messages: list[dict[str, object]]) -> Path:
+    """Two camera_info files, and what `ros2 topic echo /tf_static` prints of several messages."""
+    for name, frame in zip(("left", "right"), frames, strict=True):
+        tp.Camera.ideal(640, 480, 500.0).save(folder / f"{name}.yaml", "ros")
+        text = (folder / f"{name}.yaml").read_text()
+        (folder / f"{name}.yaml").write_text(text.replace("camera_name: camera", f"camera_name: {frame}"))
+    text = "".join(yaml.safe_dump({"transforms": message}) + "---\n" for message in messages)
+    (folder / "tf_static.yaml").write_text(text)
+    return folder
+
+
+def test_transforms_of_several_messages_are_one_tree(tmp_path: Path) -> None:
+    ros_folder(tmp_path, ("l", "r"), [moved("base", "l", 0.1)], [moved("base", "arm", 0.5)], [moved("arm", "r", 0.25)])
+    rig = tp.CameraRig.load(tmp_path)
+    assert rig.names == ("left", "right")
+    assert rig.t[1].tolist() == pytest.approx([-650.0, 0.0, 0.0])  # X_right = X_left + 0.1 - 0.5 - 0.25, in m
+
+
+@pytest.mark.parametrize(
+    ("frames", "transforms", "message"),
+    [
+        (("l", "r"), [moved("b", "l", 0), moved("b", "r", 1), moved("b", "r", 2)], "r stands in two that differ; keep"),
+        (("l", "r"), [moved("b", "l", 0), moved("c", "r", 1), moved("b", "r", 1)], "r stands in two that differ; keep"),
+        (("l", "r"), [moved("l", "r", 1), moved("r", "l", 1)], "those above r lead back to r; a tree has no loop"),
+        (("l", "l"), [moved("b", "l", 0)], r"right.yaml: header.frame_id: is 'l', as in left.yaml; give every camera"),
+    ],
+)
+def test_transforms_that_contradict_each_other_are_refused(
+    tmp_path: Path, frames: tuple[str, str], transforms: list[dict[str, object]], message: str
+) -> None:
+    with pytest.raises(tp.ConfigError, match=message):
+        tp.CameraRig.load(ros_folder(tmp_path, frames, transforms))
 
 
 def test_ros_folder(tmp_path: Path) -> None:
@@ -133,6 +189,8 @@ def test_ros_folder(tmp_path: Path) -> None:
         ("cam2:", "cam3:", r"cam3: stands beside cam0, cam1; number the cameras"),
         ("    - [0.0, 0.0, 0.0, 1.0]", "    - [0.0, 0.0, 0.0, 2.0]", r"cam1.T_cn_cnm1: has the last row"),
         ('  name: "top"\n', "  name: left\n", r"names: left, cam1, left; give every one"),
+        ('  name: "top"\n', '  name: ".."\n', r"names: '..' is no name of a folder, which pictures of a camera lie in"),
+        ('  name: "top"\n', '  name: "a/b"\n', r"names: 'a/b' is no name of a folder"),
         ("  extrinsics_covariance:\n    - [", "  other:\n    - [", r"extrinsics_covariance: is missing, and cam2"),
         ("  extrinsics_covariance:\n    - [", "  extrinsics_covariance:\n    - [1.0, ", r"rows differ in length"),
     ],

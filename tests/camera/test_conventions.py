@@ -266,10 +266,12 @@ REFUSED = {
     "ini fisheye": (INI.replace(" 0.01\n", "\n"), "distortion: 4 coefficients; an .ini has 5 "),
     "ini text": (INI.replace("660.0", "x"), "camera matrix: '0.0 x 238.0' are no numbers; "),
     "ini twice": (INI + INI, "width: given twice; keep one camera"),
+    "ini region": (INI.replace("[narrow", "roi\n10 10 300 200\n\n[narrow"), "roi: is no entry of an .ini; "),
     "ini missing": (INI.split("distortion")[0], "distortion: is missing; add it"),
     "Metashape spherical": (metashape(METASHAPE, "spherical"), "projection: 'spherical' is not supported; use frame, "),
     "Metashape skew": (metashape(METASHAPE + "<b2>1</b2>"), "b2: is not zero, and no term of brown_conrady; "),
     "Metashape k4": (metashape(METASHAPE + "<k4>1</k4>"), "k4: is not zero, and no term of brown_conrady; "),
+    "Metashape unknown": (metashape(METASHAPE + "<k5>1</k5>"), "k5: is not known of a calibration of Metashape; "),
     "Metashape fisheye p1": (metashape(METASHAPE, "fisheye"), "p1: is not zero, and no term of kannala_brandt; "),
     "PhotoScan": (metashape("<fx>650</fx><cx>320</cx>"), "fx: is of an old PhotoScan; "),
     "from the corner": (metashape(METASHAPE.replace(">3.5<", ">323.5<")), "cx: is 323.5; Metashape counts it from "),
@@ -299,6 +301,9 @@ REFUSED = {
     "BOP fisheye": (json.dumps(json.loads(BOP) | {"lens": "fisheye"}), "lens: 'fisheye' contradicts the format"),
     "two channels": (ND.replace("dt: d", "dt: 2d"), "camera_matrix.dt: is '2d'; write a matrix of one channel"),
     "sizes": (ND.replace("[ 5 ]", "[ 6 ]"), "distortion_coefficients: 5 numbers for 6; "),
+    "lens in two words": (ND + "info: {optics: {kind: Fish Eye 2.8mm}}\n", "distortion_model: is missing, and "),
+    "leading zeros": (ND.replace("640", "0640"), "image_width: is '0640'; give the frame size as a positive integer"),
+    "of another program": ("model_type: PINHOLE\nimage_width: 640\n", "camera_matrix: is missing, and nothing names "),
     "two matrices": (ND + "K: [1, 0, 0, 0, 1, 0, 0, 0, 1]\n", "camera_matrix: stands as camera_matrix and as K, which"),
 }
 
@@ -380,6 +385,9 @@ def test_binning_and_region_of_camera_info(tmp_path: Path, window: dict[str, obj
         ({"binning_x": -1}, "binning_x: is -1, binning_y 0; "),
         ({"binning_x": "two"}, "binning_x: is 'two'; write a number"),
         ({"binning_x": 1000}, "roi.width: is 0; "),
+        ({"binning_x": 1.5}, "binning_x: is 1.5; write a whole number of px"),
+        ({"roi": {"x_offset": 1.5, "y_offset": 0, "width": 100, "height": 100}}, "roi.x_offset: is 1.5; write a "),
+        ({"roi": {"x_offset": 0, "y_offset": 0, "width": 100.5, "height": 100}}, "roi.width: is 100.5; write a "),
     ],
 )
 def test_impossible_windows_are_refused(tmp_path: Path, window: dict[str, object], message: str) -> None:

@@ -293,7 +293,7 @@ TRAPS = {
     "tabs": ("a:\n\t- 1", "line 2: is not YAML "),
     "plain text": ("hello", "file: holds plain text, not a mapping; "),
     "list": ("- 1\n- 2\n", "file: holds a list, not a mapping; "),
-    "xml": ('<?xml version="1.0"?><opencv_storage/>', "camera_matrix: is missing; add it"),
+    "xml": ('<?xml version="1.0"?><opencv_storage/>', "camera_matrix: is missing, and nothing names"),
     "two documents": (PLAIN + "---\n" + PLAIN, "file: holds 2 YAML documents; keep one"),
     "duplicate key": (PLAIN + "image_width: 641\n", r"image_width: given twice \(line 5\); keep one"),
     "duplicate json key": ('{"image_width": 1, "image_width": 2}', "image_width: given twice; keep one"),

@@ -14,7 +14,7 @@ import torchpose as tp
 from tests.moments.rig_scenes import pictures, poses, rig
 from torchpose.cli.main import main
 from torchpose.geometry import rotations
-from torchpose.io.moments import MomentStore
+from torchpose.io.moments import MomentStore, find_moments
 
 COUNT = 4
 
@@ -195,6 +195,24 @@ def test_what_does_not_go_with_several_cameras(
 ) -> None:
     assert run(shots, "none.csv", *more) == 2
     assert message in capsys.readouterr().err
+
+
+def test_pictures_without_a_moment_in_common_are_told(tmp_path: Path) -> None:
+    """Cameras whose programs end names differently would have rows of one camera each, without a word."""
+    camera = tp.Camera.ideal(64, 48, 50.0)
+    eye = torch.eye(3, dtype=torch.float64).expand(2, 3, 3)
+    pair = tp.CameraRig([camera, camera], eye, [[0.0, 0, 0], [-100, 0, 0]], names=["left", "right"])
+    for name in ("left/1.png", "left/2.png", "right/1.tif", "right/2.tif", "loose.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    told: list[str] = []
+    assert len(find_moments(tmp_path, pair, told.append)) == 4
+    assert told[0] == f"{tmp_path}: passed over 1 pictures that lie in no folder of a camera"
+    assert told[1].startswith(f"{tmp_path}: no two cameras have a picture of one name (1.png, 1.tif), so every row is ")
+    (tmp_path / "loose.png").unlink()
+    (tmp_path / "right" / "1.tif").rename(tmp_path / "right" / "1.png")
+    assert len(find_moments(tmp_path, pair, told.append)) == 3
+    assert len(told) == 2, "one moment in common: the other cameras may have missed the rest"
 
 
 def test_folders_are_named_as_the_cameras(shots: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

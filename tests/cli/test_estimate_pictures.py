@@ -18,7 +18,7 @@ from torchpose.camera import Camera
 from torchpose.cli.main import main
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
-from torchpose.io.writers import check_table_path, write_rows
+from torchpose.io.writers import atomic_path, check_table_path, write_rows
 from torchpose.sim import add_noise, render
 from torchpose.target import Target
 
@@ -126,6 +126,16 @@ def test_a_table_whose_files_would_have_too_long_names_is_refused_before_the_run
             path.with_name(path.name + other).touch()
         write_rows(path, [], {"frame": str})
     write_rows(tmp_path / os.fsdecode(b"\xff" + suffix.encode()), [], {"frame": str})  # a name that is no UTF-8
+
+
+def test_a_run_that_begins_takes_nothing_from_one_that_ends(tmp_path: Path) -> None:
+    """Both look at the same place: the one whether it could write there, the other is writing its last file."""
+    last = tmp_path / "poses.csv.run.json"
+    with atomic_path(last) as temporary:
+        temporary.write_text("{}")
+        check_table_path(tmp_path / "poses.csv", "--out")
+        check_table_path(last.with_suffix(".jsonl"), "--out")
+    assert last.read_text() == "{}"
 
 
 def test_pages_are_resumed_by_their_names(folder: Path) -> None:

@@ -111,4 +111,4 @@ def test_no_frame_of_the_batch_has_a_target(statuses: Callable[..., tuple[int, d
 
 
 def test_the_help_names_all_methods() -> None:
-    assert tuple(options._METHODS.split("|")) == METHODS
+    assert tuple(options.METHODS.split("|")) == METHODS

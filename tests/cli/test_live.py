@@ -30,7 +30,7 @@ def cell(tmp_path: Path) -> Path:
 
 REFUSED: list[tuple[list[str], str]] = [
     (["frames", "--host", "0.0.0.0"], r"0.0.0.0: --host: is beyond this machine: .*; give --token TOKEN"),
-    (["frames", "--host", "192.0.2.1", "--token", ""], r"--token: has to be"),
+    (["frames", "--host", "192.0.2.1", "--token", ""], r"--token: is empty"),
     (["frames", "--token", "a b"], r"--token: has to be"),
     ([], r"SOURCE, --rig: give one of both"),
     (["frames", "--rig", "rig.yaml"], r"SOURCE, --rig: give one of both"),

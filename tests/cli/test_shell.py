@@ -15,9 +15,10 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import typer
 
 from torchpose.camera import Camera
-from torchpose.cli.main import main
+from torchpose.cli.main import app, main
 from torchpose.io.films import Film, NoFrameError, frames_of_film
 from torchpose.io.images import UnreadableImageError
 from torchpose.sim import render
@@ -108,7 +109,19 @@ def test_a_reader_that_closes_its_pipe_ends_the_run_without_a_word(tmp_path: Pat
     assert child.returncode == 141
 
 
-@pytest.mark.parametrize("ends", ["\n", "\0", "\r\n"])
+LETTERS = {"camera": "-c", "target": "-t", "out": "-o", "method": "-m", "threads": "-j", "detections": "-d"}
+LETTERS |= {"files_from": "-f", "quiet": "-q", "help": "-h"}
+
+
+def test_common_options_have_their_letter_in_every_command() -> None:
+    """As docs/shell.md has it."""
+    command: Any = typer.main.get_command(app)
+    found = [(name, option.name, option.opts) for name, one in command.commands.items() for option in one.params]
+    assert {"live", "capture"} <= {name for name, option, _ in found if option == "camera"}
+    assert [one for one in found if one[1] in LETTERS and LETTERS[one[1]] not in one[2]] == []
+
+
+@pytest.mark.parametrize("ends", ["\n", "\0", "\r\n", "\ufeff\n"])
 def test_lists_of_files(
     run: Run, pictures: np.ndarray, ends: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -116,8 +129,9 @@ def test_lists_of_files(
     for name, picture in zip(names, pictures, strict=False):
         write(name, picture)
     write("run/b/other.png", pictures[0])
-    Path("list").write_bytes(ends.join([*names, ""]).encode())
-    if ends == "\n":
+    mark, ends = ("\ufeff", ends[1:]) if ends.startswith("\ufeff") else ("", ends)  # as editors of Windows begin a file
+    Path("list").write_bytes((mark + ends.join([*names, ""])).encode())
+    if ends == "\n" and not mark:
         with Path("list").open() as file:
             monkeypatch.setattr(sys, "stdin", file)
             assert run("estimate", "-f", "-", *GIVEN, "-o", "p.csv")[0] == 0
@@ -135,12 +149,16 @@ def test_lists_of_files(
         (("-f", "."), ".: file: is a folder"),
         (("-f", "empty"), "empty: --files-from: names no file"),
         (("-f", "gone"), "nowhere.png: INPUT: does not exist"),
+        (("-f", "stored"), "s3://cell/a.png: --files-from: is a URL; lists name files, give it as INPUT"),
+        (("m.jsonl",), "m.jsonl: INPUT: has no frame with an image; write a line "),
         (("a.webp",), "a.webp: INPUT: of a kind that is not read"),
     ],
 )
 def test_mistakes_with_inputs_are_told_in_a_line(run: Run, words: tuple[str, ...], told: str) -> None:
     Path("empty").write_text("\n\n")
     Path("gone").write_text("nowhere.png\n")
+    Path("stored").write_text("s3://cell/a.png\n")
+    Path("m.jsonl").write_text('{"record": "session"}\n')
     Path("a.webp").touch()
     code, _, err = run("estimate", *words, *GIVEN, "-o", "p.csv")
     assert code == 2
@@ -179,12 +197,19 @@ def test_a_project_file_gives_what_the_command_line_does_not(run: Run, pictures:
         ("target: []", "torchpose.yaml: target: is empty; give at least 1"),
         ("target: quad40", "--camera: is missing; give it, or write `camera: ...` into torchpose.yaml"),
         ("camera: none.yaml", "f/none.yaml: file: does not exist"),
+        ("assume_upright: maybe", "f/torchpose.yaml: assume_upright: is neither true nor false; write one of them"),
         ("", "f/torchpose.yaml: file: is empty"),
+        (None, "f/torchpose.yaml: file: does not exist; check the path"),
     ],
 )
-def test_project_files_that_are_refused(run: Run, pictures: np.ndarray, text: str, told: str) -> None:
+def test_project_files_that_are_refused(run: Run, pictures: np.ndarray, text: str | None, told: str) -> None:
+    """None: a link to nothing. That of the working directory is another one."""
     write("f/0.png", pictures[0])
-    Path("f/torchpose.yaml").write_text(text)
+    if text is None:
+        Path("torchpose.yaml").write_text("camera: camera.yaml\ntarget: quad40\n")
+        Path("f/torchpose.yaml").symlink_to("gone.yaml")
+    else:
+        Path("f/torchpose.yaml").write_text(text)
     code, _, err = run("estimate", "f", "-o", "p.csv")
     assert code == 2
     assert told in err

@@ -94,6 +94,21 @@ def test_a_name_too_long_for_a_picture_is_told_before_anything_is_read(run: Call
     one_line(run(*ESTIMATE, "f", "--overlay", "pictures"), 2, "the name is too long for a picture's; shorten it")
 
 
+@pytest.mark.parametrize(("one", "two"), [("a.pgm", "a.pgm.png"), ("d/a.bmp", "d/a.bmp.png")])
+def test_two_frames_that_would_be_one_picture_are_told(run: Callable[..., Any], one: str, two: str) -> None:
+    png(f"f/{one}")
+    png(f"f/{two}")
+    png("f/other.png")
+    message = f"{one}: --overlay: would be the same picture as that of {two}, {Path(two).name}; rename one"
+    one_line(run(*ESTIMATE, "f", "--overlay", "pictures"), 2, message)
+    assert run(*ESTIMATE, "f")[0] == 0, "without pictures there is nothing in the way"
+
+
+def test_an_input_that_is_given_twice_is_called_so(run: Callable[..., Any]) -> None:
+    png("f/a.png")
+    one_line(run(*ESTIMATE, "f", "f/a.png"), 2, "a.png: INPUT: is given twice; name it once")
+
+
 def test_resume_does_again_what_was_replaced_or_could_not_be_used(
     run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -225,6 +240,23 @@ def test_names_that_no_file_can_have_are_told_in_one_line(run: Callable[..., Any
         assert code in ((0, 2) if replaced else (2,)), where
         assert "Traceback" not in told, where
         assert told.count("\n") <= 1, where
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        ([*ESTIMATE, ""], "an argument"),
+        ([*ESTIMATE, "f", "--overlay", ""], "--overlay"),
+        ([*ESTIMATE, "f", "--hand-eye="], "--hand-eye"),
+        (["watch", "", "-c", "camera.yaml"], "an argument"),
+    ],
+)
+def test_an_empty_argument_is_no_folder(run: Callable[..., Any], words: list[str], name: str) -> None:
+    """As a path "" is the working folder: a variable without a value would have it measured, or written to."""
+    png("a.png")
+    png("f/a.png")
+    one_line(run(*words), 2, f"error: {name}: is empty; give a value, or leave it out")
+    assert not Path("p.csv").exists()
 
 
 def test_a_negative_deviation_is_called_so(run: Callable[..., Any]) -> None:

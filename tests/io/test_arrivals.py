@@ -98,3 +98,30 @@ def test_a_file_that_is_put_back_waits_for_its_next_change_or_for_long(arrivals:
 def test_a_folder_that_is_none(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="gone: FOLDER: cannot be read"):
         Arrivals(tmp_path / "gone")
+
+
+def test_what_is_passed_over_is_told_once_a_kind(tmp_path: Path) -> None:
+    for name in ("a.webp", "b.webp", "c.jp2", "film.MP4", "note.txt", "d.png.part"):
+        (tmp_path / name).write_text("x")
+    told: list[str] = []
+    arrivals = Arrivals(tmp_path, settle=SETTLE, events=False, tell=told.append)
+    assert names(arrivals, 3 * SETTLE) == []
+    assert sorted(line.split(": passed over, as all ")[1].split()[0] for line in told) == [".jp2", ".mp4", ".webp"]
+    (tmp_path / "late.webp").write_text("x")
+    (tmp_path / "late.gif").write_text("x")
+    assert names(arrivals, 3 * SETTLE) == []
+    assert [line.split(": passed over")[0] for line in told[3:]] == [str(tmp_path / "late.gif")]
+
+
+def test_a_folder_that_goes_and_comes_back_is_told(tmp_path: Path) -> None:
+    folder, told = tmp_path / "in", list[str]()
+    folder.mkdir()
+    arrivals = Arrivals(folder, settle=SETTLE, events=False, tell=told.append)
+    assert names(arrivals, 2 * SETTLE) == []
+    folder.rename(tmp_path / "away")
+    assert names(arrivals, 3 * SETTLE) == []
+    assert told == [f"{folder}: FOLDER: cannot be read any more; waiting for it"]
+    (tmp_path / "away" / "a.png").write_text("x")
+    (tmp_path / "away").rename(folder)
+    assert names(arrivals) == ["a.png"]
+    assert told[1:] == [f"{folder}: FOLDER: is back"]

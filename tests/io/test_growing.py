@@ -43,6 +43,24 @@ def test_rows_are_there_as_they_are_appended_and_once(tmp_path: Path, suffix: st
     assert frames(out)[-4:] == ["c", "c", "d", "d"]
 
 
+@pytest.mark.parametrize("gone", ["p.csv", "p.csv.watch"])
+@pytest.mark.parametrize("how", ["removed", "moved", "written anew"])
+def test_a_table_that_is_taken_away_while_it_grows_is_told(tmp_path: Path, gone: str, how: str) -> None:
+    """Its rows would go into a file that nobody can open, and would count as written."""
+    table = opened(tmp_path / "p.csv")
+    table.append([record("a")])
+    if how == "moved":
+        (tmp_path / gone).rename(tmp_path / "elsewhere")
+    else:
+        (tmp_path / gone).unlink()
+    if how == "written anew":
+        (tmp_path / gone).write_text("")
+    with pytest.raises(ConfigError, match=r"p.csv: --out: it, or p.csv.watch, was moved or removed by another program"):
+        table.append([record("b")])
+    assert "b" not in table
+    table.close()
+
+
 @pytest.mark.parametrize("suffix", [".csv", ".jsonl"])
 def test_a_run_killed_anywhere_leaves_nothing_missing_or_twice(tmp_path: Path, suffix: str) -> None:
     """Every length of the table from before the last batch to its end, and every length of the journal's last line."""

@@ -56,6 +56,10 @@ def test_a_whole_last_line_counts_without_its_newline(tmp_path: Path) -> None:
         ([SESSION, FRAME | {"robot_pose": [1, 2, 3, 4, 5]}], "line 2: robot_pose"),
         ([SESSION, FRAME | {"robot_pose": [1, 2, 3, 4, 5, float("nan")]}], "line 2: robot_pose"),
         ([SESSION, FRAME | {"robot_pose": "home"}], "line 2: robot_pose"),
+        (
+            [SESSION, FRAME | {"robot_pose": [1, 2, 3, 180, 0, -90]}],
+            "line 2: robot_pose: .* in rad, no angles",
+        ),
         ([SESSION, FRAME | {"robot_pose": [10**400, 2, 3, 4, 5, 6]}], "line 2: 1000.* a number of 401 digits"),
         ([SESSION, FRAME | {"robot_pose": [1e20, 2, 3, 4, 5, 6]}], "line 2: robot_pose"),
         ([SESSION, FRAME | {"image": "a\0.png"}], "line 2: image"),

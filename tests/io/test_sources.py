@@ -86,7 +86,7 @@ def test_unusable_inputs_are_refused_in_one_line_that_names_them(tmp_path: Path,
         "no image": ([tmp_path / "a", tmp_path / "c"], "c: INPUT: holds no image"),
         "unknown suffix": ([tmp_path / "d.raw"], "d.raw"),
         "same name": ([tmp_path / "a", tmp_path / "b"], "b/1.png: INPUT: has the same name"),
-        "same file": ([tmp_path / "a", tmp_path / "a" / "1.png"], "same name"),
+        "same file": ([tmp_path / "a", tmp_path / "a" / "1.png"], "a/1.png: INPUT: is given twice; name it once"),
     }[kind]
     with pytest.raises(ConfigError) as caught:
         find_sources(inputs)

@@ -15,6 +15,7 @@ from torchpose.errors import ConfigError
 from torchpose.io import storage
 from torchpose.io.images import UnreadableImageError
 from torchpose.io.sources import Source, find_sources
+from torchpose.io.staged import Staged
 from torchpose.io.storage import Place, StorageError, as_place, place_of
 
 pytest.importorskip("moto")
@@ -83,7 +84,11 @@ def test_other_file_systems(scheme: str, tmp_path: Path) -> None:
     [
         ("s3://key:secret-word@cell/x", "holds credentials"),
         ("s3://cell/x?secret_key=secret-word", "secret_key is not known"),
-        ("nothing://cell/x", "of an unknown kind"),
+        (
+            "nothing://cell/x",
+            r"^nothing://cell: URL: cannot be used \(.*\); use s3://, gs:// or file://, or install what ",
+        ),
+        ("ftp://cell/x", r"^ftp://cell: URL: cannot be used \("),
         ("s3://other/x", "the bucket does not exist"),
         ("s3://cell/none", "does not exist"),
     ],
@@ -93,6 +98,11 @@ def test_a_url_that_leads_nowhere_is_one_line(bucket: Place, url: str, message: 
         find_sources([place_of(url)])
     assert "\n" not in str(caught.value)
     assert "secret-word" not in str(caught.value)
+
+
+def test_a_table_for_a_url_that_nothing_writes_is_refused_before_anything_is_measured(bucket: Place) -> None:
+    with pytest.raises(ConfigError, match=r"^ftp://cell: URL: cannot be used \("):
+        Staged(place_of("ftp://cell/poses.csv"), None, resume=False)
 
 
 def test_a_store_that_does_not_answer(bucket: Place, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -123,6 +123,7 @@ def test_a_waypoint_out_of_the_workspace(tmp_path: Path) -> None:
         ([{"translation": {"value_mm": [1]}}], "did you mean values_mm?"),
         ([{"handeye": {"count": 2, "x_mm": [3, -3]}}], "limits 3 > -3"),
         ([{"poses": [[1, 2, 3]]}], "steps[0].poses[0]: has 3 entries; give 6"),
+        ([{"poses": [[400, 0, 300, 0, 0, 90]]}], "steps[0].poses[0]: turns by 90 rad, more than once around"),
     ],
 )
 def test_mistakes(tmp_path: Path, steps: list[Any], words: str) -> None:

@@ -69,6 +69,8 @@ class CameraRig:
         names = tuple(str(name) for name in self.names) or tuple(f"cam{n}" for n in range(count))
         if len(names) != count or len(set(names)) < count:
             raise ConfigError(f"names: {', '.join(names)}; give every one of the {count} cameras its own")
+        if odd := next((name for name in names if not _names_a_folder(name)), None):
+            raise ConfigError(f"names: {odd!a} is no name of a folder, which pictures of a camera lie in; give another")
         covariance = self.covariance
         if covariance is not None:
             covariance = _table("extrinsics_covariance", covariance, (POSE * (count - 1), POSE * (count - 1)))
@@ -124,6 +126,11 @@ class CameraRig:
             return self.t.new_zeros(len(self), POSE, 0)
         rows = covariance_factor(self.covariance).unflatten(0, (-1, POSE))
         return torch.cat([torch.zeros_like(rows[:1]), rows])
+
+
+def _names_a_folder(name: str) -> bool:
+    """Whether a name leads to a folder below another one, and nowhere else."""
+    return name not in ("", ".", "..") and name.isprintable() and not {"/", "\\"} & set(name)
 
 
 def rotation_fault(rotation: Tensor) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from torchpose.cli.common import INTERRUPTED, say
-from torchpose.cli.options import folder_option
+from torchpose.cli.options import camera_option, folder_option, target_option
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -31,9 +31,9 @@ def capture(
     ] = None,
     camera: Annotated[
         list[str] | None,
-        typer.Option(help="Camera file, to show the status of every frame; repeat in the order of the rig file."),
+        camera_option("Camera file, to show the status of every frame; repeat in the order of the rig file."),
     ] = None,
-    target: Annotated[list[str] | None, typer.Option(help="Target file or built-in target, for the status.")] = None,
+    target: Annotated[list[str] | None, target_option("Target file or built-in target, for the status.")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No path, progress bar or summary.")] = False,
 ) -> int:
     """Move a UR robot through a plan and take a frame of every Basler camera at each pose.

@@ -138,6 +138,13 @@ def check_outputs(
     places = [picture_path(place, source.name) for source in sources]  # refuses those that lie outside
     if any(path in frames for path in places):
         raise ConfigError(f"{overlay}: --overlay: its pictures would overwrite the frames; choose another folder")
+    drawn: dict[tuple[object, Path], str] = {}
+    for source, path in zip(sources, places, strict=True):
+        first = drawn.setdefault((source.root, path), source.name)  # cameras of a rig have a root and a folder each
+        if first != source.name:
+            raise ConfigError(
+                f"{first}: --overlay: would be the same picture as that of {source.name}, {path.name}; rename one"
+            )
 
 
 def read_tone(text: str | None) -> cameras.Tone | None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchpose.cli.common import Tone, say, use_threads, with_tone
+from torchpose.cli.options import METHODS, camera_option, target_option
 from torchpose.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -25,13 +26,12 @@ _TOKEN = "What whoever opens the page has to know: once in the URL, ?token=TOKEN
 _RATE = "Frames a second: of a folder (5 unless given), of a video (its own), at most of a camera."
 _RECORD = "Folder for recordings and stills."
 _WANTED = "Standard deviation of the position that is wanted, um, to compare with."
-_METHOD = "As for `estimate`."
 _SHORT = 12  # characters of a token (convention), below which it can be guessed
 
 
 def live(
-    camera: Annotated[str, typer.Option(help=_CAMERA)],
-    target: Annotated[str, typer.Option(help=_TARGET)],
+    camera: Annotated[str, camera_option(_CAMERA)],
+    target: Annotated[str, target_option(_TARGET)],
     source: Annotated[Path | None, typer.Argument(metavar="[SOURCE]", help=_SOURCE)] = None,
     rig: Annotated[Path | None, typer.Option(metavar="RIG", help=_RIG)] = None,
     twin: Annotated[Path | None, typer.Option(metavar="TWIN", help=_TWIN)] = None,
@@ -41,10 +41,10 @@ def live(
     rate: Annotated[float | None, typer.Option(min=0.01, max=1000, metavar="FPS", help=_RATE)] = None,
     record: Annotated[Path, typer.Option(metavar="DIR", help=_RECORD)] = Path("torchpose-live"),
     wanted_um: Annotated[float | None, typer.Option(min=1e-6, max=1e6, metavar="UM", help=_WANTED)] = None,
-    method: Annotated[str, typer.Option(metavar="photometric|edges|centers|paper", help=_METHOD)] = "photometric",
+    method: Annotated[str, typer.Option("--method", "-m", metavar=METHODS, help="As for `estimate`.")] = "photometric",
     tone: Tone = None,
     assume_upright: Annotated[bool, typer.Option("--assume-upright", help="As for `estimate`.")] = False,
-    threads: Annotated[int, typer.Option(min=1, max=256, help="Threads of the estimator.")] = 1,
+    threads: Annotated[int, typer.Option("--threads", "-j", min=1, max=256, help="Threads of the estimator.")] = 1,
 ) -> int:
     """Show in a browser what a camera sees: picture, pose, uncertainty, and what to turn.
 

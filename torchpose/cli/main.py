@@ -28,7 +28,7 @@ from torchpose.cli.reproduce import reproduce
 from torchpose.cli.sensitivity import sensitivity
 from torchpose.cli.simulate import simulate
 from torchpose.cli.watch import watch
-from torchpose.errors import TorchposeError, plain, printable
+from torchpose.errors import ConfigError, TorchposeError, plain, printable
 
 _HELP = Path(__file__).with_name("help")
 _FAULTS_OF_MACHINES = (
@@ -73,8 +73,10 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     Args:
         arguments: of the command line, without the program's name; those of the process by default.
     """
-    command = _wanted(sys.argv[1:] if arguments is None else arguments)
+    words = sys.argv[1:] if arguments is None else arguments
+    command = _wanted(words)
     try:
+        _refuse_empty(words)
         with warnings.catch_warnings():
             warnings.showwarning = _say
             code = command.main(
@@ -87,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     except Exception as error:
         # typer brings its own copy of click or depends on click, by version: known by what its errors can do
         if hasattr(error, "format_message"):
-            _fail_usage(error.format_message(), sys.argv[1:] if arguments is None else arguments)
+            _fail_usage(error.format_message(), words)
         if outside := _of_the_machine(error):
             _fail(outside)
         traceback.print_exc()
@@ -105,6 +107,15 @@ def _wanted(arguments: Sequence[str]) -> Any:
     some = copy(app)
     some.registered_commands = named or app.registered_commands
     return typer.main.get_command(some)
+
+
+def _refuse_empty(words: Sequence[str]) -> None:
+    """Refuses empty arguments: as a path "" would be the folder that the shell is in."""
+    for place, word in enumerate(words):
+        if not word or re.fullmatch(r"--[a-z-]+=", word):
+            before = words[place - 1] if place and words[place - 1].startswith("-") else ""
+            name = word.rstrip("=") or before or "an argument"
+            raise ConfigError(f"{name}: is empty; give a value, or leave it out (has a variable of the shell none?)")
 
 
 def _say(

@@ -22,7 +22,7 @@ _CAMERAS = (
     "(docs/rigs.md)."
 )
 MOST_ANGLE = 80.0  # degrees between two cameras (convention): a flat target is seen from less than 90
-_METHODS = "photometric|edges|centers|paper"  # torchpose.pipeline.Method, which takes a second to import
+METHODS = "photometric|edges|centers|paper"  # torchpose.pipeline.Method, which takes a second to import
 _METHOD = "Last stage: grey values (the default), edge points, ring centres, or the paper's own chain."
 _HAND_EYE = "Calibrated camera-to-base or camera-to-tool transform; adds the poses in the robot base."
 _INSTANCES = (
@@ -98,5 +98,5 @@ Instances = Annotated[int | None, typer.Option(min=1, max=1000, metavar="K", hel
 Upright = Annotated[bool | None, typer.Option("--assume-upright", help=_UPRIGHT)]
 HandEyeFile = Annotated[Path | None, typer.Option("--hand-eye", help=_HAND_EYE)]
 RelativeTo = Annotated[str | None, typer.Option(metavar="NAME", help=_RELATIVE)]
-LastStage = Annotated[str | None, typer.Option("--method", "-m", metavar=_METHODS, help=_METHOD)]
+LastStage = Annotated[str | None, typer.Option("--method", "-m", metavar=METHODS, help=_METHOD)]
 FilesFrom = Annotated[Path | None, typer.Option("--files-from", "-f", metavar="FILE", help=_FROM)]

@@ -76,7 +76,7 @@ def watch(
     cv2.setNumThreads(1)
     use_threads(threads, share=0.5)
     with contextlib.ExitStack() as opened:
-        arrivals = Arrivals(folder, settle=settle, events=not poll)
+        arrivals = Arrivals(folder, settle=settle, events=not poll, tell=_tell)
         opened.callback(arrivals.close)
         sink = _opened(work, folder, out)
         opened.callback(sink.close)
@@ -158,6 +158,10 @@ def _with_tone(watching: Watching, sink: GrowingTable | StreamedRows, idle: floa
         if table is not None and first:
             table.keep_tone(str(lens.tone or LINEAR))
     watching.work = replace(work, camera=lens)
+
+
+def _tell(line: str) -> None:
+    say(f"torchpose: {line}", err=True)
 
 
 def _tell_start(folder: Path, by_events: bool, told: str) -> None:

@@ -25,13 +25,17 @@ _UNREAD = ("timestamp", "binary", "merge", "value")  # YAML's own kinds of words
 _NUMBERS = yaml.constructor.SafeConstructor()
 
 
+# numbers to YAML 1.1 that are text, or another number, to YAML 1.2 and to whoever wrote them: 010 (8), 12:30 (750)
+_AMBIGUOUS = re.compile(r"[-+]?(0[0-9_]+$|.*:)")
+
+
 class _Resolver(yaml.SafeLoader):
-    """What plain words mean: YAML 1.1, but ``1e-3`` is a number, as in YAML 1.2, and ``.Nan``, which OpenCV writes."""
+    """What plain words mean: YAML 1.1, but ``1e-3`` and ``-.5`` are numbers, as in YAML 1.2, and ``.Nan`` of OpenCV."""
 
 
 _Resolver.add_implicit_resolver(
     f"{_TAG}float",
-    re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$|[-+]?\.(inf|nan)$", re.IGNORECASE),
+    re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$|[-+]?\.(\d+|inf|nan)$", re.IGNORECASE),
     list("-+.0123456789"),
 )
 
@@ -252,6 +256,8 @@ def _scalar(event: yaml.ScalarEvent) -> Any:
         rules = _Resolver.yaml_implicit_resolvers
         places = [*rules.get(text[:1], []), *rules.get(None, [])]
         tag = next((rule.removeprefix(_TAG) for rule, pattern in places if pattern.match(text)), "str")
+        if tag in ("int", "float") and _AMBIGUOUS.match(text):
+            return text
     if tag not in _MEANINGS:
         return text
     if tag in ("int", "float") and len(text) > MOST_DIGITS:

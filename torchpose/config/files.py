@@ -62,13 +62,13 @@ def read_text(path: str | os.PathLike[str], *, most: int = MOST_BYTES) -> str:
     try:
         check_regular(Path(path), most=most)
         text = Path(path).read_bytes().decode("utf-8-sig")
-        problem = "is not text; give a YAML or JSON file" if "\0" in text else ""
+        problem = "is not text in UTF-8; save it so, as YAML or JSON" if "\0" in text else ""
         if not text.strip():
             problem = "is empty; write the fields into it"
     except FileNotFoundError:
         problem = "does not exist; check the path"
     except UnicodeDecodeError:
-        problem = "is not text; give a YAML or JSON file"
+        problem = "is not text in UTF-8; save it so, as YAML or JSON"
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         problem = f"cannot be read ({reason}); check the path and its permissions"

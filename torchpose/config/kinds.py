@@ -4,7 +4,9 @@ A number beyond its range is a slip of the pen or of a program (a wrong unit, a 
 it is read, before arithmetic makes NaN, or hours, of it. All limits are conventions, far outside of what is measured.
 """
 
+import math
 import unicodedata
+from collections.abc import Sequence
 from typing import Annotated
 
 from pydantic import AfterValidator, Field
@@ -14,6 +16,7 @@ MOST_FIELD_PX = 1e6  # px
 MOST_SIDE_PX = 65535  # px of a frame: the largest that any image format of ours holds
 _MOST_NUMBER = 1e100  # whose square is a float64 still
 _MOST_TEXT = 1000  # characters
+_MOST_TURN = 2 * math.pi + 1e-3  # rad: once around, and the rounding of a file
 
 
 def _word(text: str) -> str:
@@ -23,6 +26,17 @@ def _word(text: str) -> str:
     if len(text) > _MOST_TEXT:
         raise ValueError(f"has {len(text)} characters; give at most {_MOST_TEXT}")
     return text
+
+
+def check_turn(numbers: Sequence[float]) -> Sequence[float]:
+    """Refuses a rotation vector longer than a whole turn, which robots do not report: degrees stand there.
+
+    Raises:
+        ValueError: it is longer.
+    """
+    if (length := math.hypot(*numbers)) > _MOST_TURN:
+        raise ValueError(f"turns by {length:g} rad, more than once around; write a rotation vector in rad, not degrees")
+    return numbers
 
 
 def _limits(low: float, high: float) -> object:
@@ -42,6 +56,8 @@ Distance = Annotated[float, _limits(0.0, MOST_LENGTH)]
 """mm, not negative."""
 Degrees = Annotated[float, _limits(-3600.0, 3600.0)]
 Radians = Annotated[float, _limits(-100.0, 100.0)]
+RotationVector = Annotated[list[Number], Field(min_length=3, max_length=3), AfterValidator(check_turn)]
+"""rad; its length is the angle."""
 Grey = Annotated[float, _limits(0.0, 255.0)]
 """Grey level of 0..255."""
 Pixels = Annotated[float, _limits(0.0, MOST_FIELD_PX)]

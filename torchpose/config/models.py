@@ -68,6 +68,8 @@ _FIX = {
     "finite_number": "is not finite; write a finite number",
     "int_type": "is not an integer; write an integer without quotes",
     "int_from_float": "is not an integer; write an integer without quotes",
+    "bool_type": "is neither true nor false; write one of them without quotes",
+    "bool_parsing": "is neither true nor false; write one of them without quotes",
     "string_type": "is not text; put it in quotes",
     "list_type": "is not a list; write [a, b, c]",
     "model_type": "is not a mapping; write it as `key: value` lines",

@@ -90,6 +90,8 @@ def checked_values(values: Mapping[str, Any], hints: Mapping[str, Any]) -> dict[
 def tensor_of(value: Any) -> Any:
     """A NumPy array as a tensor, anything else as it is."""
     if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
+        if value.dtype.kind == "f" and value.dtype.itemsize > np.dtype(np.float64).itemsize:
+            value = value.astype(np.float64)  # np.longdouble, which torch has not
         native = np.ascontiguousarray(value.astype(value.dtype.newbyteorder("="), copy=False))
         return torch.from_numpy(native if native.flags.writeable else native.copy())  # torch warns of others
     return value

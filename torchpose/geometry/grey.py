@@ -23,6 +23,16 @@ def as_frames(frames: Any) -> Tensor:
     frames = tensor_of(frames)
     if not isinstance(frames, Tensor):
         raise FrameError(f"frames: is of type {type(frames).__name__}; pass a tensor or NumPy array (B, H, W)")
+    if frames.layout != torch.strided or frames.is_meta:
+        kind = "on the device meta" if frames.is_meta else str(frames.layout).removeprefix("torch.")
+        raise FrameError(
+            f"frames: is {kind}; pass a tensor that holds every pixel (to_dense, numbers of a real device)"
+        )
+    if frames.ndim in (3, 4) and frames.shape[-1] in (3, 4):
+        raise FrameError(
+            f"frames: shape {tuple(frames.shape)} has its colours last, as OpenCV has; pass grey frames, or RGB "
+            "(B, 3, H, W): cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)"
+        )
     if frames.ndim == 2:
         frames = frames[None]
     if frames.ndim == 4 and frames.shape[1] == 1:

@@ -13,13 +13,14 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from torchpose.errors import ConfigError
-from torchpose.io.sources import IMAGE_SUFFIXES, natural_key
+from torchpose.io.films import FILM_SUFFIXES
+from torchpose.io.sources import IMAGE_SUFFIXES, OTHERS, natural_key
 
 _PATIENCE = 10  # times the settling time (convention), after which a file that does not decode is taken as it is
 _TICK = 0.05  # s between looks at the files that wait (convention)
@@ -27,6 +28,7 @@ _RESCAN = 2.0  # s between readings of the folder where there are events (conven
 _SHARE = 20  # of the time that reading the folder may take, one part (convention)
 
 _Stamp = tuple[int, int]
+_PASSED = OTHERS.union(FILM_SUFFIXES)  # what somebody may expect to be read
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,7 @@ class Arrivals:
         folder: to watch.
         settle: seconds that a file has to keep its size and time where nothing says that it was closed.
         events: whether to ask the system for events.
+        tell: is given a line for each kind of pictures that is passed over, and when the folder is gone or back.
 
     Attributes:
         by_events: whether the system sends any.
@@ -74,8 +77,12 @@ class Arrivals:
         ConfigError: the folder cannot be read.
     """
 
-    def __init__(self, folder: Path, *, settle: float = 1.0, events: bool = True) -> None:
-        self._folder, self._settle = folder, settle
+    def __init__(
+        self, folder: Path, *, settle: float = 1.0, events: bool = True, tell: Callable[[str], None] = lambda line: None
+    ) -> None:
+        self._folder, self._settle, self._tell = folder, settle, tell
+        self._passed: set[str] = set()  # suffixes that are told
+        self._gone = False
         self._waiting: dict[Path, _Waiting] = {}
         self._taken: set[Path] = set()
         self._hints: dict[Path, bool] = {}  # whether it was closed or renamed
@@ -176,7 +183,12 @@ class Arrivals:
     def _scan(self) -> None:
         """Reads the folder."""
         start = time.monotonic()
-        found = [path for path in _pictures(self._folder) if path not in self._taken and path not in self._waiting]
+        if self._gone != (not os.path.isdir(self._folder)):
+            self._gone = not self._gone
+            state = "cannot be read any more; waiting for it" if self._gone else "is back"
+            self._tell(f"{self._folder}: FOLDER: {state}")
+        pictures = [path for path in _files(self._folder) if self._is_read(path)]
+        found = [path for path in pictures if path not in self._taken and path not in self._waiting]
         for path in sorted(found, key=lambda path: natural_key(path.as_posix())):
             # before the start nobody saw when a file was written, but its time says when
             self._see(path, closed=False, age=min(_age(path), self._settle) if self._first else 0.0)
@@ -184,6 +196,15 @@ class Arrivals:
         now = time.monotonic()
         pause = _RESCAN if self.by_events else self._settle
         self._next_scan = now + max(pause, _SHARE * (now - start))
+
+    def _is_read(self, path: Path) -> bool:
+        """Whether a file ends like a picture that is read; of another kind of pictures the first is told."""
+        suffix = path.suffix.lower()
+        if suffix in _PASSED and suffix not in self._passed:
+            self._passed.add(suffix)
+            read = ", ".join(IMAGE_SUFFIXES)
+            self._tell(f"{path}: passed over, as all {suffix} are here; what is read ends in {read}")
+        return suffix in IMAGE_SUFFIXES
 
     def _whole(self) -> list[Arrival]:
         """Takes the files that are whole."""
@@ -217,10 +238,10 @@ def _age(path: Path) -> float:
     return 0.0 if stamp is None else max(0.0, time.time() - stamp[1] / 1e9)
 
 
-def _pictures(folder: Path) -> Iterator[Path]:
-    """Files below a folder that end like pictures."""
+def _files(folder: Path) -> Iterator[Path]:
+    """Files below a folder."""
     for base, folders, files in os.walk(folder):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         for name in files:
-            if not name.startswith(".") and os.path.splitext(name)[1].lower() in IMAGE_SUFFIXES:
+            if not name.startswith("."):
                 yield Path(base, name)

@@ -103,6 +103,7 @@ class GrowingTable:
         rows = [row for record in records for row in record["rows"]]
         if not rows:
             return
+        self._check_places()
         if self._out.suffix.lower() == ".csv":
             text = csv_lines(rows, self._schema, head=self._end == 0)
         else:
@@ -131,6 +132,18 @@ class GrowingTable:
             self._journal.append(records)
         except OSError as error:
             raise self._unwritable(error) from None
+
+    def _check_places(self) -> None:
+        """Rows that went into a file without a name would be gone with this process."""
+        try:
+            there = os.path.samestat(os.stat(self._out), os.fstat(self._file.fileno()))
+        except OSError:
+            there = False
+        if not (there and self._journal.is_at_its_path()):
+            raise ConfigError(
+                f"{self._out}: --out: it, or {self._journal.path.name}, was moved or removed by another program; move "
+                "both away, and start again"
+            )
 
     def _load(self, origin: dict[str, Any]) -> int:
         """Takes over what earlier runs have left; where the table's rows end."""

@@ -90,14 +90,15 @@ class Journal:
             try:
                 if not locked(self._file.fileno()):
                     raise ConfigError(f"{path}: --out: another run is writing it; wait for it or choose another file")
-                if self._is_at_its_path():
+                if self.is_at_its_path():
                     return
             except BaseException:
                 self._file.close()
                 raise
             self._file.close()  # whoever held it before has just ended and removed it
 
-    def _is_at_its_path(self) -> bool:
+    def is_at_its_path(self) -> bool:
+        """Whether what is open is what others find under its name."""
         try:
             return os.path.samestat(os.stat(self.path), os.fstat(self._file.fileno()))
         except FileNotFoundError:

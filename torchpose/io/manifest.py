@@ -20,10 +20,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, ValidationError
 
 from torchpose.config import check_regular, parse_json, shown
-from torchpose.config.kinds import Length, Number, Radians, Text, Word
+from torchpose.config.kinds import Length, Number, Radians, Text, Word, check_turn
 from torchpose.errors import ConfigError
 
 _LONGEST_LINE = 1 << 20  # bytes (convention): a record has one or two thousand
@@ -55,6 +55,7 @@ class ManifestFrame(_Record):
         Annotated[
             tuple[Length, Length, Length, Radians, Radians, Radians],
             BeforeValidator(lambda numbers: tuple(numbers) if isinstance(numbers, list) else numbers),
+            AfterValidator(lambda numbers: (*numbers[:3], *check_turn(numbers[3:]))),
         ]
         | None
     ) = None
@@ -66,7 +67,7 @@ _WRONG = {
     "image": "missing or not a text of one line; give the image's path relative to the manifest",
     "camera": "{} is not a text of one line; give the camera's name",
     "trigger_time_s": "{} is no time; give seconds, or leave it out",
-    "robot_pose": "{}; give six finite numbers x, y, z, rx, ry, rz",
+    "robot_pose": "{}; give six finite numbers: x, y, z, and a rotation vector rx, ry, rz in rad, no angles in degrees",
 }
 
 

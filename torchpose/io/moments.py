@@ -21,7 +21,7 @@ from torchpose.io.estimates import Estimation, digest
 from torchpose.io.manifest import read_manifest
 from torchpose.io.reader import Batch, FrameReader
 from torchpose.io.rows import DETECTION_SCHEMA, POSE_SCHEMA, Row, Schema, detection_rows, fault_row, finite
-from torchpose.io.sources import MANIFEST_SUFFIX, Source, find_sources, natural_key
+from torchpose.io.sources import FRAME_SUFFIXES, MANIFEST_SUFFIX, Source, find_sources, natural_key
 from torchpose.io.store import ResultStore, Stamp
 from torchpose.pipeline import PoseEstimator
 from torchpose.results import Poses, Status
@@ -91,6 +91,12 @@ def find_moments(given: Path, rig: CameraRig, tell: Callable[[str], None] = lamb
     of_camera = _in_manifest if given.suffix.lower() == MANIFEST_SUFFIX else _in_folders
     pictures = of_camera(given, rig, tell)
     names = sorted({name for one in pictures for name in one}, key=natural_key)
+    if sum(map(bool, pictures)) > 1 and sum(map(len, pictures)) == len(names):
+        first, second = [next(iter(one)) for one in pictures if one][:2]
+        tell(
+            f"{given}: no two cameras have a picture of one name ({first}, {second}), so every row is that of one "
+            "camera alone; give pictures of one moment the same name, its ending included"
+        )
     return [Moment(name, tuple(one.get(name) for one in pictures)) for name in names]
 
 
@@ -106,8 +112,11 @@ def _in_folders(given: Path, rig: CameraRig, tell: Callable[[str], None]) -> lis
     if missing:
         tell(f"{given}: has no folder {', '.join(missing)}: these cameras contribute nothing")
     other = sorted(p.name for p in given.iterdir() if p.is_dir() and p.name not in rig.names and p.name[0] != ".")
+    loose = sum(p.suffix.lower() in FRAME_SUFFIXES and p.is_file() for p in given.iterdir())
     if other:
         tell(f"{given}: passed over {', '.join(other)}, which --cameras does not name")
+    if loose:
+        tell(f"{given}: passed over {loose} pictures that lie in no folder of a camera")
     folders = [given / name for name in rig.names]
     return [{s.name: s for s in find_sources([f], tell)} if f.is_dir() else {} for f in folders]
 

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
-from torchpose.config import beside, read_yaml, validate
+from torchpose.config import beside, read_yaml, real, validate
 from torchpose.config.kinds import Word
 from torchpose.errors import ConfigError, printable
 from torchpose.io.storage import Place
@@ -87,12 +87,13 @@ def settings(inputs: Sequence[Path | Place], **given: Any) -> Settings:
 def _file(inputs: Sequence[Path]) -> Path | None:
     """The project file. ConfigError: there are several."""
     folders = dict.fromkeys(path if os.path.isdir(path) else path.parent for path in inputs)
-    found = {path.resolve(): path for path in (folder / PROJECT_FILE for folder in folders) if os.path.isfile(path)}
+    # a link to nothing is one, too: that of the working directory would be another one
+    found = {real(path): path for path in (folder / PROJECT_FILE for folder in folders) if os.path.lexists(path)}
     if len(found) > 1:
         one, other = list(found.values())[:2]
         raise ConfigError(f"{other}: INPUT: has another {PROJECT_FILE} than {one.parent}; run them one by one")
     here = Path(PROJECT_FILE)
-    return next(iter(found.values()), here if os.path.isfile(here) else None)
+    return next(iter(found.values()), here if os.path.lexists(here) else None)
 
 
 def _placed(path: Path, name: str, value: Any) -> Any:

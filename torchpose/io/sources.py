@@ -23,7 +23,7 @@ MANIFEST_SUFFIX = ".jsonl"
 _STACKS = (".tif", ".tiff")  # that may have several pages
 FRAME_SUFFIXES = (*IMAGE_SUFFIXES, *FILM_SUFFIXES)
 # pictures in a folder that are not read, so that a user is told: raw files of cameras among them
-_OTHERS = frozenset(
+OTHERS = frozenset(
     (  # noqa: SIM905  # a list would be five times as long
         ".apng .arw .avif .cr2 .cr3 .dib .dng .exr .fit .fits .gif .hdr .heic .heif .ico .j2c .j2k .jfif "
         ".jif .jng .jp2 .jpc .jpe .jpf .jpx .jxl .jxr .mpg .nef .npy .npz .orf .pam .pbm .pcx .pfm "
@@ -122,12 +122,21 @@ def find_sources(
         read = ", ".join(FRAME_SUFFIXES if isinstance(given, Path) else IMAGE_SUFFIXES)
         if not found:
             also = f" but {_summary(passed)}" if passed.total() else ""
+            if given.suffix.lower() == MANIFEST_SUFFIX:
+                read = 'a line {"record": "frame", "id": 1, "image": "a.png"} for each'
+                raise ConfigError(f"{given}: INPUT: has no frame with an image{also}; write {read}")
             raise ConfigError(f"{given}: INPUT: holds no image{also}; give files that end in {read}")
         if passed.total():
             tell(f"{_text(str(given))}: passed over {_summary(passed)}; what is read ends in {read}")
         for source in found:
             twin = seen.setdefault(source.name, source)
             if twin is not source:
+                if (
+                    isinstance(source.path, Path)
+                    and isinstance(twin.path, Path)
+                    and real(source.path) == real(twin.path)
+                ):
+                    raise ConfigError(f"{source.path}: INPUT: is given twice; name it once")
                 raise ConfigError(
                     f"{source.path}: INPUT: has the same name in the results, {source.name!r}, as {twin.path}; "
                     "give a common parent folder or run them one by one"
@@ -156,7 +165,7 @@ def _sources_of(given: Path | Place, passed: Counter[str], below: Path | None) -
     path = given.with_name(f"{name}{MANIFEST_SUFFIX}") if camera else given
     state, suffixes = _state(path), (*FRAME_SUFFIXES, MANIFEST_SUFFIX)
     if path.suffix.lower() not in suffixes and state in ("file", _PIPE):
-        why = "of a kind that is not read" if path.suffix.lower() in _OTHERS else "of an unknown kind"
+        why = "of a kind that is not read" if path.suffix.lower() in OTHERS else "of an unknown kind"
         raise ConfigError(f"{given}: INPUT: {why}; give a folder or a file that ends in {', '.join(suffixes)}")
     if state != "file":
         raise ConfigError(f"{path}: INPUT: {state}; give image files, folders or a capture manifest")
@@ -179,10 +188,10 @@ def _stored(given: Place, passed: Counter[str]) -> Iterator[Source]:
         else:
             for one in sorted(given.listed(), key=lambda one: natural_key(one.name)):
                 suffix = Path(one.name).suffix.lower()
-                if suffix not in _OTHERS.union(FRAME_SUFFIXES) or any(p.startswith(".") for p in one.name.split("/")):
+                if suffix not in OTHERS.union(FRAME_SUFFIXES) or any(p.startswith(".") for p in one.name.split("/")):
                     continue
-                if suffix in _OTHERS or suffix in FILM_SUFFIXES:
-                    passed[suffix if suffix in _OTHERS else _STORED_FILMS] += 1
+                if suffix in OTHERS or suffix in FILM_SUFFIXES:
+                    passed[suffix if suffix in OTHERS else _STORED_FILMS] += 1
                 else:
                     yield from sources_of_file(one.name, given / one.name, given, _stamp(one))
     except StorageError as error:
@@ -265,9 +274,9 @@ def _walk(folder: Path, passed: Counter[str]) -> Iterator[Path]:
         for file in files:
             path = Path(base, file)
             suffix = path.suffix.lower()
-            if file.startswith(".") or suffix not in _OTHERS.union(FRAME_SUFFIXES):
+            if file.startswith(".") or suffix not in OTHERS.union(FRAME_SUFFIXES):
                 continue
-            if suffix in _OTHERS:
+            if suffix in OTHERS:
                 passed[suffix] += 1
             elif _state(path) == _PIPE:
                 passed["pipes or devices"] += 1

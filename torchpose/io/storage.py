@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from inspect import signature
 from io import BufferedReader
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -128,8 +129,13 @@ class Place:
         return {fs.FileType.File: "file", fs.FileType.Directory: "folder"}.get(found, "nothing")
 
     def check_bucket(self) -> None:
-        """StorageError: the bucket that the file would go to does not exist, as far as the store tells."""
+        """StorageError: the bucket that the file would go to does not exist, as far as the store tells.
+
+        ConfigError: nothing here writes URLs of this kind.
+        """
         parts = urlsplit(self.url)
+        if parts.scheme not in _NATIVE:
+            _ = self._files
         if parts.scheme in _BUCKETS and Place(f"{parts.scheme}://{parts.netloc}?{parts.query}").kind() == "nothing":
             raise StorageError(*_ANSWERS["NO_SUCH_BUCKET"])
 
@@ -274,10 +280,25 @@ def _file_system(scheme: str, netloc: str, query: str) -> "fs.FileSystem":
         with _told():
             return fs.FileSystem.from_uri(f"{scheme}://{netloc}/")[0]
     try:
-        import fsspec
-
-        return fs.PyFileSystem(fs.FSSpecHandler(fsspec.filesystem(scheme)))
-    except (ImportError, ValueError):
+        return _by_fsspec(scheme)
+    except Exception as error:  # each of fsspec's kinds has its own
+        reason = " ".join(str(error).split())[:160]
         raise ConfigError(
-            f"{scheme}://: URL: of an unknown kind; use s3://, gs://, file://, or install its fsspec"
+            f"{scheme}://{netloc}: URL: cannot be used ({reason}); use s3://, gs:// or file://, or install what fsspec "
+            f"needs for {scheme}://"
         ) from None
+
+
+def _by_fsspec(scheme: str) -> "fs.FileSystem":
+    import fsspec
+    from pyarrow import fs
+
+    kind = fsspec.get_filesystem_class(scheme)
+    wanted = [
+        one.name
+        for one in list(signature(kind.__init__).parameters.values())[1:]
+        if one.default is one.empty and one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD)
+    ]
+    if wanted:  # such as a host and a password, which no URL should hold
+        raise ValueError(f"it wants {', '.join(wanted)} besides")
+    return fs.PyFileSystem(fs.FSSpecHandler(kind()))

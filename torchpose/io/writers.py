@@ -20,7 +20,7 @@ TABLE_SUFFIXES = (".csv", ".jsonl", ".parquet")
 _WITH_POSE = ("ok", "ambiguous")
 # what the readers raise of files that are damaged: text that is none, another nesting, sizes that no memory holds
 _UNREADABLE = (ValueError, KeyError, TypeError, NotImplementedError, OSError, MemoryError, csv.Error)
-_LONG_NAME = 250  # bytes; file systems end at 255
+_LONG_NAME = 240  # bytes; file systems end at 255
 _LONGEST_LINE = 1 << 20  # bytes (convention): a row with the covariances of thousands of markers
 _ROW_GROUP = 4096
 
@@ -35,7 +35,7 @@ def check_table_path(path: Path, option: str) -> None:
     longest = path.with_name(f"{path.name}.run.json")  # of what a run writes
     if not os.path.isdir(path.parent):  # `make_folder_of` makes it once there is something to write
         longest = Path(_there(path), longest.name)
-    probe = _temporary(longest)
+    probe = longest.with_name(f".torchpose.{os.getpid()}.tmp")  # not what another run is writing at this moment
     try:
         with contextlib.suppress(FileNotFoundError):
             longest.lstat()  # the name may be too long
@@ -171,7 +171,8 @@ def atomic_path(
     With ``sync`` it survives a crash of the machine. An operating-system error is a ConfigError with ``option`` (such
     as ``--out: ``) and ``fix``.
     """
-    temporary = _temporary(path)
+    # the journal's lock keeps others from a run's tables; pictures of one folder may be those of two runs
+    temporary = _temporary(path, "" if sync else f".{os.getpid()}")
     try:
         yield temporary
         if sync:
@@ -185,10 +186,13 @@ def atomic_path(
             temporary.unlink(missing_ok=True)
 
 
-def _temporary(path: Path) -> Path:
-    """A hidden name beside ``path``; a long one is cut, as there must be room for more."""
+def _temporary(path: Path, own: str) -> Path:
+    """A hidden name beside ``path``; a long one is cut, as there must be room for more.
+
+    Without ``own`` that of all processes, so that one which is killed leaves no more than one.
+    """
     stem = path.name if len(os.fsencode(path.name)) < _LONG_NAME else hashlib.sha256(os.fsencode(path.name)).hexdigest()
-    return path.with_name(f".{stem}.tmp")
+    return path.with_name(f".{stem}{own}.tmp")
 
 
 def _cells(schema: Schema) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,7 +18,7 @@ def make_folder(folder: Path, option: str) -> None:
     """Makes the folder that is the argument of ``option``. ConfigError: it cannot be created or written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / ".probe.tmp"
+        probe = folder / f".probe.{os.getpid()}.tmp"  # another run may try the same folder
         probe.touch()
         probe.unlink()
     except OSError as error:

@@ -21,12 +21,12 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from torch import Tensor
 
 from torchpose.config import example, read_yaml, validate
-from torchpose.config.kinds import Degrees, Length, Seed, Text, Word
+from torchpose.config.kinds import Degrees, Length, RotationVector, Seed, Text, Word
 from torchpose.errors import ConfigError
 from torchpose.geometry import rotations
 from torchpose.rig.poses import Pose, as_pose, to_transform
 from torchpose.rig.settings import SixNumbers, Strict, Workspace
-from torchpose.target import RigidTransformFile, Vector
+from torchpose.target import RigidTransformFile
 
 _AXES = {"x": 0, "y": 1, "z": 2, "pitch": 3, "yaw": 4, "roll": 5}  # places in a move
 _F64 = torch.float64
@@ -158,7 +158,7 @@ class PlanFile(Strict):
 
     name: Word
     origin: RigidTransformFile
-    axes: Literal["tool", "base"] | Vector = "tool"
+    axes: Literal["tool", "base"] | RotationVector = "tool"
     steps: list[Step] = Field(min_length=1)
 
     @field_validator("steps")

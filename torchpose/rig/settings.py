@@ -7,10 +7,19 @@ from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    field_validator,
+    model_validator,
+)
 
 from torchpose.config import example, read_yaml, validate
-from torchpose.config.kinds import MOST_LENGTH, MOST_SIDE_PX, Length, Side, Word
+from torchpose.config.kinds import MOST_LENGTH, MOST_SIDE_PX, Length, Side, Word, check_turn
 from torchpose.target import Vector
 
 MAX_SPEED_MM_S = 250.0  # the reduced speed of ISO 10218-1, for work beside people
@@ -21,7 +30,10 @@ SOFTWARE = "Software"  # GenICam's name of the source of a trigger that is a cal
 ACTION = ("ActionDeviceKey", "ActionGroupKey", "ActionGroupMask")  # GenICam's, which an action command is addressed by
 Positive = Annotated[FiniteFloat, Field(gt=0, le=MOST_LENGTH)]
 AS_TUPLE = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)  # files have lists
-SixNumbers = Annotated[list[Length], Field(min_length=6, max_length=6)]
+SixNumbers = Annotated[
+    list[Length], Field(min_length=6, max_length=6), AfterValidator(lambda pose: [*pose[:3], *check_turn(pose[3:])])
+]
+"""A pose: position in mm, rotation vector in rad."""
 
 
 class Strict(BaseModel):

@@ -49,16 +49,20 @@ def load(path: str | os.PathLike[str]) -> Camera:
         read = _pick(_readers(text), selector)
         camera = read()
         check_intrinsics(camera.matrix, camera.width, camera.height, camera.model)
+    warn_without_ray(camera, f"{name}: distortion_coefficients")
+    return camera
+
+
+def warn_without_ray(camera: Camera, field: str) -> None:
+    """Warns where no ray of the lens model reaches part of the frame; ``field`` begins the message."""
     if percent := 100 * share_without_ray(camera):
         part = f"{percent:.0f}" if percent >= 10 else f"{percent:.2g}"
         warnings.warn(
-            f"{name}: distortion_coefficients: no ray reaches {part} % of the frame, beyond the fold or a"
-            " pole of the lens model; markers there are not measured: calibrate with views out to the corners, or with"
-            " fewer coefficients",
+            f"{field}: no ray reaches {part} % of the frame, beyond the fold or a pole of the lens model; markers there"
+            " are not measured: calibrate with views out to the corners, or with fewer coefficients",
             CameraWarning,
-            stacklevel=2,
+            stacklevel=3,
         )
-    return camera
 
 
 @contextmanager

@@ -51,9 +51,9 @@ _ELSEWHERE = re.compile(
 )
 # lenses of another kind, in words that no other part of a file uses
 _OTHER_LENS = re.compile(
-    r"fish-?_?eye|omni|equi-?_?dist|equi-?_?solid|equi-?_?rect|kannala|\bkb[48]?\b|\bequi\b|\bucm\b|\bmei\b|o-?cam|scaramuzza|cata-?diop"
-    r"|\bxi\b|double-?_?sphere|\beucm\b|unified|f-?_?theta|stereographic|orthographic|spherical|cylind|panoram|division"
-    r"|\bfov\b(?=.{0,3}model)|thin-?_?prism",
+    r"fish[-_ ]?eye|omni|equi-?_?dist|equi-?_?solid|equi-?_?rect|kannala|\bkb[48]?\b|\bequi\b|\bucm\b|\bmei\b|o-?cam"
+    r"|scaramuzza|cata-?diop|\bxi\b|double[-_ ]?sphere|\beucm\b|unified|f-?_?theta|stereographic|orthographic|spherical"
+    r"|cylind|panoram|division|\bfov\b(?=.{0,3}model)|thin-?_?prism",
     re.IGNORECASE,
 )
 _DEEPEST = 6  # levels of mappings that are looked through; models stand higher (convention)

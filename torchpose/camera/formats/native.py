@@ -28,6 +28,12 @@ _OWN = {*COVARIANCES, "tone", "adjustment", "roi", "binning_x", "binning_y"}
 def read(data: Mapping[str, Any], text: str) -> Camera:
     """The camera of a mapping in the native form."""
     keys = {field: _keys(data, field) for field in FIELDS}
+    if not keys["camera_matrix"] and not keys["distortion_coefficients"]:
+        raise ConfigError(
+            "camera_matrix: is missing, and nothing names a format that is read: OpenCV, ROS, Kalibr, COLMAP, Basalt,"
+            " ORB-SLAM, mrcal, RealSense, Open3D, BOP, NeRF, Metashape; write image_width, image_height, camera_matrix"
+            " and distortion_coefficients"
+        )
 
     def get(field: str) -> Any:
         values = [data[key] for key in keys[field] if data[key] is not None]
@@ -81,7 +87,7 @@ def _window(data: Mapping[str, Any], camera: Camera) -> Camera:
     for key in ("binning", "x_offset", "y_offset", "offset_x", "offset_y"):
         if data.get(key) not in (None, 0, *([1] if key == "binning" else [])):
             raise ConfigError(f"{key}: is {shown(data[key])}; write binning_x and binning_y, and the offsets below roi")
-    bins = [int(number(data.get(name) or 0, name)) for name in ("binning_x", "binning_y")]
+    bins = [_whole(data.get(name), name) for name in ("binning_x", "binning_y")]
     if any(b < 0 for b in bins):
         raise ConfigError(
             f"binning_x: is {bins[0]}, binning_y {bins[1]}; write 1 or more, or 0 where nothing is binned"
@@ -90,13 +96,13 @@ def _window(data: Mapping[str, Any], camera: Camera) -> Camera:
     roi = data.get("roi")
     if roi is not None and not isinstance(roi, Mapping):
         raise ConfigError(f"roi: is {shown(roi)}; write x_offset, y_offset, width and height below it")
-    region = [number((roi or {}).get(name) or 0, f"roi.{name}") for name in ("x_offset", "y_offset", "width", "height")]
+    region = [_whole((roi or {}).get(name), f"roi.{name}") for name in ("x_offset", "y_offset", "width", "height")]
     if not any(region):
         region = [0, 0, camera.width, camera.height]
     x, y, width, height = region
     if not (0 <= x < x + width <= camera.width and 0 <= y < y + height <= camera.height):
         raise ConfigError(
-            f"roi: {width:g} x {height:g} px at {x:g}, {y:g} are not within {camera.width} x {camera.height} px; "
+            f"roi: {width} x {height} px at {x}, {y} are not within {camera.width} x {camera.height} px; "
             "give the region in px of the whole frame"
         )
     if bins == [1, 1] and (width, height) == (camera.width, camera.height):
@@ -110,8 +116,8 @@ def _window(data: Mapping[str, Any], camera: Camera) -> Camera:
         scale[:4] = 1 / torch.tensor([bx, by, bx, by], dtype=covariance.dtype)
         covariance = scale[:, None] * covariance * scale
     return Camera(
-        size(int(width) // bx, "roi.width"),
-        size(int(height) // by, "roi.height"),
+        size(width // bx, "roi.width"),
+        size(height // by, "roi.height"),
         moved,
         camera.distortion,
         camera.model,
@@ -119,6 +125,14 @@ def _window(data: Mapping[str, Any], camera: Camera) -> Camera:
         tone=camera.tone,
         adjustment=camera.adjustment,
     )
+
+
+def _whole(value: Any, field: str) -> int:
+    """A number of pixels, 0 where nothing is said."""
+    found = number(value or 0, field)
+    if not found.is_integer():
+        raise ConfigError(f"{field}: is {found:g}; write a whole number of px")
+    return int(found)
 
 
 _INI_NAME = re.compile(r"[a-z_][a-z_ ]*", re.IGNORECASE)
@@ -152,6 +166,11 @@ def read_ini(lines: list[str]) -> Camera:
     for key in wanted.values():
         if key not in blocks:
             raise ConfigError(f"{key}: is missing; add it")
+    for key in blocks:
+        if key not in (*wanted.values(), "rectification", "projection") and not key.startswith("externals "):
+            raise ConfigError(
+                f"{key}: is no entry of an .ini; write a camera_info with binning and roi for frames that have them"
+            )
     data: dict[str, Any] = {field: blocks[key] for field, key in wanted.items()}
     for field in ("image_width", "image_height"):
         flat = [value for row in data[field] for value in row]

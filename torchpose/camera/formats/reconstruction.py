@@ -39,6 +39,7 @@ NERF_MODELS: dict[str, Model] = {
     "OPENCV": "brown_conrady",
     "OPENCV_FISHEYE": "kannala_brandt",
 }
+_METASHAPE_NUMBERS = ("width", "height", "f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
 METASHAPE_MODELS: dict[str, Model] = {"frame": "brown_conrady", "fisheye": "kannala_brandt"}
 # px between the principal point and the middle of the frame, as a share of its side. A quarter is no lens: the file
 # counts from the corner, as PhotoScan's did once (convention)
@@ -143,13 +144,14 @@ def metashape(root: Element) -> Camera:
     if "fx" in values:
         raise ConfigError("fx: is of an old PhotoScan; export the calibration from Metashape again, with f")
     model = METASHAPE_MODELS[kind]
+    if odd := next((key for key in values if key not in (*_METASHAPE_NUMBERS, "projection", "date")), None):
+        raise ConfigError(f"{odd}: is not known of a calibration of Metashape; export it anew, or calibrate without it")
     parsed: dict[str, float] = {}
-    for key in ("width", "height", "f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4"):
-        if key in values:
-            try:
-                parsed[key] = float(values[key])
-            except ValueError:
-                raise ConfigError(f"{key}: is {shown(values[key])}; write a number") from None
+    for key in (name for name in _METASHAPE_NUMBERS if name in values):
+        try:
+            parsed[key] = float(values[key])
+        except ValueError:
+            raise ConfigError(f"{key}: is {shown(values[key])}; write a number") from None
     width, height, focal = listed(parsed, ("width", "height", "f"))
     frame = size(width, "width"), size(height, "height")
     get = {key: number(value, key) for key, value in parsed.items()}.get

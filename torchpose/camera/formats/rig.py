@@ -4,6 +4,7 @@ Transforms are in metres in Kalibr's and ROS's files and in mm in ours.
 """
 
 import os
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpose.camera.formats import native, slam
+from torchpose.camera.formats import native, slam, warn_without_ray
 from torchpose.camera.formats.fields import mapping, numbers, shown
 from torchpose.camera.formats.write import covariances, focal_center, row
 from torchpose.camera.model import Camera
@@ -30,19 +31,30 @@ _YAML = (".yaml", ".yml")
 def load(path: str | os.PathLike[str]) -> CameraRig:
     """The rig in a Kalibr camchain, a stereo calibration of OpenCV, or a folder of ROS camera_info with a TF table.
 
+    Warns:
+        CameraWarning: no ray of a lens model reaches part of its frame.
+
     Raises:
         ConfigError: one line ``FILE: FIELD: what is wrong; the fix``.
     """
     place = Path(path)
-    if place.is_dir():
-        return _ros_folder(place)
-    text = read_text(place)
-    with within(f"{os.fspath(path)}: "):
+    rig = _ros_folder(place) if place.is_dir() else _one_file(place)
+    for name, camera in zip(rig.names, rig.cameras, strict=True):
+        field = f"{os.fspath(path)}: {name}."
+        with within(field):
+            check_intrinsics(camera.matrix, camera.width, camera.height, camera.model)
+        warn_without_ray(camera, f"{field}distortion_coefficients")
+    return rig
+
+
+def _one_file(path: Path) -> CameraRig:
+    text = read_text(path)
+    with within(f"{path}: "):
         data = parse_mapping(text)
         if cameras := slam.kalibr(data):
             return _kalibr(data, cameras)
         if any(key in data for key in ("R", "T", "M1", "cameraMatrix1")):
-            return _stereo(data)
+            return _stereo(data, text)
         raise ConfigError(
             "cam0: is missing; give a Kalibr camchain (cam0, cam1, ... with T_cn_cnm1), OpenCV's stereo calibration "
             "(M1, D1, M2, D2, R, T), or a folder of ROS camera_info files with tf_static.yaml"
@@ -63,9 +75,6 @@ def _kalibr(data: Mapping[str, Any], readers: Mapping[str, Callable[[], Camera]]
         turn, shift = rotations.compose(turn, 1000 * shift, R[-1], t[-1])
         R.append(turn)
         t.append(shift)
-    for key, camera in zip(keys, cameras, strict=True):
-        with within(f"{key}."):
-            check_intrinsics(camera.matrix, camera.width, camera.height, camera.model)
     return CameraRig(cameras, torch.stack(R), torch.stack(t), _covariance(data, keys), names)
 
 
@@ -154,7 +163,7 @@ def _kalibr_entry(camera: Camera, number: int) -> str:
     return text if camera.tone is None else text + f'  tone: "{camera.tone}"\n'
 
 
-def _stereo(data: Mapping[str, Any]) -> CameraRig:
+def _stereo(data: Mapping[str, Any], text: str) -> CameraRig:
     """`stereoCalibrate`'s result: X_2 = R X_1 + T. Its unit is that of the board, which no such file says."""
     spellings = {
         "M{}": ("M{}", "K{}", "cameraMatrix{}", "camera_matrix_{}"),
@@ -179,14 +188,17 @@ def _stereo(data: Mapping[str, Any]) -> CameraRig:
         raise ConfigError(f"R: with T has shapes {tuple(turn.shape)} and {len(shift)}; give 3 x 3 and 3")
     turn = _rotation(turn, "R")
     cameras = []
+    names = [name.format(number) for several in spellings.values() for name in several for number in (1, 2)]
+    rest = {key: value for key, value in data.items() if key not in (*names, "R", "T", "units")}
     for number in (1, 2):
         own = {
+            **rest,  # one of them may name the lens
             **{name: _size(data, name, number) for name in ("image_width", "image_height")},
             "camera_matrix": field("M{}", number),
             "distortion_coefficients": field("D{}", number),
         }
         with within(f"camera {number}: "):
-            cameras.append(native.read(own, ""))
+            cameras.append(native.read(own, text))
     t = torch.stack([torch.zeros_like(shift), _MM[units] * shift])
     return CameraRig(cameras, torch.stack([torch.eye(3, dtype=turn.dtype), turn]), t)
 
@@ -211,12 +223,14 @@ def _ros_folder(folder: Path) -> CameraRig:
     if not files:
         raise ConfigError(f"{folder}: file: holds no camera_info; give one .yaml file a camera")
     with within(f"{table}: "):
-        edges = _edges(parse_mapping(read_text(table)))
-    cameras, places = [], []
+        edges = _edges(read_text(table))
+    cameras: list[Camera] = []
+    places: list[str] = []
     for file in files:
-        data = parse_mapping(read_text(file))
+        text = read_text(file)
         with within(f"{file}: "):
-            cameras.append(native.read(data, ""))
+            data = parse_mapping(text)
+            cameras.append(native.read(data, text))
             header = data.get("header")
             frame = header.get("frame_id") if isinstance(header, Mapping) else data.get("camera_name")
             known = {name for edge in edges for name in edge[:2]}
@@ -226,6 +240,9 @@ def _ros_folder(folder: Path) -> CameraRig:
                     f"header.frame_id: is in no transform of {table.name}, nor is camera_name; known are "
                     f"{', '.join(sorted(known))}"
                 )
+            if frame in places:
+                other = files[places.index(frame)].name
+                raise ConfigError(f"header.frame_id: is {shown(frame)}, as in {other}; give every camera its own frame")
             places.append(frame)
     with within(f"{table}: "):
         from_first = [_between(edges, places[0], frame) for frame in places]
@@ -238,11 +255,30 @@ Edge = tuple[str, str, Tensor, Tensor]
 """Two frames and the transform of a point from the second (the child) to the first: X_parent = R X_child + t, mm."""
 
 
-def _edges(data: Mapping[str, Any]) -> list[Edge]:
-    entries = data.get("transforms")
-    if not isinstance(entries, list) or not entries:
+def _edges(text: str) -> list[Edge]:
+    """The transforms of all messages in a text, as `ros2 topic echo` divides them; one for each child."""
+    edges: dict[str, Edge] = {}
+    for part in re.split(r"^---[ \t]*$", text, flags=re.MULTILINE):
+        if not part.strip():
+            continue
+        entries = parse_mapping(part).get("transforms")
+        if not isinstance(entries, list) or not entries:
+            raise ConfigError("transforms: is missing; give the list that `ros2 topic echo /tf_static` prints")
+        for number, entry in enumerate(entries):
+            edge = _edge(entry, f"transforms[{number}]")
+            before = edges.setdefault(edge[1], edge)
+            if before[0] != edge[0] or not (torch.equal(before[2], edge[2]) and torch.equal(before[3], edge[3])):
+                raise ConfigError(f"transforms: {edge[1]} stands in two that differ; keep one, a frame has one parent")
+    for child in edges:
+        above, parent = {child}, edges[child][0]
+        while parent in edges and parent not in above:
+            above.add(parent)
+            parent = edges[parent][0]
+        if parent in above:
+            raise ConfigError(f"transforms: those above {child} lead back to {parent}; a tree has no loop")
+    if not edges:
         raise ConfigError("transforms: is missing; give the list that `ros2 topic echo /tf_static` prints")
-    return [_edge(entry, f"transforms[{number}]") for number, entry in enumerate(entries)]
+    return list(edges.values())
 
 
 def _edge(entry: Any, field: str) -> Edge:
