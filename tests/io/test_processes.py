@@ -7,6 +7,8 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import torch
 
@@ -37,6 +39,31 @@ def test_results_come_in_the_order_of_the_items_from_every_process(count: int) -
         assert processes == [processes[i % count] for i in range(len(items))]
         assert {threads for _, _, threads in found} == {1}
         assert not any(alive(process) for process in processes)
+
+
+@pytest.mark.timeout(120)
+def test_threads_that_are_at_work_are_not_forked() -> None:
+    """A caller of the library may have had OpenCV and torch use all cores; it has them again afterwards."""
+    before = cv2.getNumThreads(), torch.get_num_threads()
+    try:
+        cv2.setNumThreads(3)
+        torch.set_num_threads(3)
+        for _ in range(3):  # what starts threads
+            cv2.GaussianBlur(np.ones((2000, 2000), np.float32), (9, 9), 2.0)
+            torch.rand(1000, 1000) @ torch.rand(1000, 1000)
+        with Crew(blurred, list(range(4)), 2) as crew:
+            found = list(crew)
+        assert (cv2.getNumThreads(), torch.get_num_threads()) == (3, 3)
+    finally:
+        cv2.setNumThreads(before[0])
+        torch.set_num_threads(before[1])
+    assert found == [float(number) for number in range(4)]
+
+
+def blurred(numbers: Sequence[int]) -> Iterator[float]:
+    for number in numbers:
+        picture = cv2.GaussianBlur(np.full((500, 500), float(number), np.float32), (9, 9), 2.0)
+        yield float(torch.from_numpy(picture).mean().round())
 
 
 def test_fresh_processes_share_the_work_as_forked_ones_do() -> None:

@@ -68,16 +68,17 @@ class Crew(Generic[Item, Result]):
             return
         context = _context(fresh)
         forked = context.get_start_method() == "fork"
-        for number in range(count):
-            end, theirs = context.Pipe(duplex=False)
-            self._ends.append(end)
-            # forked, a process has the ends of all before it: unless it closes them, none notices that this one is gone
-            what: _Share = (work, items[number::count])
-            arguments = (what, theirs, self._ends, let_go) if forked else (pickle.dumps(what), theirs, [], _nothing)
-            process: Any = context.Process(target=_serve, args=arguments, daemon=True)  # type: ignore[attr-defined]
-            process.start()
-            self._processes.append(process)
-            theirs.close()
+        with _without_threads() if forked else contextlib.nullcontext():
+            for number in range(count):
+                end, theirs = context.Pipe(duplex=False)
+                self._ends.append(end)
+                # forked, a process has the ends of all before it: unless it closes them, none notices that this is gone
+                what: _Share = (work, items[number::count])
+                arguments = (what, theirs, self._ends, let_go) if forked else (pickle.dumps(what), theirs, [], _nothing)
+                process: Any = context.Process(target=_serve, args=arguments, daemon=True)  # type: ignore[attr-defined]
+                process.start()
+                self._processes.append(process)
+                theirs.close()
 
     def __enter__(self) -> Self:
         return self
@@ -135,6 +136,19 @@ def one_thread() -> None:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+
+
+@contextlib.contextmanager
+def _without_threads() -> Iterator[None]:
+    """Ends the threads of OpenCV and torch meanwhile: a forked process has none of them, and waits for them in vain."""
+    before = torch.get_num_threads(), cv2.getNumThreads()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before[0])
+        cv2.setNumThreads(before[1])
 
 
 def _context(fresh: bool) -> BaseContext:
