@@ -16,6 +16,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchpose.camera import Camera
+from torchpose.camera.model import Slopes
 from torchpose.geometry import blur as blurs
 from torchpose.geometry.blurred_edge import HOLDS, Spread
 from torchpose.geometry.grey import full_scale
@@ -147,18 +149,15 @@ def gather_pixels(sight: Sight, band: Tensor) -> PixelBlocks:
     grey = values_at(frames, (frame.index_select(0, of) * height + v) * width + u)
     limits = _clipping(grey, of, frame.numel()).index_select(0, row)
     low, high = limits.mT.contiguous().index_select(1, block)
-    x, y, slopes = camera.rays(torch.stack([u, v]).double().mT)
+    xy, slopes = camera.rays(torch.stack([u, v]).double())
     # what is clipped is no measurement
-    sound = (x + y).isfinite() & grey.isfinite() & (grey > low) & (grey < high)
+    sound = (xy.sum(0) + grey).isfinite() & (grey > low) & (grey < high)
     # rays count from that of the marker's middle pixel; what is not sound gets one of the marker, too, and stays finite
-    xy = torch.stack([x, y])
     origin = xy.index_select(1, (first + size // 2).clamp_max(block.numel() - 1)).nan_to_num(nan=0.0)
     aside = (both[:, 0, 2] / camera.matrix[0, 0]).to(xy).index_select(0, block)
     xy = torch.where(sound, xy - origin.index_select(1, block), aside).index_select(1, index).view(2, count, most)
-    j00, j01, j10, j11 = (torch.where(sound, j.float(), s) for j, s in zip(slopes, (1.0, 0.0, 0.0, 1.0), strict=True))
-    det = (j00 * j11 - j01 * j10).reciprocal()
-    warp = (j11 * det, -j01 * det, -j10 * det, j00 * det, det.abs())
-    flat = torch.stack([*warp, torch.where(sound, grey, 0.0), sound.float()])
+    flat = torch.cat([_by_pixel(slopes, camera).float(), torch.stack([grey, torch.ones_like(grey)])])
+    flat = torch.where(sound, flat, flat.new_tensor([1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0])[:, None])
     *warped, grey, valid = flat.index_select(1, index).view(len(flat), count, most)
     sector = sector_about(u, v, both[:, 0], block).index_select(0, index).view(count, most)
     normal = sight.normals[row, marker]
@@ -179,6 +178,14 @@ def gather_pixels(sight: Sight, band: Tensor) -> PixelBlocks:
         limits,
         sight.quantisation,
     )
+
+
+def _by_pixel(slopes: Slopes, camera: Camera) -> Tensor:
+    """d(ray)/d(pixel) (5, P) as in `PixelBlocks.warp`, by the slopes of the lens."""
+    back = slopes.inverse()
+    fx, fy = camera.matrix.diagonal()[:2]
+    (xx, yy), mixed = back.straight, back.mixed
+    return torch.stack([xx / fx, mixed / fy, mixed / fx, yy / fy, back.determinant.abs() / (fx * fy)])
 
 
 def _tiled(*planes: Tensor) -> Tensor:
