@@ -225,11 +225,9 @@ def fit_regions(grad: Gradient, regions: Regions, wanted: Wanted = ANYTHING) -> 
         return Candidates.unscored(regions.frame, xy.new_zeros(0, 5), xy.new_zeros(0)), regions.cell > 0
     gx, gy = regions.gradient.unbind(-1)
     magnitude = (gx * gx + gy * gy).sqrt().double()
-    params = ellipse.fit(xy, regions.region, count, magnitude)
-    # once more with what is near the ellipse; weights that fall to 0 smoothly leave it where it is when the threshold,
-    # and with it the rim of the region, changes a little
-    r = ellipse.distance(xy, regions.region, params).nan_to_num(nan=BESIDE)
-    params = ellipse.fit(xy, regions.region, count, magnitude * (1 - (r / BESIDE).square()).clamp_min(0).square())
+    # weights that fall to 0 smoothly leave the ellipse where it is when the threshold, and with it the rim of the
+    # region, changes a little
+    params = ellipse.fit_near(xy, regions.region, count, magnitude, BESIDE)
     polarity = region_polarity(regions, params[:, :2], xy).sign()
     follows, along = _on_ellipses(regions, xy, params, polarity, magnitude)
     length, edge = (torch.bincount(regions.region[positions(on)], minlength=count) for on in (follows, along))

@@ -36,9 +36,10 @@ def ellipse_from_conic(conic: Conic) -> Ellipse:
     # the sign of the inside; the conic is taken so that this is negative
     a, b, c, d, e, f = (conic * (conic[..., :1] + conic[..., 2:3]).sign()).unbind(-1)
     half, square = 2 * a, 2 * c
-    disc = half * square - b * b
-    center_x, center_y = (b * e - square * d) / disc, (b * d - half * e) / disc
-    level = -f - 0.5 * (d * center_x + e * center_y)  # less its value at the centre
+    disc = torch.addcmul(half * square, b, b, value=-1)
+    center_x = torch.addcmul(b * e, square, d, value=-1) / disc
+    center_y = torch.addcmul(b * d, half, e, value=-1) / disc
+    level = -torch.add(f, torch.addcmul(d * center_x, e, center_y), alpha=0.5)  # less its value at the centre
     # the smaller eigenvalue as a quotient: mean - diff cancels for slender ellipses; rounding must not exchange a and b
     large = 0.5 * (a + c + torch.hypot(a - c, b))
     small = torch.minimum(0.25 * disc / large, large)

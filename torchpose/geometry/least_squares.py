@@ -355,7 +355,7 @@ def covariance_factor(covariance: Float[Tensor, "n n"]) -> Float[Tensor, "n k"]:
 
 def geman_mcclure(deviation: Tensor) -> Tensor:
     """Robust weights of residuals in units of the scale: (1 + d^2)^-2 (Geman and McClure 1987)."""
-    return (1 + deviation.square()).reciprocal().square()
+    return (1 + deviation.square()).pow(-2)
 
 
 def _eye_like(matrix: Tensor) -> Tensor:

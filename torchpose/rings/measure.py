@@ -357,12 +357,12 @@ def _freed(edges: RingEdges, rough: Tensor, outward: Tensor, correct: bool) -> t
     count, outside = len(rough) // 2, outward[edges.ring]
     near = ellipse.Near.of(edges.points, edges.ring, rough)
     conic, keep = near.robust(near.circle, _SCALES)
-    slopes, kept = near.slopes(conic), near.tiles.flat(keep) > 0
-    distance = edges.offset - near.tiles.flat(near.distances(conic, slopes)) * outside
+    kept = near.tiles.flat(keep) > 0
+    distance = edges.offset - near.tiles.flat(near.distances(conic)) * outside
     blur = zernike.edge_blur(edges.offset[kept], distance[kept], edges.normal[kept], edges.ring[kept] % count, count)
     points = edges.points
     if correct:
-        bend = near.tiles.flat(near.curvatures(conic, slopes)) * outside
+        bend = near.tiles.flat(near.curvatures(conic)) * outside
         points = points + _correction(edges, blur, bend)[:, None] * edges.normal
         near = near.moved(points)
     _, keep = near.robust(conic, _SCALES[-1:])
