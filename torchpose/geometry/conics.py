@@ -54,12 +54,13 @@ def ellipse_from_conic(conic: Conic) -> Ellipse:
 
 def axes_of(square: Float[Tensor, "*N 2 2"]) -> Float[Tensor, "*N 3"]:
     """Semi-axes and angle a, b, theta of ellipses by the square S S^T of their `shape_matrix`, positive definite."""
-    s11, s12, s22 = square[..., 0, 0], square[..., 0, 1], square[..., 1, 1]
-    large = 0.5 * (s11 + s22 + torch.hypot(s11 - s22, 2 * s12))
-    small = (s11 * s22 - s12.square()) / large  # a difference would cancel for slender ones
-    theta = torch.remainder(0.5 * torch.atan2(2 * s12, s11 - s22), torch.pi)
-    theta = torch.where(theta >= torch.pi, 0.0, theta)  # a tiny negative angle is rounded up to pi
-    return torch.cat([torch.stack([large, small.minimum(large)], -1).sqrt(), theta[..., None]], -1)
+    s11, s12, _, s22 = square.flatten(-2).unbind(-1)
+    twice, apart = 2 * s12, s11 - s22
+    large = 0.5 * (s11 + s22 + torch.hypot(apart, twice))
+    small = torch.addcmul(s11 * s22, s12, s12, value=-1) / large  # a difference would cancel for slender ones
+    theta = torch.remainder(0.5 * torch.atan2(twice, apart), torch.pi)
+    theta = theta.masked_fill(theta >= torch.pi, 0.0)  # a tiny negative angle is rounded up to pi
+    return torch.stack([large.sqrt(), small.minimum(large).sqrt(), theta], -1)
 
 
 def conic_from_ellipse(ellipse: Ellipse) -> Conic:
@@ -165,17 +166,23 @@ def circle_ellipse(
     By their dual conics, r^2 (1 - n n') - c c' in space, about the image of the centre (derived). NaN where the circle
     reaches behind the camera.
     """
-    n = (rotation @ normal[..., None])[..., 0]
+    return seen_circle(matrix, center, (rotation @ normal[..., None])[..., 0], radius)
+
+
+def seen_circle(matrix: Float[Tensor, "3 3"], center: Vector, normal: Vector, radius: Scalar) -> Ellipse:
+    """`circle_ellipse` of circles whose unit normals are in the camera frame."""
     seen = center @ matrix.mT
-    at = seen[..., :2] / seen[..., 2:]
+    flat, depth = seen.split([2, 1], -1)
+    at = flat / depth
     # from space to homogeneous pixels about the image of the centre: the centre itself comes to (0, 0, depth)
-    first, last = matrix[:2] - at[..., None] * matrix[2], matrix[2]
-    turned, ahead = (first @ n[..., None])[..., 0], (n * last).sum(-1, keepdim=True)
-    square = radius.square()[..., None]
-    whole = square * ((last * last).sum() - ahead.square()) - seen[..., 2:].square()  # below 0 in front of the camera
-    side = square * ((first @ last[:, None])[..., 0] - ahead * turned) / whole
-    outer = first @ first.mT - turned[..., :, None] * turned[..., None, :]
-    spread = side[..., :, None] * side[..., None, :] - (square / whole)[..., None] * outer
+    change = matrix - torch.nn.functional.pad(at, (0, 1))[..., None] * matrix[2]
+    turned = (change * normal[..., None, :]).sum(-1)
+    flat_change = change.flatten(0, -3)
+    dual = torch.bmm(flat_change, flat_change.mT).view_as(change) - turned[..., :, None] * turned[..., None, :]
+    dual = radius.square()[..., None, None] * dual
+    whole = dual[..., 2, 2, None] - depth.square()  # below 0 in front of the camera
+    side = dual[..., :2, 2] / whole
+    spread = side[..., :, None] * side[..., None, :] - dual[..., :2, :2] / whole[..., None]
     ellipse = torch.cat([at + side, axes_of(spread)], -1)
     return torch.where(whole < 0, ellipse, torch.nan)
 

@@ -62,7 +62,7 @@ class Pose(Rows):
         return 6
 
     def moved(self, step: Tensor) -> Self:
-        return replace(self, R=rotations.exp(step[:, 3:]) @ self.R, t=self.t + step[:, :3])
+        return replace(self, R=torch.bmm(rotations.exp(step[:, 3:]), self.R), t=self.t + step[:, :3])
 
 
 @dataclass(frozen=True, eq=False)

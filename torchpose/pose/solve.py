@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchpose import pnp
+from torchpose.geometry import rotations
 from torchpose.geometry.arguments import checked
 from torchpose.geometry.robust import CUT
 from torchpose.pose.covariance import pose_covariance
@@ -128,9 +129,8 @@ def _minima(evidence: Evidence, starts: tuple[Tensor, Tensor], compile: bool) ->
 
 def _from_behind(evidence: Evidence, R: Tensor, t: Tensor) -> Tensor:
     """Poses (N,) bool that show all rings seen from behind their printed side."""
-    x = (R[:, None] @ evidence.points[..., None]).squeeze(-1) + t[:, None]
-    normal = (R[:, None] @ evidence.normals[..., None]).squeeze(-1)
-    return (((normal * x).sum(-1) < 0) | ~evidence.mask).all(-1)
+    x, normal = rotations.turned(R, torch.cat([evidence.points, evidence.normals], 1)).chunk(2, 1)
+    return (((normal * (x + t[:, None])).sum(-1) < 0) | ~evidence.mask).all(-1)
 
 
 def _no_solutions(evidence: Evidence, R: Tensor, t: Tensor) -> Solutions:

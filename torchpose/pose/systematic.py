@@ -24,7 +24,7 @@ from torchpose.camera.derivatives import by_intrinsics
 from torchpose.geometry.arguments import checked
 from torchpose.geometry.least_squares import covariance_factor, scaled_inverse, solve_scaled
 from torchpose.geometry.projection import by_pose
-from torchpose.geometry.rotations import plane_axes
+from torchpose.geometry.rotations import plane_axes, turned
 from torchpose.geometry.rows import Rows
 from torchpose.pose.covariance import center_jacobian, derivative
 from torchpose.pose.evidence import Evidence
@@ -103,7 +103,7 @@ class Setting(NamedTuple):
     @property
     def arms(self) -> Tensor:
         """The markers (N, M, 3) as seen from the target's origin, camera axes, mm."""
-        return (self.R[:, None] @ self.evidence.points[..., None])[..., 0]
+        return turned(self.R, self.evidence.points)
 
     def of_rows(self, index: Tensor) -> Self:
         return self._replace(evidence=self.evidence[index], R=self.R[index], t=self.t[index])
@@ -160,7 +160,7 @@ def on_print(
         even: see `excess.excess_of`.
     """
     R, n = setting.R, normals.right.shape[-1]
-    aside = (R[:, None] @ moved[..., :3, None])[..., 0]
+    aside = turned(R, moved[..., :3])
     back = torch.cat([aside, torch.zeros_like(aside), moved[..., 3:4]], -1) + moved[..., 4:] * motions_by_size(setting)
     right = normals.right + (normals.information @ among(back[..., None], n))[..., 0]
     normals = MarkerNormals(normals.information, right)
@@ -339,7 +339,7 @@ def _bent(setting: Setting, information: Tensor, right: Tensor) -> Tensor:
     at = xy / _reach(camera)
     by = _least_squares(setting, jacobian, weight, (at * at.square().sum(-1, keepdim=True))[..., None])
     column = by.flatten(1)
-    told = ((information @ column[..., None])[..., 0] * column).sum(-1)
+    told = ((information * column[:, None]).sum(-1) * column).sum(-1)
     return by * may_be_off(told, (column * right).sum(-1)).sqrt()[:, None, None, None]
 
 
@@ -517,8 +517,10 @@ def assembled(normals: MarkerNormals, columns: Tensor) -> tuple[Tensor, Tensor]:
     """Normal equations (N, k, k), (N, k) of unknowns with these columns (N, M, n, k)."""
     # all markers in one product: with many of them single ones are large together
     every = columns.flatten(1, 2).mT
-    matrix = every @ (normals.information @ columns).flatten(1, 2)
-    return matrix, (every @ normals.right.flatten(1)[..., None])[..., 0]
+    told = torch.bmm(normals.information.flatten(0, 1), columns.flatten(0, 1)).view_as(columns)
+    both = torch.cat([told, normals.right[..., None]], -1).flatten(1, 2)
+    matrix, right = torch.bmm(every, both).split([columns.shape[-1], 1], -1)
+    return matrix.contiguous(), right[..., 0]
 
 
 def among(by: Tensor, n: int) -> Tensor:

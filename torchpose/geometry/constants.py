@@ -1,0 +1,25 @@
+"""Small tables of numbers, made once for each dtype and device: a tensor of a list costs as much as ten sums."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchpose.geometry.segments import as_array
+
+_made: dict[tuple[Any, torch.dtype, torch.device], Tensor] = {}
+
+
+def constant(values: Any, like: Tensor, dtype: torch.dtype | None = None) -> Tensor:
+    """The tensor of a number or nested tuples of numbers, in the dtype and on the device of another; not to be written
+    to."""
+    key = values, dtype or like.dtype, like.device
+    if (known := _made.get(key)) is not None:
+        return known
+    with torch.inference_mode(False):  # it may be used where gradients are wanted
+        fresh = torch.tensor(values, dtype=key[1])
+        lasting = as_array(fresh) is not None  # not where torch traces or transforms functions
+        fresh = fresh.to(key[2])
+    if lasting:
+        _made[key] = fresh
+    return fresh
