@@ -23,3 +23,13 @@ def constant(values: Any, like: Tensor, dtype: torch.dtype | None = None) -> Ten
     if lasting:
         _made[key] = fresh
     return fresh
+
+
+def eye(size: int, like: Tensor) -> Tensor:
+    """The identity (n, n), likewise."""
+    return constant(tuple(tuple(float(i == k) for k in range(size)) for i in range(size)), like)
+
+
+def finite(values: Tensor, dim: int | tuple[int, ...], *, keepdim: bool = False) -> Tensor:
+    """Whether all values along these dimensions are numbers: their sum is, in half the calls (overflow counts as none)."""
+    return 0 * values.sum(dim, keepdim=keepdim) == 0

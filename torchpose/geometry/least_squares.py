@@ -18,6 +18,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchpose.geometry import rotations
+from torchpose.geometry.constants import eye
 from torchpose.geometry.rows import Rows, shared
 from torchpose.geometry.segments import segment_sum
 
@@ -229,11 +230,14 @@ class Normal(Rows):
         n, owner = right.shape[1], part.owner
         inner = part.information if damping is None else _damped(part.information, damping[owner])
         columns = [part.mixed.mT, part.right[..., None], *([_eye_like(inner)] if variances else [])]
-        by_own, alone, inverse = solve_scaled(inner, torch.cat(columns, -1)).tensor_split([n, n + 1], -1)
-        taken = segment_sum(torch.bmm(part.mixed, torch.cat([by_own, alone], -1)), owner, len(self))
-        information, right = information - taken[..., :-1], right - taken[..., -1]
-        columns = [right[..., None], *([_eye_like(information)] if variances else [])]
-        own, covariance = solve_scaled(information, torch.cat(columns, -1)).tensor_split([1], -1)
+        solved = solve_scaled(inner, torch.cat(columns, -1))
+        by_own, alone, inverse = solved.split([n, 1, solved.shape[-1] - n - 1], -1)
+        taken = segment_sum(torch.bmm(part.mixed, solved[..., : n + 1]), owner, len(self))
+        both = torch.cat([information, right[..., None]], -1) - taken
+        information, right = both[..., :n], both[..., n]
+        columns = [both[..., n:], *([_eye_like(information)] if variances else [])]
+        solved = solve_scaled(information, torch.cat(columns, -1) if variances else both[..., n:])
+        own, covariance = solved.split([1, solved.shape[-1] - 1], -1)
         rest = torch.baddbmm(alone, by_own, own[owner], alpha=-1).squeeze(-1)
         own = own.squeeze(-1)
         if variances:
@@ -359,7 +363,7 @@ def geman_mcclure(deviation: Tensor) -> Tensor:
 
 
 def _eye_like(matrix: Tensor) -> Tensor:
-    return torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device).expand_as(matrix)
+    return eye(matrix.shape[-1], matrix).expand_as(matrix)
 
 
 def _damped(information: Tensor, share: Tensor) -> Tensor:

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from torchpose.geometry.constants import constant
 
-
 # the entries of a cross-product matrix, by the vector's
 _SKEW = (
     (0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0),

@@ -49,6 +49,8 @@ class Rows:
 
     def replaced(self, index: Tensor, other: Self) -> Self:
         """These rows, with the rows ``index`` (K,) int64 taken from ``other``, which has K."""
+        if _all_of(index, len(self)):
+            return other
         return self._each(
             lambda a, b: a.replaced(index, b) if isinstance(a, Rows) else a.index_copy(0, index, b), other
         )

@@ -145,14 +145,15 @@ def _instances(scene: Scene, awarded: Tensor, t: Tensor) -> tuple[Tensor, Tensor
 def detections_of(scene: Scene, found: Found, mask: Tensor) -> Detections:
     """The markers of the rows that the mask (N, M) has; their instance is the row, or 0 where each has one."""
     row, marker = mask.nonzero().unbind(-1)
-    ring, target = found.rings[found.identified.ring[row, marker]], scene.target[row]
+    ring, target = found.identified.ring[row, marker], scene.target[row]
     evidence = found.evidence
     center, covariance = raw_centers(scene.camera, evidence.center[row, marker], evidence.covariance[row, marker])
     ids = scene.table.ids[target, marker]
     number = torch.zeros_like(row) if len(mask) == scene.groups else row
     disc = scene.table.radii[target, marker, 1] < 0
-    inner = torch.where(disc[:, None], torch.nan, ring.inner_raw)
-    return Detections(scene.frame[row], target, number, ids, center, covariance, ring.outer_raw, inner)
+    inner = torch.where(disc[:, None], torch.nan, found.rings.inner_raw.index_select(0, ring))
+    outer = found.rings.outer_raw.index_select(0, ring)
+    return Detections(scene.frame[row], target, number, ids, center, covariance, outer, inner)
 
 
 def award(target: tuple[Tensor, int], support: Tensor, mask: Tensor, ring: Tensor, rings: int) -> tuple[Tensor, Tensor]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Self
 
 import torch
@@ -15,6 +16,7 @@ from torchpose.detect.reduce import only_reduced
 from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
 from torchpose.geometry.blurred_edge import HOLDS, KINDS
+from torchpose.geometry.constants import constant
 from torchpose.geometry.least_squares import Pose, PosePrior
 from torchpose.geometry.robust import LEAST_KEPT as LEAST_KEPT
 from torchpose.geometry.rows import Rows, shared
@@ -98,22 +100,27 @@ class Sight(Rows):
     def of_scene(cls, scene: Scene, found: Found, rows: Tensor) -> Self:
         """Rows (N,) of a scene, with the rings that were found of them."""
         evidence = found.evidence[rows]
-        ring = found.rings[found.identified.ring[rows].clamp_min(0).flatten()]
-        raw = torch.stack([ring.outer_raw, ring.inner_raw], 1).view(*evidence.mask.shape, 2, 5)
-        blur = torch.where(ring.clipped[:, None], torch.nan, ring.blur)  # what is left of a clipped edge tells of none
+        which, every = found.identified.ring[rows].clamp_min(0).flatten(), found.rings
+        raw = torch.stack([every.outer_raw, every.inner_raw], 1).index_select(0, which)
+        # what is left of a clipped edge tells of no blur
+        blur = torch.where(every.clipped[:, None], torch.nan, every.blur).index_select(0, which)
+        polarity, seen, disc = (
+            value.index_select(0, which).view(*evidence.mask.shape, *value.shape[1:])
+            for value in (every.polarity, every.seen, every.disc)
+        )
         return cls(
             scene.frame[rows],
             evidence.mask,
-            raw,
-            ring.polarity.view_as(evidence.mask),
+            raw.view(*evidence.mask.shape, 2, 5),
+            polarity,
             evidence.points,
             evidence.normals,
             evidence.radii,
             scene.frames,
             scene.camera,
             blur.view(*evidence.mask.shape, 3),
-            seen=ring.seen.view(*evidence.mask.shape, -1),
-            disc=2 * (ring.disc.view_as(evidence.mask) & evidence.mask).sum(-1) > evidence.mask.sum(-1),
+            seen=seen,
+            disc=2 * (disc & evidence.mask).sum(-1) > evidence.mask.sum(-1),
         )
 
     @property
@@ -121,10 +128,10 @@ class Sight(Rows):
         """Variance of rounding, grey levels^2."""
         return QUANTISATION / self.reduction**2
 
-    @property
+    @cached_property
     def common_blur(self) -> Float[Tensor, "N 3"]:
         """The median of the known blurs of the markers of every row that are seen."""
-        start = torch.tensor(_START_BLUR, dtype=torch.float64, device=self.frame.device)
+        start = constant(_START_BLUR, self.centers, torch.float64)
         if self.blur is None:
             return blurs.isotropic(start.expand(len(self)))
         median = torch.where(self.mask[..., None], self.blur, torch.nan).nanmedian(1).values
@@ -150,7 +157,7 @@ class Sight(Rows):
 
     def displaced(self, by: Float[Tensor, "N M 5"]) -> Self:
         """The same rows with places of their markers beside those they have, as `Poses.place`."""
-        grown = (self.polarity * by[..., 3])[..., None] * by.new_tensor([1.0, -1.0]) + by[..., 4:]
+        grown = (self.polarity * by[..., 3])[..., None] * constant((1.0, -1.0), by) + by[..., 4:]
         return replace(self, centers=self.centers + by[..., :3], radii=self.radii + grown)
 
     def reduced(self, factor: int) -> Sight:

@@ -26,17 +26,17 @@ def first_levels(blocks: PixelBlocks, model: RingModel) -> Tensor:
 
     A third of a ring may be covered: a least-squares fit of gradients would bend towards the cover and stay there.
     """
-    columns = torch.stack([*_basis(model), tiled(blocks.grey)], 2)
+    basis = torch.stack(_basis(model), 2)
+    columns, used = torch.cat([basis, tiled(blocks.grey)[:, :, None]], 2), blocks.valid * blocks.seen
     ring, paper = _pure_levels(blocks, model.fraction.flatten(1))
     none = torch.zeros_like(ring)
     levels = torch.stack([ring, none, none, paper, none, none], -1).nan_to_num(0.0, 0.0, 0.0).double()
     for _ in range(_FIRST_STEPS):
-        predicted = (levels.float()[:, None, :, None] * columns[:, :, :LEVELS]).sum(2).flatten(1)
+        predicted = (levels.float().view(-1, 1, LEVELS, 1) * basis).sum(2).flatten(1)
         residual = blocks.grey - predicted
-        weight = blocks.valid * blocks.seen * geman_mcclure(residual / (2 * noise_spread(residual, blocks)[:, None]))
-        sums = sum_products(columns, weight)
-        levels = solve_scaled(sums[:, :LEVELS, :LEVELS], sums[:, :LEVELS, LEVELS:]).squeeze(-1)
-    return levels
+        weight = used * geman_mcclure(residual / (2 * noise_spread(residual, blocks)[:, None]))
+        levels = solve_scaled(*sum_products(columns, weight)[:, :LEVELS].split([LEVELS, 1], -1))
+    return levels.squeeze(-1)
 
 
 def _pure_levels(blocks: PixelBlocks, fraction: Tensor) -> tuple[Tensor, Tensor]:
@@ -94,8 +94,8 @@ def tiled(plane: Tensor) -> Tensor:
 
 def sum_products(columns: Tensor, weight: Tensor) -> Tensor:
     """Sums over all pixels of weight times the products of every two columns: (K, n, n) float64."""
-    weighted = columns * weight.unflatten(1, (-1, 1, TILE))
-    products = torch.bmm(weighted.flatten(0, 1), columns.flatten(0, 1).mT)
+    tiles = columns.flatten(0, 1)
+    products = torch.bmm(tiles * weight.view(-1, 1, TILE), tiles.mT)
     return products.unflatten(0, columns.shape[:2]).sum(1, dtype=torch.float64)
 
 
@@ -123,9 +123,8 @@ def noise_spread(residual: Tensor, blocks: PixelBlocks) -> Tensor:
     All markers of a frame share its noise, so none may claim much more than the best of them: cover would.
     """
     own = (1.4826 * _median(residual.abs(), blocks.valid)).nan_to_num(nan=1.0).clamp_min(math.sqrt(blocks.quantisation))
-    least = torch.full((int(blocks.row.max()) + 1 if len(own) else 0,), torch.inf, dtype=own.dtype, device=own.device)
-    least = least.scatter_reduce(0, blocks.row, own, "amin")
-    return torch.minimum(own, _MOST_SPREAD * least[blocks.row])
+    least = own.new_full((blocks.rows,), torch.inf).scatter_reduce_(0, blocks.row, own, "amin")
+    return torch.minimum(own, _MOST_SPREAD * least.index_select(0, blocks.row))
 
 
 def _median(values: Tensor, where: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ each pixel.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -20,6 +21,7 @@ from torchpose.camera import Camera
 from torchpose.camera.model import Slopes
 from torchpose.geometry import blur as blurs
 from torchpose.geometry.blurred_edge import HOLDS, Spread
+from torchpose.geometry.constants import constant, finite
 from torchpose.geometry.grey import full_scale
 from torchpose.geometry.robust import CUT, LEAST_KEPT
 from torchpose.geometry.rotations import plane_axes
@@ -56,6 +58,7 @@ class PixelBlocks(Rows):
         polarity: as in `Sight`.
         limits: the grey levels at which the frame's noise is clipped, -inf and inf where it is not.
         quantisation: variance of rounding, grey levels^2.
+        rows: how many there are.
     """
 
     row: Int[Tensor, " K"]
@@ -73,6 +76,7 @@ class PixelBlocks(Rows):
     polarity: Float[Tensor, " K"]
     limits: Float[Tensor, "K 2"]
     quantisation: float = shared()
+    rows: int = shared()
 
     def wider(self, gain: Tensor) -> PixelBlocks:
         """The same with every dark edge outwards by the edge gain (N,) of its row, mm."""
@@ -151,13 +155,13 @@ def gather_pixels(sight: Sight, band: Tensor) -> PixelBlocks:
     low, high = limits.mT.contiguous().index_select(1, block)
     xy, slopes = camera.rays(torch.stack([u, v]).double())
     # what is clipped is no measurement
-    sound = (xy.sum(0) + grey).isfinite() & (grey > low) & (grey < high)
+    sound = finite(xy, 0) & (grey > low) & (grey < high)  # NaN is neither
     # rays count from that of the marker's middle pixel; what is not sound gets one of the marker, too, and stays finite
     origin = xy.index_select(1, (first + size // 2).clamp_max(block.numel() - 1)).nan_to_num(nan=0.0)
     aside = (both[:, 0, 2] / camera.matrix[0, 0]).to(xy).index_select(0, block)
     xy = torch.where(sound, xy - origin.index_select(1, block), aside).index_select(1, index).view(2, count, most)
     flat = torch.cat([_by_pixel(slopes, camera).float(), torch.stack([grey, torch.ones_like(grey)])])
-    flat = torch.where(sound, flat, flat.new_tensor([1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0])[:, None])
+    flat = torch.where(sound, flat, constant(((1.0,), (0.0,), (0.0,), (1.0,), (1.0,), (0.0,), (0.0,)), flat))
     *warped, grey, valid = flat.index_select(1, index).view(len(flat), count, most)
     sector = sector_about(u, v, both[:, 0], block).index_select(0, index).view(count, most)
     normal = sight.normals[row, marker]
@@ -177,6 +181,7 @@ def gather_pixels(sight: Sight, band: Tensor) -> PixelBlocks:
         sight.polarity[row, marker],
         limits,
         sight.quantisation,
+        len(sight),
     )
 
 
@@ -203,9 +208,8 @@ def _seen(sight: Sight, row: Tensor, marker: Tensor) -> Tensor:
 
 def _clipping(grey: Tensor, row: Tensor, rows: int) -> Tensor:
     """Limits (N, 2) at which each row's grey values are clipped: 0, and the full scale of its brightest pixel."""
-    ends = grey.new_tensor([torch.inf, -torch.inf]).repeat(rows, 1)
-    darkest = ends[:, 0].scatter_reduce(0, row, grey, "amin")
-    brightest = ends[:, 1].scatter_reduce(0, row, grey, "amax")
+    darkest = grey.new_full((rows,), torch.inf).scatter_reduce_(0, row, grey, "amin")
+    brightest = grey.new_full((rows,), -torch.inf).scatter_reduce_(0, row, grey, "amax")
     low = torch.where(darkest <= 0, 0.0, -torch.inf)
     return torch.stack([low, full_scale(brightest)], -1)
 
@@ -263,8 +267,15 @@ def _feet(blocks: PixelBlocks, R: Tensor, t: Tensor) -> _Foot:
 def by_tiles(matrix: Tensor, planes: Tensor) -> Tensor:
     """Matrices (K, n, m) times the planes (K, T, m, S) of every tile."""
     count, tiles, _, size = planes.shape
-    each = matrix[:, None].expand(-1, tiles, -1, -1).flatten(0, 1)
+    each = matrix.index_select(0, _of_tiles(count, tiles, matrix.device))
     return torch.bmm(each, planes.flatten(0, 1)).view(count, tiles, matrix.shape[-2], size)
+
+
+@lru_cache(maxsize=64)
+def _of_tiles(count: int, tiles: int, device: torch.device) -> Tensor:
+    """Which of K blocks each of their tiles is of, (K T,) int64."""
+    with torch.inference_mode(False):
+        return torch.arange(count, device=device).repeat_interleave(tiles)
 
 
 class _Rim(NamedTuple):
@@ -336,7 +347,7 @@ def ring_model(blocks: PixelBlocks, R: Tensor, t: Tensor, spread: Spread, *, che
     edges = spread.at(blocks.row, *_normals(rim, distance), dims=2)
     sound = None
     if check:
-        blur = spread.covariance[blocks.row].float()
+        blur = spread.covariance.index_select(0, blocks.row).float()
         most, across = blurs.axes(blur)[1][:, None, None], edges.across
         if across is None:
             across = blurs.across(blur[:, None, None], *rim.normal)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cache
 
 import torch
 from jaxtyping import Float, Int
@@ -65,8 +66,8 @@ class Sectors(Rows):
         return values.flatten()[self.cell.flatten()].view(self.cell.shape)
 
     def scaled(self, factor: Tensor) -> Sectors:
-        """With the weights of every sector multiplied by ``factor`` (K, 96)."""
-        return replace(self, **{n: getattr(self, n) * factor for n in ("used", "square", "pull", "hold")})
+        """With the weights of every sector multiplied by ``factor`` (K, 96), as far as its displacement tells."""
+        return replace(self, pull=self.pull * factor, hold=self.hold * factor)
 
 
 def sum_sectors(
@@ -185,7 +186,8 @@ def _beyond_harmonics(error: Tensor, hold: Tensor) -> tuple[Tensor, Tensor]:
     basis = _harmonics(hold)
     weighted = hold[..., None] * basis
     right = (weighted * error[..., None]).sum(-2)
-    taken = (solve_scaled((weighted.mT @ basis).flatten(0, 1), right.flatten(0, 1)).view_as(right) * right).sum(-1)
+    held = (weighted.flatten(0, 1).mT @ basis).view(-1, *basis.shape[-1:] * 2)
+    taken = (solve_scaled(held, right.flatten(0, 1)).view_as(right) * right).sum(-1)
     free = ((hold > 0).sum(-1) - basis.shape[-1]).clamp_min(0).sum(-1).double()
     return ((hold * error.square()).sum(-1) - taken).sum(-1), free
 
@@ -198,10 +200,15 @@ def _displacements(sectors: Sectors, variance: Tensor) -> tuple[Tensor, Tensor]:
 
 def _harmonics(around: Tensor) -> Tensor:
     """A mean and two harmonics (S, 5) of what goes around a circle in S parts, the last dimension."""
-    parts = around.shape[-1]
-    angle = (torch.arange(parts, dtype=around.dtype, device=around.device) + 0.5) * (2 * math.pi / parts)
-    harmonics = [of(k * angle) for k in (1, 2) for of in (torch.cos, torch.sin)]
-    return torch.stack([torch.ones_like(angle), *harmonics], -1)
+    return _made_harmonics(around.shape[-1], around.dtype, around.device)
+
+
+@cache
+def _made_harmonics(parts: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    with torch.inference_mode(False):
+        angle = (torch.arange(parts, dtype=dtype, device=device) + 0.5) * (2 * math.pi / parts)
+        harmonics = [of(k * angle) for k in (1, 2) for of in (torch.cos, torch.sin)]
+        return torch.stack([torch.ones_like(angle), *harmonics], -1)
 
 
 def in_step(
