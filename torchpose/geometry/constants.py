@@ -31,5 +31,5 @@ def eye(size: int, like: Tensor) -> Tensor:
 
 
 def finite(values: Tensor, dim: int | tuple[int, ...], *, keepdim: bool = False) -> Tensor:
-    """Whether all values along these dimensions are numbers: their sum is, in half the calls (overflow counts as none)."""
+    """Whether all values along these dimensions are numbers: then their sum is one. In half of the calls."""
     return 0 * values.sum(dim, keepdim=keepdim) == 0
