@@ -180,14 +180,14 @@ def _tiled(points: Tensor, index: Tensor, count: int, weights: Tensor | None = N
     """Points (K, 2, T), 0 where their weight is, and their weights (K, 1, T), laid out in tiles."""
     tiles = Tiles.of(index, count)
     weights = torch.ones_like(index, dtype=torch.float64) if weights is None else weights.double()
-    xy, w = tiles.planes(*points.double().unbind(-1), weights).split([2, 1], 1)
+    xy, w = tiles.planes(*points.double().unbind(-1), weights).split_with_sizes([2, 1], 1)
     return tiles, torch.where(w > 0, xy, 0.0), w
 
 
 def _tile_moments(tiles: Tiles, xy: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """As `_moments`, for ellipses whose numbers of points differ too much for one block; points as of `_tiled`."""
     sums = tiles.sums(torch.cat([weights, (weights > 0).double(), xy * weights], 1).sum(-1))
-    total, used, center = sums.split([1, 1, 2], 1)
+    total, used, center = sums.split_with_sizes([1, 1, 2], 1)
     center = center / total
     moments = tiles.sums(_gram_sums(xy, center.index_select(0, tiles.group)[..., None], weights))
     return center, moments / total[..., None], used.squeeze(-1) >= _SOLVABLE_POINTS
@@ -196,7 +196,7 @@ def _tile_moments(tiles: Tiles, xy: Tensor, weights: Tensor) -> tuple[Tensor, Te
 def _gram_sums(xy: Tensor, center: Tensor, weights: Tensor | None) -> Tensor:
     """Sums (M, 3, 6) of `_moments` of points (M, 2, P) about centres (M, 2, 1): one matrix product."""
     xy = xy - center
-    x, y = xy.split(1, 1)
+    x, y = xy.split_with_sizes([1, 1], 1)
     square = torch.cat([xy * x, y * y], 1)
     left = square if weights is None else square * weights
     return torch.bmm(left, torch.cat([square, xy, torch.ones_like(x)], 1).mT)
@@ -238,7 +238,7 @@ class _Conics(NamedTuple):
     def ellipses(self) -> Tensor:
         """(M, 5)."""
         ellipse, scale = conics.ellipse_from_conic(self.conic), self.scale[:, None]
-        center, axes, theta = ellipse.split([2, 2, 1], -1)
+        center, axes, theta = ellipse.split_with_sizes([2, 2, 1], -1)
         ellipse = torch.cat([torch.addcmul(self.center, center, scale), axes * scale, theta], -1)
         return torch.where(self.sound[:, None], ellipse, torch.nan)
 
@@ -260,7 +260,7 @@ class _Conics(NamedTuple):
 
 def _terms(xy: Tensor) -> Tensor:
     """x^2, xy, y^2, x, y and 1 (K, 6, T) of (K, 2, T)."""
-    x, y = xy.split(1, 1)
+    x, y = xy.split_with_sizes([1, 1], 1)
     return torch.cat([xy * x, y * y, xy, torch.ones_like(x)], 1)
 
 
@@ -285,7 +285,7 @@ def _halir_flusser(moments: Tensor, det: Tensor) -> Tensor:
 
     The 3x3 eigenproblem in closed form. Matrices are (rows, columns, M): planes of numbers, few calls and fast ones.
     """
-    quartic, mixed, mean = moments.split([3, 2, 1], 1)
+    quartic, mixed, mean = moments.split_with_sizes([3, 2, 1], 1)
     # scatter matrix of (x^2, xy, y^2) after eliminating the linear part (x, y, 1)
     signs = constant(((1.0,), (-1.0,), (-1.0,), (1.0,)), det)
     inverse = (mean[:, 0].index_select(0, constant((2, 1, 1, 0), det, torch.int64)) * signs / det).unflatten(0, (2, 2))
@@ -445,7 +445,7 @@ class Near(NamedTuple):
     def of(cls, points: Tensor, index: Tensor, ellipses: Tensor) -> Self:
         """Of points (E, 2) near the ellipses (M, 5) of their index (E,)."""
         ellipses = ellipses.double()
-        tiles, inverse = Tiles.of(index, len(ellipses)), torch.linalg.inv_ex(conics.shape_matrix(ellipses)).inverse
+        tiles, inverse = Tiles.of(index, len(ellipses)), conics.inverse_shape(ellipses)
         each = constant(_BY_TERMS, inverse).view(6, 3, 6)
         slopes = (inverse @ each[:, 1:].transpose(0, 1).flatten(1)).unflatten(2, (6, 6)).transpose(1, 2)
         rows = torch.cat([each[None, :, :1].expand(len(inverse), -1, -1, -1), slopes], 2).flatten(2)
@@ -456,7 +456,7 @@ class Near(NamedTuple):
         u, v = points.double().unbind(-1)
         planes = tiles.planes(u, v, torch.ones_like(u))
         finite = 0 * planes.sum(1, keepdim=True) == 0
-        xy, there = torch.where(finite, planes, 0.0).split([2, 1], 1)
+        xy, there = torch.where(finite, planes, 0.0).split_with_sizes([2, 1], 1)
         group = tiles.group
         unit = torch.bmm(inverse.index_select(0, group), xy - center.index_select(0, group)[..., None])
         return cls(tiles, there[:, 0], _terms(unit), center, inverse, rows)
@@ -511,7 +511,7 @@ class Near(NamedTuple):
     def refit(self, weights: Tensor, old: Tensor) -> Tensor:
         """Conics (M, 5) of the points by their weights (K, T); the ``old`` ones where they define none."""
         gram = self.tiles.sums(torch.bmm(self.terms[:, :5] * weights[:, None], self.terms.mT))
-        conic = torch.linalg.solve_ex(*gram.split([5, 1], -1)).result.squeeze(-1)
+        conic = torch.linalg.solve_ex(*gram.split_with_sizes([5, 1], -1)).result.squeeze(-1)
         return torch.where((0 * conic).sum(-1, keepdim=True) == 0, conic, old)
 
 
@@ -546,20 +546,20 @@ def with_covariance(
     turn = torch.stack([cos, sin, -sin, cos], -1).view(-1, 2, 2)  # from the frame's axes to the ellipse's own
     axes, w = of[:, 2:4, None], planes[:, 2:]
     unit = torch.bmm(turn, planes[:, :2] - of[:, :2, None]) / axes
-    rho = _length(*unit.split(1, 1))
+    rho = _length(*unit.unbind(1))[:, None]
     slope = unit / (axes * rho)
-    norm = _length(*slope.split(1, 1))
+    norm = _length(*slope.unbind(1))[:, None]
     r, normal = ((rho - 1) / norm).nan_to_num(nan=0.0), slope / norm
     # unit circle coordinates s of the point with that normal: the boundary moves by n . (dc + E s)
     s = axes * normal
-    s = s / _length(*s.split(1, 1))
+    s = s / _length(*s.unbind(1))[:, None]
     own, mixed = normal * s, (normal * s.flip(1)).sum(1, keepdim=True)
     jac = torch.cat([torch.bmm(turn.mT, normal), own[:, :1], mixed, own[:, 1:]], 1).nan_to_num(nan=0.0)
     # times b, so that it is 1 where the ellipse is steepest
     algebraic = (w * (axes[:, 1:] * norm).square()).nan_to_num(nan=0.0)
     weighted = jac * algebraic
     both = torch.bmm(torch.cat([weighted, weighted * algebraic], 1), jac.mT)
-    normal_matrix, scatter = tiles.sums(both).split(5, 1)
+    normal_matrix, scatter = tiles.sums(both).split_with_sizes([5, 5], 1)
     chi2, n = tiles.sums(torch.cat([w * r.square(), w], 1).sum(-1)).unbind(-1)
     sigma = (chi2 / (n - 5).clamp_min(1)).sqrt()
     solvable = (n >= _SOLVABLE_POINTS) & (0 * ellipses.sum(-1) == 0)

@@ -66,7 +66,7 @@ def describe_arcs(regions: Regions, xy: Float[Tensor, "P 2"]) -> Arcs:
     gx, gy = (gx * scale).double(), (gy * scale).double()
     size = torch.bincount(index, minlength=count)
     mean = torch.stack([segment_sum(v, index, count) for v in (x, y, gx, gy)], -1) / size[:, None]
-    middle, normal = mean.split(2, -1)
+    middle, normal = mean.split_with_sizes([2, 2], -1)
     normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
     each = (*middle.unbind(-1), *normal.unbind(-1))
     mx, my, nx, ny = (v.contiguous().index_select(0, index) for v in each)

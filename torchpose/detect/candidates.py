@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -46,6 +45,7 @@ from torchpose.errors import ArgumentError
 from torchpose.geometry import conics
 from torchpose.geometry.arguments import checked
 from torchpose.geometry.grey import Frames, as_frames, levels
+from torchpose.geometry.rows import replace
 from torchpose.geometry.segments import marked, members, positions, segment_mean
 
 _MIN_CRESTS = 7  # of cells that are left where edges are thinned

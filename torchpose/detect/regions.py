@@ -6,7 +6,7 @@ connected components are found by parallel min-hooking and pointer jumping (Shil
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
-from torchpose.geometry.rows import Rows, shared
+from torchpose.geometry.rows import Rows, replace, shared
 from torchpose.geometry.segments import positions, segment_sum
 
 # Gradients agree, with each other or with the normal of a curve, within 37 degrees: a circle of 3 px turns by 19 to 27

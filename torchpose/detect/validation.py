@@ -6,7 +6,7 @@ is left. Two circles side by side have arcs that a third ellipse joins, too long
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntEnum
 
 import torch
@@ -17,7 +17,7 @@ from torchpose.detect.arcs import cells_at, perimeter_samples
 from torchpose.detect.regions import AGREE_COS, ON_EDGE, Gradient
 from torchpose.geometry import conics
 from torchpose.geometry.arguments import checked
-from torchpose.geometry.rows import Rows
+from torchpose.geometry.rows import Rows, replace
 from torchpose.geometry.sectors import MOST
 from torchpose.geometry.segments import marked, members, near_pairs, positions, segment_sum
 

@@ -82,10 +82,21 @@ def rescaled(ellipses: Float[Tensor, "*batch 5"], factor: float) -> Float[Tensor
 
 def shape_matrix(ellipse: Ellipse) -> Float[Tensor, "*N 2 2"]:
     """Symmetric S = R diag(a, b) R^T: the ellipse is centre + S (cos s, sin s). Smooth also at a circle."""
-    _, _, a, b, theta = ellipse.unbind(-1)
-    twice, total, diff = 2 * theta, a + b, a - b
-    c, s = diff * twice.cos(), diff * twice.sin()
-    return torch.stack([total + c, s, s, total - c], -1).unflatten(-1, (2, 2)) * 0.5
+    return _symmetric(*ellipse[..., 2:].unbind(-1))
+
+
+def inverse_shape(ellipse: Ellipse, power: int = 1) -> Float[Tensor, "*N 2 2"]:
+    """Inverse of `shape_matrix`, or a power of it."""
+    a, b, theta = ellipse[..., 2:].unbind(-1)
+    return _symmetric(a.pow(-power), b.pow(-power), theta)
+
+
+def _symmetric(one: Tensor, other: Tensor, angle: Tensor) -> Tensor:
+    """Symmetric matrices (..., 2, 2) of these eigenvalues, the first one's vector at an angle."""
+    middle, twice = torch.lerp(one, other, 0.5), 2 * angle
+    lean = one - middle
+    c, s = lean * twice.cos(), lean * twice.sin()
+    return torch.stack([middle + c, s, s, middle - c], -1).view(*angle.shape, 2, 2)
 
 
 def points_on(ellipse: Ellipse, angle: Scalar) -> Float[Tensor, "*N 2"]:
@@ -172,7 +183,7 @@ def circle_ellipse(
 def seen_circle(matrix: Float[Tensor, "3 3"], center: Vector, normal: Vector, radius: Scalar) -> Ellipse:
     """`circle_ellipse` of circles whose unit normals are in the camera frame."""
     seen = center @ matrix.mT
-    flat, depth = seen.split([2, 1], -1)
+    flat, depth = seen.split_with_sizes([2, 1], -1)
     at = flat / depth
     # from space to homogeneous pixels about the image of the centre: the centre itself comes to (0, 0, depth)
     change = matrix - torch.nn.functional.pad(at, (0, 1))[..., None] * matrix[2]

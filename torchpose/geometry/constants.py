@@ -1,5 +1,6 @@
 """Small tables of numbers, made once for each dtype and device: a tensor of a list costs as much as ten sums."""
 
+from functools import cache
 from typing import Any
 
 import torch
@@ -27,7 +28,12 @@ def constant(values: Any, like: Tensor, dtype: torch.dtype | None = None) -> Ten
 
 def eye(size: int, like: Tensor) -> Tensor:
     """The identity (n, n), likewise."""
-    return constant(tuple(tuple(float(i == k) for k in range(size)) for i in range(size)), like)
+    return constant(_identity(size), like)
+
+
+@cache
+def _identity(size: int) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(float(i == k) for k in range(size)) for i in range(size))
 
 
 def finite(values: Tensor, dim: int | tuple[int, ...], *, keepdim: bool = False) -> Tensor:

@@ -9,7 +9,7 @@ Schur complement (Triggs et al. 2000, section 6). All is in units of chi-squared
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import NamedTuple, Protocol, Self, cast
 
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torchpose.geometry import rotations
 from torchpose.geometry.constants import eye
-from torchpose.geometry.rows import Rows, shared
+from torchpose.geometry.rows import Rows, replace, shared
 from torchpose.geometry.segments import segment_sum
 
 _RIDGE = 1e-12  # of a unit diagonal
@@ -149,7 +149,7 @@ class Unknowns:
 def _moved(blocks: Mapping[str, Block], step: Tensor) -> dict[str, Block]:
     if not blocks:
         return {}
-    parts = step.nan_to_num(nan=0.0).split([block.size for block in blocks.values()], -1)
+    parts = step.nan_to_num(nan=0.0).split_with_sizes([block.size for block in blocks.values()], -1)
     return {name: block.moved(part) for (name, block), part in zip(blocks.items(), parts, strict=True)}
 
 
@@ -231,13 +231,13 @@ class Normal(Rows):
         inner = part.information if damping is None else _damped(part.information, damping[owner])
         columns = [part.mixed.mT, part.right[..., None], *([_eye_like(inner)] if variances else [])]
         solved = solve_scaled(inner, torch.cat(columns, -1))
-        by_own, alone, inverse = solved.split([n, 1, solved.shape[-1] - n - 1], -1)
+        by_own, alone, inverse = solved.split_with_sizes([n, 1, solved.shape[-1] - n - 1], -1)
         taken = segment_sum(torch.bmm(part.mixed, solved[..., : n + 1]), owner, len(self))
         both = torch.cat([information, right[..., None]], -1) - taken
         information, right = both[..., :n], both[..., n]
         columns = [both[..., n:], *([_eye_like(information)] if variances else [])]
         solved = solve_scaled(information, torch.cat(columns, -1) if variances else both[..., n:])
-        own, covariance = solved.split([1, solved.shape[-1] - 1], -1)
+        own, covariance = solved.split_with_sizes([1, solved.shape[-1] - 1], -1)
         rest = torch.baddbmm(alone, by_own, own[owner], alpha=-1).squeeze(-1)
         own = own.squeeze(-1)
         if variances:

@@ -7,7 +7,7 @@ moving to a device. A field may be a tensor, other rows, a tuple of these, or No
 from collections.abc import Callable, Sequence
 from dataclasses import MISSING, field, fields
 from functools import cache
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import torch
@@ -15,10 +15,20 @@ from torch import Tensor
 
 from torchpose.geometry.segments import as_array, positions
 
+_Kind = TypeVar("_Kind")
+
 
 def shared(default: Any = MISSING) -> Any:
     """A dataclass field that belongs to all rows together: selecting rows leaves it alone, `Rows.to` moves it."""
     return field(default=default, metadata={"shared": True})
+
+
+def replace(rows: _Kind, /, **changes: Any) -> _Kind:
+    """As `dataclasses.replace` of a class that checks nothing, in a fifth of the time."""
+    made = object.__new__(type(rows))
+    made.__dict__.update((name, getattr(rows, name)) for name, _ in _fields(type(rows)))  # type: ignore[arg-type]
+    made.__dict__.update(changes)
+    return made
 
 
 class Rows:

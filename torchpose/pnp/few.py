@@ -52,7 +52,7 @@ class Few(NamedTuple):
 
     def seen(self, pose: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Depths (K, N, 1) under poses (K, 3, 4), image points (K, N, 2), and these whitened."""
-        uv, z = torch.bmm(self.points, pose.mT).split([2, 1], -1)
+        uv, z = torch.bmm(self.points, pose.mT).split_with_sizes([2, 1], -1)
         uv = uv / z
         return z, uv, (self.root * uv[:, :, None]).sum(-1)
 

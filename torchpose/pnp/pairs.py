@@ -78,7 +78,7 @@ def pair_minima(
         distance = _distance(pose, few.whole(pose.flatten(0, 1), newton=False)[0][:, :6, :6], worse)
     chi2 = _apart(chi2, done.view(-1, 2), worse, distance < COINCIDENCE)
     gone = ~chi2.isfinite()
-    R, t = pose.split([3, 1], -1)
+    R, t = pose.split_with_sizes([3, 1], -1)
     t = (t * unit[:, :, None, None] - R @ center[:, None, :, None])[..., 0]
     R, t = torch.where(gone[..., None, None], torch.nan, R), torch.where(gone[..., None], torch.nan, t)
     behind = (chi2 == torch.inf).all(1)
@@ -91,7 +91,7 @@ def _distance(pose: Tensor, matrix: Tensor, worse: Tensor) -> Tensor:
     Args:
         worse: (N, 1) int64, which is the other.
     """
-    R, t = pose.split([3, 1], -1)
+    R, t = pose.split_with_sizes([3, 1], -1)
     each = torch.arange(len(R), device=R.device)
     best, of_best = R[each, 1 - worse[:, 0]], matrix[2 * each + 1 - worse[:, 0]]
     # the one as seen from the other: translation, and twice the tangent of half the angle, as steps are made

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,7 +15,7 @@ from torchpose.geometry import conics, rotations
 from torchpose.geometry.arguments import checked
 from torchpose.geometry.constants import constant
 from torchpose.geometry.least_squares import covariance_factor
-from torchpose.geometry.rows import Rows, shared
+from torchpose.geometry.rows import Rows, replace, shared
 from torchpose.identify import MarkerTable
 from torchpose.pose.centers import common_center
 from torchpose.rings import Rings
@@ -184,7 +184,7 @@ def misfit_of_shapes(evidence: Evidence, predicted: Tensor) -> Tensor:
 def center_rms(evidence: Evidence, R: Tensor, t: Tensor) -> Tensor:
     """RMS distance (N,) in px of the compensated centres from the projected ones."""
     x = rotations.turned(evidence.matrix @ R, evidence.points) + (t @ evidence.matrix.T)[:, None]
-    at, depth = x.split([2, 1], -1)
+    at, depth = x.split_with_sizes([2, 1], -1)
     square = torch.where(evidence.mask, (at / depth - evidence.center).square().sum(-1), 0.0)
     return (square.sum(-1) / evidence.mask.sum(-1)).sqrt()
 

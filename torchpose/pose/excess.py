@@ -14,7 +14,7 @@ may yet be a print whose residuals are small by chance, and the pose's covarianc
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import torch
@@ -24,7 +24,7 @@ from torch import Tensor
 from torchpose.geometry.arguments import checked
 from torchpose.geometry.least_squares import LEAST_DIRECTION
 from torchpose.geometry.robust import of_chance, quantile
-from torchpose.geometry.rows import Rows
+from torchpose.geometry.rows import Rows, replace
 from torchpose.results import Misfit
 
 OF_MARKER = 5  # two along the print, one across, and two turns of a ring that goes with the plate's bend

@@ -1,12 +1,12 @@
 """What became of every target in every frame: who owns a ring that two rows claim, the status, the rows returned."""
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchpose.geometry.arguments import checked
+from torchpose.geometry.rows import replace
 from torchpose.geometry.segments import marked, rank_in_group
 from torchpose.identify import MIN_MARKERS, Identified, Scene
 from torchpose.pose.centers import raw_centers

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import torch
@@ -25,7 +25,7 @@ from torchpose.geometry.arguments import checked
 from torchpose.geometry.least_squares import covariance_factor, scaled_inverse, solve_scaled
 from torchpose.geometry.projection import by_pose
 from torchpose.geometry.rotations import plane_axes, turned
-from torchpose.geometry.rows import Rows
+from torchpose.geometry.rows import Rows, replace
 from torchpose.pose.covariance import center_jacobian, derivative
 from torchpose.pose.evidence import Evidence
 from torchpose.pose.excess import (
@@ -519,7 +519,7 @@ def assembled(normals: MarkerNormals, columns: Tensor) -> tuple[Tensor, Tensor]:
     every = columns.flatten(1, 2).mT
     told = torch.bmm(normals.information.flatten(0, 1), columns.flatten(0, 1)).view_as(columns)
     both = torch.cat([told, normals.right[..., None]], -1).flatten(1, 2)
-    matrix, right = torch.bmm(every, both).split([columns.shape[-1], 1], -1)
+    matrix, right = torch.bmm(every, both).split_with_sizes([columns.shape[-1], 1], -1)
     return matrix.contiguous(), right[..., 0]
 
 

@@ -1,7 +1,7 @@
 """The methods of `PoseEstimator`: how each locates centres, and the steps that it takes once there are solutions."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -9,6 +9,7 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.geometry.least_squares import Pose
 from torchpose.geometry.robust import of_chance
+from torchpose.geometry.rows import replace
 from torchpose.pose import (
     CENTER_RMS,
     PLACE,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
 
@@ -19,7 +19,7 @@ from torchpose.geometry.blurred_edge import HOLDS, KINDS
 from torchpose.geometry.constants import constant
 from torchpose.geometry.least_squares import Pose, PosePrior
 from torchpose.geometry.robust import LEAST_KEPT as LEAST_KEPT
-from torchpose.geometry.rows import Rows, shared
+from torchpose.geometry.rows import Rows, replace, shared
 from torchpose.identify import Scene
 from torchpose.pose import Found, MarkerNormals
 from torchpose.target import Target

@@ -137,7 +137,7 @@ def _edge_blur(grey: Tensor, seen: Tensor, outer: Tensor, ratio: Tensor, at: Ten
     step = torch.where(outside, (profile[:, -1:] - profile[:, 1:-1]).abs(), -torch.inf).amax(1)
     steepest = torch.where(outside, rise, -torch.inf).amax(1)
     angle = (torch.arange(_EIGHTHS, dtype=torch.float64, device=grey.device) + 0.5) * (2 * torch.pi / _EIGHTHS)
-    normal = torch.linalg.inv(conics.shape_matrix(outer)) @ torch.stack([angle.cos(), angle.sin()])  # (M, 2, 8)
+    normal = conics.inverse_shape(outer) @ torch.stack([angle.cos(), angle.sin()])  # (M, 2, 8)
     length = torch.linalg.vector_norm(normal, dim=1)
     spacing = float(at[2] - at[0]) / length  # px, between the two samples, across the edge
     variance = (step / steepest * spacing).square() / (2 * torch.pi) - (spacing.square() + 1) / 12

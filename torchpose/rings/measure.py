@@ -1,7 +1,7 @@
 """Stage: concentric pairs. From candidate ellipses to rings with both circles measured."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -17,7 +17,7 @@ from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
 from torchpose.geometry.arguments import checked
 from torchpose.geometry.blurred_edge import LEAST, MOST
-from torchpose.geometry.rows import Rows
+from torchpose.geometry.rows import Rows, replace
 from torchpose.geometry.sectors import SECTORS, clear_of_ends, sector_about
 from torchpose.geometry.segments import marked, segment_mean, segment_sum
 from torchpose.rings import zernike

@@ -12,7 +12,7 @@ are padded blocks of pixels: one sequence of tensor operations for the whole bat
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple, cast
 
@@ -37,7 +37,7 @@ from torchpose.geometry.least_squares import (
     minimise,
 )
 from torchpose.geometry.robust import of_chance
-from torchpose.geometry.rows import Rows
+from torchpose.geometry.rows import Rows, replace
 from torchpose.geometry.segments import marked, segment_mean, segment_sum
 from torchpose.pose import MarkerNormals
 from torchpose.refine.photometric.band import band_width

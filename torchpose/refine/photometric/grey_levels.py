@@ -35,7 +35,7 @@ def first_levels(blocks: PixelBlocks, model: RingModel) -> Tensor:
         predicted = (levels.float().view(-1, 1, LEVELS, 1) * basis).sum(2).flatten(1)
         residual = blocks.grey - predicted
         weight = used * geman_mcclure(residual / (2 * noise_spread(residual, blocks)[:, None]))
-        levels = solve_scaled(*sum_products(columns, weight)[:, :LEVELS].split([LEVELS, 1], -1))
+        levels = solve_scaled(*sum_products(columns, weight)[:, :LEVELS].split_with_sizes([LEVELS, 1], -1))
     return levels.squeeze(-1)
 
 

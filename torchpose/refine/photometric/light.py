@@ -6,14 +6,13 @@ it is not. So they have a normal prior about 0 whose width is found in the frame
 the mean square of its gradients beyond what their noise explains.
 """
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
 from torchpose.geometry.blurred_edge import BLUR
 from torchpose.geometry.constants import constant
 from torchpose.geometry.least_squares import Eliminated, Normal, solve_scaled
+from torchpose.geometry.rows import replace
 from torchpose.geometry.segments import segment_mean, segment_sum
 from torchpose.pose import MarkerNormals
 

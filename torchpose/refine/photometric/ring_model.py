@@ -9,7 +9,7 @@ each pixel.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -25,7 +25,7 @@ from torchpose.geometry.constants import constant, finite
 from torchpose.geometry.grey import full_scale
 from torchpose.geometry.robust import CUT, LEAST_KEPT
 from torchpose.geometry.rotations import plane_axes
-from torchpose.geometry.rows import Rows, shared
+from torchpose.geometry.rows import Rows, replace, shared
 from torchpose.geometry.sectors import SECTORS, sector_about
 from torchpose.geometry.segments import values_at
 from torchpose.refine.photometric.band import band_pixels
@@ -239,7 +239,7 @@ def _feet(blocks: PixelBlocks, R: Tensor, t: Tensor) -> _Foot:
     """The radius in the plane is formed in float64, what is small beside it in float32."""
     # the arm: marker's centre about the target's origin, camera axes
     frame = torch.bmm(R.index_select(0, blocks.row), blocks.frame)
-    plane, normal, arm = frame.split([2, 1, 1], -1)
+    plane, normal, arm = frame.split_with_sizes([2, 1, 1], -1)
     center = arm + t.index_select(0, blocks.row)[..., None]
     away = (normal * center).sum(1, keepdim=True)
     # a displacement w of the ray's foot, or of the plane against it, changes x and y by these times w

@@ -12,7 +12,7 @@ and these displacements are independent and of zero mean where the model holds (
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 
 import torch
@@ -22,7 +22,7 @@ from torch import Tensor
 from torchpose.geometry import conics
 from torchpose.geometry.least_squares import scaled_inverse, solve_scaled
 from torchpose.geometry.robust import CUT, of_chance
-from torchpose.geometry.rows import Rows
+from torchpose.geometry.rows import Rows, replace
 from torchpose.geometry.sectors import MOST, SECTORS, middles
 from torchpose.geometry.segments import segment_mean, segment_sum
 from torchpose.refine.photometric.light import POSE
