@@ -52,7 +52,11 @@ class Rows:
 
     @classmethod
     def cat(cls, parts: Sequence[Self]) -> Self:
-        """The rows of all parts, one after the other. Raises ValueError where their shared fields differ."""
+        """The rows of all parts, one after the other. Raises ValueError where the shared fields of those that have any
+        rows differ."""
+        parts = [part for part in parts if len(part)] or parts[:1]
+        if len(parts) == 1:
+            return parts[0]
         return parts[0]._each(
             lambda *values: values[0].cat(values) if isinstance(values[0], Rows) else torch.cat(values), *parts[1:]
         )

@@ -1,5 +1,6 @@
 """The arithmetic of the minimiser for a few poses: dense matrices, pose first, in the fewest calls.
 
+Tensors, or arrays of NumPy (`pairs`): the same lines.
 With the batch last (`normal_equations`) every number of a formula is a call, which pays from some hundreds of poses on.
 Of one frame there are two starts, and each call costs more than what it computes; a product of matrices is one call.
 """
@@ -7,9 +8,11 @@ Of one frame there are two starts, and each call costs more than what it compute
 from __future__ import annotations
 
 from functools import cache
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 # poses up to which LAPACK and products of matrices, one after the other, cost less than the calls that they save
@@ -26,10 +29,10 @@ class Few(NamedTuple):
         aimed: (K, N, 2), image points, whitened.
     """
 
-    points: Tensor
-    arms: Tensor
-    root: Tensor
-    aimed: Tensor
+    points: Any
+    arms: Any
+    root: Any
+    aimed: Any
 
     @classmethod
     def of(cls, poses: int, points: Tensor, xy: Tensor, whitening: Tensor) -> Self:
@@ -50,42 +53,42 @@ class Few(NamedTuple):
         packed[27] = torch.where(ahead, packed[27], torch.inf)
         return packed
 
-    def seen(self, pose: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def seen(self, pose: Any) -> tuple[Any, Any, Any]:
         """Depths (K, N, 1) under poses (K, 3, 4), image points (K, N, 2), and these whitened."""
-        uv, z = torch.bmm(self.points, pose.mT).split_with_sizes([2, 1], -1)
-        uv = uv / z
+        at = _product(self.points, _transposed(pose))
+        uv, z = at[..., :2] / at[..., 2:], at[..., 2:]
         return z, uv, (self.root * uv[:, :, None]).sum(-1)
 
-    def whole(self, pose: Tensor, *, newton: bool) -> tuple[Tensor, Tensor]:
+    def whole(self, pose: Any, *, newton: bool) -> tuple[Any, Any]:
         """[J r]^T [J r] (K, 7, 7) at poses (K, 3, 4), and whether all points lie in front (K,)."""
-        z, _, seen = self.seen(pose)
-        slope = torch.cat([self.root, -seen[..., None]], -1) / z[..., None]
-        moved = torch.bmm(slope.flatten(1, 2), pose[..., :3])  # by a translation along the object's axes
-        residual = (seen - self.aimed).flatten(1)[..., None]
-        rows = torch.cat([moved, torch.linalg.cross(self.arms, moved), residual], -1)
-        whole = torch.bmm(rows.mT, rows)
+        poses, (z, _, seen) = len(pose), self.seen(pose)
+        slope = _joined([self.root, -seen[..., None]]) / z[..., None]
+        moved = _product(slope.reshape(poses, -1, 3), pose[..., :3])  # by a translation along the object's axes
+        residual = (seen - self.aimed).reshape(poses, -1, 1)
+        rows = _joined([moved, _crossed(self.arms, moved), residual])
+        whole = _product(_transposed(rows), rows)
         if newton:
             whole[:, :6, :6] += self._bent(pose, z, rows[..., :6] * residual)
-        return whole, z.amin((1, 2)) > 0
+        return whole, (z > 0).all(1)[:, 0]
 
-    def _bent(self, pose: Tensor, z: Tensor, gradient: Tensor) -> Tensor:
+    def _bent(self, pose: Any, z: Any, gradient: Any) -> Any:
         """What second derivatives times residuals add (K, 6, 6): of u along two motions -(du dz' + du' dz) / z, and of
         a turn, which moves a point along [w]x [w]x X / 2 besides."""
-        gradient = gradient.unflatten(1, (-1, 2)).sum(2)  # of each point, (K, N, 6)
-        points = self.points[..., :3]
-        axis = pose[:, 2:, :3].expand_as(points)
-        depth = torch.cat([axis, torch.linalg.cross(points, axis)], -1) / z
-        outer = torch.bmm(points.mT, gradient[..., :3]).flatten(1) @ _of_turns(z.device, z.dtype)
-        half = outer.unflatten(1, (6, 6)) - torch.bmm(gradient.mT, depth)
-        return half + half.mT
+        poses, points = len(pose), self.points[..., :3]
+        gradient = gradient.reshape(poses, -1, 2, 6).sum(2)  # of each point, (K, N, 6)
+        axis = points * 0 + pose[:, 2:, :3]
+        depth = _joined([axis, _crossed(points, axis)]) / z
+        outer = _product(_transposed(points), gradient[..., :3]).reshape(poses, 9) @ _like(_OF_TURNS, points)
+        half = outer.reshape(poses, 6, 6) - _product(_transposed(gradient), depth)
+        return half + _transposed(half)
 
 
-def stepped(pose: Tensor, step: Tensor) -> Tensor:
+def stepped(pose: Any, step: Any) -> Any:
     """Poses (K, 3, 4) after steps (K, 6), see `normal_equations.moved`."""
-    half = torch.nn.functional.pad(0.5 * step[:, 3:], (1, 0), value=1.0)  # the quaternion of Cayley's rotation
-    turn = (half[:, :, None] * half[:, None]).flatten(1) @ _of_quaternion(step.device, step.dtype).mT
-    turn = (turn[:, :9] / turn[:, 9:]).view(-1, 3, 3)
-    result = torch.bmm(pose[..., :3], torch.cat([turn, step[:, :3, None]], -1))
+    half = _joined([step[:, :1] * 0 + 1, 0.5 * step[:, 3:]])  # the quaternion of Cayley's rotation
+    turn = (half[:, :, None] * half[:, None]).reshape(-1, 16) @ _transposed(_like(_OF_QUATERNION, step))
+    turn = (turn[:, :9] / turn[:, 9:]).reshape(-1, 3, 3)
+    result = _product(pose[..., :3], _joined([turn, step[:, :3, None]]))
     result[..., 3] += pose[..., 3]
     return result
 
@@ -93,7 +96,7 @@ def stepped(pose: Tensor, step: Tensor) -> Tensor:
 def moved_few(pose: Tensor, step: Tensor) -> Tensor:
     """`moved` of poses (3, 4, K) by steps (6, K)."""
     half = torch.nn.functional.pad(0.5 * step[3:], (0, 0, 1, 0), value=1.0)  # the quaternion of Cayley's rotation
-    turn = _of_quaternion(step.device, step.dtype) @ (half[:, None] * half).flatten(0, 1)
+    turn = _like(_OF_QUATERNION, step) @ (half[:, None] * half).flatten(0, 1)
     turn = (turn[:9] / turn[9]).unflatten(0, (3, 3))
     result = (pose[:, :3, None] * torch.cat([turn, step[:3, None]], 1)).sum(1)
     result[:, 3] += pose[:, 3]
@@ -107,20 +110,17 @@ def _triangle(device: torch.device) -> Tensor:
         return torch.tensor([7 * i + k for i in range(7) for k in range(i, 7)], device=device)
 
 
-@cache
-def _of_turns(device: torch.device, dtype: torch.dtype) -> Tensor:
+def _of_turns() -> NDArray[np.float64]:
     """(9, 36): from sums of X g^T over the points to half of what a turn's second derivatives add."""
-    with torch.inference_mode(False):
-        table = torch.zeros(3, 3, 6, 6, dtype=dtype)
-        for i in range(3):
-            for k in range(3):
-                table[i, k, 3 + i, 3 + k] += 0.5
-                table[i, i, 3 + k, 3 + k] -= 0.5
-        return table.view(9, 36).to(device)
+    table = np.zeros((3, 3, 6, 6))
+    for i in range(3):
+        for k in range(3):
+            table[i, k, 3 + i, 3 + k] += 0.5
+            table[i, i, 3 + k, 3 + k] -= 0.5
+    return table.reshape(9, 36)
 
 
-@cache
-def _of_quaternion(device: torch.device, dtype: torch.dtype) -> Tensor:
+def _of_quaternion() -> NDArray[np.float64]:
     """(10, 16): from the products q q^T of quaternions to their rotations times |q|^2, and to |q|^2."""
     w, x, y, z = range(4)
     signed = (
@@ -135,57 +135,43 @@ def _of_quaternion(device: torch.device, dtype: torch.dtype) -> Tensor:
         ((w, w, 1), (x, x, -1), (y, y, -1), (z, z, 1)),
         ((w, w, 1), (x, x, 1), (y, y, 1), (z, z, 1)),
     )
+    table = np.zeros((10, 4, 4))
+    for row, terms in zip(table, signed, strict=True):
+        for i, k, factor in terms:
+            row[i, k] += factor
+    return table.reshape(10, 16)
+
+
+_OF_TURNS, _OF_QUATERNION = _of_turns(), _of_quaternion()
+
+
+def _like(table: NDArray[np.float64], values: Any) -> Any:
+    """A table as an array, or as a tensor of the dtype and on the device of the values."""
+    if not isinstance(values, Tensor):
+        return table
+    return _tensor(table is _OF_TURNS, values.device, values.dtype)
+
+
+@cache
+def _tensor(turns: bool, device: torch.device, dtype: torch.dtype) -> Tensor:
     with torch.inference_mode(False):
-        table = torch.zeros(10, 4, 4, dtype=dtype)
-        for row, terms in zip(table, signed, strict=True):
-            for i, k, factor in terms:
-                row[i, k] += factor
-        return table.view(10, 16).to(device)
+        return torch.from_numpy(_OF_TURNS if turns else _OF_QUATERNION).to(device, dtype)
 
 
-def ippe_few(
-    points: Tensor, xy: Tensor, weight: Tensor, axes: Tensor, center: Tensor, fixed: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    """`planar.ippe` of K planes: R (K, 2, 3, 3), t (K, 2, 3), and the points in the camera frame (K, N, 2, 3).
+def _transposed(matrices: Any) -> Any:
+    return matrices.mT if isinstance(matrices, Tensor) else matrices.swapaxes(-1, -2)
 
-    Args:
-        points: (K, N, 3). xy: (K, N, 2). weight: (K, N), 1 or 0.
-        axes: (K, 3, 3), those of the planes as rows. center: (K, 3).
-    """
-    offset = (points - center[:, None]) * weight[..., None]
-    plane = torch.cat([torch.bmm(offset, axes[:, :2].mT), weight[..., None]], -1)
-    basis, factor = torch.linalg.qr(plane)
-    # Harker, O'Leary: with h3 given, the first two rows of H follow by linear least squares from u (h3 . m)
-    products = (xy[..., None] * plane[:, :, None]).flatten(2)
-    coefficients = torch.bmm(basis.mT, products)
-    residual = (products - torch.bmm(basis, coefficients)).unflatten(2, (2, 3)).flatten(1, 2)
-    gram = torch.bmm(residual.mT, residual)
-    scatter = coefficients[:, :2, 2::3].square().sum((1, 2)) * plane[..., 0].square().sum(1) / weight.sum(1).square()
-    firm = torch.linalg.det(gram[:, :2, :2]) > fixed * scatter * gram.diagonal(dim1=1, dim2=2)[:, :2].sum(1)
-    p = -torch.linalg.solve_ex(gram[:, :2, :2], gram[:, :2, 2]).result
-    h = torch.bmm(coefficients.view(-1, 6, 3), torch.nn.functional.pad(p, (0, 1), value=1.0)[..., None])
-    h = torch.linalg.solve_triangular(factor, h.view(-1, 3, 2), upper=True)
-    q = h[:, 2]  # image of the centroid
-    jacobian = h[:, :2].mT - q[..., None] * p[:, None]
-    # a rotation of the axis towards the centroid, by half a turn about the middle between them
-    aim = torch.nn.functional.normalize(torch.nn.functional.pad(q, (0, 1), value=1.0), dim=-1)
-    eye = torch.eye(3, dtype=xy.dtype, device=xy.device)
-    middle = torch.nn.functional.normalize(aim + eye[2], dim=-1)
-    ray = 2 * middle[..., None] * middle[:, None] - eye
-    both = torch.linalg.solve_ex(ray[:, :2, :2] - q[..., None] * ray[:, 2:, :2], jacobian).result
-    # the largest singular value is the inverse depth
-    half, area = 0.5 * both.square().sum((1, 2)), torch.linalg.det(both)
-    both = both * (half + (half.square() - area.square()).clamp_min(0).sqrt()).rsqrt()[:, None, None]
-    third = (1 - both.square().sum(1)).clamp_min(0).sqrt()
-    third = torch.stack([third[:, 0], torch.where(both.prod(2).sum(1) > 0, -third[:, 1], third[:, 1])], -1)
-    columns = torch.cat([both[:, None].expand(-1, 2, 2, 2), torch.stack([third, -third], 1)[:, :, None]], 2)
-    normal = torch.linalg.cross(columns[..., 0], columns[..., 1])
-    R = ray[:, None] @ torch.cat([columns, normal[..., None]], -1) @ axes[:, None]
-    R = torch.where(firm[:, None, None, None], R, torch.nan)
-    # the translation of least |(x, y) Z - (X, Y)|^2
-    x = torch.bmm(offset, R.flatten(1, 2).mT).unflatten(2, (2, 3))
-    rows = torch.cat([eye[:2, :2].expand(*xy.shape, 2), -xy[..., None]], -1) * weight[..., None, None]
-    right = (xy[:, :, None] * x[..., 2:] - x[..., :2]).mT.flatten(1, 2)
-    rows = rows.flatten(1, 2)
-    t = torch.linalg.solve_ex(torch.bmm(rows.mT, rows), torch.bmm(rows.mT, right)).result.mT
-    return R, t - (R @ center[:, None, :, None]).squeeze(-1), x + t[:, None]
+
+def _product(one: Any, other: Any) -> Any:
+    return torch.bmm(one, other) if isinstance(one, Tensor) else one @ other
+
+
+def _joined(parts: list[Any]) -> Any:
+    return torch.cat(parts, -1) if isinstance(parts[0], Tensor) else np.concatenate(parts, -1)
+
+
+def _crossed(one: Any, other: Any) -> Any:
+    if isinstance(one, Tensor):
+        return torch.linalg.cross(one, other)
+    (a, b, c), (x, y, z) = (v.transpose(2, 0, 1) for v in (one, other))
+    return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], -1)

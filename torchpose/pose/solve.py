@@ -150,13 +150,16 @@ def _starts(evidence: Evidence, rough: tuple[Tensor, Tensor], near: bool = False
         return _mirrored(evidence, *rough)
     focal, principal = evidence.matrix.diagonal()[:2], evidence.matrix[:2, 2]
     xy = torch.where(evidence.mask[..., None], (evidence.center - principal) / focal, 0.0)
-    flat = pnp.planar(evidence.points, xy, mask=evidence.mask)
-    both = flat.R.isfinite().all(-1).all(-1).all(-1)  # else a marker behind the camera, or no plane
+    if 2 * len(evidence) <= pnp.FEW:
+        flat_R, flat_t, both = pnp.planar_starts(evidence.points, xy, evidence.mask)
+    else:
+        flat_R, flat_t, _ = pnp.planar(evidence.points, xy, mask=evidence.mask)
+        both = flat_R.isfinite().all(-1).all(-1).all(-1)  # else a marker behind the camera, or no plane
     planar = evidence.coplanar & (evidence.mask.sum(-1) >= 4) & both
     if bool(planar.all()):
-        return flat.R, flat.t
+        return flat_R, flat_t
     R, t = _mirrored(evidence, *rough)
-    return torch.where(planar[:, None, None, None], flat.R, R), torch.where(planar[:, None, None], flat.t, t)
+    return torch.where(planar[:, None, None, None], flat_R, R), torch.where(planar[:, None, None], flat_t, t)
 
 
 def _mirrored(evidence: Evidence, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
