@@ -65,11 +65,10 @@ def describe_arcs(regions: Regions, xy: Float[Tensor, "P 2"]) -> Arcs:
     scale = (gx * gx + gy * gy).rsqrt()
     gx, gy = (gx * scale).double(), (gy * scale).double()
     size = torch.bincount(index, minlength=count)
-    mean = torch.stack([segment_sum(v, index, count) for v in (x, y, gx, gy)], -1) / size[:, None]
+    mean = segment_sum(torch.stack([x, y, gx, gy], -1), index, count) / size[:, None]
     middle, normal = mean.split_with_sizes([2, 2], -1)
     normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
-    each = (*middle.unbind(-1), *normal.unbind(-1))
-    mx, my, nx, ny = (v.contiguous().index_select(0, index) for v in each)
+    mx, my, nx, ny = torch.cat([middle, normal], 1).index_select(0, index).unbind(1)
     along = (y - my) * nx - (x - mx) * ny  # the tangent is (-ny, nx)
     angle = torch.atan2(gy * nx - gx * ny, gx * nx + gy * ny)
     curvature = segment_sum(along * angle, index, count) / segment_sum(along * along, index, count).clamp_min(1e-9)

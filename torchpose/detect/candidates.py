@@ -253,8 +253,8 @@ def _on_ellipses(
     regions: Regions, xy: Tensor, params: Tensor, polarity: Tensor, magnitude: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Which cells (P,) lie on the ellipse of their region, and which belong to its edge, a blurred one included."""
-    each = (*conics.conic_from_ellipse(params).unbind(-1), polarity)
-    *conic, outwards = (v.contiguous().index_select(0, regions.region) for v in each)
+    each = torch.cat([conics.conic_from_ellipse(params), polarity[:, None]], 1)
+    *conic, outwards = each.index_select(0, regions.region).unbind(1)
     off, nx, ny = conics.signed_distance(conic, *xy.unbind(-1))
     gx, gy = regions.gradient.unbind(-1)
     rise = (nx * gx + ny * gy) * outwards

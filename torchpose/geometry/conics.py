@@ -65,13 +65,11 @@ def axes_of(square: Float[Tensor, "*N 2 2"]) -> Float[Tensor, "*N 3"]:
 
 def conic_from_ellipse(ellipse: Ellipse) -> Conic:
     """Conic coefficients, negative inside, of ellipses; scaled to -1 at the centre."""
-    cx, cy, a, b, theta = ellipse.unbind(-1)
-    cos, sin = theta.cos(), theta.sin()
-    p, q = (cos / a).square() + (sin / b).square(), (sin / a).square() + (cos / b).square()
-    r = 2 * cos * sin * (1 / a.square() - 1 / b.square())
-    d, e = -2 * p * cx - r * cy, -r * cx - 2 * q * cy
-    f = p * cx * cx + r * cx * cy + q * cy * cy - 1
-    return torch.stack([p, r, q, d, e, f], -1)
+    center, square = ellipse[..., :2], inverse_shape(ellipse, 2)
+    p, r, _, q = square.flatten(-2).unbind(-1)
+    linear = (square * center[..., None, :]).sum(-1)
+    d, e = (-2 * linear).unbind(-1)
+    return torch.stack([p, 2 * r, q, d, e, (linear * center).sum(-1) - 1], -1)
 
 
 def rescaled(ellipses: Float[Tensor, "*batch 5"], factor: float) -> Float[Tensor, "*batch 5"]:
@@ -117,9 +115,9 @@ def boundary(
         index: whose sample each is.
         angle: eccentric anomaly, counted from the major axis.
     """
-    theta = ellipses[:, 4]
-    each = (*ellipses[:, :4].unbind(-1), theta.cos(), theta.sin())
-    cx, cy, a, b, cos, sin = (v.contiguous().index_select(0, index) for v in each)
+    theta = ellipses[:, 4:]
+    each = torch.cat([ellipses[:, :4], theta.cos(), theta.sin()], 1)
+    cx, cy, a, b, cos, sin = each.index_select(0, index).unbind(1)
     c, s = angle.cos(), angle.sin()
     x, y, p, q = a * c, b * s, b * c, a * s
     scale = (p * p + q * q).rsqrt()

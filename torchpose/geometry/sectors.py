@@ -37,8 +37,7 @@ def sector_of(x: Tensor, y: Tensor) -> Tensor:
 def sector_about(u: Tensor, v: Tensor, ellipses: Tensor, owner: Tensor) -> Tensor:
     """Sectors (P,) of points u, v (P,) about the ellipses (K, 5) that own them (P,)."""
     inverse = conics.inverse_shape(ellipses).flatten(1)
-    each = torch.cat([inverse, ellipses[:, :2]], 1).T.contiguous().index_select(1, owner)
-    i11, i12, _, i22, cx, cy = each.unbind()
+    i11, i12, _, i22, cx, cy = torch.cat([inverse, ellipses[:, :2]], 1).index_select(0, owner).unbind(1)
     dx, dy = u - cx, v - cy
     return sector_of(i11 * dx + i12 * dy, i12 * dx + i22 * dy)
 

@@ -8,7 +8,6 @@ is done by `geometry.small_linalg`.
 
 import operator
 from collections.abc import Callable, Sequence
-from functools import reduce
 from typing import Any
 
 import torch
@@ -273,7 +272,6 @@ _DECOMPOSED: dict[Any, Callable[..., Any]] = {
     _aten.isinf.default: lambda x: x.abs() == torch.inf,
     _aten.clamp.default: _clamp,
     _aten.mean.dim: _mean,
-    _aten.prod.dim_int: lambda x, dim: reduce(operator.mul, x.unbind(dim)),
     _aten.mm.default: _matmul,
     _aten.bmm.default: _matmul,
     _aten.diag_embed.default: lambda x: torch.where(torch.eye(x.shape[-1]) > 0, x[..., None], 0),

@@ -126,7 +126,7 @@ def ring_edges(frames: Tensor, frame: Tensor, ellipses: Tensor, outward: Tensor,
 def _normal(ellipses: Tensor, ring: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     """Outward unit normals nx, ny (E,) of the ellipses' level curves through points x, y (E,)."""
     each = torch.cat([conics.inverse_shape(ellipses, 2).flatten(1), ellipses[:, :2]], 1)
-    s11, s12, _, s22, cx, cy = each.T.contiguous().index_select(1, ring).unbind()
+    s11, s12, _, s22, cx, cy = each.index_select(0, ring).unbind(1)
     dx, dy = x - cx, y - cy
     nx, ny = s11 * dx + s12 * dy, s12 * dx + s22 * dy
     scale = (nx * nx + ny * ny).rsqrt()
