@@ -15,7 +15,7 @@ from torch import Tensor
 from torchpose.errors import ArgumentError
 from torchpose.geometry import conics
 from torchpose.geometry.arguments import checked, expect_index, expect_not_negative, expect_positive
-from torchpose.geometry.constants import constant
+from torchpose.geometry.constants import constant, either
 from torchpose.geometry.least_squares import geman_mcclure
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import Tiles
@@ -169,7 +169,7 @@ def _moments(points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Ten
     else:
         w = weights.double()[:, None]
         there = w > 0
-        xy = torch.where(there, xy, 0.0)
+        xy = either(there, xy, 0.0)
         total, enough = w.sum(-1, keepdim=True), there.sum((1, 2)) >= _SOLVABLE_POINTS
         center = torch.bmm(xy, w.mT) / total
     sums = _fused_sums if torch.compiler.is_compiling() else _gram_sums
@@ -181,7 +181,7 @@ def _tiled(points: Tensor, index: Tensor, count: int, weights: Tensor | None = N
     tiles = Tiles.of(index, count)
     weights = torch.ones_like(index, dtype=torch.float64) if weights is None else weights.double()
     xy, w = tiles.planes(*points.double().unbind(-1), weights).split_with_sizes([2, 1], 1)
-    return tiles, torch.where(w > 0, xy, 0.0), w
+    return tiles, either(w > 0, xy, 0.0), w
 
 
 def _tile_moments(tiles: Tiles, xy: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -240,7 +240,7 @@ class _Conics(NamedTuple):
         ellipse, scale = conics.ellipse_from_conic(self.conic), self.scale[:, None]
         center, axes, theta = ellipse.split_with_sizes([2, 2, 1], -1)
         ellipse = torch.cat([torch.addcmul(self.center, center, scale), axes * scale, theta], -1)
-        return torch.where(self.sound[:, None], ellipse, torch.nan)
+        return either(self.sound[:, None], ellipse, torch.nan)
 
     def distances(self, tiles: Tiles, xy: Tensor) -> Tensor:
         """As `distance`, of points (K, 2, T) in tiles, from the ellipses; NaN where there is none."""
@@ -250,7 +250,7 @@ class _Conics(NamedTuple):
         x, y = torch.addcmul(b * e, square, d, value=-1) / disc, torch.addcmul(b * d, half, e, value=-1) / disc
         # the conic is rho^2 - 1 where it is -1 at the centre
         level = f + 0.5 * torch.addcmul(d * x, e, y)
-        conic = torch.where(self.sound[:, None], self.conic / -level[:, None], torch.nan)
+        conic = either(self.sound[:, None], self.conic / -level[:, None], torch.nan)
         rows = _rows(conic).index_select(0, tiles.group)
         unit = (xy - self.center.index_select(0, tiles.group)[..., None]) / self.scale[tiles.group, None, None]
         square, u, v = torch.bmm(rows, _terms(unit)).unbind(1)
@@ -329,7 +329,7 @@ def _taubin(moments: Tensor) -> Tensor:
     _, vectors = torch.linalg.eigh(white)
     best = torch.linalg.solve_triangular(factor.mT, vectors[:, :, :1], upper=True).squeeze(-1)
     conic = torch.cat([best, -(best * mean).sum(-1, keepdim=True)], -1)
-    return torch.where(sound[:, 0], conic, torch.nan)
+    return either(sound[:, 0], conic, torch.nan)
 
 
 def _positive_eigenvector(matrix: Tensor) -> Tensor:
@@ -456,7 +456,7 @@ class Near(NamedTuple):
         u, v = points.double().unbind(-1)
         planes = tiles.planes(u, v, torch.ones_like(u))
         finite = 0 * planes.sum(1, keepdim=True) == 0
-        xy, there = torch.where(finite, planes, 0.0).split_with_sizes([2, 1], 1)
+        xy, there = either(finite, planes, 0.0).split_with_sizes([2, 1], 1)
         group = tiles.group
         unit = torch.bmm(inverse.index_select(0, group), xy - center.index_select(0, group)[..., None])
         return cls(tiles, there[:, 0], _terms(unit), center, inverse, rows)
@@ -566,6 +566,6 @@ def with_covariance(
     eye = torch.eye(5, dtype=torch.float64, device=points.device)
     inverse, info = torch.linalg.inv_ex(torch.where(solvable[:, None, None], normal_matrix, eye))
     solvable = solvable & (info == 0)
-    variance = torch.where(solvable, correlation * sigma.square(), torch.nan)
+    variance = either(solvable, correlation * sigma.square(), torch.nan)
     covariance = torch.bmm(torch.bmm(inverse, scatter), inverse) * variance[:, None, None]
     return EllipseFit(ellipses, covariance, sigma, n)

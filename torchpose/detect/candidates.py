@@ -44,6 +44,7 @@ from torchpose.detect.validation import (
 from torchpose.errors import ArgumentError
 from torchpose.geometry import conics
 from torchpose.geometry.arguments import checked
+from torchpose.geometry.constants import either
 from torchpose.geometry.grey import Frames, as_frames, levels
 from torchpose.geometry.rows import replace
 from torchpose.geometry.segments import marked, members, positions, segment_mean
@@ -233,7 +234,7 @@ def fit_regions(grad: Gradient, regions: Regions, wanted: Wanted = ANYTHING) -> 
     length, edge = (torch.bincount(regions.region[positions(on)], minlength=count) for on in (follows, along))
     verdict = plausible(grad, params)
     elsewhere = length < _MIN_CELLS * conics.perimeter(params)
-    verdict = torch.where((verdict == Verdict.ACCEPTED) & elsewhere, int(Verdict.OFF_ELLIPSE), verdict)
+    verdict = either((verdict == Verdict.ACCEPTED) & elsewhere, int(Verdict.OFF_ELLIPSE), verdict)
     good = positions(verdict == Verdict.ACCEPTED)
     found = score(grad, regions.frame[good], params[good], polarity[good])
     # a region that is not a whole ellipse runs along something else as well: only what lies along the ellipse counts
@@ -241,7 +242,7 @@ def fit_regions(grad: Gradient, regions: Regions, wanted: Wanted = ANYTHING) -> 
     partial = (found.cover <= WHOLE) | beyond[good]
     partial = partial & (found.verdict == Verdict.ACCEPTED)
     lost = partial & ~asked_for(grad, found, wanted, partial)
-    found = replace(found, verdict=torch.where(lost, int(Verdict.UNWANTED), found.verdict))
+    found = replace(found, verdict=either(lost, int(Verdict.UNWANTED), found.verdict))
     whole = marked(good[(found.verdict == Verdict.ACCEPTED) & (found.cover > WHOLE)], count)
     explained = along & whole.index_select(0, regions.region)
     bad = positions((verdict != Verdict.ACCEPTED) & params.isfinite().all(-1))
@@ -301,6 +302,6 @@ def asked_for(grad: Gradient, found: Candidates, wanted: Wanted, among: Bool[Ten
 def plausible(grad: Gradient, ellipses: Float[Tensor, "M 5"]) -> Int[Tensor, " M"]:
     """Verdict on the size and shape of ellipses; `Verdict.TOO_LARGE` for NaN."""
     a, b = ellipses[:, 2], ellipses[:, 3]
-    verdict = torch.where(a <= 0.5 * max(grad.shape[1:]), int(Verdict.ACCEPTED), int(Verdict.TOO_LARGE))
-    verdict = torch.where(b < MIN_ASPECT * a, int(Verdict.TOO_FLAT), verdict)
-    return torch.where(b < MIN_SEMI_MINOR, int(Verdict.TOO_SMALL), verdict)
+    verdict = either(a <= 0.5 * max(grad.shape[1:]), int(Verdict.ACCEPTED), int(Verdict.TOO_LARGE))
+    verdict = either(b < MIN_ASPECT * a, int(Verdict.TOO_FLAT), verdict)
+    return either(b < MIN_SEMI_MINOR, int(Verdict.TOO_SMALL), verdict)

@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchpose.geometry.constants import either
+
 Ellipse = Float[Tensor, "*#N 5"]
 Conic = Float[Tensor, "*#N 6"]
 Matrix = Float[Tensor, "*#N 3 3"]
@@ -193,7 +195,7 @@ def seen_circle(matrix: Float[Tensor, "3 3"], center: Vector, normal: Vector, ra
     side = dual[..., :2, 2] / whole
     spread = side[..., :, None] * side[..., None, :] - dual[..., :2, :2] / whole[..., None]
     ellipse = torch.cat([at + side, axes_of(spread)], -1)
-    return torch.where(whole < 0, ellipse, torch.nan)
+    return either(whole < 0, ellipse, torch.nan)
 
 
 def circle_poses(conic: Matrix, radius: Scalar) -> tuple[Float[Tensor, "*N 2 3"], Float[Tensor, "*N 2 3"]]:

@@ -14,6 +14,8 @@ _made: dict[tuple[Any, torch.dtype, torch.device], Tensor] = {}
 def constant(values: Any, like: Tensor, dtype: torch.dtype | None = None) -> Tensor:
     """The tensor of a number or nested tuples of numbers, in the dtype and on the device of another; not to be written
     to."""
+    if torch.compiler.is_compiling():  # which keeps what is constant itself
+        return torch.tensor(values, dtype=dtype or like.dtype, device=like.device)
     key = values, dtype or like.dtype, like.device
     if (known := _made.get(key)) is not None:
         return known
@@ -39,3 +41,23 @@ def _identity(size: int) -> tuple[tuple[float, ...], ...]:
 def finite(values: Tensor, dim: int | tuple[int, ...], *, keepdim: bool = False) -> Tensor:
     """Whether all values along these dimensions are numbers: then their sum is one. In half of the calls."""
     return 0 * values.sum(dim, keepdim=keepdim) == 0
+
+
+def either(condition: Tensor, one: Tensor | float, other: Tensor | float) -> Tensor:
+    """As `torch.where`, without a tensor made anew of a number that stands beside a tensor it fits."""
+    if isinstance(one, Tensor) and not isinstance(other, Tensor):
+        other = constant(other, one) if _fits(other, one) else other
+    elif isinstance(other, Tensor) and not isinstance(one, Tensor):
+        one = constant(one, other) if _fits(one, other) else one
+    elif type(one) is int and type(other) is int:
+        one, other = (constant(value, condition, torch.int64) for value in (one, other))
+    return torch.where(condition, one, other)
+
+
+def _fits(number: float, values: Tensor) -> bool:
+    return values.is_floating_point() or (type(number) is int and values.dtype == torch.int64)
+
+
+def numbers(values: Tensor) -> Tensor:
+    """As `torch.isfinite`, in half the calls: what is none differs from itself."""
+    return values - values == 0

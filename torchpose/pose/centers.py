@@ -7,6 +7,7 @@ from torchpose.camera import Camera
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import conics
 from torchpose.geometry.arguments import checked
+from torchpose.geometry.constants import either
 
 
 @checked
@@ -69,12 +70,12 @@ def exact(ellipses: Tensor, covariances: Tensor, radii: Tensor) -> tuple[Tensor,
     scale = (inverse / (shape.det().square())).pow(1 / 3)
     lever = inverse - inverse.mean(-1, keepdim=True)
     slope = ((lever * scale)[..., None, None] * dual).sum(-3)
-    _, vectors = torch.linalg.eigh(torch.where(slope.isfinite(), slope, 0.0))
+    _, vectors = torch.linalg.eigh(either(slope.isfinite(), slope, 0.0))
     h = vectors[..., :, -1]  # the other two eigenvalues vanish
     center = unit[..., 0] * h[..., :2] / h[..., 2:] + middle[..., 0, :]
     share = lever * scale / (lever * scale).sum(-1, keepdim=True)
     covariance = (share.square()[..., None, None] * covariances).sum(-3)
-    return torch.where(slope.isfinite().all(-1).all(-1)[..., None], center, torch.nan), covariance
+    return either(slope.isfinite().all(-1).all(-1)[..., None], center, torch.nan), covariance
 
 
 @checked

@@ -13,7 +13,7 @@ from torchpose.camera import Camera
 from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics, rotations
 from torchpose.geometry.arguments import checked
-from torchpose.geometry.constants import constant
+from torchpose.geometry.constants import constant, either
 from torchpose.geometry.least_squares import covariance_factor
 from torchpose.geometry.rows import Rows, replace, shared
 from torchpose.identify import MarkerTable
@@ -177,7 +177,7 @@ def misfit_of_shapes(evidence: Evidence, predicted: Tensor) -> Tensor:
     seen = evidence.mask[..., None]
     weight = torch.linalg.inv_ex(torch.where(seen[..., None, None], covariance, constant(_EYE, v))).inverse
     chi2 = ((weight[:, None] * v[..., None, :]).sum(-1) * v).sum(-1)
-    return torch.where(seen[:, None], chi2, 0.0).sum((-1, -2))
+    return either(seen[:, None], chi2, 0.0).sum((-1, -2))
 
 
 @checked
@@ -185,7 +185,7 @@ def center_rms(evidence: Evidence, R: Tensor, t: Tensor) -> Tensor:
     """RMS distance (N,) in px of the compensated centres from the projected ones."""
     x = rotations.turned(evidence.matrix @ R, evidence.points) + (t @ evidence.matrix.T)[:, None]
     at, depth = x.split_with_sizes([2, 1], -1)
-    square = torch.where(evidence.mask, (at / depth - evidence.center).square().sum(-1), 0.0)
+    square = either(evidence.mask, (at / depth - evidence.center).square().sum(-1), 0.0)
     return (square.sum(-1) / evidence.mask.sum(-1)).sqrt()
 
 

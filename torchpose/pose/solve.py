@@ -14,6 +14,7 @@ from torch import Tensor
 from torchpose import pnp
 from torchpose.geometry import rotations
 from torchpose.geometry.arguments import checked
+from torchpose.geometry.constants import either
 from torchpose.geometry.robust import CUT
 from torchpose.pose.covariance import pose_covariance
 from torchpose.pose.evidence import CENTER_RMS, Evidence, misfit_of_shapes, predicted_circles, visible
@@ -49,7 +50,7 @@ def solve_poses(
     rest = evidence[row].without(marker)
     retry = _solve(rest, _starts(rest, (rough[0][row], rough[1][row]), near), compile)
     # of the subsets that fit, the one with the least chi-squared
-    cost = torch.where(retry.status == Status.REJECTED, torch.inf, retry.chi2.nan_to_num(nan=torch.inf))
+    cost = either(retry.status == Status.REJECTED, torch.inf, retry.chi2.nan_to_num(nan=torch.inf))
     least = torch.full(bad.shape, torch.inf, dtype=cost.dtype, device=cost.device).scatter_reduce(0, row, cost, "amin")
     winner = (cost.isfinite() & (cost == least[row])).nonzero()[:, 0]
     return solved.replaced(row[winner], retry[winner])
@@ -68,7 +69,7 @@ def _solve(evidence: Evidence, starts: tuple[Tensor, Tensor], compile: bool) -> 
     ahead = of_centers[:, 1] - of_centers[:, 0] + (of_shapes[:, 1] - of_shapes[:, 0]) / over
     shift, larger = sizes_beyond(evidence, circles[row[:, 0], best[:, 0]])
     covariance, determined = pose_covariance(evidence, R[:, 0], t[:, 0])
-    chi2_alt = torch.where(chi2[:, 1].isfinite(), chi2[:, 1], torch.nan)
+    chi2_alt = either(chi2[:, 1].isfinite(), chi2[:, 1], torch.nan)
     seen = evidence.mask.sum(-1)
     freedom = (2 * seen - 6).clamp_min(1)
     # half of the way to the next code, markers may as well be their neighbours
@@ -84,9 +85,9 @@ def _solve(evidence: Evidence, starts: tuple[Tensor, Tensor], compile: bool) -> 
         (behind, Reason.BEHIND_CAMERA),
         (degenerate | (solvable & ~determined), Reason.DEGENERATE),
     ):
-        reason = torch.where(condition, int(why), reason)  # the last that holds
-    status = torch.where(reason == Reason.NONE, int(Status.OK), int(Status.REJECTED))
-    status = torch.where(reason == Reason.TWO_SOLUTIONS, int(Status.AMBIGUOUS), status)
+        reason = either(condition, int(why), reason)  # the last that holds
+    status = either(reason == Reason.NONE, int(Status.OK), int(Status.REJECTED))
+    status = either(reason == Reason.TWO_SOLUTIONS, int(Status.AMBIGUOUS), status)
     one, two = ((R[:, k], t[:, k], rms[:, k]) for k in range(2))
     alone = covariance.new_zeros(len(covariance), 6, evidence.numbers)
     parts = (covariance, covariance, alone)
@@ -108,7 +109,7 @@ class _Minima(NamedTuple):
 
 
 def _minima(evidence: Evidence, starts: tuple[Tensor, Tensor], compile: bool) -> _Minima:
-    given = (evidence.points, torch.where(evidence.mask[..., None], evidence.center, 0.0), evidence.matrix)
+    given = (evidence.points, either(evidence.mask[..., None], evidence.center, 0.0), evidence.matrix)
     covariances = visible(evidence.covariance + evidence.placed, evidence.mask)
     if not compile and 2 * len(evidence) <= pnp.FEW:
         found = pnp.pair_minima(*given, covariances, evidence.mask, starts, _ITERATIONS)
@@ -149,7 +150,7 @@ def _starts(evidence: Evidence, rough: tuple[Tensor, Tensor], near: bool = False
     if near:
         return _mirrored(evidence, *rough)
     focal, principal = evidence.matrix.diagonal()[:2], evidence.matrix[:2, 2]
-    xy = torch.where(evidence.mask[..., None], (evidence.center - principal) / focal, 0.0)
+    xy = either(evidence.mask[..., None], (evidence.center - principal) / focal, 0.0)
     if 2 * len(evidence) <= pnp.FEW:
         flat_R, flat_t, both = pnp.planar_starts(evidence.points, xy, evidence.mask)
     else:

@@ -16,7 +16,7 @@ from torchpose.detect.reduce import only_reduced
 from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
 from torchpose.geometry.blurred_edge import HOLDS, KINDS
-from torchpose.geometry.constants import constant
+from torchpose.geometry.constants import constant, either
 from torchpose.geometry.least_squares import Pose, PosePrior
 from torchpose.geometry.robust import LEAST_KEPT as LEAST_KEPT
 from torchpose.geometry.rows import Rows, replace, shared
@@ -103,7 +103,7 @@ class Sight(Rows):
         which, every = found.identified.ring[rows].clamp_min(0).flatten(), found.rings
         raw = torch.stack([every.outer_raw, every.inner_raw], 1).index_select(0, which)
         # what is left of a clipped edge tells of no blur
-        blur = torch.where(every.clipped[:, None], torch.nan, every.blur).index_select(0, which)
+        blur = either(every.clipped[:, None], torch.nan, every.blur).index_select(0, which)
         polarity, seen, disc = (
             value.index_select(0, which).view(*evidence.mask.shape, *value.shape[1:])
             for value in (every.polarity, every.seen, every.disc)
@@ -134,7 +134,7 @@ class Sight(Rows):
         start = constant(_START_BLUR, self.centers, torch.float64)
         if self.blur is None:
             return blurs.isotropic(start.expand(len(self)))
-        median = torch.where(self.mask[..., None], self.blur, torch.nan).nanmedian(1).values
+        median = either(self.mask[..., None], self.blur, torch.nan).nanmedian(1).values
         return torch.where(median.isnan(), blurs.isotropic(start), median)
 
     @property
@@ -146,7 +146,7 @@ class Sight(Rows):
         may = self.mask & (self.blur[..., 0] + self.blur[..., 2] > (HOLDS * smallest).square())
         if not bool(may.any()):
             return torch.ones_like(self.mask[:, 0])
-        share = torch.where(self.mask, blurs.axes(self.blur)[1].sqrt() / smallest, torch.nan)
+        share = either(self.mask, blurs.axes(self.blur)[1].sqrt() / smallest, torch.nan)
         return ~(share.nanquantile(0.5, -1) > HOLDS)
 
     @property

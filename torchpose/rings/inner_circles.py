@@ -13,7 +13,7 @@ from torchpose.detect import Candidates
 from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics, sectors
 from torchpose.geometry.blurred_edge import MOST
-from torchpose.geometry.constants import constant
+from torchpose.geometry.constants import constant, either
 from torchpose.geometry.grey import full_scale
 from torchpose.geometry.least_squares import solve_scaled
 from torchpose.geometry.robust import RATIO_RANGE
@@ -146,8 +146,8 @@ def _edge_blur(grey: Tensor, seen: Tensor, outer: Tensor, ratio: Tensor, at: Ten
     profile = (mean / weight.sum(-1)[:, None]).double()  # NaN where it is not seen
     outside = (at > 0.5 * (1 + ratio)[:, None])[..., None]
     rise = (profile[:, 2:] - profile[:, :-2]).abs()
-    step = torch.where(outside, (profile[:, -1:] - profile[:, 1:-1]).abs(), -torch.inf).amax(1)
-    steepest = torch.where(outside, rise, -torch.inf).amax(1)
+    step = either(outside, (profile[:, -1:] - profile[:, 1:-1]).abs(), -torch.inf).amax(1)
+    steepest = either(outside, rise, -torch.inf).amax(1)
     middles = [(k + 0.5) * 2 * math.pi / _EIGHTHS for k in range(_EIGHTHS)]
     around = constant((tuple(map(math.cos, middles)), tuple(map(math.sin, middles))), outer)
     normal = conics.inverse_shape(outer) @ around  # (M, 2, 8)
@@ -156,7 +156,7 @@ def _edge_blur(grey: Tensor, seen: Tensor, outer: Tensor, ratio: Tensor, at: Ten
     variance = (step / steepest * spacing).square() / (2 * torch.pi) - (spacing.square() + 1) / 12
     known = variance.isfinite()
     rows = blurs.columns(*(normal / length[:, None]).unbind(1)).mT * known[:, None]
-    right = torch.bmm(rows, torch.where(known, variance, 0.0)[..., None])
+    right = torch.bmm(rows, either(known, variance, 0.0)[..., None])
     found = solve_scaled(torch.bmm(rows, rows.mT), right).squeeze(-1)
     return blurs.limited(found.nan_to_num(nan=0.0), 0.0, MOST**2)
 
@@ -164,7 +164,7 @@ def _edge_blur(grey: Tensor, seen: Tensor, outer: Tensor, ratio: Tensor, at: Ten
 def _mean_profile(grey: Tensor, seen: Tensor, gaps: bool) -> Tensor:
     """Means (P, R) float64 of grey (P, R, A) over directions (P, A) that are seen; with ``gaps`` some may be NaN."""
     if gaps:
-        return torch.where(seen[:, None], grey, torch.nan).nanmean(-1).double()
+        return either(seen[:, None], grey, torch.nan).nanmean(-1).double()
     return (grey @ seen[..., None].float()).squeeze(-1).double() / seen.sum(-1, keepdim=True)
 
 

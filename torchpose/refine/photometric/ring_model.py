@@ -21,7 +21,7 @@ from torchpose.camera import Camera
 from torchpose.camera.model import Slopes
 from torchpose.geometry import blur as blurs
 from torchpose.geometry.blurred_edge import HOLDS, Spread
-from torchpose.geometry.constants import constant, finite
+from torchpose.geometry.constants import constant, either, finite
 from torchpose.geometry.grey import full_scale
 from torchpose.geometry.robust import CUT, LEAST_KEPT
 from torchpose.geometry.rotations import plane_axes
@@ -203,14 +203,14 @@ def _seen(sight: Sight, row: Tensor, marker: Tensor) -> Tensor:
     if sight.seen is None:
         return torch.ones(len(row), SECTORS, dtype=torch.float32, device=row.device)
     seen = sight.seen[row, marker].float()
-    return torch.where(seen.mean(-1, keepdim=True) < LEAST_KEPT, 1.0, seen)
+    return either(seen.mean(-1, keepdim=True) < LEAST_KEPT, 1.0, seen)
 
 
 def _clipping(grey: Tensor, row: Tensor, rows: int) -> Tensor:
     """Limits (N, 2) at which each row's grey values are clipped: 0, and the full scale of its brightest pixel."""
     darkest = grey.new_full((rows,), torch.inf).scatter_reduce_(0, row, grey, "amin")
     brightest = grey.new_full((rows,), -torch.inf).scatter_reduce_(0, row, grey, "amax")
-    low = torch.where(darkest <= 0, 0.0, -torch.inf)
+    low = either(darkest <= 0, 0.0, -torch.inf)
     return torch.stack([low, full_scale(brightest)], -1)
 
 

@@ -20,6 +20,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchpose.geometry import conics
+from torchpose.geometry.constants import either
 from torchpose.geometry.least_squares import scaled_inverse, solve_scaled
 from torchpose.geometry.robust import CUT, of_chance
 from torchpose.geometry.rows import Rows, replace
@@ -139,7 +140,7 @@ def _cells(sectors: Sectors, noise: Tensor, allowed: float = 0.0) -> tuple[Tenso
     """Chi-squared of the displacement of every cell, given ``allowed`` px besides noise, and its hold: (K, 24)."""
     pull, hold = (v.unflatten(1, (-1, _CELL)).sum(-1) for v in (sectors.pull, sectors.hold))
     variance = noise * hold + (allowed * hold).square()
-    return torch.where(hold > 0, pull.square() / variance.clamp_min(_TINY), 0.0), hold
+    return either(hold > 0, pull.square() / variance.clamp_min(_TINY), 0.0), hold
 
 
 def misfit(sectors: Sectors, clear: Tensor, variance: Tensor, row: Tensor, rows: int) -> Tensor:
@@ -163,12 +164,12 @@ def overdispersion(sectors: Sectors, variance: Tensor, row: Tensor, rows: int) -
     """
     pull, hold = (v.double().unflatten(1, (2, -1, _CELL)).sum(-1) for v in (sectors.pull, sectors.hold))
     hold = hold / variance[:, None, None]
-    error = torch.where(hold > 0, pull / variance[:, None, None] / hold.clamp_min(_TINY), 0.0)
+    error = either(hold > 0, pull / variance[:, None, None] / hold.clamp_min(_TINY), 0.0)
     each, free = _beyond_harmonics(error, hold)
     chi2, freedom = segment_sum(each, row, rows), segment_sum(free, row, rows).clamp_min(1)
     factor = chi2 / freedom
     more = of_more(factor, freedom)
-    return torch.where(more, factor, 1.0), torch.where(more, 0.0, freedom)
+    return either(more, factor, 1.0), either(more, 0.0, freedom)
 
 
 def of_more(factor: Tensor, freedom: Tensor) -> Tensor:
@@ -195,7 +196,7 @@ def _beyond_harmonics(error: Tensor, hold: Tensor) -> tuple[Tensor, Tensor]:
 def _displacements(sectors: Sectors, variance: Tensor) -> tuple[Tensor, Tensor]:
     """Displacements (K, 2, 48) in px of the rims in single sectors, inner circle first, and their information."""
     pull, hold = (v.double().unflatten(1, (2, SECTORS)) / variance[:, None, None] for v in (sectors.pull, sectors.hold))
-    return torch.where(hold > 0, pull / hold.clamp_min(_TINY), 0.0), hold
+    return either(hold > 0, pull / hold.clamp_min(_TINY), 0.0), hold
 
 
 def _harmonics(around: Tensor) -> Tensor:
@@ -307,7 +308,7 @@ def level_scatter(
         empty.flatten().scatter_add(0, flat, plane.flatten()).view(len(row), 2, -1, _CELL).sum(-1).double()
         for plane in planes
     )
-    chi2, freedom = _beyond_harmonics(torch.where(usual > 0, sums / usual.clamp_min(_TINY), 0.0), usual)
+    chi2, freedom = _beyond_harmonics(either(usual > 0, sums / usual.clamp_min(_TINY), 0.0), usual)
     return segment_sum(chi2, row, rows) / segment_sum(freedom, row, rows).clamp_min(1)
 
 
