@@ -44,7 +44,7 @@ from torchpose.detect.validation import (
 from torchpose.errors import ArgumentError
 from torchpose.geometry import conics
 from torchpose.geometry.arguments import checked
-from torchpose.geometry.constants import either
+from torchpose.geometry.constants import either, finite
 from torchpose.geometry.grey import Frames, as_frames, levels
 from torchpose.geometry.rows import replace
 from torchpose.geometry.segments import marked, members, positions, segment_mean
@@ -245,7 +245,7 @@ def fit_regions(grad: Gradient, regions: Regions, wanted: Wanted = ANYTHING) -> 
     found = replace(found, verdict=either(lost, int(Verdict.UNWANTED), found.verdict))
     whole = marked(good[(found.verdict == Verdict.ACCEPTED) & (found.cover > WHOLE)], count)
     explained = along & whole.index_select(0, regions.region)
-    bad = positions((verdict != Verdict.ACCEPTED) & params.isfinite().all(-1))
+    bad = positions((verdict != Verdict.ACCEPTED) & finite(params, 1))
     rejected = Candidates.unscored(regions.frame[bad], params[bad], polarity[bad], verdict[bad])
     return Candidates.cat([found, rejected]), explained
 

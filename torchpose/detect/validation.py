@@ -205,7 +205,8 @@ def same_ellipses(ones: Candidates, others: Candidates, tolerance: float = SAME)
     alike = positions(ones.polarity[i] == others.polarity[j])
     i, j = i[alike], j[alike]
     p, q = ones.ellipse[i], others.ellipse[j]
-    shape = (conics.shape_matrix(p) - conics.shape_matrix(q)).flatten(1).abs().amax(-1)
+    one, other = conics.shape_matrix(torch.stack([p, q]))
+    shape = (one - other).flatten(1).abs().amax(-1)
     apart = torch.maximum(torch.linalg.vector_norm(p[:, :2] - q[:, :2], dim=-1), shape)
     same = positions(apart < reach[i])
     return i[same], j[same]

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchpose import pnp
 from torchpose.geometry import rotations
 from torchpose.geometry.arguments import checked
-from torchpose.geometry.constants import either
+from torchpose.geometry.constants import either, finite, numbers
 from torchpose.geometry.robust import CUT
 from torchpose.pose.covariance import pose_covariance
 from torchpose.pose.evidence import CENTER_RMS, Evidence, misfit_of_shapes, predicted_circles, visible
@@ -69,12 +69,12 @@ def _solve(evidence: Evidence, starts: tuple[Tensor, Tensor], compile: bool) -> 
     ahead = of_centers[:, 1] - of_centers[:, 0] + (of_shapes[:, 1] - of_shapes[:, 0]) / over
     shift, larger = sizes_beyond(evidence, circles[row[:, 0], best[:, 0]])
     covariance, determined = pose_covariance(evidence, R[:, 0], t[:, 0])
-    chi2_alt = either(chi2[:, 1].isfinite(), chi2[:, 1], torch.nan)
+    chi2_alt = either(numbers(chi2[:, 1]), chi2[:, 1], torch.nan)
     seen = evidence.mask.sum(-1)
     freedom = (2 * seen - 6).clamp_min(1)
     # half of the way to the next code, markers may as well be their neighbours
     contradicts = (of_centers[:, 0] > CUT**2 * freedom) & (rms[:, 0] > CENTER_RMS) | (shift > 0.5)
-    solvable = chi2[:, 0].isfinite()
+    solvable = numbers(chi2[:, 0])
     reason = torch.full_like(seen, Reason.NONE)
     for condition, why in (
         (ahead < AMBIGUOUS_CHI2, Reason.TWO_SOLUTIONS),
@@ -113,7 +113,7 @@ def _minima(evidence: Evidence, starts: tuple[Tensor, Tensor], compile: bool) ->
     covariances = visible(evidence.covariance + evidence.placed, evidence.mask)
     if not compile and 2 * len(evidence) <= pnp.FEW:
         found = pnp.pair_minima(*given, covariances, evidence.mask, starts, _ITERATIONS)
-        return _Minima(*found, ~starts[0].isfinite().flatten(1).all(1))
+        return _Minima(*found, ~finite(starts[0], (1, 2, 3)))
     result = pnp.solve(
         *given,
         covariances=covariances,

@@ -13,7 +13,7 @@ from torchpose.detect import Candidates
 from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics, sectors
 from torchpose.geometry.blurred_edge import MOST
-from torchpose.geometry.constants import constant, either
+from torchpose.geometry.constants import constant, either, finite, numbers
 from torchpose.geometry.grey import full_scale
 from torchpose.geometry.least_squares import solve_scaled
 from torchpose.geometry.robust import RATIO_RANGE
@@ -154,7 +154,7 @@ def _edge_blur(grey: Tensor, seen: Tensor, outer: Tensor, ratio: Tensor, at: Ten
     length = torch.linalg.vector_norm(normal, dim=1)
     spacing = 2 * (_OUTERMOST - _INNERMOST) / (_RADII - 1) / length  # px, between the two samples, across the edge
     variance = (step / steepest * spacing).square() / (2 * torch.pi) - (spacing.square() + 1) / 12
-    known = variance.isfinite()
+    known = numbers(variance)
     rows = blurs.columns(*(normal / length[:, None]).unbind(1)).mT * known[:, None]
     right = torch.bmm(rows, either(known, variance, 0.0)[..., None])
     found = solve_scaled(torch.bmm(rows, rows.mT), right).squeeze(-1)
@@ -165,7 +165,7 @@ def _mean_profile(grey: Tensor, seen: Tensor, gaps: bool) -> Tensor:
     """Means (P, R) float64 of grey (P, R, A) over directions (P, A) that are seen; with ``gaps`` some may be NaN."""
     if gaps:
         return either(seen[:, None], grey, torch.nan).nanmean(-1).double()
-    return (grey @ seen[..., None].float()).squeeze(-1).double() / seen.sum(-1, keepdim=True)
+    return torch.bmm(grey, seen[..., None].float()).squeeze(-1).double() / seen.sum(-1, keepdim=True)
 
 
 def _ratio(inner: Tensor, outer: Tensor) -> Tensor:
@@ -187,10 +187,13 @@ def _planes(candidates: Candidates, camera: Camera | None) -> tuple[Tensor, Tens
     if camera is None:
         return index, none
     k = camera.matrix.to(candidates.ellipse)
-    conic = k.T @ conics.to_matrix(conics.conic_from_ellipse(candidates.ellipse)) @ k
+    square = conics.to_matrix(conics.conic_from_ellipse(candidates.ellipse)) @ k
+    conic = torch.bmm(k.T.expand_as(square), square)
     where = conics.circle_poses(conic, torch.ones_like(candidates.log10_nfa))[0] @ k.T
     apart = where[..., :2] / where[..., 2:] - candidates.ellipse[:, None, :2]
     far = torch.linalg.vector_norm(apart, dim=-1).amax(-1) > _PARTED * candidates.ellipse[:, 3]
-    far &= apart.isfinite().flatten(1).all(-1)
+    far &= finite(apart, (1, 2))
+    if not bool(far.any()):
+        return index, none
     own = torch.cat([index[~far], index[far].repeat_interleave(2)])
     return own, torch.cat([none[~far], apart[far].flatten(0, 1)])
