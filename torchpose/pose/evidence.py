@@ -105,17 +105,18 @@ def gather_evidence(
     """
     mask = ring >= 0
     row, marker = mask.nonzero().unbind(-1)
-    seen = rings[ring[row, marker]]
-    center, covariance = locate(seen.outer, seen.inner, markers.radii[row, marker])
-    disc = markers.radii[row, marker, 1] < 0
-    center = torch.where(disc[:, None], seen.outer.params[:, :2], center)
-    covariance = torch.where(disc[:, None, None], seen.outer.center_covariance, covariance)
+    which, radii = ring[row, marker], markers.radii[row, marker]
+    outer, inner, blur = rings.outer[which], rings.inner[which], rings.blur[which]
+    center, covariance = locate(outer, inner, radii)
+    disc = radii[:, 1] < 0
+    center = torch.where(disc[:, None], outer.params[:, :2], center)
+    covariance = torch.where(disc[:, None, None], outer.center_covariance, covariance)
 
     def laid_out(values: Tensor, fill: float) -> Tensor:
         empty = torch.full((*ring.shape, *values.shape[1:]), fill, dtype=torch.float64, device=ring.device)
         return empty.index_put((row, marker), values)
 
-    ellipses = laid_out(torch.stack([seen.outer.params, seen.inner.params], 1), 1.0)
+    ellipses = laid_out(torch.stack([outer.params, inner.params], 1), 1.0)
     # a circle of the radius r has the shape matrix r A, A from the plane to the image
     variance = markers.by_print[:, :, :3].square().sum(-1).amax(-1) / markers.radii[..., 0].square()
     shape = conics.shape_matrix(ellipses[:, :, 0])
@@ -126,8 +127,8 @@ def gather_evidence(
         laid_out(center, torch.nan),
         laid_out(covariance, torch.nan),
         ellipses,
-        laid_out(torch.stack([seen.outer.covariance, seen.inner.covariance], 1), 1.0),
-        laid_out(blurs.axes(seen.blur)[1], 1.0),
+        laid_out(torch.stack([outer.covariance, inner.covariance], 1), 1.0),
+        laid_out(blurs.axes(blur)[1], 1.0),
         mask,
         markers.coplanar,
         markers.polarity,

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchpose.geometry.arguments import checked
-from torchpose.geometry.constants import either
+from torchpose.geometry.constants import either, numbers
 from torchpose.geometry.rows import replace
 from torchpose.geometry.segments import marked, rank_in_group
 from torchpose.identify import MIN_MARKERS, Identified, Scene
@@ -114,7 +114,7 @@ def _vouched(solutions: Solutions, identified: Tensor) -> Solutions:
 def _positive(covariance: Tensor) -> Tensor:
     """Covariances (N,) bool, each scaled by its own deviations, that are positive definite."""
     scale = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).rsqrt()
-    scaled = either(scale.isfinite()[..., None], covariance * scale[..., :, None] * scale[..., None, :], -1.0)
+    scaled = either(numbers(scale)[..., None], covariance * scale[..., :, None] * scale[..., None, :], -1.0)
     return torch.linalg.cholesky_ex(scaled.nan_to_num(nan=-1.0))[1] == 0
 
 

@@ -417,9 +417,8 @@ class _Fit:
         if self.gain:
             part = part.wider(unknowns.values("gain")[:, 0])
         model, self.model = self.model or ring_model(part, pose.R, pose.t, spread, check=True), None
-        columns, slope = columns_of(part, model, levels)
-        residual = columns[:, :, -2].flatten(1)
-        self.residual, self.of_ring = residual, columns[:, :, POSE].flatten(1)
+        columns, slope, residual = columns_of(part, model, levels)
+        self.residual, self.of_ring = residual, 1 - model.fraction.flatten(1)
         noise = noise_spread(residual, part), model_misfit(levels)
         self.usable, self.weight = inliers(residual, part, model, *noise)
         if stage.coarse:  # the first steps begin with what was seen so far, the others see for themselves

@@ -55,11 +55,11 @@ def _pure_levels(blocks: PixelBlocks, fraction: Tensor) -> tuple[Tensor, Tensor]
     return ring - at_ring * slope, paper + (1 - at_paper) * slope
 
 
-def columns_of(blocks: PixelBlocks, model: RingModel, levels: Tensor) -> tuple[Tensor, Tensor]:
+def columns_of(blocks: PixelBlocks, model: RingModel, levels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Derivatives by pose (6), blur (3) and levels (L), the residual, and the derivative by the edge gain, by tiles:
     (K, P / 256, 11 + L, 256) float32.
 
-    Also the derivative by the distance from the edges (K, P).
+    Also the derivative by the distance from the edges, and the residual, (K, P).
     """
     a0, ax, ay, p0, px, py, *curved = levels.float()[..., None, None].unbind(1)
     x, y = model.x, model.y
@@ -74,7 +74,8 @@ def columns_of(blocks: PixelBlocks, model: RingModel, levels: Tensor) -> tuple[T
     basis = _basis(model, bool(curved))
     by_blur = (contrast * v for v in model.by_blur)
     by_pose = (by_d[:, :, None] * model.by_pose).unbind(2)
-    return torch.stack([*by_pose, *by_blur, *basis, residual, contrast * model.by_gain], 2), by_d.flatten(1)
+    columns = torch.stack([*by_pose, *by_blur, *basis, residual, contrast * model.by_gain], 2)
+    return columns, by_d.flatten(1), residual.flatten(1)
 
 
 def _basis(model: RingModel, curved: bool = False) -> tuple[Tensor, ...]:
