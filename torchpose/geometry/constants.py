@@ -9,33 +9,38 @@ from torch import Tensor
 from torchpose.geometry.segments import as_array
 
 _made: dict[tuple[Any, torch.dtype, torch.device], Tensor] = {}
+# the same by the identity of the numbers, which are mostly written in the code: to compare them all takes longer
+_known: dict[tuple[int, torch.dtype, torch.device], tuple[Any, Tensor]] = {}
 
 
 def constant(values: Any, like: Tensor, dtype: torch.dtype | None = None) -> Tensor:
     """The tensor of a number or nested tuples of numbers, in the dtype and on the device of another; not to be written
     to."""
+    kind = dtype or like.dtype, like.device
+    known = _known.get((id(values), *kind))
+    if known is not None and known[0] is values:
+        return known[1]
     if torch.compiler.is_compiling():  # which keeps what is constant itself
-        return torch.tensor(values, dtype=dtype or like.dtype, device=like.device)
-    key = values, dtype or like.dtype, like.device
-    if (known := _made.get(key)) is not None:
-        return known
+        return torch.tensor(values, dtype=kind[0], device=kind[1])
+    if (made := _made.get((values, *kind))) is not None:
+        return made
     with torch.inference_mode(False):  # it may be used where gradients are wanted
-        fresh = torch.tensor(values, dtype=key[1])
+        fresh = torch.tensor(values, dtype=kind[0])
         lasting = as_array(fresh) is not None  # not where torch traces or transforms functions
-        fresh = fresh.to(key[2])
+        fresh = fresh.to(kind[1])
     if lasting:
-        _made[key] = fresh
+        _made[values, *kind], _known[id(values), *kind] = fresh, (values, fresh)
     return fresh
 
 
-def eye(size: int, like: Tensor) -> Tensor:
-    """The identity (n, n), likewise."""
-    return constant(_identity(size), like)
+def eye(size: int, like: Tensor, times: float = 1.0) -> Tensor:
+    """The identity (n, n), or a multiple of it, likewise."""
+    return constant(_diagonal(size, times), like)
 
 
 @cache
-def _identity(size: int) -> tuple[tuple[float, ...], ...]:
-    return tuple(tuple(float(i == k) for k in range(size)) for i in range(size))
+def _diagonal(size: int, value: float) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(value * (i == k) for k in range(size)) for i in range(size))
 
 
 def finite(values: Tensor, dim: int | tuple[int, ...], *, keepdim: bool = False) -> Tensor:

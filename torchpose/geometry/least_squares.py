@@ -333,7 +333,7 @@ def solve_scaled(matrix: Tensor, right: Tensor) -> Tensor:
     """
     columns = right[..., None] if right.ndim < matrix.ndim else right
     scale = matrix.diagonal(dim1=-2, dim2=-1).clamp_min(_LEAST_DIAGONAL).rsqrt()[..., None]
-    scaled = torch.addcmul(_RIDGE * eye(matrix.shape[-1], matrix), matrix * scale, scale.mT)
+    scaled = torch.addcmul(eye(matrix.shape[-1], matrix, _RIDGE), matrix * scale, scale.mT)
     solution = scale * torch.linalg.solve_ex(scaled, columns * scale).result
     return solution.squeeze(-1) if right.ndim < matrix.ndim else solution
 
