@@ -25,7 +25,9 @@ if TYPE_CHECKING:
 
 Model = Literal["brown_conrady", "kannala_brandt"]
 # of normalised coordinates: a step of less leaves an error of its own square, about, which one more step squares again
-_LAST_STEP = 1e-6
+# (derived: that is rounding)
+_LAST_STEP = 1e-4
+_PLAIN_STEPS = 3
 _MAX_ITERATIONS = 60
 _NEAR = 1e-2  # of the root of the rounding: a step of Newton's from there is exact to rounding (derived: it squares)
 _NONE = torch.zeros(0)
@@ -299,14 +301,15 @@ class Camera:
         """Undistorted x, y (2, ...) of distorted ones, to within the last step that `undistort_points` makes."""
         # plain steps reach nearly all pixels of nearly all lenses, in a third of the calls
         xy = bent
-        for _ in range(2):
+        for number in range(_PLAIN_STEPS):
             found, slopes = lens.linearised(xy)
-            back = slopes.inverse()
-            xy = xy - back.of(found - bent)
-        step = back.of(lens.bent(xy) - bent)
-        xy = xy - step
-        sure = (torch.hypot(*step) < _LAST_STEP) & (torch.hypot(*xy) < 0.9 * self.fold_radius)
-        return xy if bool(sure.all()) else torch.where(sure, xy, self._invert_slowly(lens, bent))
+            step = slopes.inverse().of(found - bent)
+            xy = xy - step
+            if number:
+                sure = (_square(step) < _LAST_STEP**2) & (_square(xy) < (0.9 * self.fold_radius) ** 2)
+                if bool(sure.all()):
+                    return xy
+        return torch.where(sure, xy, self._invert_slowly(lens, bent))
 
     def _invert_slowly(self, lens: _Lens, bent: Tensor) -> Tensor:
         """The same wherever there is an inverse; NaN elsewhere."""
@@ -364,8 +367,8 @@ class Slopes(NamedTuple):
 
     def inverse(self) -> Slopes:
         """By Cramer's rule."""
-        over = self.determinant
-        return Slopes(self.straight.flip(0) / over, self.mixed / -over)
+        over = self.determinant.reciprocal()
+        return Slopes(self.straight.flip(0) * over, self.mixed * -over)
 
     def of(self, xy: Tensor) -> Tensor:
         """Times vectors (2, ...)."""

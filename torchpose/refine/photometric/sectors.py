@@ -76,7 +76,7 @@ def sum_sectors(
 ) -> Sectors:
     """Sums of residuals (K, P) with derivatives by the edge ``slope``, and weights, of which ``usable`` is the most."""
     middle = 0.5 * (1 + blocks.radii[:, 1] / blocks.radii[:, 0])
-    outer = torch.hypot(model.x, model.y).flatten(1) > middle[:, None].float()
+    outer = torch.addcmul(model.x * model.x, model.y, model.y).flatten(1) > middle.square()[:, None].float()
     count = len(blocks.row)
     block = torch.arange(count, device=blocks.row.device)[:, None]
     cell = (2 * block + outer) * SECTORS + blocks.sector
