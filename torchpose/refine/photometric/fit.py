@@ -50,7 +50,7 @@ from torchpose.refine.photometric.grey_levels import (
     sum_products,
 )
 from torchpose.refine.photometric.light import LEVELS, POSE, normal_equations, of_markers, pulled_by_levels
-from torchpose.refine.photometric.ring_model import RingModel, gather_pixels, ring_model
+from torchpose.refine.photometric.ring_model import PixelBlocks, RingModel, gather_pixels, ring_model
 from torchpose.refine.photometric.sectors import (
     Sectors,
     away_from_unclear,
@@ -392,7 +392,7 @@ class _Fit:
 
     def first_levels(self, start: Pose, spread: Spread) -> Tensor:
         """Grey levels (K, 6) where a fit begins."""
-        self.model = ring_model(self.coarse, start.R, start.t, spread, check=True)
+        self.model = ring_model(self.coarse, start.R, start.t, spread, check=True, gain=self.gain)
         return first_levels(self.coarse, self.model)
 
     def of(self, rows: Tensor) -> _Fit:
@@ -416,7 +416,7 @@ class _Fit:
         spread = cast(Spread, unknowns.own["blur"])
         if self.gain:
             part = part.wider(unknowns.values("gain")[:, 0])
-        model, self.model = self.model or ring_model(part, pose.R, pose.t, spread, check=True), None
+        model, self.model = self.model or self._model(part, pose, spread), None
         columns, slope, residual = columns_of(part, model, levels)
         self.residual, self.of_ring = residual, 1 - model.fraction.flatten(1)
         noise = noise_spread(residual, part), model_misfit(levels)
@@ -433,6 +433,11 @@ class _Fit:
         used, known = self.weight.sum(-1), self._known(unknowns)
         normal, self.variance = normal_equations(self.sums, used, levels, part.row, self.least, known, gain=self.gain)
         return normal
+
+    def _model(self, part: PixelBlocks, pose: Pose, spread: Spread) -> RingModel:
+        # what markers tell of the gain is asked of all pixels
+        gain = self.gain or not self.stage.coarse
+        return ring_model(part, pose.R, pose.t, spread, check=True, gain=gain)
 
     def look(self, spread: Spread, levels: Tensor) -> Look:
         """With the blurs of rows and the levels (K, L) of their markers."""

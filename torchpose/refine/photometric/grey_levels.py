@@ -56,8 +56,8 @@ def _pure_levels(blocks: PixelBlocks, fraction: Tensor) -> tuple[Tensor, Tensor]
 
 
 def columns_of(blocks: PixelBlocks, model: RingModel, levels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Derivatives by pose (6), blur (3) and levels (L), the residual, and the derivative by the edge gain, by tiles:
-    (K, P / 256, 11 + L, 256) float32.
+    """Derivatives by pose (6), blur (3) and levels (L), the residual, and the derivative by the edge gain where
+    the model has it, by tiles: (K, P / 256, 11 + L, 256) float32.
 
     Also the derivative by the distance from the edges, and the residual, (K, P).
     """
@@ -74,7 +74,8 @@ def columns_of(blocks: PixelBlocks, model: RingModel, levels: Tensor) -> tuple[T
     basis = _basis(model, bool(curved))
     by_blur = (contrast * v for v in model.by_blur)
     by_pose = (by_d[:, :, None] * model.by_pose).unbind(2)
-    columns = torch.stack([*by_pose, *by_blur, *basis, residual, contrast * model.by_gain], 2)
+    by_gain = () if model.by_gain is None else (contrast * model.by_gain,)
+    columns = torch.stack([*by_pose, *by_blur, *basis, residual, *by_gain], 2)
     return columns, by_d.flatten(1), residual.flatten(1)
 
 

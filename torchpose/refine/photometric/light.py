@@ -43,7 +43,7 @@ def normal_equations(
 
     Args:
         sums: (K, 11 + L, 11 + L), of every marker, weight times products of the derivatives by pose (9) and levels (L),
-            the residual, and the derivative by the edge gain.
+            the residual, and the derivative by the edge gain; the latter may be left out where it is no unknown.
         used: (K,) sum of weights.
         levels: (K, L) so far, L = 6, or 12 with the light's curvature.
         owner: (K,) int64, frame of every marker.
@@ -52,18 +52,19 @@ def normal_equations(
         gain: the edge gain is an unknown of the frame, too, the tenth; the prior is about it as well.
     """
     rows, chosen = len(least), POSE + gain
-    each = torch.stack([sums[:, -2, -2], used - levels.shape[1]], -1)
+    error = POSE + levels.shape[1]  # where the residual stands
+    each = torch.stack([sums[:, error, error], used - levels.shape[1]], -1)
     chi2, freedom = segment_sum(each, owner, rows).unbind(-1)
     variance = (chi2 / (freedom - chosen).clamp_min(1)).maximum(least)
     sums = sums / variance.index_select(0, owner)[:, None, None]
     by_own = torch.cat([sums[:, :POSE], sums[:, -1:]], 1) if gain else sums[:, :POSE]
-    of_levels = sums[:, POSE:-2, POSE:-2].clone()
+    of_levels = sums[:, POSE:error, POSE:error].clone()
     diagonal = of_levels.diagonal(dim1=-2, dim2=-1)
     diagonal.add_(diagonal.mean(-1, keepdim=True), alpha=_RIDGE)
-    part = Eliminated(by_own[..., POSE:-2], of_levels, sums[:, POSE:-2, -2], owner)
+    part = Eliminated(by_own[..., POSE:error], of_levels, sums[:, POSE:error, error], owner)
     # of pose and blur, and of the gain, which stands behind the residual
     every = segment_sum(by_own, owner, rows)
-    right, own = every[..., -2], torch.cat([every[..., :POSE], every[..., -1:]], -1) if gain else every[..., :POSE]
+    right, own = every[..., error], torch.cat([every[..., :POSE], every[..., -1:]], -1) if gain else every[..., :POSE]
     own.diagonal(dim1=-2, dim2=-1)[:, POSE - BLUR : POSE].add_(_BLUR_KNOWN)
     normal = Normal(own, right, chi2 / variance, part)
     normal = normal if prior is None else normal.with_prior(*prior)

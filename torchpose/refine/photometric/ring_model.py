@@ -117,7 +117,7 @@ class RingModel(NamedTuple):
     """Prediction and derivatives at one pose; planes (K, T, S) in float32.
 
     fraction: of paper, F. by_d: dF/dd through both circles. by_blur: 3 planes. by_pose: (K, T, 6, S), derivative of d.
-    by_gain: dF/d(edge gain), 1/mm.
+    by_gain: dF/d(edge gain), 1/mm; None if not asked for.
     x, y: plane coordinates over the outer radius. sound: bool, False where the expansions below do not hold: deep in
     a hole that is small for its blur, or where it is flat; None if not asked for.
     """
@@ -126,7 +126,7 @@ class RingModel(NamedTuple):
     by_d: Tensor
     by_blur: tuple[Tensor, ...]
     by_pose: Tensor
-    by_gain: Tensor
+    by_gain: Tensor | None
     x: Tensor
     y: Tensor
     sound: Tensor | None
@@ -338,7 +338,9 @@ def _normals(rim: _Rim, distance: Tensor) -> tuple[Tensor, Tensor]:
     return (nu + turn * nv) * length, (nv - turn * nu) * length
 
 
-def ring_model(blocks: PixelBlocks, R: Tensor, t: Tensor, spread: Spread, *, check: bool = False) -> RingModel:
+def ring_model(
+    blocks: PixelBlocks, R: Tensor, t: Tensor, spread: Spread, *, check: bool = False, gain: bool = True
+) -> RingModel:
     """Predicts every pixel at poses (N, 3, 3), (N, 3) and N blurs, and with ``check`` says where that is sound."""
     foot = _feet(blocks, R, t)
     rim = _rims(blocks, foot, turning=spread.kind == "line")
@@ -357,7 +359,8 @@ def ring_model(blocks: PixelBlocks, R: Tensor, t: Tensor, spread: Spread, *, che
     by_blur = tuple(one - other for one, other in both.by_blur)
     place = foot.place / blocks.radii[:, :1, None, None].float()
     fraction, by_d = both.fraction[0] + 1 - both.fraction[1], both.by_distance[0] - both.by_distance[1]
-    # dark edges move outwards: those of a dark ring away from each other
-    by_gain = both.by_distance.sum(0) * rim.per_mm * -blocks.polarity[:, None, None].float()
+    by_gain = None
+    if gain:  # dark edges move outwards: those of a dark ring away from each other
+        by_gain = both.by_distance.sum(0) * rim.per_mm * -blocks.polarity[:, None, None].float()
     x, y = place.unbind(2)
     return RingModel(fraction, by_d, by_blur, rim.by_pose, by_gain, x, y, sound)
