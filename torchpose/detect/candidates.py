@@ -184,6 +184,8 @@ def find_ellipses(
     ``onward`` tells of rings that single regions follow which frames arcs are put together in.
     """
     cell, least = strong_cells(grad), MIN_CELLS
+    if cell.numel() == 0:  # frames without any cost nothing here
+        return Candidates.unscored(cell, cell.new_zeros(0, 5, dtype=torch.float64), cell.double())
     if wanted.concentric:
         cell, least = crests(grad, cell), _MIN_CRESTS
     regions = level_line_regions(grad, cell, least)

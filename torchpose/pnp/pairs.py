@@ -8,22 +8,17 @@ that are given: the same steps (`iterative`), with the pose first (`few`), and w
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpose.pnp.few import Few, stepped
-from torchpose.pnp.iterative import RESERVE
+from torchpose.pnp.few import Few, factors, minimised, on_host
 from torchpose.pnp.planar import COLLINEARITY, FIXED, FLATNESS
 from torchpose.pnp.verdict import COINCIDENCE, DECISION
 
 Array = NDArray[Any]
-_RTOL = 1e-12  # as of `iterative.minimise`
-_MOST_DAMPING = 1e8  # as there
 
 
 class Pairs(NamedTuple):
@@ -37,14 +32,6 @@ class Pairs(NamedTuple):
     behind: Tensor
 
 
-def _on_host(function: Callable[..., tuple[Array, ...]], *args: Any) -> tuple[Tensor, ...]:
-    """What a function of arrays makes of tensors, on their device."""
-    device = next(v.device for v in args if isinstance(v, Tensor))
-    with np.errstate(all="ignore"):  # what is no number is none in the end
-        found = function(*(v.detach().cpu().numpy() if isinstance(v, Tensor) else v for v in args))
-    return tuple(torch.from_numpy(v).to(device) for v in found)
-
-
 def planar_starts(points: Tensor, xy: Tensor, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Both poses of a few rows of coplanar points by IPPE, to first order about their centroids: as `planar`, without a
     last word on the translation.
@@ -55,7 +42,7 @@ def planar_starts(points: Tensor, xy: Tensor, mask: Tensor) -> tuple[Tensor, Ten
     Returns:
         R (N, 2, 3, 3), t (N, 2, 3), and whether there are such poses, in front of the camera (N,) bool.
     """
-    R, t, known = _on_host(_of_planes, points, xy, mask)
+    R, t, known = on_host(_of_planes, points, xy, mask)
     return R, t, known
 
 
@@ -69,7 +56,7 @@ def pair_minima(
     max_iterations: int,
 ) -> Pairs:
     """Minima from two starts for each of N rows; arguments as of `solve`, points (N, M, 3), starts (N, 2, ...)."""
-    return Pairs(*_on_host(_minima, points, pixels, matrix, covariances, mask, *starts, max_iterations))
+    return Pairs(*on_host(_minima, points, pixels, matrix, covariances, mask, *starts, max_iterations))
 
 
 def _minima(
@@ -82,16 +69,14 @@ def _minima(
     unit = np.sqrt(np.square(local).sum(-1).max(-1, keepdims=True)).clip(np.finfo(local.dtype).tiny)
     focal, principal = matrix.diagonal()[:2], matrix[:2, 2]
     xy = np.where(mask[..., None], (pixels - principal) / focal, 0.0)
-    root = np.linalg.solve(_factors(covariances), np.diag(focal)) * seen[..., None]
-    aimed = (root * xy[:, :, None]).sum(-1)
+    root = np.linalg.solve(factors(covariances), np.diag(focal)) * seen[..., None]
     # residuals that are wrong by the rounding of their image points
     scale = np.square(root).max((-1, -2)) * (1 + np.square(xy).sum(-1))
     floor = (4 * np.finfo(xy.dtype).eps) ** 2 * scale.sum(-1)
-    x = np.concatenate([local / unit[..., None], np.ones_like(seen)], -1)
-    x, root, aimed, floor = (value.repeat(2, 0) for value in (x, root, aimed, floor))
-    few = Few(x, x[..., :3].repeat(2, 1), root, aimed)
+    few = Few.at(*(value.repeat(2, 0) for value in (local / unit[..., None], xy, root)))
     shift = (R @ center[:, None, :, None] + t[..., None]) / unit[:, :, None, None]
-    pose, done, information = _minimised(few, np.concatenate([R, shift], -1).reshape(-1, 3, 4), floor, steps)
+    ends = minimised(few, np.concatenate([R, shift], -1).reshape(-1, 3, 4), floor.repeat(2), steps, _relevant)
+    pose, information = ends.pose, few.whole(ends.pose, newton=False)[:, :6, :6]
     depth, uv, white = few.seen(pose)
     pose = pose.reshape(-1, 2, 3, 4)
     chi2 = np.where(depth.min((1, 2)) > 0, np.square(white - few.aimed).sum((1, 2)), np.inf).reshape(-1, 2)
@@ -99,12 +84,18 @@ def _minima(
     rms = np.sqrt(np.square(off).sum((2, 3)) / count)
     worse = (np.nan_to_num(chi2[:, 1], nan=np.inf) >= np.nan_to_num(chi2[:, 0], nan=np.inf)).astype(int)
     same = _distance(pose, information.reshape(-1, 2, 6, 6), worse) < COINCIDENCE
-    chi2 = _apart(chi2, done.reshape(-1, 2), worse, same)
+    chi2 = _apart(chi2, ends.done.reshape(-1, 2), worse, same)
     gone = ~np.isfinite(chi2)
     R, t = pose[..., :3], (pose[..., 3:] * unit[:, :, None, None] - pose[..., :3] @ center[:, None, :, None])[..., 0]
     R, t = np.where(gone[..., None, None], np.nan, R), np.where(gone[..., None], np.nan, t)
     behind = (chi2 == np.inf).all(1)
     return R, t, np.where(gone, np.nan, rms), np.where(gone, np.nan, chi2), behind
+
+
+def _relevant(cost: Array) -> Array:
+    """Costs (2 N,) above which a minimum of two matters no more, given those at the starts: as `verdict.relevant`."""
+    least = np.nan_to_num(cost.reshape(-1, 2), nan=np.inf).min(1)
+    return (2 * least + 2 * DECISION).repeat(2)
 
 
 def _distance(pose: Array, information: Array, worse: Array) -> Array:
@@ -135,79 +126,6 @@ def _apart(chi2: Array, done: Array, worse: Array, same: Array) -> Array:
     alone = same[:, None] | ~some.all(1, keepdims=True)
     lost = (~done & ~(second & alone)).any(1, keepdims=True) & some.any(1, keepdims=True)
     return np.where(lost | (second & alone & some), np.nan, chi2)
-
-
-def _minimised(few: Few, start: Array, floor: Array, steps: int) -> tuple[Array, Array, Array]:
-    """Poses (K, 3, 4) of minima, those of one row following each other, whether they were reached (K,) bool, and the
-    information about them (K, 6, 6), without second derivatives, before the last step."""
-    pose = trial = start
-    over = done = np.zeros(len(floor), bool)
-    damping, cost, whole = np.full_like(floor, 1e-3), np.full_like(floor, np.inf), start
-    decrease = enough = cost
-    for number in range(steps):
-        there, ahead = few.whole(trial, newton=True)
-        new = np.where(ahead, there[:, 6, 6], np.inf)
-        lower = (new <= cost + 2 * np.sqrt(cost * floor) + floor) if number else ~over
-        accept = lower & ~over
-        taken = accept[:, None, None] if number else True
-        pose, whole, cost = (
-            np.where(taken, trial, pose),
-            np.where(taken, there, whole) if number else there,
-            (np.where(accept, new, cost)),
-        )
-        if number == 0:
-            least = np.nan_to_num(cost.reshape(-1, 2), nan=np.inf).min(1)
-            enough = (2 * least + 2 * DECISION).repeat(2)  # as of `verdict.relevant`
-        old = (trial, decrease, damping, done)
-        damping = np.where(lower, (0.1 * damping).clip(1e-6), (10 * damping).clip(1e-2))
-        step, decrease, definite = _damped(whole, damping)
-        if not (definite | over).all():
-            step, decrease = _off_saddle(few, pose, cost, damping, (step, decrease, definite))
-        trial, sure = stepped(pose, -step), damping <= 1
-        left = sure & (cost - RESERVE * decrease > enough)
-        trial, decrease = np.where(left[:, None, None], pose, trial), np.where(left, 0.0, decrease)
-        done = sure & (decrease <= _RTOL * cost + floor) & (cost < np.inf)
-        trial = np.where(over[:, None, None], old[0], trial)
-        decrease, damping, done = (
-            np.where(over, a, b) for a, b in zip(old[1:], (decrease, damping, done), strict=True)
-        )
-        # neither a pose without numbers nor one whose steps have shrunk to nothing will come to an end
-        over = done | ~((damping < _MOST_DAMPING) & (cost < np.inf))
-        if over.all():
-            break
-    pose = np.where(done[:, None, None], trial, pose)
-    return pose, done, few.whole(pose, newton=False)[0][:, :6, :6]
-
-
-def _damped(whole: Array, damping: Array) -> tuple[Array, Array, Array]:
-    """Steps (K, 6), the decrease of the cost that they promise, and whether they are to a minimum (K,)."""
-    matrix, right = whole[:, :6, :6].copy(), whole[:, :6, 6]
-    matrix[:, range(6), range(6)] *= 1 + damping[:, None]
-    definite = np.isfinite(_factors(matrix)).all((1, 2))
-    step = np.full_like(right, np.nan)
-    step[definite] = np.linalg.solve(matrix[definite], right[definite, :, None])[..., 0]
-    return step, (step * right).sum(1), definite
-
-
-def _factors(matrices: Array) -> Array:
-    """Cholesky's factors (K, n, n), NaN where a matrix is not positive definite."""
-    try:
-        return np.linalg.cholesky(matrices)
-    except np.linalg.LinAlgError:
-        if matrices.ndim == 2:
-            return np.full_like(matrices, np.nan)
-    return np.stack([_factors(matrix) for matrix in matrices])
-
-
-def _off_saddle(
-    few: Few, pose: Array, cost: Array, damping: Array, newton: tuple[Array, Array, Array]
-) -> tuple[Array, Array]:
-    """Steps and decreases, those of Gauss-Newton, stretched, where the matrix is not definite; see `iterative`."""
-    step, decrease, _ = _damped(few.whole(pose, newton=False)[0], damping)
-    stretch = np.where(damping < 1e-3, np.sqrt(0.1 * cost / decrease).clip(1, 1e3), 1.0)
-    definite = newton[2]
-    step = np.where(definite[:, None], newton[0], stretch[:, None] * step)
-    return step, np.where(definite, newton[1], decrease)
 
 
 def _of_planes(points: Array, xy: Array, mask: Array) -> tuple[Array, ...]:
