@@ -362,7 +362,7 @@ class Slopes(NamedTuple):
 
     @property
     def determinant(self) -> Tensor:
-        xx, yy = self.straight
+        xx, yy = self.straight.unbind()
         return torch.addcmul(xx * yy, self.mixed, self.mixed, value=-1)
 
     def inverse(self) -> Slopes:
@@ -397,7 +397,7 @@ class _Lens(NamedTuple):
         r2 = _square(xy)
         if self.kind == "fisheye":
             return self._fisheye(r2)[0] * xy
-        x, y = self.twice * xy
+        x, y = (self.twice * xy).unbind()
         return torch.addcmul((self._radial(r2)[0] + x + y) * xy, r2, self.aside)
 
     def linearised(self, xy: Tensor) -> tuple[Tensor, Slopes]:
@@ -414,10 +414,10 @@ class _Lens(NamedTuple):
         if denominator is not None:
             below = _polynomial(r2, [2 * (power + 1) * k for power, k in enumerate(self.below)])
             slope = (slope - s * below) / denominator
-        lean, steep, (x, y) = self.twice * xy, slope * xy, xy
-        lean_x, lean_y = lean
+        lean, steep, (x, y) = self.twice * xy, slope * xy, xy.unbind()
+        lean_x, lean_y = lean.unbind()
         s = s + lean_x + lean_y
-        p2, p1 = self.twice
+        p2, p1 = self.twice.unbind()
         across = torch.addcmul(p1 * x, p2, y)
         slopes = Slopes(torch.add(s, lean, alpha=2).addcmul(steep, xy), across.addcmul(steep[0], y))
         return torch.addcmul(s * xy, r2, self.aside), slopes
@@ -446,7 +446,7 @@ class _Lens(NamedTuple):
 
 def _square(xy: Tensor) -> Tensor:
     """x^2 + y^2 (...) of (2, ...)."""
-    x, y = xy  # sums of planes of two rows take twice as long
+    x, y = xy.unbind()  # sums of planes of two rows take twice as long
     return torch.addcmul(x * x, y, y)
 
 
