@@ -48,7 +48,7 @@ def test_constants_within_transforms_of_functions_leave_nothing_behind() -> None
 def test_either_is_where(values: Tensor, value: float) -> None:
     condition = torch.tensor([[True], [False], [True], [False]])
     for one, other in ((values, value), (value, values), (values, values + 1), (4, 7), (0.5, 2.0)):
-        wanted = torch.where(condition, one, other)  # type: ignore[call-overload]  # of numbers, too
+        wanted = torch.where(condition, one, other)
         found = either(condition, one, other)
         assert found.dtype == wanted.dtype
         assert torch.equal(found.nan_to_num(nan=-9.0), wanted.nan_to_num(nan=-9.0))
