@@ -183,10 +183,9 @@ def find_ellipses(
     ``known`` are accepted ellipses of a finer scale in the pixels of this one, which may explain edges better.
     ``onward`` tells of rings that single regions follow which frames arcs are put together in.
     """
-    cell = strong_cells(grad)
-    if cell.numel() == 0:  # frames without any cost nothing here
+    cell, least = strong_cells(grad), MIN_CELLS
+    if not cell.numel():  # frames without any cost nothing here
         return Candidates.unscored(cell, cell.new_zeros(0, 5, dtype=torch.float64), cell.double())
-    least = MIN_CELLS
     if wanted.concentric:
         cell, least = crests(grad, cell), _MIN_CRESTS
     regions = level_line_regions(grad, cell, least)
