@@ -243,6 +243,21 @@ def test_robust_fit(generator: torch.Generator) -> None:
     assert_same_ellipses(found, clean, atol=0.02)
 
 
+def test_fit_near_is_the_fit_of_what_the_first_one_passes_near(generator: torch.Generator) -> None:
+    """By its definition: distances from a first fit, and their weights in a second one."""
+    truth = random_ellipses(40, generator)
+    xy, index = sample(truth, 100, generator, noise=0.3)
+    stray = torch.rand(len(xy), generator=generator) < 0.1
+    xy = torch.where(stray[:, None], xy + 2.0, xy)
+    weights = 0.5 + torch.rand(len(xy), generator=generator, dtype=torch.float64)
+    first = ellipse.fit(xy, index, 40, weights)
+    far = (ellipse.distance(xy, index, first) / 3).square()
+    wanted = ellipse.fit(xy, index, 40, weights * (1 - far).clamp_min(0).square())
+    assert_same_ellipses(ellipse.fit_near(xy, index, 40, weights, 3.0), wanted, atol=1e-9)
+    line = torch.linspace(0, 9, 10, dtype=torch.float64)[:, None] * torch.tensor([1.0, 2.0], dtype=torch.float64)
+    assert ellipse.fit_near(line, torch.zeros(10, dtype=torch.int64), 1, None, 3.0).isnan().all()
+
+
 def test_robust_fit_of_clean_points_is_the_plain_fit(generator: torch.Generator) -> None:
     truth = random_ellipses(20, generator)
     xy, index = sample(truth, 100, generator, noise=0.03)

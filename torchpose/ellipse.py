@@ -15,6 +15,7 @@ from torch import Tensor
 from torchpose.errors import ArgumentError
 from torchpose.geometry import conics
 from torchpose.geometry.arguments import checked, expect_index, expect_not_negative, expect_positive
+from torchpose.geometry.constants import constant, either
 from torchpose.geometry.least_squares import geman_mcclure
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import Tiles
@@ -22,6 +23,7 @@ from torchpose.geometry.segments import Tiles
 _SOLVABLE_POINTS = 6  # five parameters and one point to spare (derived)
 _CHUNK = 1 << 15  # points summed at a time: blocks that stay in the processor's cache
 _MOST_PADDING = 4  # places a point: beyond, points are summed one by one (convention: cost alone depends on it)
+_LEAST_SLOPE = 1e-9  # 1/px, of a conic (convention: far below that of any ellipse)
 _FLAT = 1e-12  # squared ratio of the extents of a point set across and along, below which it is a line (convention)
 
 Method = Literal["halir-flusser", "taubin"]
@@ -97,6 +99,16 @@ def fit(
     return _from_moments(*(torch.cat(part) for part in zip(*parts, strict=True)), method=method)
 
 
+@checked
+def fit_near(points: Points, index: Index, count: int, weights: Weights, reach: float) -> Ellipses:
+    """As `fit`, then once more with weights that fall smoothly to 0 at ``reach`` px from that ellipse."""
+    _expect(index, count, weights)
+    tiles, xy, w = _tiled(points, index, count, weights)
+    first = _Conics.of(*_tile_moments(tiles, xy, w))
+    far = (first.distances(tiles, xy).nan_to_num(nan=reach) / reach).square()[:, None]
+    return _Conics.of(*_tile_moments(tiles, xy, w * (1 - far).clamp_min(0).square())).ellipses()
+
+
 def _expect(index: Tensor, count: int, weights: Tensor | None = None) -> None:
     expect_not_negative(count=count)
     expect_index("index", index, count)
@@ -144,62 +156,58 @@ def fit_blocks(
 
 
 def _moments(points: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-    """Centroids (M, 2), mean central moments (M, 12), and whether there are enough points (M,).
+    """Centroids (M, 2), mean central moments (M, 3, 6), and whether there are enough points (M,).
 
-    The moments are m20 m11 m02, m30 m21 m12 m03, m40 m31 m22 m13 m04.
+    The moments are means of the products of x^2, xy, y^2 and x^2, xy, y^2, x, y, 1.
     """
     xy = points.double().mT.contiguous()  # (M, 2, P): the fastest layout by far for all that follows
     if weights is None:
         w: Tensor | None = None
         total: Tensor | int = xy.shape[2]
         enough = torch.full((xy.shape[0],), xy.shape[2] >= _SOLVABLE_POINTS, device=xy.device)
-        center = xy.mean(-1)
+        center = xy.mean(-1, keepdim=True)
     else:
         w = weights.double()[:, None]
-        xy = torch.where(w > 0, xy, 0.0)
-        total, enough = w.sum(-1), (w > 0).sum(-1).squeeze(-1) >= _SOLVABLE_POINTS
-        center = (xy @ w.mT).squeeze(-1) / total
-    # writing in place saves a copy, and leaves no gradient
-    sums = _fused_sums if torch.compiler.is_compiling() or xy.requires_grad else _gram_sums
-    return center, sums(xy, center[..., None], w) / total, enough
+        there = w > 0
+        xy = either(there, xy, 0.0)
+        total, enough = w.sum(-1, keepdim=True), there.sum((1, 2)) >= _SOLVABLE_POINTS
+        center = torch.bmm(xy, w.mT) / total
+    sums = _fused_sums if torch.compiler.is_compiling() else _gram_sums
+    return center.squeeze(-1), sums(xy, center, w) / total, enough
 
 
 def _tiled(points: Tensor, index: Tensor, count: int, weights: Tensor | None = None) -> tuple[Tiles, Tensor, Tensor]:
-    """Points (K, 2, T) and their weights (K, 1, T) laid out in tiles."""
+    """Points (K, 2, T), 0 where their weight is, and their weights (K, 1, T), laid out in tiles."""
     tiles = Tiles.of(index, count)
     weights = torch.ones_like(index, dtype=torch.float64) if weights is None else weights.double()
-    xy, w = tiles.planes(*points.double().unbind(-1), weights).split([2, 1], 1)
-    return tiles, xy, w
+    xy, w = tiles.planes(*points.double().unbind(-1), weights).split_with_sizes([2, 1], 1)
+    return tiles, either(w > 0, xy, 0.0), w
 
 
 def _tile_moments(tiles: Tiles, xy: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """As `_moments`, for ellipses whose numbers of points differ too much for one block."""
-    counts = weights > 0
-    xy = torch.where(counts, xy, 0.0)
-    total, used = tiles.sums(weights.sum(-1)), tiles.sums(counts.sum(-1))
-    center = tiles.sums((xy * weights).sum(-1)) / total
-    sums = _fused_sums if xy.requires_grad else _gram_sums
-    moments = tiles.sums(sums(xy, center[tiles.group][..., None], weights)) / total
-    return center, moments, used.squeeze(-1) >= _SOLVABLE_POINTS
+    """As `_moments`, for ellipses whose numbers of points differ too much for one block; points as of `_tiled`."""
+    sums = tiles.sums(torch.cat([weights, (weights > 0).double(), xy * weights], 1).sum(-1))
+    total, used, center = sums.split_with_sizes([1, 1, 2], 1)
+    center = center / total
+    moments = tiles.sums(_gram_sums(xy, center.index_select(0, tiles.group)[..., None], weights))
+    return center, moments / total[..., None], used.squeeze(-1) >= _SOLVABLE_POINTS
 
 
 def _gram_sums(xy: Tensor, center: Tensor, weights: Tensor | None) -> Tensor:
-    """Sums (M, 12) of the monomials of `_moments` of points (M, 2, P) about centres (M, 2, 1): one matrix product."""
-    planes = xy.new_empty(xy.shape[0], 5, xy.shape[2])  # x, y, x^2, xy, y^2
-    torch.sub(xy, center, out=planes[:, :2])
-    torch.mul(planes[:, :2], planes[:, :1], out=planes[:, 2:4])
-    torch.mul(planes[:, 1], planes[:, 1], out=planes[:, 4])
-    left = planes[:, 2:] if weights is None else planes[:, 2:] * weights
-    gram = left @ planes.mT
-    return torch.cat([left.sum(-1), gram[:, 0, :2], gram[:, 2, :2], gram[:, 0, 2:], gram[:, 1:, 4]], -1)
+    """Sums (M, 3, 6) of `_moments` of points (M, 2, P) about centres (M, 2, 1): one matrix product."""
+    xy = xy - center
+    x, y = xy.split_with_sizes([1, 1], 1)
+    square = torch.cat([xy * x, y * y], 1)
+    left = square if weights is None else square * weights
+    return torch.bmm(left, torch.cat([square, xy, torch.ones_like(x)], 1).mT)
 
 
 def _fused_sums(xy: Tensor, center: Tensor, weights: Tensor | None) -> Tensor:
     """The same as plain sums, which a compiler makes one pass over the points of."""
     x, y = (xy - center).unbind(1)
-    xx, xy_, yy = x * x, x * y, y * y
-    terms = (xx, xy_, yy, xx * x, xx * y, yy * x, yy * y, xx * xx, xx * xy_, xx * yy, xy_ * yy, yy * yy)
-    return torch.stack([(z if weights is None else z * weights[:, 0]).sum(-1) for z in terms], -1)
+    square = (x * x, x * y, y * y)
+    terms = [one * other for one in square for other in (*square, x, y, torch.ones_like(x))]
+    return torch.stack([(z if weights is None else z * weights[:, 0]).sum(-1) for z in terms], -1).unflatten(-1, (3, 6))
 
 
 def _from_moments(center: Tensor, moments: Tensor, enough: Tensor, *, method: Method) -> Tensor:
@@ -218,44 +226,81 @@ class _Conics(NamedTuple):
     @classmethod
     def of(cls, center: Tensor, moments: Tensor, enough: Tensor, method: Method = "halir-flusser") -> Self:
         """From the results of `_moments`."""
-        rows = moments.mT.contiguous()
-        square = (rows[0] + rows[2]).reciprocal()
-        scale = square.rsqrt()
-        scaled = torch.cat([rows[:3] * square, rows[3:7] * (square / scale), rows[7:] * square.square()])
-        conic = _taubin(scaled.unbind(0)) if method == "taubin" else _halir_flusser(scaled)
-        m20, m11, m02 = scaled[:3].unbind()  # m20 + m02 = 1, so their determinant is the squared ratio of the extents
-        return cls(conic, center, scale, enough & (m20 * m02 - m11 * m11 > _FLAT))
+        planes = moments.permute(1, 2, 0).contiguous()
+        square = (planes[0, 5] + planes[2, 5]).reciprocal()
+        orders = constant(((2.0,), (2.0,), (2.0,), (1.5,), (1.5,), (1.0,)), square)
+        planes = planes * square**orders
+        m20, m11, m02 = planes[:, 5].unbind()  # m20 + m02 = 1, so their determinant is the squared ratio of the extents
+        det = torch.addcmul(m20 * m02, m11, m11, value=-1)
+        conic = _taubin(planes) if method == "taubin" else _halir_flusser(planes, det)
+        return cls(conic, center, square.rsqrt(), enough & (det > _FLAT))
 
     def ellipses(self) -> Tensor:
         """(M, 5)."""
         ellipse, scale = conics.ellipse_from_conic(self.conic), self.scale[:, None]
-        ellipse = torch.cat([ellipse[:, :2] * scale + self.center, ellipse[:, 2:4] * scale, ellipse[:, 4:]], -1)
-        return torch.where(self.sound[:, None], ellipse, torch.nan)
+        center, axes, theta = ellipse.split_with_sizes([2, 2, 1], -1)
+        ellipse = torch.cat([torch.addcmul(self.center, center, scale), axes * scale, theta], -1)
+        return either(self.sound[:, None], ellipse, torch.nan)
+
+    def distances(self, tiles: Tiles, xy: Tensor) -> Tensor:
+        """As `distance`, of points (K, 2, T) in tiles, from the ellipses; NaN where there is none."""
+        a, b, c, d, e, f = self.conic.unbind(-1)
+        half, square = 2 * a, 2 * c
+        disc = torch.addcmul(half * square, b, b, value=-1)
+        x, y = torch.addcmul(b * e, square, d, value=-1) / disc, torch.addcmul(b * d, half, e, value=-1) / disc
+        # the conic is rho^2 - 1 where it is -1 at the centre
+        level = f + 0.5 * torch.addcmul(d * x, e, y)
+        conic = either(self.sound[:, None], self.conic / -level[:, None], torch.nan)
+        rows = _rows(conic).index_select(0, tiles.group)
+        unit = (xy - self.center.index_select(0, tiles.group)[..., None]) / self.scale[tiles.group, None, None]
+        square, u, v = torch.bmm(rows, _terms(unit)).unbind(1)
+        rho = (square + 1).sqrt()
+        return 2 * rho * (rho - 1) / _length(u, v) * self.scale[tiles.group, None]
 
 
-def _halir_flusser(moments: Tensor) -> Tensor:
-    """Conics (M, 6) of central moments (12, M), as `_moments` orders them, with m20 + m02 = 1.
+def _terms(xy: Tensor) -> Tensor:
+    """x^2, xy, y^2, x, y and 1 (K, 6, T) of (K, 2, T)."""
+    x, y = xy.split_with_sizes([1, 1], 1)
+    return torch.cat([xy * x, y * y, xy, torch.ones_like(x)], 1)
+
+
+def _rows(conic: Tensor) -> Tensor:
+    """Conics (M, 6) as sums of `_terms`, and their derivatives by x and y: (M, 3, 6)."""
+    return (conic @ constant(_BY_TERMS, conic)).unflatten(1, (3, 6))
+
+
+# each coefficient's part in the sums of `_rows`, (6, 18)
+_BY_TERMS = (
+    (1.0, *[0.0] * 5, *[0.0] * 3, 2.0, 0.0, 0.0, *[0.0] * 6),
+    (0.0, 1.0, *[0.0] * 4, *[0.0] * 4, 1.0, 0.0, *[0.0] * 3, 1.0, 0.0, 0.0),
+    (*[0.0] * 2, 1.0, *[0.0] * 3, *[0.0] * 6, *[0.0] * 4, 2.0, 0.0),
+    (*[0.0] * 3, 1.0, *[0.0] * 2, *[0.0] * 5, 1.0, *[0.0] * 6),
+    (*[0.0] * 4, 1.0, 0.0, *[0.0] * 6, *[0.0] * 5, 1.0),
+    (*[0.0] * 5, 1.0, *[0.0] * 12),
+)
+
+
+def _halir_flusser(moments: Tensor, det: Tensor) -> Tensor:
+    """Conics (M, 6) of central moments (3, 6, M), as of `_moments`, with m20 + m02 = 1 and m20 m02 - m11^2 = det.
 
     The 3x3 eigenproblem in closed form. Matrices are (rows, columns, M): planes of numbers, few calls and fast ones.
     """
-    mean, third, fourth = moments[:3], moments[3:7], moments[7:]
-    # the moments of one order make up a Hankel matrix
-    square, mixed, quartic = mean.unfold(0, 2, 1).mT, third.unfold(0, 2, 1).mT, fourth.unfold(0, 3, 1).mT
-    eye = torch.eye(3, dtype=moments.dtype, device=moments.device)[..., None]
-    # scatter matrix of (x^2, xy, y^2) after eliminating the linear part (x, y, 1); the trace of the square is 1
-    det = mean[0] * mean[2] - mean[1].square()
-    linear = (mixed[:, :, None] * ((eye[:2, :2] - square) / det)).sum(1)
-    scatter = quartic - (linear[:, None] * mixed).sum(2) - mean[:, None] * mean
+    quartic, mixed, mean = moments.split_with_sizes([3, 2, 1], 1)
+    # scatter matrix of (x^2, xy, y^2) after eliminating the linear part (x, y, 1)
+    signs = constant(((1.0,), (-1.0,), (-1.0,), (1.0,)), det)
+    inverse = (mean[:, 0].index_select(0, constant((2, 1, 1, 0), det, torch.int64)) * signs / det).unflatten(0, (2, 2))
+    rest = torch.cat([(mixed[:, :, None] * inverse).sum(1), mean], 1)
+    scatter = quartic - (rest[:, None] * moments[:, 3:]).sum(2)
     # rows of M = C^-1 S with the constraint matrix C of 4AC - B^2
-    quadratic = _positive_eigenvector(torch.stack([0.5 * scatter[2], -scatter[1], 0.5 * scatter[0]]), eye)
+    quadratic = _positive_eigenvector(scatter.flip(0) * constant((((0.5,),), ((-1.0,),), ((0.5,),)), det))
     # back-substitute the linear part
-    rest = torch.cat([linear, mean[:, None]], 1)
     return torch.cat([quadratic, -(quadratic[:, None] * rest).sum(0)]).mT
 
 
-def _taubin(moments: tuple[Tensor, ...]) -> Tensor:
-    """Conics (M, 6) of central moments: smallest eigenvector of the scatter against the mean squared gradient."""
-    m20, m11, m02, m30, m21, m12, m03, m40, m31, m22, m13, m04 = moments
+def _taubin(moments: Tensor) -> Tensor:
+    """Conics (M, 6) of central moments (3, 6, M): smallest eigenvector of the scatter against the mean squared
+    gradient."""
+    (m40, m31, m22, m30, m21, m20), (*_, m11), (_, m13, m04, m12, m03, m02) = moments
     zero, one = torch.zeros_like(m20), torch.ones_like(m20)
     # (A, B, C, D, E) after eliminating F = -(A m20 + B m11 + C m02)
     mean = torch.stack([m20, m11, m02, zero, zero], -1)
@@ -284,16 +329,18 @@ def _taubin(moments: tuple[Tensor, ...]) -> Tensor:
     _, vectors = torch.linalg.eigh(white)
     best = torch.linalg.solve_triangular(factor.mT, vectors[:, :, :1], upper=True).squeeze(-1)
     conic = torch.cat([best, -(best * mean).sum(-1, keepdim=True)], -1)
-    return torch.where(sound[:, 0], conic, torch.nan)
+    return either(sound[:, 0], conic, torch.nan)
 
 
-def _positive_eigenvector(matrix: Tensor, eye: Tensor) -> Tensor:
+def _positive_eigenvector(matrix: Tensor) -> Tensor:
     """Eigenvectors (3, M) of the one non-negative eigenvalue of C^-1 S (3, 3, M), the largest of three real ones."""
+    eye = constant(tuple(tuple((float(i == k),) for k in range(3)) for i in range(3)), matrix)
     centered = matrix - matrix.diagonal().mean(-1) * eye
-    p = ((centered * centered.transpose(0, 1)).sum((0, 1)) / 6).clamp_min(0)
-    det = (torch.linalg.cross(centered[0], centered[1], dim=0) * centered[2]).sum(0)
-    root = p.sqrt()
-    largest = 2 * root * ((det / (2 * p * root)).clamp(-1, 1).acos() / 3).cos()
+    # Viete's solution of the cubic: the largest root is twice the radius times a cosine
+    twice = ((centered * centered.transpose(0, 1)).sum((0, 1)) * (2 / 3)).clamp_min(0).sqrt()
+    one, two, three = centered
+    det = (torch.linalg.cross(one, two, dim=0) * three).sum(0)
+    largest = twice * ((4 * det / twice.pow(3)).clamp(-1, 1).acos() / 3).cos()
     rows = centered - largest * eye
     # the null vector is the cross product of any two independent rows: take the longest of the three
     crosses = torch.linalg.cross(rows, rows.roll(-1, 0), dim=1)
@@ -367,9 +414,8 @@ def fit_robust(
     if len(start) != count:
         raise ArgumentError(f"start: has {len(start)} ellipses; give one for each of the {count} of count")
     near = Near.of(points, index, start)
-    _, keep = near.robust(near.circle, scales, cut)
-    ellipses = _Conics.of(*_tile_moments(near.tiles, near.xy, keep[:, None])).ellipses()
-    return ellipses, near.tiles.flat(keep) > 0
+    kept = near.tiles.flat(near.robust(near.circle, scales, cut)[1])
+    return fit(points, index, count, kept), kept > 0
 
 
 class Near(NamedTuple):
@@ -381,86 +427,82 @@ class Near(NamedTuple):
 
     Attributes:
         tiles: the points'.
-        xy: (K, 2, T), px, 0 where there is none.
         there: (K, T), 1 where there is one, else 0.
         terms: (K, 6, T), x^2, xy, y^2, x, y and 1.
         center: (M, 2), of the ellipses.
         inverse: (M, 2, 2), from px about them to these coordinates.
+        rows: (M, 6, 18), as `_rows` for each coefficient of a conic, derivatives per px.
     """
 
     tiles: Tiles
-    xy: Tensor
     there: Tensor
     terms: Tensor
     center: Tensor
     inverse: Tensor
+    rows: Tensor
 
     @classmethod
     def of(cls, points: Tensor, index: Tensor, ellipses: Tensor) -> Self:
         """Of points (E, 2) near the ellipses (M, 5) of their index (E,)."""
         ellipses = ellipses.double()
-        tiles, inverse = Tiles.of(index, len(ellipses)), torch.linalg.inv_ex(conics.shape_matrix(ellipses)).inverse
-        return cls._at(tiles, points, ellipses[:, :2], inverse)
+        tiles, inverse = Tiles.of(index, len(ellipses)), conics.inverse_shape(ellipses)
+        each = constant(_BY_TERMS, inverse).view(6, 3, 6)
+        slopes = (inverse @ each[:, 1:].transpose(0, 1).flatten(1)).unflatten(2, (6, 6)).transpose(1, 2)
+        rows = torch.cat([each[None, :, :1].expand(len(inverse), -1, -1, -1), slopes], 2).flatten(2)
+        return cls._at(tiles, points, ellipses[:, :2], inverse, rows)
 
     @classmethod
-    def _at(cls, tiles: Tiles, points: Tensor, center: Tensor, inverse: Tensor) -> Self:
+    def _at(cls, tiles: Tiles, points: Tensor, center: Tensor, inverse: Tensor, rows: Tensor) -> Self:
         u, v = points.double().unbind(-1)
         planes = tiles.planes(u, v, torch.ones_like(u))
-        finite = planes.isfinite().all(1, keepdim=True)
-        xy, there = torch.where(finite, planes, 0.0).split([2, 1], 1)
-        unit = torch.bmm(inverse[tiles.group], xy - center[tiles.group][..., None])
-        terms = xy.new_ones(xy.shape[0], 6, xy.shape[2])
-        torch.mul(unit, unit[:, :1], out=terms[:, :2])
-        torch.mul(unit[:, 1], unit[:, 1], out=terms[:, 2])
-        terms[:, 3:5] = unit
-        return cls(tiles, xy, there[:, 0], terms, center, inverse)
+        finite = 0 * planes.sum(1, keepdim=True) == 0
+        xy, there = either(finite, planes, 0.0).split_with_sizes([2, 1], 1)
+        group = tiles.group
+        unit = torch.bmm(inverse.index_select(0, group), xy - center.index_select(0, group)[..., None])
+        return cls(tiles, there[:, 0], _terms(unit), center, inverse, rows)
 
     def moved(self, points: Tensor) -> Self:
         """The same points at other places (E, 2)."""
-        return self._at(self.tiles, points, self.center, self.inverse)
+        return self._at(self.tiles, points, self.center, self.inverse, self.rows)
 
     @property
     def circle(self) -> Tensor:
         """Conics (M, 5) of the ellipses themselves."""
-        return self.terms.new_tensor([1.0, 0.0, 1.0, 0.0, 0.0]).expand(len(self.center), 5)
+        return constant((1.0, 0.0, 1.0, 0.0, 0.0), self.terms).expand(len(self.center), 5)
 
-    def slopes(self, conic: Tensor) -> Tensor:
-        """Gradients (K, 2, T) of conics (M, 5) at the points, per px."""
-        a, b, c, d, e = conic.unbind(-1)
-        slope = torch.stack([2 * a, b, d, b, 2 * c, e], -1).unflatten(-1, (2, 3))
-        return torch.bmm(torch.bmm(self.inverse, slope)[self.tiles.group], self.terms[:, 3:])
+    def _rows(self, conic: Tensor) -> Tensor:
+        """`_rows` (M, 3, 6) of conics (M, 5), derivatives per px."""
+        return torch.bmm(torch.nn.functional.pad(conic, (0, 1), value=-1.0)[:, None], self.rows).view(-1, 3, 6)
 
-    def distances(self, conic: Tensor, slopes: Tensor | None = None) -> Tensor:
+    def distances(self, conic: Tensor) -> Tensor:
         """First-order distances (K, T) in px of the points from conics (M, 5), positive outside (Sampson)."""
-        slopes = self.slopes(conic) if slopes is None else slopes
-        both = torch.nn.functional.pad(conic, (0, 1), value=-1.0)[:, None]
-        value = torch.bmm(both[self.tiles.group], self.terms).squeeze(1)
-        return value / _length(slopes)
+        value, u, v = torch.bmm(self._rows(conic).index_select(0, self.tiles.group), self.terms).unbind(1)
+        return value / _length(u, v).clamp_min_(_LEAST_SLOPE)
 
-    def curvatures(self, conic: Tensor, slopes: Tensor) -> Tensor:
+    def curvatures(self, conic: Tensor) -> Tensor:
         """Curvatures (K, T) in 1/px of the level curves of conics (M, 5) at the points."""
-        second = conic[:, (0, 1, 1, 2)].unflatten(-1, (2, 2)) * conic.new_tensor([[2.0, 1.0], [1.0, 2.0]])
-        second = torch.bmm(torch.bmm(self.inverse, second), self.inverse)[self.tiles.group]
-        steep = _length(slopes)
-        along = torch.stack([slopes[:, 1], -slopes[:, 0]], 1)
-        return (torch.bmm(second, along) * along).sum(1) / steep**3
+        rows = self._rows(conic)[:, 1:]
+        second = torch.bmm(rows[..., 3:5], self.inverse).index_select(0, self.tiles.group)
+        u, v = torch.bmm(rows.index_select(0, self.tiles.group), self.terms).unbind(1)
+        along = torch.stack([v, -u], 1)
+        return (torch.bmm(second, along) * along).sum(1) / _length(u, v) ** 3
 
     def robust(self, conic: Tensor, scales: tuple[float, ...], cut: float = 4.0) -> tuple[Tensor, Tensor]:
         """Conics (M, 5) from ``conic`` on, see `fit_robust`, and which points were kept (K, T), 1 or 0."""
 
         def trust(off: Tensor, scale: float) -> Tensor:
-            return self.there * geman_mcclure(off / scale).nan_to_num(nan=0.0)
+            return self.there * geman_mcclure(off / scale)
 
         for scale in scales:
             conic = self.refit(trust(self.distances(conic), scale), conic)
         keep = before = self.there
         for number in range(3):
-            r = self.distances(conic)
+            r = self.distances(conic).abs()
             # the weighted RMS under Geman-McClure weights is a scale that outliers hardly move
             w = trust(r, scales[-1])
-            sums = self.tiles.sums(torch.stack([w * r.square().nan_to_num(nan=0.0), w], 1).sum(-1))
-            sigma = (sums[:, 0] / sums[:, 1]).sqrt()
-            before, keep = keep, self.there * (r.abs() <= (cut * sigma + 0.02)[self.tiles.group, None])
+            sums = self.tiles.sums(torch.stack([w * r * r, w], 1).sum(-1))
+            limit = cut * (sums[:, :1] / sums[:, 1:]).sqrt() + 0.02
+            before, keep = keep, self.there * (r <= limit.index_select(0, self.tiles.group))
             if number and torch.equal(before, keep):  # the same points again
                 break
             conic = self.refit(keep, conic)
@@ -468,14 +510,13 @@ class Near(NamedTuple):
 
     def refit(self, weights: Tensor, old: Tensor) -> Tensor:
         """Conics (M, 5) of the points by their weights (K, T); the ``old`` ones where they define none."""
-        gram = self.tiles.sums(torch.bmm(self.terms * weights[:, None], self.terms.mT))
-        conic = torch.linalg.solve_ex(gram[:, :5, :5], gram[:, :5, 5]).result
-        return torch.where(conic.isfinite().all(-1, keepdim=True), conic, old)
+        gram = self.tiles.sums(torch.bmm(self.terms[:, :5] * weights[:, None], self.terms.mT))
+        conic = torch.linalg.solve_ex(*gram.split_with_sizes([5, 1], -1)).result.squeeze(-1)
+        return torch.where((0 * conic).sum(-1, keepdim=True) == 0, conic, old)
 
 
-def _length(planes: Tensor) -> Tensor:
-    """Lengths (K, T) of vectors (K, 2, T), in a tenth of the time of a norm along an axis that is not the last."""
-    x, y = planes.unbind(1)
+def _length(x: Tensor, y: Tensor) -> Tensor:
+    """Lengths (K, T) of vectors, in a tenth of the time of a norm along an axis that is not the last."""
     return torch.addcmul(x * x, y, y).sqrt_()
 
 
@@ -500,31 +541,31 @@ def with_covariance(
     expect_positive(correlation=correlation)
     w = torch.ones_like(points[:, 0], dtype=torch.float64) if weights is None else weights.double()
     tiles = Tiles.of(index, count)
-    planes, of = tiles.planes(*points.double().unbind(-1), w), ellipses[tiles.group]
+    planes, of = tiles.planes(*points.double().unbind(-1), w), ellipses.index_select(0, tiles.group)
     cos, sin = of[:, 4].cos(), of[:, 4].sin()
     turn = torch.stack([cos, sin, -sin, cos], -1).view(-1, 2, 2)  # from the frame's axes to the ellipse's own
     axes, w = of[:, 2:4, None], planes[:, 2:]
     unit = torch.bmm(turn, planes[:, :2] - of[:, :2, None]) / axes
-    rho = _length(unit)[:, None]
+    rho = _length(*unit.unbind(1))[:, None]
     slope = unit / (axes * rho)
-    norm = _length(slope)[:, None]
+    norm = _length(*slope.unbind(1))[:, None]
     r, normal = ((rho - 1) / norm).nan_to_num(nan=0.0), slope / norm
     # unit circle coordinates s of the point with that normal: the boundary moves by n . (dc + E s)
     s = axes * normal
-    s = s / _length(s)[:, None]
+    s = s / _length(*s.unbind(1))[:, None]
     own, mixed = normal * s, (normal * s.flip(1)).sum(1, keepdim=True)
     jac = torch.cat([torch.bmm(turn.mT, normal), own[:, :1], mixed, own[:, 1:]], 1).nan_to_num(nan=0.0)
     # times b, so that it is 1 where the ellipse is steepest
     algebraic = (w * (axes[:, 1:] * norm).square()).nan_to_num(nan=0.0)
     weighted = jac * algebraic
-    normal_matrix = tiles.sums(weighted @ jac.mT)
-    scatter = tiles.sums((weighted * algebraic) @ jac.mT)
+    both = torch.bmm(torch.cat([weighted, weighted * algebraic], 1), jac.mT)
+    normal_matrix, scatter = tiles.sums(both).split_with_sizes([5, 5], 1)
     chi2, n = tiles.sums(torch.cat([w * r.square(), w], 1).sum(-1)).unbind(-1)
     sigma = (chi2 / (n - 5).clamp_min(1)).sqrt()
-    solvable = (n >= _SOLVABLE_POINTS) & ellipses.isfinite().all(-1)
+    solvable = (n >= _SOLVABLE_POINTS) & (0 * ellipses.sum(-1) == 0)
     eye = torch.eye(5, dtype=torch.float64, device=points.device)
     inverse, info = torch.linalg.inv_ex(torch.where(solvable[:, None, None], normal_matrix, eye))
     solvable = solvable & (info == 0)
-    covariance = (inverse @ scatter @ inverse) * (correlation * sigma.square())[:, None, None]
-    covariance = torch.where(solvable[:, None, None], covariance, torch.nan)
+    variance = either(solvable, correlation * sigma.square(), torch.nan)
+    covariance = torch.bmm(torch.bmm(inverse, scatter), inverse) * variance[:, None, None]
     return EllipseFit(ellipses, covariance, sigma, n)

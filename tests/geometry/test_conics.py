@@ -87,6 +87,14 @@ def test_points_lie_on_the_ellipse(ellipse: torch.Tensor) -> None:
 
 
 @no_deadline
+@given(ellipses())
+def test_inverse_shapes(ellipse: torch.Tensor) -> None:
+    shape, eye = conics.shape_matrix(ellipse), torch.eye(2, dtype=torch.float64)
+    torch.testing.assert_close(shape @ conics.inverse_shape(ellipse), eye, rtol=0, atol=1e-9)
+    torch.testing.assert_close(shape @ shape @ conics.inverse_shape(ellipse, 2), eye, rtol=0, atol=1e-7)
+
+
+@no_deadline
 @given(ellipses(), st.floats(-1e3, 1e3).filter(lambda s: abs(s) > 1e-3))
 def test_scale_and_sign_of_the_conic_do_not_matter(ellipse: torch.Tensor, scale: float) -> None:
     at_origin = torch.cat([torch.zeros(2, dtype=torch.float64), ellipse[2:]])

@@ -47,7 +47,7 @@ def awkward(dtype: torch.dtype) -> tuple[Tensor, Tensor]:
 
 
 ELEMENTWISE: dict[str, Callable[[Tensor, Tensor], Any]] = {
-    "sums": lambda a, b: (a + b, a - b, a + 2, 2 - a, -a, a - 0.5),
+    "sums": lambda a, b: (a + b, a - b, a + 2, 2 - a, -a, a - 0.5, torch.add(a, b, alpha=2)),
     "products": lambda a, b: (a * b, a.square(), 3 * a, torch.addcmul(a, a, b), torch.addcmul(a, a, b, value=-1)),
     "comparisons": lambda a, b: (a < b, a <= b, a > b, a >= b, a == b, a != b, a < 1, a == 0, a.isinf(), a.isfinite()),
     "truths": lambda a, b: ((a < b) & (a < 1), (a < b) | (b > 1), ~(a < b), (a < b).to(a) + 1),
@@ -90,7 +90,7 @@ SHAPES: dict[str, Callable[[Tensor], Any]] = {
     "sums": lambda a: (a.sum(0), a.sum((0, 1)), a.sum(1, keepdim=True), a.mean(0), a.mean((0, 1))),
     "extremes": lambda a: (a.amin(0), a.amax((0, 1)), (a > 0).all(0), (a > 1).any(1)),
     "views": lambda a: (a[1], a[:, 1:], a[None], a.transpose(0, 1), a.flatten(0, 1), a[:, None, -1], a[0:1].squeeze(0)),
-    "joins": lambda a: (torch.cat([a, a[:1]]), torch.stack([a[0], a[1]], 1), torch.stack(a.unbind())),
+    "joins": lambda a: (torch.cat([a, a[:1]]), torch.stack([a[0], a[1]], 1), torch.stack(a.unbind()), a.flip(1)),
     "parts": lambda a: (a.flatten(0, 1).split([5, 1, 6]), a.split(2), a.unbind(1), a.unflatten(1, (2, 2))),
     "new": lambda a: (
         torch.zeros_like(a),

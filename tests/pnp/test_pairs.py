@@ -58,3 +58,27 @@ def test_points_behind_the_camera() -> None:
     assert found.behind.all()
     assert found.R.isnan().all()
     assert found.chi2.isnan().all()
+
+
+@pytest.mark.parametrize("points", [SQUARE, GRID], ids=["square", "grid"])
+def test_starts_of_planes_have_the_true_pose(points: Tensor) -> None:
+    """Wherever the plane lies in the target, and with a point that is not seen where there are enough."""
+    r, t, xy = views(points, ROWS, seed=4)
+    mask = torch.ones(ROWS, len(points), dtype=torch.bool)
+    mask[::3, 0] = len(points) < 5
+    R, at, known = pnp.planar_starts(points.expand(ROWS, -1, -1), torch.where(mask[..., None], xy, 0.0), mask)
+    assert known.all()
+    off = (R - r[:, None]).abs().amax((2, 3)) + (at - t[:, None]).abs().amax(2) / t[:, None, 2]
+    assert off.amin(1).max() < 1e-9
+    wanted = pnp.planar(points, xy, mask=mask)
+    both = (R[:, :, None] - wanted.R[:, None]).abs().amax((3, 4))
+    assert both.amin(2).max() < 1e-9
+
+
+def test_no_starts_without_a_plane() -> None:
+    _, _, xy = views(SQUARE, 3, seed=4)
+    line = torch.tensor([[0.0, 0, 0], [1, 1, 0], [2, 2, 0], [3, 3, 0]], dtype=F64)
+    points = torch.stack([line, CUBOID[:4] + torch.tensor([[0.0, 0, 30]] + 3 * [[0.0, 0, 0]], dtype=F64), SQUARE])
+    mask = torch.ones(3, 4, dtype=torch.bool)
+    mask[2, :2] = False  # two points are seen
+    assert not pnp.planar_starts(points, torch.where(mask[..., None], xy, 0.0), mask)[2].any()

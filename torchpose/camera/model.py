@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -25,9 +25,12 @@ if TYPE_CHECKING:
 
 Model = Literal["brown_conrady", "kannala_brandt"]
 # of normalised coordinates: a step of less leaves an error of its own square, about, which one more step squares again
-_LAST_STEP = 1e-6
+# (derived: that is rounding)
+_LAST_STEP = 1e-4
+_PLAIN_STEPS = 3
 _MAX_ITERATIONS = 60
 _NEAR = 1e-2  # of the root of the rounding: a step of Newton's from there is exact to rounding (derived: it squares)
+_NONE = torch.zeros(0)
 # the tensors of a camera and what files call them
 _FIELDS = {
     "matrix": "camera_matrix",
@@ -252,24 +255,19 @@ class Camera:
     def distort(self, xy: Tensor) -> Tensor:
         """Pixels (..., 2) of undistorted normalised coordinates (..., 2), x = X/Z, y = Y/Z."""
         focal, center = self._intrinsics(xy)
-        return torch.stack(self._warp(*xy.unbind(-1), slopes=False), -1) * focal + center
+        return self._lens(xy).bent(xy.movedim(-1, 0)).movedim(0, -1) * focal + center
 
     def linearised(self, xy: Tensor) -> tuple[Tensor, Tensor]:
         """`distort` and `J_distort` at once."""
         focal, center = self._intrinsics(xy)
-        u, v, j_xx, j_xy, j_yy = self._warp(*xy.unbind(-1))
-        jacobian = torch.stack([j_xx, j_xy, j_xy, j_yy], -1).unflatten(-1, (2, 2)) * focal[:, None]
-        return torch.stack([u, v], -1) * focal + center, jacobian
+        bent, slopes = self._lens(xy).linearised(xy.movedim(-1, 0))
+        (xx, yy), mixed = slopes
+        jacobian = torch.stack([xx, mixed, mixed, yy], -1).unflatten(-1, (2, 2)) * focal[:, None]
+        return bent.movedim(0, -1) * focal + center, jacobian
 
     def J_distort(self, xy: Tensor) -> Tensor:
         """Jacobian (..., 2, 2) of `distort`: d(u, v)/d(x, y), px per unit of normalised coordinates."""
-        return torch.stack(self.slopes(*xy.unbind(-1)), -1).unflatten(-1, (2, 2))
-
-    def slopes(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The entries du/dx, du/dy, dv/dx, dv/dy (...) of `J_distort` at x, y (...), unstacked, for many points."""
-        (fx, fy), _ = self._intrinsics(x)
-        _, _, j_xx, j_xy, j_yy = self._warp(x, y)
-        return j_xx * fx, j_xy * fx, j_xy * fy, j_yy * fy
+        return self.linearised(xy)[1]
 
     def undistort_points(self, uv: Tensor) -> Tensor:
         """Undistorted normalised coordinates (..., 2) of pixels (..., 2): the inverse of `distort`, to rounding.
@@ -279,126 +277,177 @@ class Camera:
         NaN where there is no valid inverse: the pixel lies beyond the image of `fold_radius`, or is not finite.
         """
         focal, center = self._intrinsics(uv)
-        xy_distorted = (uv - center) / focal
-        if not self.distorts:
-            return xy_distorted
-        x, y, *_ = self._undistorted(*xy_distorted.unbind(-1))
-        return torch.stack([x, y], -1)
+        bent = (uv - center) / focal
+        return self._undistorted(bent.movedim(-1, 0))[0].movedim(0, -1) if self.distorts else bent
 
-    def rays(self, uv: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor, Tensor]]:
-        """Undistorted x, y (...) of pixels (..., 2), see `undistort_points`, and `slopes` there, which cost nothing."""
-        focal, center = self._intrinsics(uv)
-        (fx, fy), (x, y) = focal, ((uv - center) / focal).unbind(-1)
-        if not self.distorts:
-            none = torch.zeros_like(x)
-            return x, y, (fx.expand_as(x), none, none, fy.expand_as(x))
-        x, y, j_xx, j_xy, j_yy = self._undistorted(x, y)
-        return x, y, (j_xx * fx, j_xy * fx, j_xy * fy, j_yy * fy)
+    def rays(self, uv: Tensor) -> tuple[Tensor, Slopes]:
+        """Undistorted x, y (2, ...) of pixels (2, ...), see `undistort_points`, and the slopes there, which cost
+        nothing."""
+        focal, center = (v.view(2, *[1] * (uv.ndim - 1)) for v in self._intrinsics(uv))
+        bent = (uv - center) / focal
+        return self._undistorted(bent) if self.distorts else (bent, _straight(bent))
 
-    def _undistorted(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Undistorted x, y of distorted ones, and xx, xy, yy of the Jacobian within a last step of there."""
+    def _undistorted(self, bent: Tensor) -> tuple[Tensor, Slopes]:
+        """Undistorted x, y (2, ...) of distorted ones, and the slopes within a last step of there."""
+        lens, bent = self._lens(bent), bent.contiguous()
         with torch.no_grad():
-            x, y = self._invert(u.detach().contiguous(), v.detach().contiguous())
+            xy = self._invert(lens, bent.detach())
         # one more Newton step, differentiable: d(x, y) = J^-1 (d(u, v) - what the coefficients move)
-        x_distorted, y_distorted, *jacobian = self._warp(x, y)
-        j_xx, j_xy, j_yy = (j.detach() for j in jacobian)
-        dx, dy = _newton_step(x_distorted - u, y_distorted - v, j_xx, j_xy, j_yy)
-        return x - dx, y - dy, j_xx, j_xy, j_yy
+        found, slopes = lens.linearised(xy)
+        slopes = Slopes(*(v.detach() for v in slopes))
+        return xy - slopes.inverse().of(found - bent), slopes
 
-    def _invert(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        """Undistorted x, y of distorted ones, to within the last step that `undistort_points` makes."""
+    def _invert(self, lens: _Lens, bent: Tensor) -> Tensor:
+        """Undistorted x, y (2, ...) of distorted ones, to within the last step that `undistort_points` makes."""
         # plain steps reach nearly all pixels of nearly all lenses, in a third of the calls
-        x, y = u, v
-        for _ in range(2):
-            x_distorted, y_distorted, *jacobian = self._warp(x, y)
-            dx, dy = _newton_step(x_distorted - u, y_distorted - v, *jacobian)
-            x, y = x - dx, y - dy
-        x_distorted, y_distorted = self._warp(x, y, slopes=False)
-        dx, dy = _newton_step(x_distorted - u, y_distorted - v, *jacobian)
-        x, y = x - dx, y - dy
-        sure = (torch.hypot(dx, dy) < _LAST_STEP) & (torch.hypot(x, y) < 0.9 * self.fold_radius)
-        if bool(sure.all()):
-            return x, y
-        slow = self._invert_slowly(u, v)
-        return torch.where(sure, x, slow[0]), torch.where(sure, y, slow[1])
+        xy = bent
+        for number in range(_PLAIN_STEPS):
+            found, slopes = lens.linearised(xy)
+            step = slopes.inverse().of(found - bent)
+            xy = xy - step
+            if number:
+                sure = (_square(step) < _LAST_STEP**2) & (_square(xy) < (0.9 * self.fold_radius) ** 2)
+                if bool(sure.all()):
+                    return xy
+        return torch.where(sure, xy, self._invert_slowly(lens, bent))
 
-    def _invert_slowly(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+    def _invert_slowly(self, lens: _Lens, bent: Tensor) -> Tensor:
         """The same wherever there is an inverse; NaN elsewhere."""
-        eps = torch.finfo(u.dtype).eps
+        eps = torch.finfo(bent.dtype).eps
         limit = self.fold_radius
-        radius = torch.hypot(u, v)
+        radius = torch.hypot(*bent)
         near = _NEAR * math.sqrt(eps) * (1 + radius)
-        inside = (0.99 * limit / radius.clamp_min(eps)).clamp_max(1)
-        x, y = inside * u, inside * v
-        x_distorted, y_distorted, *jacobian = self._warp(x, y)
-        ex, ey = x_distorted - u, y_distorted - v
-        error = torch.hypot(ex, ey)
+        xy = (0.99 * limit / radius.clamp_min(eps)).clamp_max(1) * bent
+        found, slopes = lens.linearised(xy)
+        off = found - bent
+        error = torch.hypot(*off)
         fraction = torch.ones_like(error)
         for _ in range(_MAX_ITERATIONS):
             if bool(((error <= near) | ~error.isfinite() | (fraction < 1e-6)).all()):
                 break
-            dx, dy = _newton_step(ex, ey, *jacobian)
-            x_trial, y_trial = x - fraction * dx, y - fraction * dy
-            x_distorted, y_distorted, *trial_jacobian = self._warp(x_trial, y_trial)
-            ex_trial, ey_trial = x_distorted - u, y_distorted - v
-            trial_error = torch.hypot(ex_trial, ey_trial)
-            better = (trial_error < error) & (torch.hypot(x_trial, y_trial) < limit)
-            old = x, y, ex, ey, error, *jacobian
-            new = x_trial, y_trial, ex_trial, ey_trial, trial_error, *trial_jacobian
-            x, y, ex, ey, error, *jacobian = (torch.where(better, b, a) for a, b in zip(old, new, strict=True))
+            trial = xy - fraction * slopes.inverse().of(off)
+            found, trial_slopes = lens.linearised(trial)
+            trial_off = found - bent
+            trial_error = torch.hypot(*trial_off)
+            better = (trial_error < error) & (torch.hypot(*trial) < limit)
+            old, new = (xy, off, error, *slopes), (trial, trial_off, trial_error, *trial_slopes)
+            xy, off, error, *both = (torch.where(better, b, a) for a, b in zip(old, new, strict=True))
+            slopes = Slopes(*both)
             fraction = torch.where(better, 1.0, 0.5 * fraction)
-        j_xx, j_xy, j_yy = jacobian
-        valid = (error <= near.clamp_min(1e4 * eps)) & (j_xx * j_yy - j_xy * j_xy > 0)
-        return torch.where(valid, x, torch.nan), torch.where(valid, y, torch.nan)
+        valid = (error <= near.clamp_min(1e4 * eps)) & (slopes.determinant > 0)
+        return torch.where(valid, xy, torch.nan)
 
     def _intrinsics(self, like: Tensor) -> tuple[Tensor, Tensor]:
         m = self.matrix.to(like)
         return m.diagonal()[:2], m[:2, 2]
 
-    def _warp(self, x: Tensor, y: Tensor, *, slopes: bool = True) -> tuple[Tensor, ...]:
-        """Distorted normalised x, y; with ``slopes`` the xx, xy, yy of the Jacobian, symmetric in both models."""
-        r2 = torch.addcmul(x * x, y, y)
+    def _lens(self, like: Tensor) -> _Lens:
+        d = self.distortion.to(like)
         if self.model == "kannala_brandt":
-            k1, k2, k3, k4 = self.distortion.to(x).unbind()
-            small = r2 < 1e-6
-            r2_safe = torch.where(small, torch.ones_like(r2), r2)
-            r = r2_safe.sqrt()
-            theta_over_r = torch.where(small, 1 - r2 / 3 + r2 * r2 / 5, torch.atan(r) / r)
-            t2 = theta_over_r * theta_over_r * r2
-            s = theta_over_r * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
-            if not slopes:
-                return s * x, s * y
-            growth = (1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))) / (1 + r2)
-            # 2 ds/d(r^2), and its series at the axis
-            slope = torch.where(small, 2 * (k1 - 1 / 3) + r2 * (4 * k2 - 4 * k1 + 0.8), (growth - s) / r2_safe)
-            return s * x, s * y, s + slope * x * x, slope * x * y, s + slope * y * y
-        d = self.distortion.to(x)
+            return _Lens("fisheye", d.unbind())
         if not len(d):
-            one = torch.ones_like(x)
-            return (x, y, one, torch.zeros_like(x), one) if slopes else (x, y)
-        k1, k2, p1, p2, *more = d.unbind()
-        along, below = [k1, k2, *more[:1]], more[1:]
-        twice = [*(2 * (power + 1) * k for power, k in enumerate(along))] if slopes else []
-        s = 1 + r2 * _polynomial(r2, along)
-        if below:
-            denominator = 1 + r2 * _polynomial(r2, below)
-            s = s / denominator
-        # 2 (p1 y + p2 x) x + p2 r^2 is OpenCV's 2 p1 x y + p2 (r^2 + 2 x^2)
-        px, py = 2 * p2 * x, 2 * p1 * y
-        s_tangential = s + (px + py)
-        bent = torch.addcmul(s_tangential * x, r2, p2), torch.addcmul(s_tangential * y, r2, p1)
-        if not slopes:
-            return bent
-        slope = _polynomial(r2, twice)
-        if below:
-            slope = (slope - s * _polynomial(r2, [2 * (power + 1) * k for power, k in enumerate(below)])) / denominator
-        sx = slope * x
-        return (
-            *bent,
-            torch.addcmul(s_tangential + 2 * px, sx, x),
-            torch.addcmul(2 * (p1 * x + p2 * y), sx, y),
-            torch.addcmul(s_tangential + 2 * py, slope * y, y),
-        )
+            return _Lens("none")
+        k1, k2, _, _, *more = d.unbind()
+        # of x and y: 2 (p1 y + p2 x) x + p2 r^2 is OpenCV's 2 p1 x y + p2 (r^2 + 2 x^2)
+        aside = d[2:4].flip(0).view(2, *[1] * (like.ndim - 1))
+        return _Lens("brown", (k1, k2, *more[:1]), tuple(more[1:]), aside, 2 * aside)
+
+
+class Slopes(NamedTuple):
+    """Symmetric 2 x 2 matrices as planes: xx and yy (2, ...), and xy (...). Of a lens d(distorted)/d(undistorted),
+    normalised coordinates both; its Jacobian is symmetric in all models."""
+
+    straight: Tensor
+    mixed: Tensor
+
+    @property
+    def determinant(self) -> Tensor:
+        xx, yy = self.straight.unbind()
+        return torch.addcmul(xx * yy, self.mixed, self.mixed, value=-1)
+
+    def inverse(self) -> Slopes:
+        """By Cramer's rule."""
+        over = self.determinant.reciprocal()
+        return Slopes(self.straight.flip(0) * over, self.mixed * -over)
+
+    def of(self, xy: Tensor) -> Tensor:
+        """Times vectors (2, ...)."""
+        return torch.addcmul(self.straight * xy, self.mixed, xy.flip(0))
+
+
+def _straight(xy: Tensor) -> Slopes:
+    """Of no lens."""
+    return Slopes(torch.ones_like(xy), torch.zeros_like(xy[0]))
+
+
+class _Lens(NamedTuple):
+    """What a lens does to planes x, y (2, ...): its kind, radial coefficients of numerator and denominator, and the
+    tangential ones p2, p1 (2, ...), and twice these."""
+
+    kind: Literal["none", "brown", "fisheye"]
+    along: Sequence[Tensor] = ()
+    below: Sequence[Tensor] = ()
+    aside: Tensor = _NONE
+    twice: Tensor = _NONE
+
+    def bent(self, xy: Tensor) -> Tensor:
+        """Distorted x, y (2, ...)."""
+        if self.kind == "none":
+            return xy
+        r2 = _square(xy)
+        if self.kind == "fisheye":
+            return self._fisheye(r2)[0] * xy
+        x, y = (self.twice * xy).unbind()
+        return torch.addcmul((self._radial(r2)[0] + x + y) * xy, r2, self.aside)
+
+    def linearised(self, xy: Tensor) -> tuple[Tensor, Slopes]:
+        """Distorted x, y, and the slopes there."""
+        if self.kind == "none":
+            return xy, _straight(xy)
+        r2 = _square(xy)
+        if self.kind == "fisheye":
+            s, slope = self._fisheye(r2)
+            steep = slope * xy
+            return s * xy, Slopes(torch.addcmul(s, steep, xy), steep[0] * xy[1])
+        s, denominator = self._radial(r2)
+        slope = _polynomial(r2, [2 * (power + 1) * k for power, k in enumerate(self.along)])
+        if denominator is not None:
+            below = _polynomial(r2, [2 * (power + 1) * k for power, k in enumerate(self.below)])
+            slope = (slope - s * below) / denominator
+        lean, steep, (x, y) = self.twice * xy, slope * xy, xy.unbind()
+        lean_x, lean_y = lean.unbind()
+        s = s + lean_x + lean_y
+        p2, p1 = self.twice.unbind()
+        across = torch.addcmul(p1 * x, p2, y)
+        slopes = Slopes(torch.add(s, lean, alpha=2).addcmul(steep, xy), across.addcmul(steep[0], y))
+        return torch.addcmul(s * xy, r2, self.aside), slopes
+
+    def _radial(self, r2: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Scale of x and y at r^2, and the polynomial below, if there is one."""
+        s = 1 + r2 * _polynomial(r2, self.along)
+        if not self.below:
+            return s, None
+        denominator = 1 + r2 * _polynomial(r2, self.below)
+        return s / denominator, denominator
+
+    def _fisheye(self, r2: Tensor) -> tuple[Tensor, Tensor]:
+        """Scale of x and y at r^2, and twice its derivative by r^2."""
+        k1, k2, k3, k4 = self.along
+        small = r2 < 1e-6
+        r2_safe = torch.where(small, torch.ones_like(r2), r2)
+        r = r2_safe.sqrt()
+        theta_over_r = torch.where(small, 1 - r2 / 3 + r2 * r2 / 5, torch.atan(r) / r)
+        t2 = theta_over_r * theta_over_r * r2
+        s = theta_over_r * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+        growth = (1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))) / (1 + r2)
+        # with its series at the axis
+        return s, torch.where(small, 2 * (k1 - 1 / 3) + r2 * (4 * k2 - 4 * k1 + 0.8), (growth - s) / r2_safe)
+
+
+def _square(xy: Tensor) -> Tensor:
+    """x^2 + y^2 (...) of (2, ...)."""
+    x, y = xy.unbind()  # sums of planes of two rows take twice as long
+    return torch.addcmul(x * x, y, y)
 
 
 def _polynomial(at: Tensor, coefficients: Sequence[Tensor]) -> Tensor:
@@ -419,12 +468,6 @@ def _check_covariance(covariance: Tensor, coefficients: int) -> None:
         raise ConfigError(f"{field}: has shape {tuple(covariance.shape)}; give 4 x 4 for fx fy cx cy{of_all}")
     if fault := covariance_fault(covariance):
         raise ConfigError(f"{field}: {fault}; {fix}")
-
-
-def _newton_step(ex: Tensor, ey: Tensor, j_xx: Tensor, j_xy: Tensor, j_yy: Tensor) -> tuple[Tensor, Tensor]:
-    """J^-1 e by Cramer's rule."""
-    determinant = j_xx * j_yy - j_xy * j_xy
-    return (j_yy * ex - j_xy * ey) / determinant, (j_xx * ey - j_xy * ex) / determinant
 
 
 def _version(tensor: Tensor) -> int:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchpose.detect.regions import AGREE_COS, MOST_A_FRAME, Gradient, Regions
 from torchpose.geometry import conics, segments
+from torchpose.geometry.constants import either
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import positions, ragged_arange, segment_sum
 
@@ -65,11 +66,10 @@ def describe_arcs(regions: Regions, xy: Float[Tensor, "P 2"]) -> Arcs:
     scale = (gx * gx + gy * gy).rsqrt()
     gx, gy = (gx * scale).double(), (gy * scale).double()
     size = torch.bincount(index, minlength=count)
-    mean = torch.stack([segment_sum(v, index, count) for v in (x, y, gx, gy)], -1) / size[:, None]
-    middle, normal = mean.split(2, -1)
+    mean = segment_sum(torch.stack([x, y, gx, gy], -1), index, count) / size[:, None]
+    middle, normal = mean.split_with_sizes([2, 2], -1)
     normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
-    each = (*middle.unbind(-1), *normal.unbind(-1))
-    mx, my, nx, ny = (v.contiguous().index_select(0, index) for v in each)
+    mx, my, nx, ny = torch.cat([middle, normal], 1).index_select(0, index).unbind(1)
     along = (y - my) * nx - (x - mx) * ny  # the tangent is (-ny, nx)
     angle = torch.atan2(gy * nx - gx * ny, gx * nx + gy * ny)
     curvature = segment_sum(along * angle, index, count) / segment_sum(along * along, index, count).clamp_min(1e-9)
@@ -87,7 +87,7 @@ def chain_pairs(arcs: Arcs, polarity: float = 0.0) -> Int[Tensor, "Q 2"]:
     ``polarity`` only those count that belong to ellipses of this one.
     """
     curved = arcs.turn > _LEAST_TURN
-    rank = segments.rank_in_group(arcs.frame, by=torch.where(curved, -arcs.size, 0))
+    rank = segments.rank_in_group(arcs.frame, by=either(curved, -arcs.size, 0))
     index = positions(curved & (rank < MOST_A_FRAME) & (arcs.curvature * polarity >= 0))
     i, j = segments.pairs_in_group(arcs.frame[index], arcs.frame[index])
     ahead = positions(i < j)
@@ -166,10 +166,10 @@ def fit_scatter(sums: Float[Tensor, "M 6 6"], center: Tensor, scale: Tensor | No
     unit = 1 / torch.stack([scale * scale, scale * scale, scale * scale, scale, scale, one], -1)
     scatter = sums * unit[:, :, None] * unit[:, None]
     sound = scatter.isfinite().all(-1).all(-1)
-    conic = torch.linalg.eigh(torch.where(sound[:, None, None], scatter, 0.0)).eigenvectors[..., 0]
+    conic = torch.linalg.eigh(either(sound[:, None, None], scatter, 0.0)).eigenvectors[..., 0]
     params = conics.ellipse_from_conic(conic)
     params = torch.cat([params[:, :2] * scale[:, None] + center, params[:, 2:4] * scale[:, None], params[:, 4:]], -1)
-    return torch.where(sound[:, None], params, torch.nan)
+    return either(sound[:, None], params, torch.nan)
 
 
 def perimeter_samples(ellipses: Float[Tensor, "M 5"], most: int | None = None, multiple: int = 2) -> Perimeter:

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -45,7 +44,9 @@ from torchpose.detect.validation import (
 from torchpose.errors import ArgumentError
 from torchpose.geometry import conics
 from torchpose.geometry.arguments import checked
+from torchpose.geometry.constants import either, finite
 from torchpose.geometry.grey import Frames, as_frames, levels
+from torchpose.geometry.rows import replace
 from torchpose.geometry.segments import marked, members, positions, segment_mean
 
 _MIN_CRESTS = 7  # of cells that are left where edges are thinned
@@ -183,6 +184,8 @@ def find_ellipses(
     ``onward`` tells of rings that single regions follow which frames arcs are put together in.
     """
     cell, least = strong_cells(grad), MIN_CELLS
+    if not cell.numel():  # frames without any cost nothing here
+        return Candidates.unscored(cell, cell.new_zeros(0, 5, dtype=torch.float64), cell.double())
     if wanted.concentric:
         cell, least = crests(grad, cell), _MIN_CRESTS
     regions = level_line_regions(grad, cell, least)
@@ -225,17 +228,15 @@ def fit_regions(grad: Gradient, regions: Regions, wanted: Wanted = ANYTHING) -> 
         return Candidates.unscored(regions.frame, xy.new_zeros(0, 5), xy.new_zeros(0)), regions.cell > 0
     gx, gy = regions.gradient.unbind(-1)
     magnitude = (gx * gx + gy * gy).sqrt().double()
-    params = ellipse.fit(xy, regions.region, count, magnitude)
-    # once more with what is near the ellipse; weights that fall to 0 smoothly leave it where it is when the threshold,
-    # and with it the rim of the region, changes a little
-    r = ellipse.distance(xy, regions.region, params).nan_to_num(nan=BESIDE)
-    params = ellipse.fit(xy, regions.region, count, magnitude * (1 - (r / BESIDE).square()).clamp_min(0).square())
+    # weights that fall to 0 smoothly leave the ellipse where it is when the threshold, and with it the rim of the
+    # region, changes a little
+    params = ellipse.fit_near(xy, regions.region, count, magnitude, BESIDE)
     polarity = region_polarity(regions, params[:, :2], xy).sign()
     follows, along = _on_ellipses(regions, xy, params, polarity, magnitude)
     length, edge = (torch.bincount(regions.region[positions(on)], minlength=count) for on in (follows, along))
     verdict = plausible(grad, params)
     elsewhere = length < _MIN_CELLS * conics.perimeter(params)
-    verdict = torch.where((verdict == Verdict.ACCEPTED) & elsewhere, int(Verdict.OFF_ELLIPSE), verdict)
+    verdict = either((verdict == Verdict.ACCEPTED) & elsewhere, int(Verdict.OFF_ELLIPSE), verdict)
     good = positions(verdict == Verdict.ACCEPTED)
     found = score(grad, regions.frame[good], params[good], polarity[good])
     # a region that is not a whole ellipse runs along something else as well: only what lies along the ellipse counts
@@ -243,10 +244,10 @@ def fit_regions(grad: Gradient, regions: Regions, wanted: Wanted = ANYTHING) -> 
     partial = (found.cover <= WHOLE) | beyond[good]
     partial = partial & (found.verdict == Verdict.ACCEPTED)
     lost = partial & ~asked_for(grad, found, wanted, partial)
-    found = replace(found, verdict=torch.where(lost, int(Verdict.UNWANTED), found.verdict))
+    found = replace(found, verdict=either(lost, int(Verdict.UNWANTED), found.verdict))
     whole = marked(good[(found.verdict == Verdict.ACCEPTED) & (found.cover > WHOLE)], count)
     explained = along & whole.index_select(0, regions.region)
-    bad = positions((verdict != Verdict.ACCEPTED) & params.isfinite().all(-1))
+    bad = positions((verdict != Verdict.ACCEPTED) & finite(params, 1))
     rejected = Candidates.unscored(regions.frame[bad], params[bad], polarity[bad], verdict[bad])
     return Candidates.cat([found, rejected]), explained
 
@@ -255,8 +256,8 @@ def _on_ellipses(
     regions: Regions, xy: Tensor, params: Tensor, polarity: Tensor, magnitude: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Which cells (P,) lie on the ellipse of their region, and which belong to its edge, a blurred one included."""
-    each = (*conics.conic_from_ellipse(params).unbind(-1), polarity)
-    *conic, outwards = (v.contiguous().index_select(0, regions.region) for v in each)
+    each = torch.cat([conics.conic_from_ellipse(params), polarity[:, None]], 1)
+    *conic, outwards = each.index_select(0, regions.region).unbind(1)
     off, nx, ny = conics.signed_distance(conic, *xy.unbind(-1))
     gx, gy = regions.gradient.unbind(-1)
     rise = (nx * gx + ny * gy) * outwards
@@ -303,6 +304,6 @@ def asked_for(grad: Gradient, found: Candidates, wanted: Wanted, among: Bool[Ten
 def plausible(grad: Gradient, ellipses: Float[Tensor, "M 5"]) -> Int[Tensor, " M"]:
     """Verdict on the size and shape of ellipses; `Verdict.TOO_LARGE` for NaN."""
     a, b = ellipses[:, 2], ellipses[:, 3]
-    verdict = torch.where(a <= 0.5 * max(grad.shape[1:]), int(Verdict.ACCEPTED), int(Verdict.TOO_LARGE))
-    verdict = torch.where(b < MIN_ASPECT * a, int(Verdict.TOO_FLAT), verdict)
-    return torch.where(b < MIN_SEMI_MINOR, int(Verdict.TOO_SMALL), verdict)
+    verdict = either(a <= 0.5 * max(grad.shape[1:]), int(Verdict.ACCEPTED), int(Verdict.TOO_LARGE))
+    verdict = either(b < MIN_ASPECT * a, int(Verdict.TOO_FLAT), verdict)
+    return either(b < MIN_SEMI_MINOR, int(Verdict.TOO_SMALL), verdict)

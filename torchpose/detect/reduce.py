@@ -9,6 +9,7 @@ from jaxtyping import Float, Int, Real, Shaped
 from torch import Tensor
 
 from torchpose.geometry.arguments import checked
+from torchpose.geometry.constants import either
 
 # upper bound of the reduced frame's size when the factor is chosen automatically: 2 MP are halved (convention)
 REDUCED_PIXELS = 1_300_000
@@ -53,7 +54,7 @@ def reduction_for(width: Float[Tensor, " N"], widest: float) -> Int[Tensor, " N"
     """The power of two, at most 4, by which frames are reduced so that what is ``width`` px wide is not wider."""
     factor = torch.ones_like(width, dtype=torch.int64)
     for power in range(1, _MOST_REDUCTION.bit_length()):
-        factor = torch.where(width > widest * 2 ** (power - 1), 2**power, factor)
+        factor = either(width > widest * 2 ** (power - 1), 2**power, factor)
     return factor
 
 

@@ -6,7 +6,8 @@ connected components are found by parallel min-hooking and pointer jumping (Shil
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -14,7 +15,8 @@ import torch
 from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
-from torchpose.geometry.rows import Rows, shared
+from torchpose.geometry.constants import finite, numbers
+from torchpose.geometry.rows import Rows, replace, shared
 from torchpose.geometry.segments import positions, segment_sum
 
 # Gradients agree, with each other or with the normal of a curve, within 37 degrees: a circle of 3 px turns by 19 to 27
@@ -54,15 +56,19 @@ class Gradient(Rows):
         a, b, c, d = (flat.index_select(0, cells + step).float() for step in (0, 1, width, width + 1))
         diag, anti = d.sub_(a), b.sub_(c)
         gx, gy = (diag + anti).mul_(0.5), (diag - anti).mul_(0.5)
-        if self.frames.is_floating_point():
-            bad = ~(gx + gy).isfinite()
+        if not self.whole:
+            bad = ~numbers(gx + gy)
             gx, gy = gx.masked_fill_(bad, 0.0), gy.masked_fill_(bad, 0.0)
         return gx, gy
 
+    @cached_property
+    def whole(self) -> bool:
+        """Whether every pixel is a number."""
+        return not self.frames.is_floating_point() or bool(finite(self.frames, (0, 1, 2)))
+
     def centers(self, cells: Int[Tensor, " P"]) -> Float[Tensor, "P 2"]:
         """Positions of flat cells in reduced px."""
-        column, row = self.grid(cells)
-        return torch.stack([column.double() + 0.5, row.double() + 0.5]).mT
+        return (torch.stack(self.grid(cells)).double() + 0.5).mT
 
     def frame(self, cells: Int[Tensor, " P"]) -> Int[Tensor, " P"]:
         """The frames of flat cells."""
@@ -114,12 +120,14 @@ def gradient(frames: Real[Tensor, "B h w"]) -> Gradient:
     sigma = (_lower_median(power) / (2 * math.log(2))).sqrt()
     grey = a.flatten(1)
     low = high = grey
-    if frames.is_floating_point():
-        finite = grey.isfinite()
-        low, high = grey.where(finite, torch.inf), grey.where(finite, -torch.inf)
+    grad = Gradient(frames, sigma)
+    if not grad.whole:
+        known = numbers(grey)
+        low, high = grey.where(known, torch.inf), grey.where(known, -torch.inf)
     low, high = low.amin(-1), high.amax(-1)
     threshold = torch.maximum(_NOISE_SIGMAS * sigma, _RANGE_FRACTION * (high - low)).clamp_min(_LEAST_LEVEL)
-    return Gradient(frames, threshold)
+    grad.threshold.copy_(threshold)
+    return grad
 
 
 def _lower_median(rows: Float[Tensor, "B n"]) -> Float[Tensor, " B"]:

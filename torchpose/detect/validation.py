@@ -6,7 +6,7 @@ is left. Two circles side by side have arcs that a third ellipse joins, too long
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntEnum
 
 import torch
@@ -17,7 +17,8 @@ from torchpose.detect.arcs import cells_at, perimeter_samples
 from torchpose.detect.regions import AGREE_COS, ON_EDGE, Gradient
 from torchpose.geometry import conics
 from torchpose.geometry.arguments import checked
-from torchpose.geometry.rows import Rows
+from torchpose.geometry.constants import either
+from torchpose.geometry.rows import Rows, replace
 from torchpose.geometry.sectors import MOST
 from torchpose.geometry.segments import marked, members, near_pairs, positions, segment_sum
 
@@ -133,7 +134,7 @@ def edges_at(grad: Gradient, frame: Tensor, of: Tensor, xy: Tensor, normal: Tens
     gx, gy = (g.double() for g in grad.components(cell))
     nx, ny = normal.unbind(-1)
     cos = (gx * nx + gy * ny) / (gx * gx + gy * gy).sqrt().clamp_min(1e-6)
-    error = torch.where(on_frame, cos.clamp(-1, 1).acos() / torch.pi, 0.5)  # 0.5: neither for nor against
+    error = either(on_frame, cos.clamp(-1, 1).acos() / torch.pi, 0.5)  # 0.5: neither for nor against
     return Samples(of, xy, torch.stack([gx, gy]).mT, error)
 
 
@@ -149,8 +150,8 @@ def score(grad: Gradient, frame: Tensor, ellipses: Tensor, polarity: Tensor) -> 
     """Ellipses with their numbers of false alarms, of which noise gives less than one a frame below 1."""
     samples = sample_edges(grad, frame, ellipses, polarity)
     nfa, cover = false_alarms(grad, samples.error, samples.of, ellipses.shape[0])
-    verdict = torch.where(nfa < 0, int(Verdict.ACCEPTED), int(Verdict.FALSE_ALARM))
-    verdict = torch.where((nfa < 0) & (cover < MOST), int(Verdict.FRAGMENT), verdict)
+    verdict = either(nfa < 0, int(Verdict.ACCEPTED), int(Verdict.FALSE_ALARM))
+    verdict = either((nfa < 0) & (cover < MOST), int(Verdict.FRAGMENT), verdict)
     return Candidates(frame, ellipses, polarity, nfa, cover, verdict)
 
 
@@ -193,7 +194,7 @@ def merge_duplicates(found: Candidates, tolerance: float = SAME, *, explain: boo
     again = marked(some[later], len(found))
     if not explain:
         return found[~again]
-    return replace(found, verdict=torch.where(again, int(Verdict.DUPLICATE), found.verdict))
+    return replace(found, verdict=either(again, int(Verdict.DUPLICATE), found.verdict))
 
 
 @checked
@@ -204,7 +205,8 @@ def same_ellipses(ones: Candidates, others: Candidates, tolerance: float = SAME)
     alike = positions(ones.polarity[i] == others.polarity[j])
     i, j = i[alike], j[alike]
     p, q = ones.ellipse[i], others.ellipse[j]
-    shape = (conics.shape_matrix(p) - conics.shape_matrix(q)).flatten(1).abs().amax(-1)
+    one, other = conics.shape_matrix(torch.stack([p, q]))
+    shape = (one - other).flatten(1).abs().amax(-1)
     apart = torch.maximum(torch.linalg.vector_norm(p[:, :2] - q[:, :2], dim=-1), shape)
     same = positions(apart < reach[i])
     return i[same], j[same]
@@ -214,7 +216,7 @@ def without_known(found: Candidates, known: Candidates) -> Candidates:
     """The same candidates; those accepted that are among ``known``, with fewer false alarms there, are duplicates."""
     i, j = same_ellipses(known, found)
     again = marked(j[known.log10_nfa[i] < found.log10_nfa[j]], len(found)) & (found.verdict == Verdict.ACCEPTED)
-    return replace(found, verdict=torch.where(again, int(Verdict.DUPLICATE), found.verdict))
+    return replace(found, verdict=either(again, int(Verdict.DUPLICATE), found.verdict))
 
 
 def explain_once(grad: Gradient, found: Candidates, known: Candidates | None = None) -> Candidates:
@@ -235,7 +237,7 @@ def explain_once(grad: Gradient, found: Candidates, known: Candidates | None = N
         free = ~marked(sample[kept[other]], len(samples))
         nfa, cover = false_alarms(grad, samples.error[free], samples.of[free], part.numel())
         kept[part] = (nfa < 0) & (cover >= MOST)
-    return replace(found, verdict=torch.where(kept[: len(found)], found.verdict, int(Verdict.EXPLAINED)))
+    return replace(found, verdict=either(kept[: len(found)], found.verdict, int(Verdict.EXPLAINED)))
 
 
 def _overlapping(some: Candidates, others: Candidates) -> tuple[Tensor, Tensor]:

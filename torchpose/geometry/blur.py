@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchpose.geometry.constants import constant
+
 Blur = Float[Tensor, "*batch 3"]
 
 
@@ -20,7 +22,7 @@ def isotropic(sigma: Float[Tensor, "*batch"]) -> Blur:
 def across(blur: Blur, nu: Tensor, nv: Tensor) -> Tensor:
     """Variance along the normal (nu, nv)."""
     s11, s12, s22 = blur.unbind(-1)
-    return s11 * nu * nu + 2 * s12 * nu * nv + s22 * nv * nv
+    return torch.addcmul(s11 * nu, s12, nv, value=2) * nu + s22 * nv * nv
 
 
 def columns(nu: Tensor, nv: Tensor) -> Tensor:
@@ -31,18 +33,20 @@ def columns(nu: Tensor, nv: Tensor) -> Tensor:
 def axes(blur: Blur) -> tuple[Tensor, Tensor]:
     """Variances along the minor and the major axis."""
     s11, s12, s22 = blur.unbind(-1)
-    middle, reach = 0.5 * (s11 + s22), torch.hypot(0.5 * (s11 - s22), s12)
+    middle = torch.lerp(s11, s22, 0.5)
+    reach = torch.hypot(s11 - middle, s12)
     return middle - reach, middle + reach
 
 
 def limited(blur: Blur, low: float, high: float) -> Blur:
     """The nearest blur of the same axes whose variances along both lie within the limits."""
     s11, s12, s22 = blur.unbind(-1)
-    middle, lean = 0.5 * (s11 + s22), 0.5 * (s11 - s22)
+    middle = torch.lerp(s11, s22, 0.5)
+    lean = s11 - middle
     reach = torch.hypot(lean, s12)
     least, most = (middle - reach).clamp(low, high), (middle + reach).clamp(low, high)
     share = 0.5 * (most - least) / reach.clamp_min(1e-12)
-    middle, lean, s12 = 0.5 * (most + least), lean * share, s12 * share
+    middle, lean, s12 = torch.lerp(least, most, 0.5), lean * share, s12 * share
     return torch.stack([middle + lean, s12, middle - lean], -1)
 
 
@@ -64,4 +68,4 @@ def enlarged(blur: Blur, factor: int) -> Blur:
 
 def pixel(like: Tensor, share: float = 1.0) -> Float[Tensor, "3"]:
     """Covariance of the square pixel, or of a share of it: 1/12 along either axis."""
-    return like.new_tensor([share / 12, 0.0, share / 12])
+    return constant((share / 12, 0.0, share / 12), like)

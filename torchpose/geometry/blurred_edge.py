@@ -15,7 +15,7 @@ order, k^3 (X^2 Y^2 / 2 - Y^4 / 8), is counted there by its mean: of 12 px besid
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol, Self, get_args
 
 import torch
@@ -24,7 +24,7 @@ from torch import Tensor
 
 from torchpose.geometry import blur as blurs
 from torchpose.geometry.quadrature import disc_chords, gauss_legendre
-from torchpose.geometry.rows import Rows, shared
+from torchpose.geometry.rows import Rows, replace, shared
 
 Kind = Literal["gauss", "line", "disc"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -141,7 +141,7 @@ class _Gauss:
     """Planes (K, P) of what the blur is across and along edges of the normals nu, nv."""
 
     def __init__(self, values: Tensor, nu: Tensor, nv: Tensor) -> None:
-        s11, s12, s22 = values.split(1, -1)
+        s11, s12, s22 = values[..., None].unbind(-2)
         self.uu, self.vv, uv = nu * nu, nv * nv, nu * nv
         self.uv2 = 2 * uv
         self.across = s11 * self.uu + s12 * self.uv2 + s22 * self.vv

@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchpose.geometry.constants import either
+
 Ellipse = Float[Tensor, "*#N 5"]
 Conic = Float[Tensor, "*#N 6"]
 Matrix = Float[Tensor, "*#N 3 3"]
@@ -36,9 +38,10 @@ def ellipse_from_conic(conic: Conic) -> Ellipse:
     # the sign of the inside; the conic is taken so that this is negative
     a, b, c, d, e, f = (conic * (conic[..., :1] + conic[..., 2:3]).sign()).unbind(-1)
     half, square = 2 * a, 2 * c
-    disc = half * square - b * b
-    center_x, center_y = (b * e - square * d) / disc, (b * d - half * e) / disc
-    level = -f - 0.5 * (d * center_x + e * center_y)  # less its value at the centre
+    disc = torch.addcmul(half * square, b, b, value=-1)
+    center_x = torch.addcmul(b * e, square, d, value=-1) / disc
+    center_y = torch.addcmul(b * d, half, e, value=-1) / disc
+    level = -torch.add(f, torch.addcmul(d * center_x, e, center_y), alpha=0.5)  # less its value at the centre
     # the smaller eigenvalue as a quotient: mean - diff cancels for slender ellipses; rounding must not exchange a and b
     large = 0.5 * (a + c + torch.hypot(a - c, b))
     small = torch.minimum(0.25 * disc / large, large)
@@ -53,23 +56,22 @@ def ellipse_from_conic(conic: Conic) -> Ellipse:
 
 def axes_of(square: Float[Tensor, "*N 2 2"]) -> Float[Tensor, "*N 3"]:
     """Semi-axes and angle a, b, theta of ellipses by the square S S^T of their `shape_matrix`, positive definite."""
-    s11, s12, s22 = square[..., 0, 0], square[..., 0, 1], square[..., 1, 1]
-    large = 0.5 * (s11 + s22 + torch.hypot(s11 - s22, 2 * s12))
-    small = (s11 * s22 - s12.square()) / large  # a difference would cancel for slender ones
-    theta = torch.remainder(0.5 * torch.atan2(2 * s12, s11 - s22), torch.pi)
-    theta = torch.where(theta >= torch.pi, 0.0, theta)  # a tiny negative angle is rounded up to pi
-    return torch.cat([torch.stack([large, small.minimum(large)], -1).sqrt(), theta[..., None]], -1)
+    s11, s12, _, s22 = square.flatten(-2).unbind(-1)
+    twice, apart = 2 * s12, s11 - s22
+    large = 0.5 * (s11 + s22 + torch.hypot(apart, twice))
+    small = torch.addcmul(s11 * s22, s12, s12, value=-1) / large  # a difference would cancel for slender ones
+    theta = torch.remainder(0.5 * torch.atan2(twice, apart), torch.pi)
+    theta = theta.masked_fill(theta >= torch.pi, 0.0)  # a tiny negative angle is rounded up to pi
+    return torch.stack([large.sqrt(), small.minimum(large).sqrt(), theta], -1)
 
 
 def conic_from_ellipse(ellipse: Ellipse) -> Conic:
     """Conic coefficients, negative inside, of ellipses; scaled to -1 at the centre."""
-    cx, cy, a, b, theta = ellipse.unbind(-1)
-    cos, sin = theta.cos(), theta.sin()
-    p, q = (cos / a).square() + (sin / b).square(), (sin / a).square() + (cos / b).square()
-    r = 2 * cos * sin * (1 / a.square() - 1 / b.square())
-    d, e = -2 * p * cx - r * cy, -r * cx - 2 * q * cy
-    f = p * cx * cx + r * cx * cy + q * cy * cy - 1
-    return torch.stack([p, r, q, d, e, f], -1)
+    center, square = ellipse[..., :2], inverse_shape(ellipse, 2)
+    p, r, _, q = square.flatten(-2).unbind(-1)
+    linear = (square * center[..., None, :]).sum(-1)
+    d, e = (-2 * linear).unbind(-1)
+    return torch.stack([p, 2 * r, q, d, e, (linear * center).sum(-1) - 1], -1)
 
 
 def rescaled(ellipses: Float[Tensor, "*batch 5"], factor: float) -> Float[Tensor, "*batch 5"]:
@@ -80,10 +82,21 @@ def rescaled(ellipses: Float[Tensor, "*batch 5"], factor: float) -> Float[Tensor
 
 def shape_matrix(ellipse: Ellipse) -> Float[Tensor, "*N 2 2"]:
     """Symmetric S = R diag(a, b) R^T: the ellipse is centre + S (cos s, sin s). Smooth also at a circle."""
-    _, _, a, b, theta = ellipse.unbind(-1)
-    twice, total, diff = 2 * theta, a + b, a - b
-    c, s = diff * twice.cos(), diff * twice.sin()
-    return torch.stack([total + c, s, s, total - c], -1).unflatten(-1, (2, 2)) * 0.5
+    return _symmetric(*ellipse[..., 2:].unbind(-1))
+
+
+def inverse_shape(ellipse: Ellipse, power: int = 1) -> Float[Tensor, "*N 2 2"]:
+    """Inverse of `shape_matrix`, or a power of it."""
+    a, b, theta = ellipse[..., 2:].unbind(-1)
+    return _symmetric(a.pow(-power), b.pow(-power), theta)
+
+
+def _symmetric(one: Tensor, other: Tensor, angle: Tensor) -> Tensor:
+    """Symmetric matrices (..., 2, 2) of these eigenvalues, the first one's vector at an angle."""
+    middle, twice = torch.lerp(one, other, 0.5), 2 * angle
+    lean = one - middle
+    c, s = lean * twice.cos(), lean * twice.sin()
+    return torch.stack([middle + c, s, s, middle - c], -1).view(*angle.shape, 2, 2)
 
 
 def points_on(ellipse: Ellipse, angle: Scalar) -> Float[Tensor, "*N 2"]:
@@ -104,9 +117,9 @@ def boundary(
         index: whose sample each is.
         angle: eccentric anomaly, counted from the major axis.
     """
-    theta = ellipses[:, 4]
-    each = (*ellipses[:, :4].unbind(-1), theta.cos(), theta.sin())
-    cx, cy, a, b, cos, sin = (v.contiguous().index_select(0, index) for v in each)
+    theta = ellipses[:, 4:]
+    each = torch.cat([ellipses[:, :4], theta.cos(), theta.sin()], 1)
+    cx, cy, a, b, cos, sin = each.index_select(0, index).unbind(1)
     c, s = angle.cos(), angle.sin()
     x, y, p, q = a * c, b * s, b * c, a * s
     scale = (p * p + q * q).rsqrt()
@@ -164,19 +177,25 @@ def circle_ellipse(
     By their dual conics, r^2 (1 - n n') - c c' in space, about the image of the centre (derived). NaN where the circle
     reaches behind the camera.
     """
-    n = (rotation @ normal[..., None])[..., 0]
+    return seen_circle(matrix, center, (rotation @ normal[..., None])[..., 0], radius)
+
+
+def seen_circle(matrix: Float[Tensor, "3 3"], center: Vector, normal: Vector, radius: Scalar) -> Ellipse:
+    """`circle_ellipse` of circles whose unit normals are in the camera frame."""
     seen = center @ matrix.mT
-    at = seen[..., :2] / seen[..., 2:]
+    flat, depth = seen.split_with_sizes([2, 1], -1)
+    at = flat / depth
     # from space to homogeneous pixels about the image of the centre: the centre itself comes to (0, 0, depth)
-    first, last = matrix[:2] - at[..., None] * matrix[2], matrix[2]
-    turned, ahead = (first @ n[..., None])[..., 0], (n * last).sum(-1, keepdim=True)
-    square = radius.square()[..., None]
-    whole = square * ((last * last).sum() - ahead.square()) - seen[..., 2:].square()  # below 0 in front of the camera
-    side = square * ((first @ last[:, None])[..., 0] - ahead * turned) / whole
-    outer = first @ first.mT - turned[..., :, None] * turned[..., None, :]
-    spread = side[..., :, None] * side[..., None, :] - (square / whole)[..., None] * outer
+    change = matrix - torch.nn.functional.pad(at, (0, 1))[..., None] * matrix[2]
+    turned = (change * normal[..., None, :]).sum(-1)
+    flat_change = change.flatten(0, -3)
+    dual = torch.bmm(flat_change, flat_change.mT).view_as(change) - turned[..., :, None] * turned[..., None, :]
+    dual = radius.square()[..., None, None] * dual
+    whole = dual[..., 2, 2, None] - depth.square()  # below 0 in front of the camera
+    side = dual[..., :2, 2] / whole
+    spread = side[..., :, None] * side[..., None, :] - dual[..., :2, :2] / whole[..., None]
     ellipse = torch.cat([at + side, axes_of(spread)], -1)
-    return torch.where(whole < 0, ellipse, torch.nan)
+    return either(whole < 0, ellipse, torch.nan)
 
 
 def circle_poses(conic: Matrix, radius: Scalar) -> tuple[Float[Tensor, "*N 2 3"], Float[Tensor, "*N 2 3"]]:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchpose.errors import FrameError
 from torchpose.geometry.arguments import tensor_of
+from torchpose.geometry.constants import constant, either
 
 FRAME_TYPES = (torch.uint8, torch.uint16, torch.float16, torch.bfloat16, torch.float32, torch.float64)
 Frames = Tensor | NDArray[Any]
@@ -78,5 +79,5 @@ def grey(frames: Tensor) -> Tensor:
 
 def full_scale(brightest: Tensor) -> Tensor:
     """Grey values at which frames are clipped, by their brightest ones: the full scale of a sensor, or inf."""
-    full = torch.isin(brightest, torch.tensor(_FULL_SCALES, dtype=brightest.dtype, device=brightest.device))
-    return torch.where(full, brightest, torch.inf)
+    full = torch.isin(brightest, constant(_FULL_SCALES, brightest))
+    return either(full, brightest, torch.inf)

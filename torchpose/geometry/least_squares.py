@@ -9,7 +9,7 @@ Schur complement (Triggs et al. 2000, section 6). All is in units of chi-squared
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import NamedTuple, Protocol, Self, cast
 
@@ -18,7 +18,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchpose.geometry import rotations
-from torchpose.geometry.rows import Rows, shared
+from torchpose.geometry.constants import eye
+from torchpose.geometry.rows import Rows, replace, shared
 from torchpose.geometry.segments import segment_sum
 
 _RIDGE = 1e-12  # of a unit diagonal
@@ -62,7 +63,7 @@ class Pose(Rows):
         return 6
 
     def moved(self, step: Tensor) -> Self:
-        return replace(self, R=rotations.exp(step[:, 3:]) @ self.R, t=self.t + step[:, :3])
+        return replace(self, R=torch.bmm(rotations.exp(step[:, 3:]), self.R), t=self.t + step[:, :3])
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +149,7 @@ class Unknowns:
 def _moved(blocks: Mapping[str, Block], step: Tensor) -> dict[str, Block]:
     if not blocks:
         return {}
-    parts = step.nan_to_num(nan=0.0).split([block.size for block in blocks.values()], -1)
+    parts = step.nan_to_num(nan=0.0).split_with_sizes([block.size for block in blocks.values()], -1)
     return {name: block.moved(part) for (name, block), part in zip(blocks.items(), parts, strict=True)}
 
 
@@ -229,11 +230,14 @@ class Normal(Rows):
         n, owner = right.shape[1], part.owner
         inner = part.information if damping is None else _damped(part.information, damping[owner])
         columns = [part.mixed.mT, part.right[..., None], *([_eye_like(inner)] if variances else [])]
-        by_own, alone, inverse = solve_scaled(inner, torch.cat(columns, -1)).tensor_split([n, n + 1], -1)
-        taken = segment_sum(torch.bmm(part.mixed, torch.cat([by_own, alone], -1)), owner, len(self))
-        information, right = information - taken[..., :-1], right - taken[..., -1]
-        columns = [right[..., None], *([_eye_like(information)] if variances else [])]
-        own, covariance = solve_scaled(information, torch.cat(columns, -1)).tensor_split([1], -1)
+        solved = solve_scaled(inner, torch.cat(columns, -1))
+        by_own, alone, inverse = solved.split_with_sizes([n, 1, solved.shape[-1] - n - 1], -1)
+        taken = segment_sum(torch.bmm(part.mixed, solved[..., : n + 1]), owner, len(self))
+        both = torch.cat([information, right[..., None]], -1) - taken
+        information, right = both[..., :n], both[..., n]
+        columns = [both[..., n:], *([_eye_like(information)] if variances else [])]
+        solved = solve_scaled(information, torch.cat(columns, -1) if variances else both[..., n:])
+        own, covariance = solved.split_with_sizes([1, solved.shape[-1] - 1], -1)
         rest = torch.baddbmm(alone, by_own, own[owner], alpha=-1).squeeze(-1)
         own = own.squeeze(-1)
         if variances:
@@ -329,8 +333,7 @@ def solve_scaled(matrix: Tensor, right: Tensor) -> Tensor:
     """
     columns = right[..., None] if right.ndim < matrix.ndim else right
     scale = matrix.diagonal(dim1=-2, dim2=-1).clamp_min(_LEAST_DIAGONAL).rsqrt()[..., None]
-    scaled = matrix * scale * scale.mT
-    scaled.diagonal(dim1=-2, dim2=-1).add_(_RIDGE)
+    scaled = torch.addcmul(eye(matrix.shape[-1], matrix, _RIDGE), matrix * scale, scale.mT)
     solution = scale * torch.linalg.solve_ex(scaled, columns * scale).result
     return solution.squeeze(-1) if right.ndim < matrix.ndim else solution
 
@@ -355,11 +358,11 @@ def covariance_factor(covariance: Float[Tensor, "n n"]) -> Float[Tensor, "n k"]:
 
 def geman_mcclure(deviation: Tensor) -> Tensor:
     """Robust weights of residuals in units of the scale: (1 + d^2)^-2 (Geman and McClure 1987)."""
-    return (1 + deviation.square()).reciprocal().square()
+    return (1 + deviation.square()).pow(-2)
 
 
 def _eye_like(matrix: Tensor) -> Tensor:
-    return torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device).expand_as(matrix)
+    return eye(matrix.shape[-1], matrix).expand_as(matrix)
 
 
 def _damped(information: Tensor, share: Tensor) -> Tensor:

@@ -4,8 +4,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.geometry import rotations
-
 
 def image_by_point(xy: Float[Tensor, "*batch 2"], depth: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 2 3"]:
     """Derivatives of the image on the plane z = 1 by the point, in camera axes, from image and depth of the point."""
@@ -20,4 +18,4 @@ def by_pose(by_point: Float[Tensor, "*batch k 3"], arm: Float[Tensor, "*batch 3"
         by_point: of anything, by the point in camera axes.
         arm: R X, the point about the target's origin, camera axes.
     """
-    return torch.cat([by_point, -by_point @ rotations.skew(arm)], -1)
+    return torch.cat([by_point, torch.linalg.cross(arm[..., None, :].expand_as(by_point), by_point)], -1)

@@ -7,12 +7,19 @@ rotations, of which refinement turns many, and their import would delay the star
 import torch
 from torch import Tensor
 
+from torchpose.geometry.constants import constant
+
+# the entries of a cross-product matrix, by the vector's
+_SKEW = (
+    (0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0),
+    (0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0),
+    (0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+)
+
 
 def skew(v: Tensor) -> Tensor:
     """Cross-product matrix [v]x of vectors (..., 3), as (..., 3, 3): ``skew(a) @ b == cross(a, b)``."""
-    x, y, z = v.unbind(-1)
-    o = torch.zeros_like(x)
-    return torch.stack([o, -z, y, z, o, -x, -y, x, o], -1).unflatten(-1, (3, 3))
+    return (v @ constant(_SKEW, v)).unflatten(-1, (3, 3))
 
 
 def exp(rotation_vector: Tensor) -> Tensor:
@@ -24,10 +31,16 @@ def exp(rotation_vector: Tensor) -> Tensor:
     angle = (rotation_vector.square().sum(-1) + torch.finfo(rotation_vector.dtype).tiny).sqrt()[..., None, None]
     half = torch.sinc(angle * (0.5 / torch.pi))
     k = skew(rotation_vector)
+    square = torch.bmm(k.reshape(-1, 3, 3), k.reshape(-1, 3, 3)).view_as(k)
     # sin(w) / w = cos(w / 2) sin(w / 2) / (w / 2), and the versine's quotient is half of the square of the latter
     a = torch.cos(0.5 * angle) * half
     eye = torch.eye(3, dtype=rotation_vector.dtype, device=rotation_vector.device)
-    return eye + a * k + (0.5 * half * half) * (k @ k)
+    return eye + a * k + (0.5 * half * half) * square
+
+
+def turned(rotation: Tensor, vectors: Tensor) -> Tensor:
+    """Vectors (N, M, 3) turned by rotations (N, 3, 3), in one call where matrices times columns are nine."""
+    return torch.bmm(vectors, rotation.mT)
 
 
 def quaternion(rotation: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ moving to a device. A field may be a tensor, other rows, a tuple of these, or No
 from collections.abc import Callable, Sequence
 from dataclasses import MISSING, field, fields
 from functools import cache
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import torch
@@ -15,10 +15,20 @@ from torch import Tensor
 
 from torchpose.geometry.segments import as_array, positions
 
+_Kind = TypeVar("_Kind")
+
 
 def shared(default: Any = MISSING) -> Any:
     """A dataclass field that belongs to all rows together: selecting rows leaves it alone, `Rows.to` moves it."""
     return field(default=default, metadata={"shared": True})
+
+
+def replace(rows: _Kind, /, **changes: Any) -> _Kind:
+    """As `dataclasses.replace` of a class that checks nothing, in a fifth of the time."""
+    made = object.__new__(type(rows))
+    made.__dict__.update((name, getattr(rows, name)) for name, _ in _fields(type(rows)))  # type: ignore[arg-type]
+    made.__dict__.update(changes)
+    return made
 
 
 class Rows:
@@ -42,13 +52,19 @@ class Rows:
 
     @classmethod
     def cat(cls, parts: Sequence[Self]) -> Self:
-        """The rows of all parts, one after the other. Raises ValueError where their shared fields differ."""
+        """The rows of all parts, one after the other. Raises ValueError where the shared fields of those that have any
+        rows differ."""
+        parts = [part for part in parts if len(part)] or parts[:1]
+        if len(parts) == 1:
+            return parts[0]
         return parts[0]._each(
             lambda *values: values[0].cat(values) if isinstance(values[0], Rows) else torch.cat(values), *parts[1:]
         )
 
     def replaced(self, index: Tensor, other: Self) -> Self:
         """These rows, with the rows ``index`` (K,) int64 taken from ``other``, which has K."""
+        if _all_of(index, len(self)):
+            return other
         return self._each(
             lambda a, b: a.replaced(index, b) if isinstance(a, Rows) else a.index_copy(0, index, b), other
         )

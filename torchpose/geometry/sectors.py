@@ -6,6 +6,7 @@ ring's outer ellipse, from +u on the circle that its shape matrix makes the elli
 """
 
 import math
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -20,9 +21,11 @@ MOST = (
 )  # of a perimeter: more than a circle in a square shows, or a ring that is half hidden (derived: both show half)
 
 
+@cache
 def middles(device: torch.device) -> Tensor:
     """Angles (48,) of the middles, half a step off the axes, so that a mirrored ring has the mirrored row."""
-    return (torch.arange(SECTORS, dtype=torch.float64, device=device) + 0.5) * (2 * torch.pi / SECTORS)
+    with torch.inference_mode(False):
+        return (torch.arange(SECTORS, dtype=torch.float64, device=device) + 0.5) * (2 * torch.pi / SECTORS)
 
 
 def sector_of(x: Tensor, y: Tensor) -> Tensor:
@@ -33,9 +36,8 @@ def sector_of(x: Tensor, y: Tensor) -> Tensor:
 
 def sector_about(u: Tensor, v: Tensor, ellipses: Tensor, owner: Tensor) -> Tensor:
     """Sectors (P,) of points u, v (P,) about the ellipses (K, 5) that own them (P,)."""
-    inverse = torch.linalg.inv(conics.shape_matrix(ellipses)).flatten(1)
-    each = (*inverse[:, [0, 1, 3]].unbind(-1), *ellipses[:, :2].unbind(-1))
-    i11, i12, i22, cx, cy = (value.contiguous().index_select(0, owner) for value in each)
+    inverse = conics.inverse_shape(ellipses).flatten(1)
+    i11, i12, _, i22, cx, cy = torch.cat([inverse, ellipses[:, :2]], 1).index_select(0, owner).unbind(1)
     dx, dy = u - cx, v - cy
     return sector_of(i11 * dx + i12 * dy, i12 * dx + i22 * dy)
 

@@ -47,6 +47,8 @@ def marked(index: Int[Tensor, " K"], count: int) -> Bool[Tensor, " count"]:
 
 def segment_sum(values: Shaped[Tensor, "E ..."], index: Int[Tensor, " E"], count: int) -> Shaped[Tensor, "count ..."]:
     """Sums of the rows of ``values`` that share an ``index`` in [0, count)."""
+    if count == 1:
+        return values.sum(0, keepdim=True, dtype=values.dtype)
     out = torch.zeros(count, *values.shape[1:], dtype=values.dtype, device=values.device)
     return out.index_add(0, index, values)
 

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
+from torchpose.geometry.constants import either
 from torchpose.geometry.rows import Rows
 from torchpose.identify.scene import MOST_GAIN, MarkerTable
 from torchpose.rings import Rings
@@ -73,7 +74,7 @@ class Assignments(Rows):
 
     def common(self, origin: Tensor, member: Tensor) -> Tensor:
         """By how far edges of ``member`` (S,) are moved where those of ``origin`` (S,) are: NaN if one is clipped."""
-        return torch.where(self.clipped[origin] == self.clipped[member], self.likely[origin], torch.nan)
+        return either(self.clipped[origin] == self.clipped[member], self.likely[origin], torch.nan)
 
 
 def ratio_tolerance(semi_minor: Ratio, blur: Ratio | float = 1.0) -> Ratio:
@@ -176,9 +177,9 @@ def propose(rings: Rings, table: MarkerTable, matrix: Tensor) -> Assignments:
     codes = Codes(*(code[ring, target, marker] for code in codes))
     clipped, side = rings.clipped[ring], rings.polarity[ring]
     # where a clipped edge would be for the code to be right: one drawn inwards all around looks steeper than it is
-    drawn = torch.where(clipped, side * codes.moved, 0.0)[:, None]
+    drawn = either(clipped, side * codes.moved, 0.0)[:, None]
     ellipse = torch.cat([outer[ring, :2], outer[ring, 2:4] + drawn, outer[ring, 4:]], -1)
-    radius = table.radii[target, marker, 0] + torch.where(clipped, 0.0, side * codes.likely)
+    radius = table.radii[target, marker, 0] + either(clipped, 0.0, side * codes.likely)
     # every ring alone has two poses of its plane
     conic = matrix.T @ conics.to_matrix(conics.conic_from_ellipse(ellipse)) @ matrix
     place, axis = conics.circle_poses(conic, radius)

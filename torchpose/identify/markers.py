@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.geometry.arguments import checked
+from torchpose.geometry.constants import either
 from torchpose.geometry.rows import Rows, shared
 from torchpose.geometry.segments import marked, pairs_in_group, segment_sum
 from torchpose.identify.assignments import Assignments, Codes, propose, ratio_tolerance
@@ -121,7 +122,7 @@ def likely_gain(codes: Codes, told: Tensor, pose: Tensor, scale: Tensor) -> Tens
         pose: (S,), of each.
         scale: (H,) mm, standard deviation of the gain.
     """
-    weight = torch.where(told, (MOST_GAIN * codes.per_unit).square(), 0.0)
+    weight = either(told, (MOST_GAIN * codes.per_unit).square(), 0.0)
     known, sums = (segment_sum(value, pose, len(scale)) for value in (weight, weight * codes.moved))
     return sums / (known + scale.pow(-2))
 
@@ -174,7 +175,7 @@ def _weighed(tried: Hypotheses, one: Assignments, table: MarkerTable, size: tupl
     # and gain or clipping move the edges of all rings as far as those of the one that the pose comes from
     codes = one.codes_of(member)
     off = codes.under(one.common(tried.origin[pose], member))
-    cost = torch.where((tried.miss < 1) & (off < 1), 0.5 * (tried.miss + off), torch.inf)
+    cost = either((tried.miss < 1) & (off < 1), 0.5 * (tried.miss + off), torch.inf)
     slot = pose * markers + every.marker
     per_marker = torch.full((len(tried.R) * markers,), torch.inf, dtype=cost.dtype, device=cost.device)
     per_marker.scatter_reduce_(0, slot, cost, "amin")
@@ -183,7 +184,7 @@ def _weighed(tried: Hypotheses, one: Assignments, table: MarkerTable, size: tupl
     per_marker = per_marker.view(-1, markers)
     found = per_marker.isfinite()
     count = found.sum(-1)
-    score = count - torch.where(found, per_marker, 0.0).sum(-1) / (2 * markers)
+    score = count - either(found, per_marker, 0.0).sum(-1) / (2 * markers)
     row = one.row[tried.origin]
     return Rivals(row, score, count, rank(row, score, size[0]), gain, every.where(chosen), every, size)
 

@@ -7,7 +7,6 @@ their codes as any ring is.
 """
 
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -18,6 +17,7 @@ from torchpose.geometry import conics, rotations
 from torchpose.geometry.arguments import checked
 from torchpose.geometry.least_squares import solve_scaled
 from torchpose.geometry.projection import by_pose, image_by_point
+from torchpose.geometry.rows import replace
 from torchpose.geometry.segments import segment_sum, values_at
 from torchpose.identify.by_codes import by_codes
 from torchpose.identify.markers import Identified
@@ -132,7 +132,7 @@ def _drawn(raw: Tensor, cell: int, reach: int) -> Tensor:
     along = torch.arange(-reach, reach + 1, dtype=raw.dtype, device=raw.device) * cell
     xy = torch.stack(torch.meshgrid(along, along, indexing="xy")).flatten(1)
     offset = (raw[:, :, :2] - raw[:, :1, :2])[..., None]
-    u, v = (torch.linalg.inv(conics.shape_matrix(raw)) @ (xy - offset)).unbind(2)  # (P, 2, k k)
+    u, v = (conics.inverse_shape(raw) @ (xy - offset)).unbind(2)  # (P, 2, k k)
     rho = torch.addcmul(u * u, v, v).sqrt_()
     # cells on a rim belong to both sides
     steep = raw[:, :, 3:4] / cell

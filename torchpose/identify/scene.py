@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.geometry.arguments import checked
+from torchpose.geometry.constants import either
 from torchpose.geometry.least_squares import covariance_factor
 from torchpose.geometry.rotations import plane_axes
 from torchpose.geometry.rows import Rows, shared
@@ -125,7 +126,7 @@ def _half_gap(radii: Tensor) -> Tensor:
     """Half of the least difference between two ratios of radii (M, 2); inf where there is one."""
     ratio = radii[:, 1] / radii[:, 0]
     apart = (ratio[:, None] - ratio).abs()
-    return 0.5 * torch.where(apart > 0.5 * MIN_RATIO_GAP, apart, torch.inf).amin()
+    return 0.5 * either(apart > 0.5 * MIN_RATIO_GAP, apart, torch.inf).amin()
 
 
 def _by_numbers(targets: Sequence[Target], camera: Camera | None) -> tuple[Tensor, Tensor]:
@@ -215,7 +216,7 @@ class Scene(NamedTuple):
 
     def stated_gain(self, gain: Tensor) -> Tensor:
         """The gains (N,) of rows whose targets' files state how uncertain the edge gain is, 0 of the others."""
-        return torch.where(self.table.gain_sigma[self.target] > 0, gain, 0.0)
+        return either(self.table.gain_sigma[self.target] > 0, gain, 0.0)
 
     def printed_radii(self, gain: Tensor) -> Tensor:
         """(N, M, 2) mm, of the markers of every row printed with an edge gain (N,) beyond that of the file."""

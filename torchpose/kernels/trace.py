@@ -116,7 +116,7 @@ def _move(program: Program, like: Any, move: Callable[..., Any], args: Any, kwar
 
 def _each(program: Program, like: Tensor, text: str, *operands: Any, alpha: int = 1) -> Array:
     if alpha != 1:
-        raise NotImplementedError("a factor in a sum of a compiled function")
+        operands = (*operands[:-1], _each(program, like, "{} * {}", operands[-1], alpha))
     return program.each(text, like.dtype, *(program.array(v, like.dtype) for v in operands))
 
 
@@ -155,7 +155,7 @@ _MOVES: dict[Any, Callable[..., Any]] = {
         _aten.unsqueeze.default, _aten.squeeze.dim, _aten.squeeze.dims, _aten.select.int, _aten.slice.Tensor,
         _aten.unbind.int, _aten.split.Tensor, _aten.split_with_sizes.default, _aten.stack.default, _aten.cat.default,
         _aten.select_scatter.default, _aten.slice_scatter.default, _aten.diagonal_scatter.default,
-        _aten.copy.default, _aten.fill.Tensor,
+        _aten.copy.default, _aten.fill.Tensor, _aten.flip.default,
     )},
     _aten.view.default: torch.reshape,
     _aten._unsafe_view.default: torch.reshape,

@@ -6,7 +6,7 @@ from torchpose.pnp.epnp import epnp
 from torchpose.pnp.few import MOST as FEW
 from torchpose.pnp.lines import lines
 from torchpose.pnp.p3p import p3p
-from torchpose.pnp.pairs import pair_minima
+from torchpose.pnp.pairs import pair_minima, planar_starts
 from torchpose.pnp.planar import planar
 from torchpose.pnp.posit import posit
 from torchpose.pnp.result import PnPCode, PnPError, PnPResult
@@ -25,6 +25,7 @@ __all__ = [
     "p3p",
     "pair_minima",
     "planar",
+    "planar_starts",
     "posit",
     "solve",
 ]

@@ -86,12 +86,6 @@ def weighted_mean(x: Tensor, weight: Tensor | None) -> Tensor:
     return x.mean(1) if weight is None else (x * weight).sum(1) / weight.sum(0)
 
 
-def is_rotation(R: Tensor) -> Tensor:
-    """Matrices (..., 3, 3) that are rotations; those of a method that went astray are not."""
-    length = (R.square().sum(-1) - 1).abs().amax(-1)
-    return (length < _ROUNDING) & (torch.linalg.det(R) > 1 - _ROUNDING)
-
-
 def rank(r: Tensor, t: Tensor, points: Tensor, xy: Tensor, weight: Tensor | None) -> Candidates:
     """Sorts poses R (3, 3, S, B), t (3, S, B) by their reprojection error.
 

@@ -11,11 +11,9 @@ import torch
 from torch import Tensor
 
 from torchpose.kernels import repeated, tracing
+from torchpose.pnp.few import RESERVE as RESERVE
+from torchpose.pnp.few import RTOL, Array, Few, minimised, on_host, packed
 from torchpose.pnp.normal_equations import COST, Observations, damped_step, moved, normal_equations
-
-# promised decreases by which the cost of a second minimum may yet fall: 2.9 at most in 564,000 cases but for one
-# (scripts/pnp_statistics.py, seeds 0 to 5); a start from which it falls by more mostly ends in the best minimum
-RESERVE = 4.0
 
 
 class Estimate(NamedTuple):
@@ -131,7 +129,7 @@ def minimise(
     pose: Tensor,
     *,
     max_iterations: int,
-    rtol: float | Tensor = 1e-12,
+    rtol: float | Tensor = RTOL,
     enough: Tensor | None = None,
     compile: bool = False,
 ) -> Estimate:
@@ -150,7 +148,8 @@ def minimise(
     state = _State(pose, unknown, lam, pose, lam, none, none, torch.zeros_like(none, dtype=torch.int64))
     if compile:
         return _ended(repeated(_advance)(max_iterations, state, obs, rtol, floor, enough))
-    obs = obs.dense(pose.shape[-1])
+    if obs.few(pose.shape[-1]):
+        return _of_few(obs, pose, max_iterations, float(rtol), floor, enough)
     result, index = None, torch.arange(pose.shape[-1], device=pose.device)  # of the poses still under way
     for iteration in range(1, max_iterations + 1):
         state, going = _advance(state, obs, rtol, floor, enough)
@@ -168,6 +167,21 @@ def minimise(
             obs, floor, enough, index = obs.select(remaining), floor[remaining], enough[remaining], index[remaining]
             state = _State(*(v.index_select(-1, remaining) for v in state))
     raise AssertionError("unreachable: the last iteration returns")
+
+
+def _of_few(obs: Observations, start: Tensor, steps: int, rtol: float, floor: Tensor, enough: Tensor) -> Estimate:
+    """`minimise` on the host."""
+
+    def solved(
+        points: Array, xy: Array, whitening: Array, start: Array, floor: Array, enough: Array
+    ) -> tuple[Array, ...]:
+        few = Few.of(start.shape[-1], points, xy, whitening)
+        ends = minimised(few, start.transpose(2, 0, 1), floor, steps, enough, rtol)
+        ends.whole[:, 6, 6] = ends.cost
+        return ends.pose.transpose(1, 2, 0), packed(ends.whole), ends.iterations, ends.done
+
+    pose, normal, iterations, done = on_host(solved, *obs[:3], start, floor, enough)
+    return Estimate(pose.to(start), normal.to(start), iterations, done)
 
 
 def _ended(state: _State) -> Estimate:

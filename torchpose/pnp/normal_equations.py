@@ -20,7 +20,7 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.geometry.small_linalg import cayley, cross, matmul3, solve_rows
 from torchpose.kernels import tracing
-from torchpose.pnp.few import MOST, Few, moved_few
+from torchpose.pnp.few import MOST
 
 # upper triangle of the 6 x 7 matrix [J^T J | J^T r] row by row, and the cost, packed in 28 numbers
 STARTS = (0, 7, 13, 18, 22, 25, 27)
@@ -55,7 +55,6 @@ class Observations(NamedTuple):
         camera: distorted camera through which the poses are projected; None: the pinhole of normalised coordinates.
         huber: residual in standard deviations above which the cost grows linearly; None: least squares.
         sums: `Sums` of the points where all poses share them, None otherwise.
-        few: the same as matrices, of a few poses through a pinhole; None otherwise.
     """
 
     points: Tensor
@@ -64,7 +63,6 @@ class Observations(NamedTuple):
     camera: Camera | None = None
     huber: float | Tensor | None = None
     sums: Sums | None = None
-    few: Few | None = None
 
     def select(self, index: Tensor) -> Observations:
         """The poses ``index``."""
@@ -74,10 +72,9 @@ class Observations(NamedTuple):
         """With a dimension of one before the batch, for several poses of the same points."""
         return self._each(lambda x: x.unsqueeze(-2))
 
-    def dense(self, poses: int) -> Observations:
-        """With matrices where so many poses are few, for `normal_equations` of one each."""
-        many = poses > MOST or self.camera is not None or self.huber is not None or tracing()
-        return self if many else self._replace(few=Few.of(poses, *self[:3]))
+    def few(self, poses: int) -> bool:
+        """Whether so many poses of them are few enough for `few.minimised`."""
+        return not (poses > MOST or self.camera is not None or self.huber is not None or tracing())
 
     def to(self, dtype: torch.dtype) -> Observations:
         sums = None if self.sums is None else Sums(*(v.to(dtype) for v in self.sums))
@@ -85,7 +82,7 @@ class Observations(NamedTuple):
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> Observations:
         points, xy, whitening = map(change, self[:3])
-        return self._replace(points=points, xy=xy, whitening=whitening, few=None)
+        return self._replace(points=points, xy=xy, whitening=whitening)
 
 
 class Derivatives(NamedTuple):
@@ -176,8 +173,6 @@ def normal_equations(obs: Observations, pose: Tensor, newton: bool = False, fine
     the point is -(du dz' + du' dz) / z; the distortion of a camera is taken as linear.
     ``fine`` as in `differentiate`: a step has then the accuracy of its dtype, but for an error in proportion to itself.
     """
-    if obs.few is not None and pose.ndim == 3:
-        return obs.few.normal(pose, newton=newton)
     z, rows, cost = differentiate(obs, pose, fine)
     u, v = rows.unbind(1)
     products = torch.empty((_PRODUCTS, *cost.shape), dtype=cost.dtype, device=cost.device)
@@ -285,8 +280,6 @@ def _full(device: torch.device) -> Tensor:
 
 def moved(pose: Tensor, step: Tensor) -> Tensor:
     """Poses [R C(w) | R d + t] (3, 4, ...) of steps (d, w) (6, ...), with Cayley's rotation C(w)."""
-    if few(step):
-        return moved_few(pose, step)
     result = matmul3(pose[:, :3], torch.cat([cayley(step[3:]), step[:3, None]], 1))
     result[:, 3] += pose[:, 3]
     return result

@@ -1,23 +1,24 @@
-"""Both minima of a few poses through a pinhole, each from a start of its own, in the fewest calls.
+"""Both poses of a few rows through a pinhole: starts of planes, and the minima reached from two starts each, on the
+host.
 
-What `solve` does from two starts that are given, for those who want the minima and nothing else: the same steps
-(`iterative`), with the pose first (`few`), and without codes, ratios and covariances.
+Of one frame there are two poses of four points. A tensor operation costs more than all their arithmetic, and a device
+would be waited for at every decision; so the numbers are fetched once, and NumPy does what `solve` does from two starts
+that are given: the same steps (`iterative`), with the pose first (`few`), and without codes, ratios and covariances.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import torch
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpose.pnp.few import Few, stepped
-from torchpose.pnp.iterative import RESERVE
-from torchpose.pnp.verdict import COINCIDENCE, relevant
+from torchpose.pnp.few import Few, factors, minimised, on_host
+from torchpose.pnp.planar import COLLINEARITY, FIXED, FLATNESS
+from torchpose.pnp.verdict import COINCIDENCE, DECISION
 
-_RTOL = 1e-12  # as of `iterative.minimise`
-# times, by which information with second derivatives may differ from that without (convention: only cost depends on it)
-_BENT = 1e3
+Array = NDArray[Any]
 
 
 class Pairs(NamedTuple):
@@ -31,11 +32,18 @@ class Pairs(NamedTuple):
     behind: Tensor
 
 
-class _Body(NamedTuple):
-    """The points' frame: their centroids (N, 3), and their extent (N, 1)."""
+def planar_starts(points: Tensor, xy: Tensor, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Both poses of a few rows of coplanar points by IPPE, to first order about their centroids: as `planar`, without a
+    last word on the translation.
 
-    center: Tensor
-    unit: Tensor
+    Args:
+        points: (N, M, 3). xy: (N, M, 2), normalised, 0 where not seen. mask: (N, M) bool.
+
+    Returns:
+        R (N, 2, 3, 3), t (N, 2, 3), and whether there are such poses, in front of the camera (N,) bool.
+    """
+    R, t, known = on_host(_of_planes, points, xy, mask)
+    return R, t, known
 
 
 def pair_minima(
@@ -48,130 +56,130 @@ def pair_minima(
     max_iterations: int,
 ) -> Pairs:
     """Minima from two starts for each of N rows; arguments as of `solve`, points (N, M, 3), starts (N, 2, ...)."""
-    seen = mask[..., None].to(points)
+    return Pairs(*on_host(_minima, points, pixels, matrix, covariances, mask, *starts, max_iterations))
+
+
+def _minima(
+    points: Array, pixels: Array, matrix: Array, covariances: Array, mask: Array, R: Array, t: Array, steps: int
+) -> tuple[Array, ...]:
+    seen = mask[..., None].astype(points.dtype)
     count = seen.sum(1)
     center = (points * seen).sum(1) / count
     local = (points - center[:, None]) * seen
-    unit = local.square().sum(-1).amax(-1, keepdim=True).sqrt().clamp_min(torch.finfo(local.dtype).tiny)
+    unit = np.sqrt(np.square(local).sum(-1).max(-1, keepdims=True)).clip(np.finfo(local.dtype).tiny)
     focal, principal = matrix.diagonal()[:2], matrix[:2, 2]
-    xy = torch.where(mask[..., None], (pixels - principal) / focal, 0.0)
-    factor, root = torch.linalg.cholesky_ex(covariances)[0], torch.diag(focal).expand_as(covariances)
-    root = torch.linalg.solve_triangular(factor, root, upper=False) * seen[..., None]
-    aimed = (root * xy[:, :, None]).sum(-1)
+    xy = np.where(mask[..., None], (pixels - principal) / focal, 0.0)
+    root = np.linalg.solve(factors(covariances), np.diag(focal)) * seen[..., None]
     # residuals that are wrong by the rounding of their image points
-    scale = root.square().amax((-1, -2)) * (1 + xy.square().sum(-1))
-    floor = (4 * torch.finfo(xy.dtype).eps) ** 2 * scale.sum(-1)
-    x = torch.nn.functional.pad(local / unit[..., None], (0, 1), value=1.0)
-    x, root, aimed, floor = (value.repeat_interleave(2, 0) for value in (x, root, aimed, floor))
-    few = Few(x, x[..., :3].repeat_interleave(2, 1), root, aimed)
-    R, t = starts
+    scale = np.square(root).max((-1, -2)) * (1 + np.square(xy).sum(-1))
+    floor = (4 * np.finfo(xy.dtype).eps) ** 2 * scale.sum(-1)
+    few = Few.at(*(value.repeat(2, 0) for value in (local / unit[..., None], xy, root)))
     shift = (R @ center[:, None, :, None] + t[..., None]) / unit[:, :, None, None]
-    pose, done, matrix = _minimised(few, torch.cat([R, shift], -1).flatten(0, 1), floor, max_iterations)
+    ends = minimised(few, np.concatenate([R, shift], -1).reshape(-1, 3, 4), floor.repeat(2), steps, _relevant)
+    pose, information = ends.pose, few.whole(ends.pose, newton=False)[:, :6, :6]
     depth, uv, white = few.seen(pose)
-    pose = pose.unflatten(0, (-1, 2))
-    chi2 = torch.where(depth.amin((1, 2)) > 0, (white - few.aimed).square().sum((1, 2)), torch.inf).view(-1, 2)
-    off = (uv.unflatten(0, (-1, 2)) - xy[:, None]) * focal * seen[:, None]
-    rms = (off.square().sum((2, 3)) / count).sqrt()
-    worse = (chi2[:, 1:].nan_to_num(nan=torch.inf) >= chi2[:, :1].nan_to_num(nan=torch.inf)).long()
-    distance = _distance(pose, matrix, worse)
-    if bool(((distance > COINCIDENCE / _BENT) & (distance < COINCIDENCE * _BENT)).any()):
-        distance = _distance(pose, few.whole(pose.flatten(0, 1), newton=False)[0][:, :6, :6], worse)
-    chi2 = _apart(chi2, done.view(-1, 2), worse, distance < COINCIDENCE)
-    gone = ~chi2.isfinite()
-    R, t = pose.split([3, 1], -1)
-    t = (t * unit[:, :, None, None] - R @ center[:, None, :, None])[..., 0]
-    R, t = torch.where(gone[..., None, None], torch.nan, R), torch.where(gone[..., None], torch.nan, t)
-    behind = (chi2 == torch.inf).all(1)
-    return Pairs(R, t, torch.where(gone, torch.nan, rms), torch.where(gone, torch.nan, chi2), behind)
+    pose = pose.reshape(-1, 2, 3, 4)
+    chi2 = np.where(depth.min((1, 2)) > 0, np.square(white - few.aimed).sum((1, 2)), np.inf).reshape(-1, 2)
+    off = (uv.reshape(-1, 2, *xy.shape[1:]) - xy[:, None]) * focal * seen[:, None]
+    rms = np.sqrt(np.square(off).sum((2, 3)) / count)
+    worse = (np.nan_to_num(chi2[:, 1], nan=np.inf) >= np.nan_to_num(chi2[:, 0], nan=np.inf)).astype(int)
+    same = _distance(pose, information.reshape(-1, 2, 6, 6), worse) < COINCIDENCE
+    chi2 = _apart(chi2, ends.done.reshape(-1, 2), worse, same)
+    gone = ~np.isfinite(chi2)
+    R, t = pose[..., :3], (pose[..., 3:] * unit[:, :, None, None] - pose[..., :3] @ center[:, None, :, None])[..., 0]
+    R, t = np.where(gone[..., None, None], np.nan, R), np.where(gone[..., None], np.nan, t)
+    behind = (chi2 == np.inf).all(1)
+    return R, t, np.where(gone, np.nan, rms), np.where(gone, np.nan, chi2), behind
 
 
-def _distance(pose: Tensor, matrix: Tensor, worse: Tensor) -> Tensor:
-    """Squared Mahalanobis distances (N, 1) of poses (N, 2, 3, 4) by the information (2 N, 6, 6) about the better one.
+def _relevant(cost: Array) -> Array:
+    """Costs (2 N,) above which a minimum of two matters no more, given those at the starts: as `verdict.relevant`."""
+    least = np.nan_to_num(cost.reshape(-1, 2), nan=np.inf).min(1)
+    return (2 * least + 2 * DECISION).repeat(2)
+
+
+def _distance(pose: Array, information: Array, worse: Array) -> Array:
+    """Squared Mahalanobis distances (N,) of poses (N, 2, 3, 4) by the information (N, 2, 6, 6) about the better one.
 
     Args:
-        worse: (N, 1) int64, which is the other.
+        worse: (N,) int, which is the other.
     """
-    R, t = pose.split([3, 1], -1)
-    each = torch.arange(len(R), device=R.device)
-    best, of_best = R[each, 1 - worse[:, 0]], matrix[2 * each + 1 - worse[:, 0]]
+    each = np.arange(len(pose))
+    R, t = pose[..., :3], pose[..., 3:]
     # the one as seen from the other: translation, and twice the tangent of half the angle, as steps are made
-    turn = R[:, 0].mT @ R[:, 1]
-    axis = (turn - turn.mT)[:, (2, 0, 1), (1, 2, 0)]
-    axis = 2 * axis / (1 + turn.diagonal(dim1=1, dim2=2).sum(-1, keepdim=True)).clamp_min(1e-12)
-    step = torch.cat([best.mT @ (t[:, 1] - t[:, 0]), axis[..., None]], 1)
-    return (step.mT @ of_best @ step).flatten(1)
+    turn = np.swapaxes(R[:, 0], -1, -2) @ R[:, 1]
+    axis = (turn - np.swapaxes(turn, -1, -2))[:, (2, 0, 1), (1, 2, 0)]
+    axis = 2 * axis / (1 + np.trace(turn, axis1=1, axis2=2)[:, None]).clip(1e-12)
+    shift = np.swapaxes(R[each, 1 - worse], -1, -2) @ (t[:, 1] - t[:, 0])
+    step = np.concatenate([shift[..., 0], axis], 1)
+    return np.einsum("ni,nij,nj->n", step, information[each, 1 - worse], step)
 
 
-def _apart(chi2: Tensor, done: Tensor, worse: Tensor, same: Tensor) -> Tensor:
+def _apart(chi2: Array, done: Array, worse: Array, same: Array) -> Array:
     """Chi-squared (N, 2) of minima that are two, NaN for what is none.
 
     Args:
         done: (N, 2) bool, were they reached?
-        worse: (N, 1) int64, which has the larger one. same: (N, 1) bool, are both one?
+        worse: (N,) int, which has the larger one. same: (N,) bool, are both one?
     """
-    second, some = torch.arange(2, device=chi2.device) == worse, chi2 < torch.inf
-    alone = same | ~some.all(1, keepdim=True)
-    lost = (~done & ~(second & alone)).any(1, keepdim=True) & some.any(1, keepdim=True)
-    return torch.where(lost | (second & alone & some), torch.nan, chi2)
+    second, some = np.arange(2) == worse[:, None], chi2 < np.inf
+    alone = same[:, None] | ~some.all(1, keepdims=True)
+    lost = (~done & ~(second & alone)).any(1, keepdims=True) & some.any(1, keepdims=True)
+    return np.where(lost | (second & alone & some), np.nan, chi2)
 
 
-def _minimised(few: Few, start: Tensor, floor: Tensor, steps: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Poses (K, 3, 4) of minima, those of one row following each other, whether they were reached (K,) bool, and the
-    information about them (K, 6, 6), before the last step."""
-    pose = trial = start
-    over = done = torch.zeros_like(floor, dtype=torch.bool)
-    damping, cost, whole = torch.full_like(floor, 1e-3), torch.full_like(floor, torch.inf), start
-    decrease = enough = cost
-    for number in range(steps):
-        there, ahead = few.whole(trial, newton=True)
-        new = torch.where(ahead, there[:, 6, 6], torch.inf)
-        lower = (new <= cost + 2 * (cost * floor).sqrt() + floor) if number else ~over
-        accept = lower & ~over
-        if number == 0 or bool(accept.all()):
-            pose, whole, cost = trial, there, new
-        else:
-            pose, whole = (torch.where(accept[:, None, None], *v) for v in ((trial, pose), (there, whole)))
-            cost = torch.where(accept, new, cost)
-        if number == 0:
-            enough = relevant(cost.view(-1, 2).nan_to_num(nan=torch.inf).amin(1)).repeat_interleave(2)
-        old = (trial, decrease, damping, done)
-        damping = torch.where(lower, (0.1 * damping).clamp_min(1e-6), (10 * damping).clamp_min(1e-2))
-        step, decrease, definite = _damped(whole, damping)
-        if not bool((definite | over).all()):
-            step, decrease = _off_saddle(few, pose, cost, damping, (step, decrease, definite))
-        trial, sure = stepped(pose, -step), damping <= 1
-        left = sure & (cost - RESERVE * decrease > enough)
-        if bool(left.any()):
-            trial, decrease = torch.where(left[:, None, None], pose, trial), torch.where(left, 0.0, decrease)
-        done = sure & (decrease <= _RTOL * cost + floor) & (cost < torch.inf)
-        if bool(over.any()):
-            trial = torch.where(over[:, None, None], old[0], trial)
-            decrease, damping, done = (
-                torch.where(over, a, b) for a, b in zip(old[1:], (decrease, damping, done), strict=True)
-            )
-        # neither a pose without numbers nor one whose steps have shrunk to nothing will come to an end
-        over = done | ~((damping < 1e8) & (cost < torch.inf))
-        if bool(over.all()):
-            break
-    return torch.where(done[:, None, None], trial, pose), done, whole[:, :6, :6]
+def _of_planes(points: Array, xy: Array, mask: Array) -> tuple[Array, ...]:
+    """`planar_starts`: the homography by Harker and O'Leary, about the centroid, its first order by IPPE."""
+    seen = mask[..., None].astype(points.dtype)
+    count = seen.sum(1)
+    center = (points * seen).sum(1) / count
+    offset = (points - center[:, None]) * seen
+    square, vectors = np.linalg.eigh(np.swapaxes(offset, 1, 2) @ offset)
+    first, second = vectors[..., 2], vectors[..., 1]
+    axes = np.stack([first, second, np.cross(first, second)], 1)
+    sound = (square[:, 1] > COLLINEARITY**2 * square[:, 2]) & (square[:, 0] <= FLATNESS**2 * square[:, 2])
+    # along its principal axes the coordinates of a plane, and 1, are orthogonal
+    plane = np.concatenate([offset @ np.swapaxes(axes[:, :2], 1, 2), seen], -1)
+    length = np.sqrt(np.stack([square[:, 2], square[:, 1], count[:, 0]], 1))
+    basis = plane / length[:, None]
+    products = (xy[..., None] * plane[:, :, None]).reshape(*mask.shape, 6)
+    coefficients = np.swapaxes(basis, 1, 2) @ products
+    # with h3 given, the first two rows of the homography follow by linear least squares from u (h3 . m)
+    residual = (products - basis @ coefficients).reshape(len(points), -1, 3)
+    gram = np.swapaxes(residual, 1, 2) @ residual
+    scatter = np.square(coefficients[:, :2, 2::3]).sum((1, 2)) * square[:, 2] / np.square(count[:, 0])
+    firm = _det2(gram) > FIXED * scatter * (gram[:, 0, 0] + gram[:, 1, 1])
+    p = -_solved2(gram, gram[:, :2, 2:])[..., 0]
+    h = coefficients.reshape(-1, 6, 3) @ np.concatenate([p, np.ones_like(count)], 1)[..., None]
+    h = h.reshape(-1, 3, 2) / length[..., None]
+    q = h[:, 2]  # image of the centroid
+    jacobian = np.swapaxes(h[:, :2], 1, 2) - q[..., None] * p[:, None]
+    # a rotation of the axis towards the centroid, by half a turn about the middle between them
+    sight = np.concatenate([q, np.ones_like(count)], 1)
+    middle = sight / np.linalg.norm(sight, axis=1, keepdims=True) + np.array([0.0, 0.0, 1.0])
+    ray = middle[..., None] * middle[:, None] / middle[:, 2:, None] - np.eye(3)
+    both = _solved2(ray[:, :2, :2] - q[..., None] * ray[:, 2:, :2], jacobian)
+    # the largest singular value is the inverse depth
+    half, area = 0.5 * np.square(both).sum((1, 2)), _det2(both)
+    inverse = np.sqrt(half + np.sqrt((np.square(half) - np.square(area)).clip(0)))[:, None]
+    both = both / inverse[..., None]
+    third = np.sqrt((1 - np.square(both).sum(1)).clip(0))
+    third[:, 1] *= np.where(both.prod(2).sum(1) > 0, -1.0, 1.0)
+    columns = np.concatenate([both[:, None].repeat(2, 1), np.stack([third, -third], 1)[:, :, None]], 2)
+    normal = np.cross(columns[..., 0], columns[..., 1])[..., None]
+    R = ray[:, None] @ np.concatenate([columns, normal], -1) @ axes[:, None]
+    t = (sight / inverse)[:, None]
+    depth = (offset @ np.swapaxes(R[:, :, 2], 1, 2)) + t[..., 2:]
+    sound &= firm & np.isfinite(R).all((1, 2, 3)) & (depth > 0).all((1, 2))
+    return R, t - (R @ center[:, None, :, None])[..., 0], sound
 
 
-def _damped(whole: Tensor, damping: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Steps (K, 6), the decrease of the cost that they promise, and whether they are to a minimum (K,)."""
-    matrix, right = whole[:, :6, :6], whole[:, :6, 6:]
-    matrix = matrix + torch.diag_embed(matrix.diagonal(dim1=1, dim2=2) * damping[:, None])
-    factor, failed = torch.linalg.cholesky_ex(matrix)
-    step = torch.cholesky_solve(right, factor)
-    return step[..., 0], (step * right).sum((1, 2)), failed == 0
+def _det2(matrix: Array) -> Array:
+    """Determinants (N,) of the upper left 2 x 2 blocks."""
+    return matrix[:, 0, 0] * matrix[:, 1, 1] - matrix[:, 0, 1] * matrix[:, 1, 0]
 
 
-def _off_saddle(
-    few: Few, pose: Tensor, cost: Tensor, damping: Tensor, newton: tuple[Tensor, Tensor, Tensor]
-) -> tuple[Tensor, Tensor]:
-    """Steps and decreases, those of Gauss-Newton, stretched, where the matrix is not definite; see `iterative`."""
-    step, decrease, _ = _damped(few.whole(pose, newton=False)[0], damping)
-    stretch = torch.where(damping < 1e-3, (0.1 * cost / decrease).sqrt().clamp(1, 1e3), 1.0)
-    definite = newton[2]
-    return torch.where(definite[:, None], newton[0], stretch[:, None] * step), torch.where(
-        definite, newton[1], decrease
-    )
+def _solved2(matrix: Array, right: Array) -> Array:
+    """Solutions (N, 2, m) with the upper left 2 x 2 blocks, by Cramer's rule; not finite where these are singular."""
+    adjugate = matrix[:, 1::-1, 1::-1].swapaxes(1, 2) * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    return adjugate @ right / _det2(matrix)[:, None, None]

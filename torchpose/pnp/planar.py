@@ -11,21 +11,20 @@ import torch
 from torch import Tensor
 
 from torchpose.geometry.small_linalg import cross, matmul3
-from torchpose.pnp.candidates import Candidates, batch_last, is_rotation, rank, weighted_mean
-from torchpose.pnp.few import MOST, ippe_few
+from torchpose.pnp.candidates import Candidates, batch_last, rank, weighted_mean
 
 # thickness over extent (standard deviations) above which points are no plane
-_FLATNESS = 1e-2
+FLATNESS = 1e-2
 # below which they are an exact plane but for rounding in float32 (derived)
 _EVENNESS = 1e-6
 # and above which they have no second pose that resembles the first (convention)
 _THINNESS = 0.15
 # width over length (standard deviations) below which points are a line
-_COLLINEARITY = 1e-4
+COLLINEARITY = 1e-4
 # least curvature of the products of places and images, over their scatters, that fixes a homography: it is 0 where all
 # points but one lie on a line or only three are distinct, about 4 for a square seen from afar: in exact images
 # (rounding), and for a start that noise must not spoil (convention; what fails it is looked at by `third_pass`)
-_FIXED = 1e-12
+FIXED = 1e-12
 FIXED_FIRMLY = 1e-3
 
 
@@ -45,7 +44,7 @@ class Frame(NamedTuple):
     @property
     def flat(self) -> Tensor:
         """(B,) bool, do the points lie in a plane?"""
-        return self.extent[0] <= _FLATNESS * self.extent[2]
+        return self.extent[0] <= FLATNESS * self.extent[2]
 
     @property
     def even(self) -> Tensor:
@@ -60,7 +59,7 @@ class Frame(NamedTuple):
     @property
     def wide(self) -> Tensor:
         """(B,) bool, do they fill more than a line?"""
-        return self.extent[1] > _COLLINEARITY * self.extent[2]
+        return self.extent[1] > COLLINEARITY * self.extent[2]
 
     def local(self, offset: Tensor) -> Tensor:
         """Offsets (3, N, B) from the centre along the axes."""
@@ -85,29 +84,8 @@ def planar(object_points: Tensor, image_points: Tensor, mask: Tensor | None = No
     """
     points, xy, weight = batch_last(object_points, image_points, mask)
     frame = plane_frame(points, weight)
-    if xy.shape[2] <= MOST:
-        return _planar_few(points, xy, weight, frame)
     r, t = ippe(points, xy, weight, frame.axes, frame.center)
     return rank(torch.where(frame.flat & frame.wide, r, torch.nan), t, points, xy, weight)
-
-
-def _planar_few(points: Tensor, xy: Tensor, weight: Tensor | None, frame: Frame) -> Candidates:
-    """The same for a few sets of points, pose first."""
-    poses, count = xy.shape[2], xy.shape[1]
-    x, uv = points.permute(2, 1, 0).expand(poses, count, 3), xy.permute(2, 1, 0)
-    one = torch.ones_like(uv[..., 0]) if weight is None else weight.mT
-    axes, center = frame.axes.permute(2, 0, 1).expand(poses, 3, 3), frame.center.mT.expand(poses, 3)
-    flat = (frame.flat & frame.wide).expand(poses)
-    R, t, camera = ippe_few(x, uv, one, axes, center, _FIXED)
-    square = (camera[..., :2] / camera[..., 2:] - uv[:, :, None]).square().sum(-1)
-    rms = ((square * one[..., None]).sum(1) / one.sum(1)[:, None]).sqrt()
-    ahead = ((camera[..., 2] > 0) | (one[..., None] == 0)).all(1)
-    rms = torch.where(ahead & flat[:, None] & rms.isfinite() & is_rotation(R), rms, torch.inf)
-    rms, order = rms.sort(1)
-    row = torch.arange(poses, device=order.device)[:, None]
-    valid = rms.isfinite()
-    R = torch.where(valid[..., None, None], R[row, order], torch.nan)
-    return Candidates(R, torch.where(valid[..., None], t[row, order], torch.nan), torch.where(valid, rms, torch.nan))
 
 
 def plane_frame(points: Tensor, weight: Tensor | None) -> Frame:
@@ -129,7 +107,7 @@ def plane_frame(points: Tensor, weight: Tensor | None) -> Frame:
 
 
 def ippe(
-    points: Tensor, xy: Tensor, weight: Tensor | None, frame: Tensor, center: Tensor, fixed: float = _FIXED
+    points: Tensor, xy: Tensor, weight: Tensor | None, frame: Tensor, center: Tensor, fixed: float = FIXED
 ) -> tuple[Tensor, Tensor]:
     """R (3, 3, 2, B) and t (3, 2, B) of the points (3, N, B) of the plane ``frame`` (3, 3, B) about ``center`` (3, B).
 

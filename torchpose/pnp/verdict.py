@@ -131,7 +131,7 @@ def choose(obs: Observations, found: Found, compile: bool = False) -> Minima:
         return Found(*(v.gather(-2, order[rank].expand(*v.shape[:-2], 1, batch)).squeeze(-2) for v in found))
 
     pose, cost, iterations, converged = pick(0)
-    normal = compiled(normal_equations)(obs, pose) if compile else normal_equations(obs.dense(batch), pose)
+    normal = compiled(normal_equations)(obs, pose) if compile else normal_equations(obs, pose)
     # a minimum is known by the cost that its last step promised; one behind the camera from the start by none
     normal[COST] = cost
     best = Estimate(pose, normal, iterations, converged)

@@ -7,6 +7,7 @@ from torchpose.camera import Camera
 from torchpose.ellipse import EllipseFit
 from torchpose.geometry import conics
 from torchpose.geometry.arguments import checked
+from torchpose.geometry.constants import either, finite
 
 
 @checked
@@ -62,19 +63,20 @@ def exact(ellipses: Tensor, covariances: Tensor, radii: Tensor) -> tuple[Tensor,
     unit = ellipses[..., 2].amax(-1)[..., None, None]
     e = (ellipses[..., :2] - middle) / unit
     shape = conics.shape_matrix(ellipses) / unit[..., None]
-    block = e[..., :, None] * e[..., None, :] - shape @ shape
-    last = torch.cat([e, torch.ones_like(e[..., :1])], -1)
-    dual = torch.cat([torch.cat([block, e[..., :, None]], -1), last[..., None, :]], -2)  # times -1
+    last = torch.nn.functional.pad(e, (0, 1), value=1.0)
+    square = torch.nn.functional.pad(shape, (0, 1, 0, 1)).flatten(0, -3)
+    dual = last[..., :, None] * last[..., None, :] - torch.bmm(square, square).view(*last.shape, 3)  # times -1
     inverse = (radii.amax(-1, keepdim=True) / radii).square()  # 1 / r^2
     scale = (inverse / (shape.det().square())).pow(1 / 3)
     lever = inverse - inverse.mean(-1, keepdim=True)
     slope = ((lever * scale)[..., None, None] * dual).sum(-3)
-    _, vectors = torch.linalg.eigh(torch.where(slope.isfinite(), slope, 0.0))
+    known = finite(slope, (-2, -1))
+    _, vectors = torch.linalg.eigh(either(known[..., None, None], slope, 0.0))
     h = vectors[..., :, -1]  # the other two eigenvalues vanish
     center = unit[..., 0] * h[..., :2] / h[..., 2:] + middle[..., 0, :]
     share = lever * scale / (lever * scale).sum(-1, keepdim=True)
     covariance = (share.square()[..., None, None] * covariances).sum(-3)
-    return torch.where(slope.isfinite().all(-1).all(-1)[..., None], center, torch.nan), covariance
+    return either(known[..., None], center, torch.nan), covariance
 
 
 @checked
@@ -87,4 +89,4 @@ def raw_centers(camera: Camera, ideal: Tensor, covariance: Tensor) -> tuple[Tens
         return ideal, covariance
     at, jacobian = camera.linearised(xy)
     jacobian = jacobian / focal
-    return at, jacobian @ covariance @ jacobian.mT
+    return at, torch.bmm(torch.bmm(jacobian, covariance), jacobian.mT)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -11,10 +11,11 @@ from torch import Tensor
 
 from torchpose.camera import Camera
 from torchpose.geometry import blur as blurs
-from torchpose.geometry import conics
+from torchpose.geometry import conics, rotations
 from torchpose.geometry.arguments import checked
+from torchpose.geometry.constants import constant, either
 from torchpose.geometry.least_squares import covariance_factor
-from torchpose.geometry.rows import Rows, shared
+from torchpose.geometry.rows import Rows, replace, shared
 from torchpose.identify import MarkerTable
 from torchpose.pose.centers import common_center
 from torchpose.rings import Rings
@@ -22,6 +23,10 @@ from torchpose.rings import Rings
 # px, and times the curvature a / b^2 and the blur's variance, of a px at least: what blur and mask do to an ellipse's
 # shape. Blur alone draws an edge inwards by half of the product, more where it is wider.
 SHAPE_FLOOR = (0.03, 0.5)
+_EYE = ((1.0, 0.0), (0.0, 1.0))
+# from the covariance (5, 5) of a fitted ellipse to that of e11 - e22 and 2 e12, both in a row
+_PICK = ((0.0, 0.0, 1.0, 0.0, -1.0), (0.0, 0.0, 0.0, 2.0, 0.0))
+_OF_SHAPE = tuple(tuple(p[i] * q[k] for p in _PICK for q in _PICK) for i in range(5) for k in range(5))
 CENTER_RMS = 0.3  # px, of centres: small errors of calibration or print are no mix-up (convention)
 
 
@@ -100,17 +105,18 @@ def gather_evidence(
     """
     mask = ring >= 0
     row, marker = mask.nonzero().unbind(-1)
-    seen = rings[ring[row, marker]]
-    center, covariance = locate(seen.outer, seen.inner, markers.radii[row, marker])
-    disc = markers.radii[row, marker, 1] < 0
-    center = torch.where(disc[:, None], seen.outer.params[:, :2], center)
-    covariance = torch.where(disc[:, None, None], seen.outer.center_covariance, covariance)
+    which, radii = ring[row, marker], markers.radii[row, marker]
+    outer, inner, blur = rings.outer[which], rings.inner[which], rings.blur[which]
+    center, covariance = locate(outer, inner, radii)
+    disc = radii[:, 1] < 0
+    center = torch.where(disc[:, None], outer.params[:, :2], center)
+    covariance = torch.where(disc[:, None, None], outer.center_covariance, covariance)
 
     def laid_out(values: Tensor, fill: float) -> Tensor:
         empty = torch.full((*ring.shape, *values.shape[1:]), fill, dtype=torch.float64, device=ring.device)
         return empty.index_put((row, marker), values)
 
-    ellipses = laid_out(torch.stack([seen.outer.params, seen.inner.params], 1), 1.0)
+    ellipses = laid_out(torch.stack([outer.params, inner.params], 1), 1.0)
     # a circle of the radius r has the shape matrix r A, A from the plane to the image
     variance = markers.by_print[:, :, :3].square().sum(-1).amax(-1) / markers.radii[..., 0].square()
     shape = conics.shape_matrix(ellipses[:, :, 0])
@@ -121,12 +127,12 @@ def gather_evidence(
         laid_out(center, torch.nan),
         laid_out(covariance, torch.nan),
         ellipses,
-        laid_out(torch.stack([seen.outer.covariance, seen.inner.covariance], 1), 1.0),
-        laid_out(blurs.axes(seen.blur)[1], 1.0),
+        laid_out(torch.stack([outer.covariance, inner.covariance], 1), 1.0),
+        laid_out(blurs.axes(blur)[1], 1.0),
         mask,
         markers.coplanar,
         markers.polarity,
-        variance[..., None, None] * shape @ shape,
+        variance[..., None, None] * (shape @ shape),
         markers.by_print,
         markers.by_camera,
         markers.scale_sigma,
@@ -137,13 +143,13 @@ def gather_evidence(
 
 def predicted_circles(evidence: Evidence, R: Tensor, t: Tensor) -> Tensor:
     """Ellipses (N, S, M, 2, 5), ideal px, of every marker's circles under S poses R (N, S, 3, 3), t (N, S, 3)."""
-    x = (R[:, :, None] @ evidence.points[:, None, ..., None]).squeeze(-1) + t[:, :, None]  # (N, S, M, 3)
-    return conics.circle_ellipse(
-        evidence.matrix,
-        R[:, :, None, None],
-        x[..., None, :],
-        evidence.normals[:, None, :, None],
-        evidence.radii[:, None],
+    both = torch.cat([evidence.points, evidence.normals], 1)
+    # of all poses in one product
+    both = rotations.turned(R.flatten(1, 2), both).unflatten(2, (-1, 3)).transpose(1, 2)  # (N, S, 2 M, 3)
+    x, normal = both.chunk(2, 2)
+    x = (x + t[:, :, None])[..., None, :]
+    return conics.seen_circle(
+        evidence.matrix, x.expand(-1, -1, -1, 2, -1), normal[..., None, :], evidence.radii[:, None]
     )
 
 
@@ -160,33 +166,30 @@ def misfit_of_shapes(evidence: Evidence, predicted: Tensor) -> Tensor:
         evidence: N rows.
         predicted: as `predicted_circles`.
     """
-    difference = conics.shape_matrix(evidence.shape)[:, None] - conics.shape_matrix(predicted)
-    theta = evidence.shape[..., 4]
-    cos, sin = theta.cos(), theta.sin()
-    axes = torch.stack([cos, -sin, sin, cos], -1).unflatten(-1, (2, 2))[:, None]
-    change = axes.mT @ difference @ axes
-    v = torch.stack([change[..., 0, 0] - change[..., 1, 1], 2 * change[..., 0, 1]], -1)
-    pick = torch.tensor([[0, 0, 1, 0, -1], [0, 0, 0, 2, 0]], dtype=v.dtype, device=v.device)
-    bend = evidence.shape[..., 2] / evidence.shape[..., 3].square()
+    _, _, a, b, theta = evidence.shape.unbind(-1)
+    _, _, other_a, other_b, other_theta = predicted.unbind(-1)
+    # e11 - e22 and 2 e12 of the change, in the axes of the ellipse that was measured
+    apart, turn = other_a - other_b, 2 * (other_theta - theta[:, None])
+    v = torch.stack([(a - b)[:, None] - apart * turn.cos(), -apart * turn.sin()], -1)
+    bend = a / b.square()
     floor = SHAPE_FLOOR[0] + SHAPE_FLOOR[1] * bend * evidence.blur[..., None].clamp_min(1.0)
-    eye = torch.eye(2, dtype=v.dtype, device=v.device)
-    covariance = pick @ evidence.shape_covariance @ pick.T + floor.square()[..., None, None] * eye
-    seen = evidence.mask[..., None, None, None]
-    weight = torch.linalg.inv(torch.where(seen, covariance, eye))[:, None]
-    chi2 = (v[..., None, :] @ weight @ v[..., None]).squeeze(-1).squeeze(-1)
-    return torch.where(evidence.mask[:, None, :, None], chi2, 0.0).sum((-1, -2))
+    covariance = (evidence.shape_covariance.flatten(-2) @ constant(_OF_SHAPE, v)).unflatten(-1, (2, 2))
+    covariance.diagonal(dim1=-2, dim2=-1).add_(floor.square()[..., None])
+    seen = evidence.mask[..., None]
+    weight = torch.linalg.inv_ex(torch.where(seen[..., None, None], covariance, constant(_EYE, v))).inverse
+    chi2 = ((weight[:, None] * v[..., None, :]).sum(-1) * v).sum(-1)
+    return either(seen[:, None], chi2, 0.0).sum((-1, -2))
 
 
 @checked
 def center_rms(evidence: Evidence, R: Tensor, t: Tensor) -> Tensor:
     """RMS distance (N,) in px of the compensated centres from the projected ones."""
-    x = (R[:, None] @ evidence.points[..., None]).squeeze(-1) + t[:, None]
-    d = (x @ evidence.matrix.T)[..., :2] / x[..., 2:] - evidence.center
-    square = torch.where(evidence.mask, d.square().sum(-1), 0.0)
+    x = rotations.turned(evidence.matrix @ R, evidence.points) + (t @ evidence.matrix.T)[:, None]
+    at, depth = x.split_with_sizes([2, 1], -1)
+    square = either(evidence.mask, (at / depth - evidence.center).square().sum(-1), 0.0)
     return (square.sum(-1) / evidence.mask.sum(-1)).sqrt()
 
 
 def visible(covariance: Tensor, mask: Tensor) -> Tensor:
     """Covariances with the identity where nothing was seen."""
-    eye = torch.eye(2, dtype=covariance.dtype, device=covariance.device)
-    return torch.where(mask[..., None, None], covariance, eye)
+    return torch.where(mask[..., None, None], covariance, constant(_EYE, covariance))

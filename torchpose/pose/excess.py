@@ -14,7 +14,7 @@ may yet be a print whose residuals are small by chance, and the pose's covarianc
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import torch
@@ -22,9 +22,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.geometry.arguments import checked
+from torchpose.geometry.constants import either, finite
 from torchpose.geometry.least_squares import LEAST_DIRECTION
 from torchpose.geometry.robust import of_chance, quantile
-from torchpose.geometry.rows import Rows
+from torchpose.geometry.rows import Rows, replace
 from torchpose.results import Misfit
 
 OF_MARKER = 5  # two along the print, one across, and two turns of a ring that goes with the plate's bend
@@ -235,12 +236,12 @@ def _most(freedom: Tensor) -> Tensor:
 
 
 def _modes(information: Tensor, right: Tensor) -> _Modes:
-    finite = (information.isfinite().all(-1) & right.isfinite()).all(-1, keepdim=True)
-    right = torch.where(finite, right, 0.0)
-    values, vectors = torch.linalg.eigh(torch.where(finite[..., None], information, 0.0))
+    known = finite(torch.cat([information, right[..., None]], -1), (1, 2))[:, None]
+    right = either(known, right, 0.0)
+    values, vectors = torch.linalg.eigh(either(known[..., None], information, 0.0))
     there = values > LEAST_DIRECTION * values[:, -1:].clamp_min(torch.finfo(values.dtype).tiny)
-    root = torch.where(there, values, 0.0).sqrt()
-    residual = torch.where(there, (vectors.mT @ right[..., None])[..., 0] / root.clamp_min(1e-300), 0.0)
+    root = either(there, values, 0.0).sqrt()
+    residual = either(there, torch.bmm(vectors.mT, right[..., None])[..., 0] / root.clamp_min(1e-300), 0.0)
     return _Modes(residual, root[..., None] * vectors.mT, there)
 
 

@@ -1,12 +1,13 @@
 """What became of every target in every frame: who owns a ring that two rows claim, the status, the rows returned."""
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchpose.geometry.arguments import checked
+from torchpose.geometry.constants import either, numbers
+from torchpose.geometry.rows import replace
 from torchpose.geometry.segments import marked, rank_in_group
 from torchpose.identify import MIN_MARKERS, Identified, Scene
 from torchpose.pose.centers import raw_centers
@@ -55,14 +56,14 @@ def outcome(scene: Scene, found: Found) -> Poses:
     mask = found.evidence.mask.index_copy(0, solvable, solutions.mask)
     status = torch.full((rows,), int(Status.REJECTED), device=device).index_copy(0, solvable, solutions.status)
     reason = torch.full((rows,), int(Reason.RESIDUAL), device=device).index_copy(0, solvable, solutions.reason)
-    support = torch.where(status == Status.REJECTED, 0, mask.sum(-1))
+    support = either(status == Status.REJECTED, 0, mask.sum(-1))
     awarded, claimed = award((scene.target, len(scene.table)), support, mask, found.identified.ring, len(found.rings))
 
     # without a pose: the rings that nobody else explains tell why
     proposed = found.identified.proposed(~claimed)
     mask &= awarded[:, None] | ~torch.cat([claimed, claimed.new_ones(1)])[found.identified.ring]
     few = ~awarded & (proposed < MIN_MARKERS)
-    few_status = torch.where(proposed == 0, int(Status.NO_TARGET), int(Status.TOO_FEW_MARKERS))
+    few_status = either(proposed == 0, int(Status.NO_TARGET), int(Status.TOO_FEW_MARKERS))
 
     whole = bool(awarded.all())  # each has a solution then
 
@@ -71,12 +72,12 @@ def outcome(scene: Scene, found: Found) -> Poses:
             return values
         out = torch.full((rows, *values.shape[1:]), torch.nan, dtype=values.dtype, device=device)
         kept = awarded.view(-1, *[1] * (values.ndim - 1))
-        return torch.where(kept, out.index_copy(0, solvable, values), torch.nan)
+        return either(kept, out.index_copy(0, solvable, values), torch.nan)
 
     # no row is sure of its pose without a covariance that is one
     unknown = (status == Status.OK) & ~_positive(spread(solutions.covariance))
-    status = torch.where(unknown, int(Status.REJECTED), status)
-    reason = torch.where(unknown, int(Reason.DEGENERATE), reason)
+    status = either(unknown, int(Status.REJECTED), status)
+    reason = either(unknown, int(Reason.DEGENERATE), reason)
     every = Poses(
         frame=scene.frame,
         target=scene.target,
@@ -85,7 +86,7 @@ def outcome(scene: Scene, found: Found) -> Poses:
             found.identified.copies, torch.bincount(scene.group[awarded], minlength=scene.groups)[scene.group]
         ),
         status=torch.where(few, few_status, status),
-        reason=torch.where(few, int(Reason.NONE), reason),
+        reason=either(few, int(Reason.NONE), reason),
         markers=torch.where(few, proposed, mask.sum(-1)),
         **{
             name: torch.zeros_like(status).index_copy(0, solvable, getattr(solutions, name)) * awarded
@@ -113,7 +114,7 @@ def _vouched(solutions: Solutions, identified: Tensor) -> Solutions:
 def _positive(covariance: Tensor) -> Tensor:
     """Covariances (N,) bool, each scaled by its own deviations, that are positive definite."""
     scale = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).rsqrt()
-    scaled = torch.where(scale.isfinite()[..., None], covariance * scale[..., :, None] * scale[..., None, :], -1.0)
+    scaled = either(numbers(scale)[..., None], covariance * scale[..., :, None] * scale[..., None, :], -1.0)
     return torch.linalg.cholesky_ex(scaled.nan_to_num(nan=-1.0))[1] == 0
 
 
@@ -145,14 +146,15 @@ def _instances(scene: Scene, awarded: Tensor, t: Tensor) -> tuple[Tensor, Tensor
 def detections_of(scene: Scene, found: Found, mask: Tensor) -> Detections:
     """The markers of the rows that the mask (N, M) has; their instance is the row, or 0 where each has one."""
     row, marker = mask.nonzero().unbind(-1)
-    ring, target = found.rings[found.identified.ring[row, marker]], scene.target[row]
+    ring, target = found.identified.ring[row, marker], scene.target[row]
     evidence = found.evidence
     center, covariance = raw_centers(scene.camera, evidence.center[row, marker], evidence.covariance[row, marker])
     ids = scene.table.ids[target, marker]
     number = torch.zeros_like(row) if len(mask) == scene.groups else row
     disc = scene.table.radii[target, marker, 1] < 0
-    inner = torch.where(disc[:, None], torch.nan, ring.inner_raw)
-    return Detections(scene.frame[row], target, number, ids, center, covariance, ring.outer_raw, inner)
+    inner = either(disc[:, None], torch.nan, found.rings.inner_raw.index_select(0, ring))
+    outer = found.rings.outer_raw.index_select(0, ring)
+    return Detections(scene.frame[row], target, number, ids, center, covariance, outer, inner)
 
 
 def award(target: tuple[Tensor, int], support: Tensor, mask: Tensor, ring: Tensor, rings: int) -> tuple[Tensor, Tensor]:

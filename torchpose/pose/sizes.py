@@ -7,6 +7,7 @@ for their neighbours in code have another sum. The distances between the markers
 import torch
 from torch import Tensor
 
+from torchpose.geometry.constants import either
 from torchpose.pose.evidence import Evidence
 from torchpose.target import MIN_RATIO_GAP
 
@@ -25,15 +26,15 @@ def sizes_beyond(evidence: Evidence, predicted: Tensor) -> tuple[Tensor, Tensor]
     outer, inner = evidence.radii.unbind(-1)
     there = evidence.radii > 0  # of a disc the inner edge is nowhere
     excess = evidence.shape[..., 2:4] / predicted[..., 2:4] - 1
-    further = torch.where(there[..., None], evidence.radii[..., None] * excess, 0.0)
+    further = either(there[..., None], evidence.radii[..., None] * excess, 0.0)
     difference, edge = further.sum(-2), further.sum((-2, -1)) / (2 * there.sum(-1))
     error = 2 * _SIZE_ERROR * evidence.blur.sqrt().clamp_min(1.0) / evidence.shape[..., 0, 3]
     each = torch.cat([difference / outer[..., None], torch.stack([edge, error, 0.5 * error * outer], -1)], -1)
     seen = evidence.mask[..., None]
-    one, two, larger, error, error_mm = (torch.where(seen, each, 0.0).sum(1) / seen.sum(1)).unbind(-1)
+    one, two, larger, error, error_mm = (either(seen, each, 0.0).sum(1) / seen.sum(1)).unbind(-1)
     # blur that bends the shapes draws one axis alone
-    both = torch.where(one * two > 0, torch.minimum(one.abs(), two.abs()), 0.0)
-    beyond = torch.where(larger.abs() > error_mm, larger, 0.0)
+    both = either(one * two > 0, torch.minimum(one.abs(), two.abs()), 0.0)
+    beyond = either(larger.abs() > error_mm, larger, 0.0)
     return (both - error).clamp_min(0) / _code_gap(inner / outer), beyond
 
 
@@ -41,4 +42,4 @@ def _code_gap(ratio: Tensor) -> Tensor:
     """Least difference (N,) between ratios (N, M) of radii; padded ones are 1."""
     apart = (ratio[:, :, None] - ratio[:, None]).abs()
     both = (ratio < 1)[:, :, None] & (ratio < 1)[:, None] & (apart > 0.5 * MIN_RATIO_GAP)
-    return torch.where(both, apart, torch.inf).flatten(1).amin(1)
+    return either(both, apart, torch.inf).flatten(1).amin(1)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchpose.geometry.rows import Rows
+from torchpose.geometry.rows import Rows, replace
 from torchpose.results import Status
 
 PLACE = 5  # of a marker: x, y, z beside its place, dark edges outwards, both edges from its centre; mm

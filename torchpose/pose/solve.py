@@ -12,7 +12,9 @@ import torch
 from torch import Tensor
 
 from torchpose import pnp
+from torchpose.geometry import rotations
 from torchpose.geometry.arguments import checked
+from torchpose.geometry.constants import either, finite, numbers
 from torchpose.geometry.robust import CUT
 from torchpose.pose.covariance import pose_covariance
 from torchpose.pose.evidence import CENTER_RMS, Evidence, misfit_of_shapes, predicted_circles, visible
@@ -48,7 +50,7 @@ def solve_poses(
     rest = evidence[row].without(marker)
     retry = _solve(rest, _starts(rest, (rough[0][row], rough[1][row]), near), compile)
     # of the subsets that fit, the one with the least chi-squared
-    cost = torch.where(retry.status == Status.REJECTED, torch.inf, retry.chi2.nan_to_num(nan=torch.inf))
+    cost = either(retry.status == Status.REJECTED, torch.inf, retry.chi2.nan_to_num(nan=torch.inf))
     least = torch.full(bad.shape, torch.inf, dtype=cost.dtype, device=cost.device).scatter_reduce(0, row, cost, "amin")
     winner = (cost.isfinite() & (cost == least[row])).nonzero()[:, 0]
     return solved.replaced(row[winner], retry[winner])
@@ -67,12 +69,12 @@ def _solve(evidence: Evidence, starts: tuple[Tensor, Tensor], compile: bool) -> 
     ahead = of_centers[:, 1] - of_centers[:, 0] + (of_shapes[:, 1] - of_shapes[:, 0]) / over
     shift, larger = sizes_beyond(evidence, circles[row[:, 0], best[:, 0]])
     covariance, determined = pose_covariance(evidence, R[:, 0], t[:, 0])
-    chi2_alt = torch.where(chi2[:, 1].isfinite(), chi2[:, 1], torch.nan)
+    chi2_alt = either(numbers(chi2[:, 1]), chi2[:, 1], torch.nan)
     seen = evidence.mask.sum(-1)
     freedom = (2 * seen - 6).clamp_min(1)
     # half of the way to the next code, markers may as well be their neighbours
     contradicts = (of_centers[:, 0] > CUT**2 * freedom) & (rms[:, 0] > CENTER_RMS) | (shift > 0.5)
-    solvable = chi2[:, 0].isfinite()
+    solvable = numbers(chi2[:, 0])
     reason = torch.full_like(seen, Reason.NONE)
     for condition, why in (
         (ahead < AMBIGUOUS_CHI2, Reason.TWO_SOLUTIONS),
@@ -83,9 +85,9 @@ def _solve(evidence: Evidence, starts: tuple[Tensor, Tensor], compile: bool) -> 
         (behind, Reason.BEHIND_CAMERA),
         (degenerate | (solvable & ~determined), Reason.DEGENERATE),
     ):
-        reason = torch.where(condition, int(why), reason)  # the last that holds
-    status = torch.where(reason == Reason.NONE, int(Status.OK), int(Status.REJECTED))
-    status = torch.where(reason == Reason.TWO_SOLUTIONS, int(Status.AMBIGUOUS), status)
+        reason = either(condition, int(why), reason)  # the last that holds
+    status = either(reason == Reason.NONE, int(Status.OK), int(Status.REJECTED))
+    status = either(reason == Reason.TWO_SOLUTIONS, int(Status.AMBIGUOUS), status)
     one, two = ((R[:, k], t[:, k], rms[:, k]) for k in range(2))
     alone = covariance.new_zeros(len(covariance), 6, evidence.numbers)
     parts = (covariance, covariance, alone)
@@ -107,11 +109,11 @@ class _Minima(NamedTuple):
 
 
 def _minima(evidence: Evidence, starts: tuple[Tensor, Tensor], compile: bool) -> _Minima:
-    given = (evidence.points, torch.where(evidence.mask[..., None], evidence.center, 0.0), evidence.matrix)
+    given = (evidence.points, either(evidence.mask[..., None], evidence.center, 0.0), evidence.matrix)
     covariances = visible(evidence.covariance + evidence.placed, evidence.mask)
     if not compile and 2 * len(evidence) <= pnp.FEW:
         found = pnp.pair_minima(*given, covariances, evidence.mask, starts, _ITERATIONS)
-        return _Minima(*found, ~starts[0].isfinite().flatten(1).all(1))
+        return _Minima(*found, ~finite(starts[0], (1, 2, 3)))
     result = pnp.solve(
         *given,
         covariances=covariances,
@@ -128,9 +130,8 @@ def _minima(evidence: Evidence, starts: tuple[Tensor, Tensor], compile: bool) ->
 
 def _from_behind(evidence: Evidence, R: Tensor, t: Tensor) -> Tensor:
     """Poses (N,) bool that show all rings seen from behind their printed side."""
-    x = (R[:, None] @ evidence.points[..., None]).squeeze(-1) + t[:, None]
-    normal = (R[:, None] @ evidence.normals[..., None]).squeeze(-1)
-    return (((normal * x).sum(-1) < 0) | ~evidence.mask).all(-1)
+    x, normal = rotations.turned(R, torch.cat([evidence.points, evidence.normals], 1)).chunk(2, 1)
+    return (((normal * (x + t[:, None])).sum(-1) < 0) | ~evidence.mask).all(-1)
 
 
 def _no_solutions(evidence: Evidence, R: Tensor, t: Tensor) -> Solutions:
@@ -149,14 +150,17 @@ def _starts(evidence: Evidence, rough: tuple[Tensor, Tensor], near: bool = False
     if near:
         return _mirrored(evidence, *rough)
     focal, principal = evidence.matrix.diagonal()[:2], evidence.matrix[:2, 2]
-    xy = torch.where(evidence.mask[..., None], (evidence.center - principal) / focal, 0.0)
-    flat = pnp.planar(evidence.points, xy, mask=evidence.mask)
-    both = flat.R.isfinite().all(-1).all(-1).all(-1)  # else a marker behind the camera, or no plane
+    xy = either(evidence.mask[..., None], (evidence.center - principal) / focal, 0.0)
+    if 2 * len(evidence) <= pnp.FEW:
+        flat_R, flat_t, both = pnp.planar_starts(evidence.points, xy, evidence.mask)
+    else:
+        flat_R, flat_t, _ = pnp.planar(evidence.points, xy, mask=evidence.mask)
+        both = flat_R.isfinite().all(-1).all(-1).all(-1)  # else a marker behind the camera, or no plane
     planar = evidence.coplanar & (evidence.mask.sum(-1) >= 4) & both
     if bool(planar.all()):
-        return flat.R, flat.t
+        return flat_R, flat_t
     R, t = _mirrored(evidence, *rough)
-    return torch.where(planar[:, None, None, None], flat.R, R), torch.where(planar[:, None, None], flat.t, t)
+    return torch.where(planar[:, None, None, None], flat_R, R), torch.where(planar[:, None, None], flat_t, t)
 
 
 def _mirrored(evidence: Evidence, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import torch
@@ -22,10 +22,11 @@ from torch import Tensor
 from torchpose.camera import Camera
 from torchpose.camera.derivatives import by_intrinsics
 from torchpose.geometry.arguments import checked
+from torchpose.geometry.constants import constant, either
 from torchpose.geometry.least_squares import covariance_factor, scaled_inverse, solve_scaled
 from torchpose.geometry.projection import by_pose
-from torchpose.geometry.rotations import plane_axes
-from torchpose.geometry.rows import Rows
+from torchpose.geometry.rotations import plane_axes, turned
+from torchpose.geometry.rows import Rows, replace
 from torchpose.pose.covariance import center_jacobian, derivative
 from torchpose.pose.evidence import Evidence
 from torchpose.pose.excess import (
@@ -103,7 +104,7 @@ class Setting(NamedTuple):
     @property
     def arms(self) -> Tensor:
         """The markers (N, M, 3) as seen from the target's origin, camera axes, mm."""
-        return (self.R[:, None] @ self.evidence.points[..., None])[..., 0]
+        return turned(self.R, self.evidence.points)
 
     def of_rows(self, index: Tensor) -> Self:
         return self._replace(evidence=self.evidence[index], R=self.R[index], t=self.t[index])
@@ -160,10 +161,12 @@ def on_print(
         even: see `excess.excess_of`.
     """
     R, n = setting.R, normals.right.shape[-1]
-    aside = (R[:, None] @ moved[..., :3, None])[..., 0]
-    back = torch.cat([aside, torch.zeros_like(aside), moved[..., 3:4]], -1) + moved[..., 4:] * motions_by_size(setting)
-    right = normals.right + (normals.information @ among(back[..., None], n))[..., 0]
-    normals = MarkerNormals(normals.information, right)
+    if bool(moved.any()):
+        aside = turned(R, moved[..., :3])
+        back = torch.cat([aside, torch.zeros_like(aside), moved[..., 3:4]], -1)
+        back = back + moved[..., 4:] * motions_by_size(setting)
+        normals = MarkerNormals(normals.information, normals.right + _told(normals, among(back[..., None], n))[..., 0])
+    right = normals.right
     own = torch.eye(n, dtype=right.dtype, device=right.device)[:, :-1].expand(*right.shape[:2], n, n - 1)
     by_camera, by_target = motions_by_camera(setting), motions_by_target(setting)
     stated = torch.cat([by_camera, by_target], -1)
@@ -253,14 +256,14 @@ class JointSolution(NamedTuple):
         """
         columns = torch.cat([own, by_print], -1)
         matrix, right = assembled(normals, columns)
-        by_lens = columns.flatten(1, 2).mT @ (normals.information @ by_camera).flatten(1, 2)
+        by_lens = torch.bmm(columns.flatten(1, 2).mT, _told(normals, by_camera).flatten(1, 2))
         k = own.shape[-1]
         alone, known = scaled_inverse(matrix[:, :k, :k])
         both = torch.cat([right[..., None], by_lens], -1)
-        step, noise = alone @ both[:, :k], alone[:, :POSE, :POSE]
+        step, noise = torch.bmm(alone, both[:, :k]), alone[:, :POSE, :POSE]
         if by_print.shape[-1] == 0:
             step, lens, none = step[:, :POSE, 0] * float(estimate), step[:, :POSE, 1:], right[:, k:]
-            return cls(step, none, noise + lens @ lens.mT, noise, lens[..., :0], lens, known)
+            return cls(step, none, noise + torch.bmm(lens, lens.mT), noise, lens[..., :0], lens, known)
         shift = alone @ matrix[:, :k, k:]  # of the own unknowns, found without the numbers, by these
         told = matrix[:, k:, k:] - matrix[:, k:, :k] @ shift
         finite = told.isfinite().all(-1).all(-1)
@@ -339,7 +342,7 @@ def _bent(setting: Setting, information: Tensor, right: Tensor) -> Tensor:
     at = xy / _reach(camera)
     by = _least_squares(setting, jacobian, weight, (at * at.square().sum(-1, keepdim=True))[..., None])
     column = by.flatten(1)
-    told = ((information @ column[..., None])[..., 0] * column).sum(-1)
+    told = ((information * column[:, None]).sum(-1) * column).sum(-1)
     return by * may_be_off(told, (column * right).sum(-1)).sqrt()[:, None, None, None]
 
 
@@ -494,9 +497,12 @@ def _as_motions(setting: Setting, by: Callable[[Tensor], Tensor]) -> Tensor:
 
 def _least_squares(setting: Setting, jacobian: Tensor, weight: Tensor, pixels: Tensor) -> Tensor:
     """Motions (N, M, 7, n) of single markers that move points best as by the columns ``pixels`` (N, P, 2, n)."""
-    mask, weighted = setting.evidence.mask, jacobian.mT @ weight
-    both = (_by_marker(weighted @ what, mask.shape[1]) for what in (jacobian, pixels))
-    return torch.where(mask[..., None, None], solve_scaled(*both), 0.0)
+    mask, each = setting.evidence.mask, (setting.evidence.mask.numel(), -1)
+    weighted = torch.bmm(weight.flatten(0, 1), jacobian.flatten(0, 1)).view(*each, jacobian.shape[-1])
+    columns = torch.cat([jacobian, pixels], -1).view(*each, jacobian.shape[-1] + pixels.shape[-1])
+    sums = torch.bmm(weighted.mT, columns).unflatten(0, mask.shape)
+    held, pulled = sums.split_with_sizes([jacobian.shape[-1], pixels.shape[-1]], -1)
+    return either(mask[..., None, None], solve_scaled(held, pulled), 0.0)
 
 
 def remaining_of(normals: MarkerNormals, known: Tensor, excess: Tensor, count: int) -> tuple[Tensor, Tensor]:
@@ -509,7 +515,7 @@ def remaining_of(normals: MarkerNormals, known: Tensor, excess: Tensor, count: i
     if count:
         matrix.diagonal(dim1=-2, dim2=-1)[:, k - count : k] += 1
     both = torch.cat([matrix[:, :k, k:], right[:, :k, None]], -1)
-    taken = matrix[:, k:, :k] @ solve_scaled(matrix[:, :k, :k], both)
+    taken = torch.bmm(matrix[:, k:, :k], solve_scaled(matrix[:, :k, :k], both))
     return matrix[:, k:, k:] - taken[..., :-1], right[:, k:] - taken[..., -1]
 
 
@@ -517,8 +523,14 @@ def assembled(normals: MarkerNormals, columns: Tensor) -> tuple[Tensor, Tensor]:
     """Normal equations (N, k, k), (N, k) of unknowns with these columns (N, M, n, k)."""
     # all markers in one product: with many of them single ones are large together
     every = columns.flatten(1, 2).mT
-    matrix = every @ (normals.information @ columns).flatten(1, 2)
-    return matrix, (every @ normals.right.flatten(1)[..., None])[..., 0]
+    both = torch.cat([_told(normals, columns), normals.right[..., None]], -1).flatten(1, 2)
+    matrix, right = torch.bmm(every, both).split_with_sizes([columns.shape[-1], 1], -1)
+    return matrix.contiguous(), right[..., 0]
+
+
+def _told(normals: MarkerNormals, columns: Tensor) -> Tensor:
+    """What the markers tell of columns (N, M, n, k), each of its own: (N, M, n, k)."""
+    return torch.bmm(normals.information.flatten(0, 1), columns.flatten(0, 1)).view_as(columns)
 
 
 def among(by: Tensor, n: int) -> Tensor:
@@ -541,7 +553,7 @@ def _rim_jacobian(evidence: Evidence, R: Tensor, t: Tensor) -> tuple[Tensor, Ten
     outward = cos * one + sin * two
     points = evidence.points[:, :, None, None] + radii * outward
     along = radii * (cos * two - sin * one)
-    side = evidence.polarity[:, None, None, None, None] * t.new_tensor([1.0, -1.0])[:, None, None]
+    side = evidence.polarity[:, None, None, None, None] * constant((((1.0,),), ((-1.0,),)), t)
     seen_from = torch.stack([points, along, side * outward], -1).flatten(1, 3)
     arm, *moved = (R[:, None] @ seen_from).unbind(-1)
     by_point, xy = derivative(arm + t[:, None], evidence.matrix)
@@ -568,8 +580,3 @@ def center_normals(evidence: Evidence, R: Tensor, t: Tensor) -> MarkerNormals:
     error = torch.where(evidence.mask[..., None], evidence.center - at, 0.0)
     weighted = jacobian.mT @ weight
     return MarkerNormals(weighted @ jacobian, (weighted @ error[..., None])[..., 0])
-
-
-def _by_marker(values: Tensor, markers: int) -> Tensor:
-    """Sums (N, M, ...) over the points (N, P, ...) of each marker."""
-    return values.unflatten(1, (markers, -1)).sum(2)

@@ -5,14 +5,13 @@ Two poses that compensated centres cannot tell apart may differ by many deviatio
 open, but not the grey values around their edges.
 """
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
 from torchpose.geometry import rotations
 from torchpose.geometry.arguments import checked
 from torchpose.geometry.robust import of_chance
+from torchpose.geometry.rows import replace
 from torchpose.pose import AMBIGUOUS_CHI2, SHAPE_FLOOR, Evidence, Solutions, center_rms, pose_covariance, shape_chi2
 from torchpose.refine.centers import refine_centers
 from torchpose.refine.photometric.fit import refine_photometric

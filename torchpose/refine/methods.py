@@ -1,14 +1,16 @@
 """The methods of `PoseEstimator`: how each locates centres, and the steps that it takes once there are solutions."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torchpose.camera import Camera
+from torchpose.geometry.constants import either
 from torchpose.geometry.least_squares import Pose
 from torchpose.geometry.robust import of_chance
+from torchpose.geometry.rows import replace
 from torchpose.pose import (
     CENTER_RMS,
     PLACE,
@@ -181,7 +183,7 @@ def _of_joint(rows: Solutions, seen: Evidence, pose: Pose, joint: OnPrint) -> So
         covariance=joint.covariance,
         noise=joint.noise,
         systematic=joint.systematic,
-        place=torch.where(seen.mask[..., None], joint.place, torch.nan),
+        place=either(seen.mask[..., None], joint.place, torch.nan),
         misfit=joint.misfit,
         residual_chi2=joint.chi2,
         freedom=joint.freedom,

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import torch
@@ -15,9 +16,10 @@ from torchpose.detect.reduce import only_reduced
 from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
 from torchpose.geometry.blurred_edge import HOLDS, KINDS
+from torchpose.geometry.constants import constant, either
 from torchpose.geometry.least_squares import Pose, PosePrior
 from torchpose.geometry.robust import LEAST_KEPT as LEAST_KEPT
-from torchpose.geometry.rows import Rows, shared
+from torchpose.geometry.rows import Rows, replace, shared
 from torchpose.identify import Scene
 from torchpose.pose import Found, MarkerNormals
 from torchpose.target import Target
@@ -98,22 +100,27 @@ class Sight(Rows):
     def of_scene(cls, scene: Scene, found: Found, rows: Tensor) -> Self:
         """Rows (N,) of a scene, with the rings that were found of them."""
         evidence = found.evidence[rows]
-        ring = found.rings[found.identified.ring[rows].clamp_min(0).flatten()]
-        raw = torch.stack([ring.outer_raw, ring.inner_raw], 1).view(*evidence.mask.shape, 2, 5)
-        blur = torch.where(ring.clipped[:, None], torch.nan, ring.blur)  # what is left of a clipped edge tells of none
+        which, every = found.identified.ring[rows].clamp_min(0).flatten(), found.rings
+        raw = torch.stack([every.outer_raw, every.inner_raw], 1).index_select(0, which)
+        # what is left of a clipped edge tells of no blur
+        blur = either(every.clipped[:, None], torch.nan, every.blur).index_select(0, which)
+        polarity, seen, disc = (
+            value.index_select(0, which).view(*evidence.mask.shape, *value.shape[1:])
+            for value in (every.polarity, every.seen, every.disc)
+        )
         return cls(
             scene.frame[rows],
             evidence.mask,
-            raw,
-            ring.polarity.view_as(evidence.mask),
+            raw.view(*evidence.mask.shape, 2, 5),
+            polarity,
             evidence.points,
             evidence.normals,
             evidence.radii,
             scene.frames,
             scene.camera,
             blur.view(*evidence.mask.shape, 3),
-            seen=ring.seen.view(*evidence.mask.shape, -1),
-            disc=2 * (ring.disc.view_as(evidence.mask) & evidence.mask).sum(-1) > evidence.mask.sum(-1),
+            seen=seen,
+            disc=2 * (disc & evidence.mask).sum(-1) > evidence.mask.sum(-1),
         )
 
     @property
@@ -121,13 +128,13 @@ class Sight(Rows):
         """Variance of rounding, grey levels^2."""
         return QUANTISATION / self.reduction**2
 
-    @property
+    @cached_property
     def common_blur(self) -> Float[Tensor, "N 3"]:
         """The median of the known blurs of the markers of every row that are seen."""
-        start = torch.tensor(_START_BLUR, dtype=torch.float64, device=self.frame.device)
+        start = constant(_START_BLUR, self.centers, torch.float64)
         if self.blur is None:
             return blurs.isotropic(start.expand(len(self)))
-        median = torch.where(self.mask[..., None], self.blur, torch.nan).nanmedian(1).values
+        median = either(self.mask[..., None], self.blur, torch.nan).nanmedian(1).values
         return torch.where(median.isnan(), blurs.isotropic(start), median)
 
     @property
@@ -139,7 +146,7 @@ class Sight(Rows):
         may = self.mask & (self.blur[..., 0] + self.blur[..., 2] > (HOLDS * smallest).square())
         if not bool(may.any()):
             return torch.ones_like(self.mask[:, 0])
-        share = torch.where(self.mask, blurs.axes(self.blur)[1].sqrt() / smallest, torch.nan)
+        share = either(self.mask, blurs.axes(self.blur)[1].sqrt() / smallest, torch.nan)
         return ~(share.nanquantile(0.5, -1) > HOLDS)
 
     @property
@@ -150,7 +157,7 @@ class Sight(Rows):
 
     def displaced(self, by: Float[Tensor, "N M 5"]) -> Self:
         """The same rows with places of their markers beside those they have, as `Poses.place`."""
-        grown = (self.polarity * by[..., 3])[..., None] * by.new_tensor([1.0, -1.0]) + by[..., 4:]
+        grown = (self.polarity * by[..., 3])[..., None] * constant((1.0, -1.0), by) + by[..., 4:]
         return replace(self, centers=self.centers + by[..., :3], radii=self.radii + grown)
 
     def reduced(self, factor: int) -> Sight:

@@ -105,30 +105,27 @@ def ring_edges(frames: Tensor, frame: Tensor, ellipses: Tensor, outward: Tensor,
     second = zernike.locate(frames, frame.index_select(0, moved_ring), moved_pixel)
     also = positions(second.inside)
 
-    def both(first: Tensor, other: Tensor) -> Tensor:
-        return torch.cat([first.index_select(0, keep), other.index_select(0, also)])
-
-    ring = both(ring, moved_ring)
-    points, normal = (
-        [both(a, b) for a, b in zip(getattr(found, n).unbind(-1), getattr(second, n).unbind(-1), strict=True)]
-        for n in ("points", "normal")
-    )
-    offset, step = both(found.offset, second.offset), both(found.step, second.step)
-    nx, ny = _normal(ellipses, ring, *points)
-    aligned = (normal[0] * nx + normal[1] * ny) * outward.index_select(0, ring) > AGREE_COS
+    every = torch.cat([_columns(found).index_select(0, keep), _columns(second).index_select(0, also)])
+    ring = torch.cat([ring.index_select(0, keep), moved_ring.index_select(0, also)])
+    x, y, along_x, along_y, _, step = every.unbind(1)
+    nx, ny = _normal(ellipses, ring, x, y)
+    aligned = (along_x * nx + along_y * ny) * outward.index_select(0, ring) > AGREE_COS
     mean_step = segment_mean(step, ring, ellipses.shape[0], aligned.double())
     good = positions(aligned & (step > STEP_RANGE[0] * mean_step.index_select(0, ring)))
     order = good[torch.argsort(ring[good], stable=True)]
-    (x, y), (nx, ny) = ([c.index_select(0, order) for c in pair] for pair in (points, normal))
-    return RingEdges(ring[order], torch.stack([x, y]).mT, torch.stack([nx, ny]).mT, offset[order], step[order])
+    every = every.index_select(0, order)
+    return RingEdges(ring.index_select(0, order), every[:, :2], every[:, 2:4], every[:, 4], every[:, 5])
+
+
+def _columns(edges: zernike.Edges) -> Tensor:
+    """Points, normals, offsets and steps (E, 6)."""
+    return torch.cat([edges.points, edges.normal, edges.offset[:, None], edges.step[:, None]], 1)
 
 
 def _normal(ellipses: Tensor, ring: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     """Outward unit normals nx, ny (E,) of the ellipses' level curves through points x, y (E,)."""
-    inverse = torch.linalg.inv(conics.shape_matrix(ellipses))
-    square = (inverse @ inverse).flatten(1)
-    each = (*square[:, [0, 1, 3]].unbind(-1), *ellipses[:, :2].unbind(-1))
-    s11, s12, s22, cx, cy = (v.contiguous().index_select(0, ring) for v in each)
+    each = torch.cat([conics.inverse_shape(ellipses, 2).flatten(1), ellipses[:, :2]], 1)
+    s11, s12, _, s22, cx, cy = each.index_select(0, ring).unbind(1)
     dx, dy = x - cx, y - cy
     nx, ny = s11 * dx + s12 * dy, s12 * dx + s22 * dy
     scale = (nx * nx + ny * ny).rsqrt()

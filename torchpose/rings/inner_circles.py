@@ -1,6 +1,8 @@
 """The circle inside each candidate, from the mean radial profile of grey: ratio of the radii, and where it shows."""
 
+import math
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,6 +13,7 @@ from torchpose.detect import Candidates
 from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics, sectors
 from torchpose.geometry.blurred_edge import MOST
+from torchpose.geometry.constants import constant, either, finite, numbers
 from torchpose.geometry.grey import full_scale
 from torchpose.geometry.least_squares import solve_scaled
 from torchpose.geometry.robust import RATIO_RANGE
@@ -22,6 +25,8 @@ _RADII = 72
 _INNERMOST, _OUTERMOST = 0.08, 1.12  # of the outer ellipse, the range of the radial profile
 # of the outer edge's slope in the mean radial profile: a blur of the inner circle's size leaves as much (convention)
 _LEAST_PEAK = 0.25
+# of the radii that have a rise, the first that is farther out than an inner circle
+_FAR = math.floor((RATIO_RANGE[1] - _INNERMOST) / (_OUTERMOST - _INNERMOST) * (_RADII - 1))
 _EIGHTHS = 8  # parts of the perimeter in which the blur is looked at
 # of the semi-minor axis: from which shift of the centres on perspective smears the profile (convention: a sample of it)
 _PARTED = 0.02
@@ -65,20 +70,18 @@ def find_inner(
     """
     height, width = frames.shape[-2:]
     device = frames.device
-    rho = torch.linspace(_INNERMOST, _OUTERMOST, _RADII, dtype=torch.float64, device=device)
-    angle = sectors.middles(device)
-    circle = torch.stack([angle.cos(), angle.sin()])
+    rho, circle, shifted = _grid(device)
     own, apart = _planes(candidates, camera) if known is None else _plane(candidates, known)
-    outer = candidates.ellipse[own]
+    outer = candidates.ellipse.index_select(0, own)
     shape = conics.shape_matrix(outer)
-    shift = (1 - rho.square()).clamp_min(0) * apart[..., None]  # (P, 2, R)
+    shift = shifted * apart[..., None]  # (P, 2, R)
     u, v = ((shape @ circle)[:, :, None, :] * rho[:, None] + (outer[:, :2, None] + shift)[..., None]).round_().unbind(1)
     u, v = u.clamp_(0, width - 1), v.clamp_(0, height - 1)
     cell = v.add_(height * candidates.frame[own, None, None]).mul_(width).add_(u).long()
     grey = values_at(frames, cell)
     at, polarity = rho[1:-1], candidates.polarity[own]
     # what covers the outer circle on one side hides the inner one there too: only directions that show the outer count
-    far = int((at <= RATIO_RANGE[1]).sum())
+    far = _FAR
     edge = ((grey[:, far + 2 :] - grey[:, far:-2]) * polarity[:, None, None].float()).amax(1)
     seen = edge > 0.5 * edge.nanmedian(-1, keepdim=True).values
     if known is not None:
@@ -103,6 +106,15 @@ def find_inner(
     blur = _edge_blur(grey[first], seen[first], candidates.ellipse, ratio, at)
     clipped = _clipped(grey, seen, candidates.frame[own])[first]
     return InnerCircles(ratio, found, inner, seen[first], blur, clipped)
+
+
+@cache
+def _grid(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Radii (R,) of the profile, directions (2, 48), and how far a circle of each radius is shifted (R,)."""
+    with torch.inference_mode(False):
+        rho = torch.linspace(_INNERMOST, _OUTERMOST, _RADII, dtype=torch.float64, device=device)
+        angle = sectors.middles(device)
+        return rho, torch.stack([angle.cos(), angle.sin()]), (1 - rho.square()).clamp_min(0)
 
 
 def _clipped(grey: Tensor, seen: Tensor, frame: Tensor) -> Tensor:
@@ -134,24 +146,26 @@ def _edge_blur(grey: Tensor, seen: Tensor, outer: Tensor, ratio: Tensor, at: Ten
     profile = (mean / weight.sum(-1)[:, None]).double()  # NaN where it is not seen
     outside = (at > 0.5 * (1 + ratio)[:, None])[..., None]
     rise = (profile[:, 2:] - profile[:, :-2]).abs()
-    step = torch.where(outside, (profile[:, -1:] - profile[:, 1:-1]).abs(), -torch.inf).amax(1)
-    steepest = torch.where(outside, rise, -torch.inf).amax(1)
-    angle = (torch.arange(_EIGHTHS, dtype=torch.float64, device=grey.device) + 0.5) * (2 * torch.pi / _EIGHTHS)
-    normal = torch.linalg.inv(conics.shape_matrix(outer)) @ torch.stack([angle.cos(), angle.sin()])  # (M, 2, 8)
+    step = either(outside, (profile[:, -1:] - profile[:, 1:-1]).abs(), -torch.inf).amax(1)
+    steepest = either(outside, rise, -torch.inf).amax(1)
+    middles = [(k + 0.5) * 2 * math.pi / _EIGHTHS for k in range(_EIGHTHS)]
+    around = constant((tuple(map(math.cos, middles)), tuple(map(math.sin, middles))), outer)
+    normal = conics.inverse_shape(outer) @ around  # (M, 2, 8)
     length = torch.linalg.vector_norm(normal, dim=1)
-    spacing = float(at[2] - at[0]) / length  # px, between the two samples, across the edge
+    spacing = 2 * (_OUTERMOST - _INNERMOST) / (_RADII - 1) / length  # px, between the two samples, across the edge
     variance = (step / steepest * spacing).square() / (2 * torch.pi) - (spacing.square() + 1) / 12
-    known = variance.isfinite()
+    known = numbers(variance)
     rows = blurs.columns(*(normal / length[:, None]).unbind(1)).mT * known[:, None]
-    found = solve_scaled(rows @ rows.mT, (rows @ torch.where(known, variance, 0.0)[..., None]).squeeze(-1))
+    right = torch.bmm(rows, either(known, variance, 0.0)[..., None])
+    found = solve_scaled(torch.bmm(rows, rows.mT), right).squeeze(-1)
     return blurs.limited(found.nan_to_num(nan=0.0), 0.0, MOST**2)
 
 
 def _mean_profile(grey: Tensor, seen: Tensor, gaps: bool) -> Tensor:
     """Means (P, R) float64 of grey (P, R, A) over directions (P, A) that are seen; with ``gaps`` some may be NaN."""
     if gaps:
-        return torch.where(seen[:, None], grey, torch.nan).nanmean(-1).double()
-    return (grey @ seen[..., None].float()).squeeze(-1).double() / seen.sum(-1, keepdim=True)
+        return either(seen[:, None], grey, torch.nan).nanmean(-1).double()
+    return torch.bmm(grey, seen[..., None].float()).squeeze(-1).double() / seen.sum(-1, keepdim=True)
 
 
 def _ratio(inner: Tensor, outer: Tensor) -> Tensor:
@@ -173,10 +187,13 @@ def _planes(candidates: Candidates, camera: Camera | None) -> tuple[Tensor, Tens
     if camera is None:
         return index, none
     k = camera.matrix.to(candidates.ellipse)
-    conic = k.T @ conics.to_matrix(conics.conic_from_ellipse(candidates.ellipse)) @ k
+    square = conics.to_matrix(conics.conic_from_ellipse(candidates.ellipse)) @ k
+    conic = torch.bmm(k.T.expand_as(square), square)
     where = conics.circle_poses(conic, torch.ones_like(candidates.log10_nfa))[0] @ k.T
     apart = where[..., :2] / where[..., 2:] - candidates.ellipse[:, None, :2]
     far = torch.linalg.vector_norm(apart, dim=-1).amax(-1) > _PARTED * candidates.ellipse[:, 3]
-    far &= apart.isfinite().flatten(1).all(-1)
+    far &= finite(apart, (1, 2))
+    if not bool(far.any()):
+        return index, none
     own = torch.cat([index[~far], index[far].repeat_interleave(2)])
     return own, torch.cat([none[~far], apart[far].flatten(0, 1)])

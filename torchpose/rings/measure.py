@@ -1,7 +1,7 @@
 """Stage: concentric pairs. From candidate ellipses to rings with both circles measured."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -17,7 +17,8 @@ from torchpose.geometry import blur as blurs
 from torchpose.geometry import conics
 from torchpose.geometry.arguments import checked
 from torchpose.geometry.blurred_edge import LEAST, MOST
-from torchpose.geometry.rows import Rows
+from torchpose.geometry.constants import finite
+from torchpose.geometry.rows import Rows, replace
 from torchpose.geometry.sectors import SECTORS, clear_of_ends, sector_about
 from torchpose.geometry.segments import marked, segment_mean, segment_sum
 from torchpose.rings import zernike
@@ -320,7 +321,7 @@ def _by_edges(frames: Tensor, circles: Circles, camera: Camera, how: _How) -> tu
     step_ratio = step[count:] / step[:count]
     offset = torch.linalg.vector_norm(raw[count:, :2] - inner[:, :2], dim=-1)
     good = (
-        fit.covariance.isfinite().all(-1).all(-1).view(2, count).all(0)
+        finite(fit.covariance, (1, 2)).view(2, count).all(0)
         & _within(reach, raw, rough).view(2, count).all(0)
         & (cover[:count] > _LEAST_COVER[0])
         & (cover[count:] > _LEAST_COVER[1])
@@ -342,7 +343,8 @@ def _within(reach: Tensor, fitted: Tensor, rough: Tensor) -> Tensor:
     """Whether ellipses (N, 5) lie along their rough ones, (N,): all points are within reach of those, and a fit that is
     not has followed the stump of a circle cut off."""
     shift = torch.linalg.vector_norm(fitted[:, :2] - rough[:, :2], dim=-1)
-    growth = (conics.shape_matrix(fitted) - conics.shape_matrix(rough)).abs().amax((1, 2))
+    now, before = conics.shape_matrix(torch.stack([fitted, rough]))
+    growth = (now - before).abs().amax((1, 2))
     return torch.maximum(shift, growth) < reach + 1.5
 
 
@@ -357,12 +359,12 @@ def _freed(edges: RingEdges, rough: Tensor, outward: Tensor, correct: bool) -> t
     count, outside = len(rough) // 2, outward[edges.ring]
     near = ellipse.Near.of(edges.points, edges.ring, rough)
     conic, keep = near.robust(near.circle, _SCALES)
-    slopes, kept = near.slopes(conic), near.tiles.flat(keep) > 0
-    distance = edges.offset - near.tiles.flat(near.distances(conic, slopes)) * outside
+    kept = near.tiles.flat(keep) > 0
+    distance = edges.offset - near.tiles.flat(near.distances(conic)) * outside
     blur = zernike.edge_blur(edges.offset[kept], distance[kept], edges.normal[kept], edges.ring[kept] % count, count)
     points = edges.points
     if correct:
-        bend = near.tiles.flat(near.curvatures(conic, slopes)) * outside
+        bend = near.tiles.flat(near.curvatures(conic)) * outside
         points = points + _correction(edges, blur, bend)[:, None] * edges.normal
         near = near.moved(points)
     _, keep = near.robust(conic, _SCALES[-1:])

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torchpose.errors import ArgumentError
 from torchpose.geometry import blur as blurs
 from torchpose.geometry.arguments import checked, expect_index, unasked
+from torchpose.geometry.constants import constant
 from torchpose.geometry.least_squares import solve_scaled
 from torchpose.geometry.rows import Rows
 from torchpose.geometry.segments import segment_sum, values_at
@@ -31,6 +32,9 @@ _SUBSAMPLES = 128  # of a pixel along a side (convention: the rim of the disc to
 _ROUND = (
     0.01  # information about the blur's direction that is taken for there, in that about its size: an arc tells little
 )
+_HELD = ((0.0, 0.0, 0.0), (0.0, _ROUND, 0.0), (0.0, 0.0, _ROUND))
+# from a mean, and what the two axes and the diagonals have more or less, to a blur, px^2
+_AS_BLUR = tuple(tuple(MASK**2 / 12 * v for v in row) for row in ((1, 0, 1), (1, 0, -1), (0, 1, 0)))
 _LEAST_SLOPE = 0.4  # sigma = 0.22 N; a wider blur is out of the mask's reach and stays uncorrected beyond that
 
 
@@ -138,8 +142,8 @@ def moments_at(
     height, width = frames.shape[-2:]
     half = size // 2
     _expect_inside(frames, frame, pixels, half)
-    d = torch.arange(-half, half + 1, device=frames.device)
-    window = (d[:, None] * width + d[None, :]).flatten()
+    across = range(-half, half + 1)
+    window = constant(tuple(row * width + column for row in across for column in across), pixels)
     base = (frame * height + pixels[:, 1]) * width + pixels[:, 0]
     values = values_at(frames, base[:, None] + window)
     # every kernel but A_00 sums to nearly zero: taking the middle grey off first keeps float32 exact to rounding
@@ -196,13 +200,10 @@ def edge_blur(offset: Tensor, distance: Tensor, normal: Tensor, group: Tensor, c
     # a mean, and what the two directions of an axis and their diagonals have more or less
     rows = torch.stack([torch.ones_like(nu), nu * nu - nv * nv, 2 * nu * nv], -1) * distance[:, None]
     columns = torch.cat([rows, (distance - offset)[:, None]], -1)
-    sums = segment_sum((rows[:, :, None] * columns[:, None]).flatten(1), group, count).unflatten(1, (3, 4))
-    matrix, right = sums[..., :3], sums[..., 3]
-    matrix = matrix + torch.diag_embed(matrix[:, :1, 0] * matrix.new_tensor([0.0, _ROUND, _ROUND]))
-    loss = solve_scaled(matrix, right).nan_to_num(nan=0.0)
-    mean, lean, diagonal = loss.unbind(-1)
-    found = torch.stack([mean + lean, diagonal, mean - lean], -1) * (MASK**2 / 12)
-    return blurs.limited(found, 0.0, (1 - _LEAST_SLOPE) * MASK**2 / 12)
+    sums = segment_sum((rows[:, :, None] * columns[:, None]).flatten(1), group, count).view(-1, 3, 4)
+    matrix = sums[..., :3] + sums[:, :1, :1] * constant(_HELD, sums)
+    loss = solve_scaled(matrix, sums[..., 3:]).squeeze(-1).nan_to_num(nan=0.0)
+    return blurs.limited(loss @ constant(_AS_BLUR, loss), 0.0, (1 - _LEAST_SLOPE) * MASK**2 / 12)
 
 
 @checked

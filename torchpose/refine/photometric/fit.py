@@ -12,7 +12,7 @@ are padded blocks of pixels: one sequence of tensor operations for the whole bat
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple, cast
 
@@ -24,6 +24,7 @@ from torchpose.detect.reduce import reduction_for
 from torchpose.geometry import blur as blurs
 from torchpose.geometry.arguments import checked
 from torchpose.geometry.blurred_edge import KINDS, LEAST, LONG, MOST, Spread
+from torchpose.geometry.constants import finite
 from torchpose.geometry.least_squares import (
     Block,
     Eliminated,
@@ -36,7 +37,7 @@ from torchpose.geometry.least_squares import (
     minimise,
 )
 from torchpose.geometry.robust import of_chance
-from torchpose.geometry.rows import Rows
+from torchpose.geometry.rows import Rows, replace
 from torchpose.geometry.segments import marked, segment_mean, segment_sum
 from torchpose.pose import MarkerNormals
 from torchpose.refine.photometric.band import band_width
@@ -49,7 +50,7 @@ from torchpose.refine.photometric.grey_levels import (
     sum_products,
 )
 from torchpose.refine.photometric.light import LEVELS, POSE, normal_equations, of_markers, pulled_by_levels
-from torchpose.refine.photometric.ring_model import RingModel, gather_pixels, ring_model
+from torchpose.refine.photometric.ring_model import PixelBlocks, RingModel, gather_pixels, ring_model
 from torchpose.refine.photometric.sectors import (
     Sectors,
     away_from_unclear,
@@ -184,7 +185,7 @@ class _Fits:
         self.spread = Spread.of(blur, kind) if look is None else Spread(look.blur, kind)
         self.band = band_width(self.spread) if look is None else look.band
         self.fit = _Fit(sight, self.band, known, _MOST_COARSE)
-        self.ends: list[tuple[_Fit, Minimum]] = []
+        self.ends: list[tuple[_Fit, Minimum, Tensor]] = []
 
     def first(self) -> _Result:
         look = self.sight.look
@@ -264,7 +265,7 @@ class _Fits:
         found = _minimised(fit, start, spread, stages, None if levels is None else levels[fit.mask])
         owner, rows = fit.blocks.row, len(spread)
         covariance, determined = found.covariance()
-        good = determined & covariance.isfinite().all(-1).all(-1)
+        good = determined & finite(covariance, (1, 2))
         of_rows = [(x > 0).sum(-1, dtype=torch.float64) for x in (fit.weight, fit.usable, fit.blocks.valid)]
         of_rows.append((fit.coarse.valid > 0).sum(-1, dtype=torch.float64))
         kept, usable, seen, of_them = segment_sum(torch.stack(of_rows, -1), owner, rows).unbind(-1)
@@ -274,7 +275,7 @@ class _Fits:
         look = fit.look(spread, found.unknowns.values("levels"))
         at = torch.arange(rows, device=doubt.device)
         end = torch.full_like(at, len(self.ends))
-        self.ends.append((fit, found))
+        self.ends.append((fit, found, covariance))
         fresh = spread.kind == "gauss" and self.sight.look is None
         misshapen = fit.stands_out(look.levels[fit.mask]) if fresh else torch.zeros_like(good)
         known = (spread.covariance, look, fit.variance.sqrt(), kept / usable, good, doubt, misshapen)
@@ -283,12 +284,12 @@ class _Fits:
     def finished(self, result: _Result) -> Refined:
         """What the rows tell at the end of their fits."""
         ends = result.end.unique().tolist() if len(self.ends) > 1 else [0]
-        order = [(result.end == end).nonzero()[:, 0] for end in ends]
         parts = [_told(*self.ends[end]) for end in ends]
         if len(self.ends) > 1:
+            order = [(result.end == end).nonzero()[:, 0] for end in ends]
             parts = [part[result.at[index]] for part, index in zip(parts, order, strict=True)]
         told = parts[0] if len(parts) == 1 else _Told.cat(parts)[torch.argsort(torch.cat(order))]
-        good = result.good & told.covariance.isfinite().all(-1).all(-1)
+        good = result.good & finite(told.covariance, (1, 2))
         of_fit = (result.spread, result.noise, result.kept, good, result.doubt)
         return Refined(
             result.pose.R, result.pose.t, told.covariance, *of_fit, told.normals, told.gain, told.even, result.look
@@ -305,12 +306,13 @@ class _Told(Rows):
     gain: Float[Tensor, " N"] | None
 
 
-def _told(fit: _Fit, found: Minimum) -> _Told:
+def _told(fit: _Fit, found: Minimum, covariance: Tensor) -> _Told:
+    """Of a fit, where it ended, and the covariance of pose and blur there."""
     owner, rows = fit.blocks.row, len(fit.band)
     wider, even = overdispersion(fit.sectors.scaled(fit.factor), fit.variance[owner], owner, rows)
     if fit.stage.tempered:  # its weights have what the rims scatter by
         even = overdispersion(fit.sectors.scaled(fit.clear.to(fit.factor)), fit.variance[owner], owner, rows)[1]
-    covariance = wider[:, None, None] * found.covariance()[0]
+    covariance = wider[:, None, None] * covariance
     part = cast(Eliminated, found.normal.eliminated)
     normals = of_markers(fit.sums, fit.variance, part, fit.mask, found.step.own).over(wider)
     rough = even == 0
@@ -390,7 +392,7 @@ class _Fit:
 
     def first_levels(self, start: Pose, spread: Spread) -> Tensor:
         """Grey levels (K, 6) where a fit begins."""
-        self.model = ring_model(self.coarse, start.R, start.t, spread, check=True)
+        self.model = ring_model(self.coarse, start.R, start.t, spread, check=True, gain=self.gain)
         return first_levels(self.coarse, self.model)
 
     def of(self, rows: Tensor) -> _Fit:
@@ -400,7 +402,7 @@ class _Fit:
             0, rows, torch.arange(len(rows), device=rows.device)
         )
         blocks = self.blocks[number[self.blocks.row] >= 0]
-        fit.blocks = replace(blocks, row=number[blocks.row])
+        fit.blocks = replace(blocks, row=number[blocks.row], rows=len(rows))
         fit.coarse = fit.blocks.every(_COARSE)
         fit.prior = None if self.prior is None else self.prior[rows]
         fit.mask, fit.band, fit.variance, fit.least = (
@@ -414,10 +416,9 @@ class _Fit:
         spread = cast(Spread, unknowns.own["blur"])
         if self.gain:
             part = part.wider(unknowns.values("gain")[:, 0])
-        model, self.model = self.model or ring_model(part, pose.R, pose.t, spread, check=True), None
-        columns, slope = columns_of(part, model, levels)
-        residual = columns[:, :, -2].flatten(1)
-        self.residual, self.of_ring = residual, columns[:, :, POSE].flatten(1)
+        model, self.model = self.model or self._model(part, pose, spread), None
+        columns, slope, residual = columns_of(part, model, levels)
+        self.residual, self.of_ring = residual, 1 - model.fraction.flatten(1)
         noise = noise_spread(residual, part), model_misfit(levels)
         self.usable, self.weight = inliers(residual, part, model, *noise)
         if stage.coarse:  # the first steps begin with what was seen so far, the others see for themselves
@@ -432,6 +433,11 @@ class _Fit:
         used, known = self.weight.sum(-1), self._known(unknowns)
         normal, self.variance = normal_equations(self.sums, used, levels, part.row, self.least, known, gain=self.gain)
         return normal
+
+    def _model(self, part: PixelBlocks, pose: Pose, spread: Spread) -> RingModel:
+        # what markers tell of the gain is asked of all pixels
+        gain = self.gain or not self.stage.coarse
+        return ring_model(part, pose.R, pose.t, spread, check=True, gain=gain)
 
     def look(self, spread: Spread, levels: Tensor) -> Look:
         """With the blurs of rows and the levels (K, L) of their markers."""

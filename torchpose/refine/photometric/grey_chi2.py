@@ -43,8 +43,7 @@ def grey_chi2(sight: Sight, one: Refined, two: Refined) -> tuple[Tensor, Tensor,
         model = ring_model(blocks, pose.R, pose.t, spread, check=True)
         levels = first_levels(blocks, model)
         for _ in range(_LEVEL_STEPS):
-            columns, slope = columns_of(blocks, model, levels)
-            residual = columns[:, :, -2].flatten(1)
+            columns, slope, residual = columns_of(blocks, model, levels)
             noise = noise_spread(residual, blocks), model_misfit(levels)
             usable, weight = inliers(residual, blocks, model, *noise)
             sectors = sum_sectors(residual, slope, usable, weight, blocks, model)

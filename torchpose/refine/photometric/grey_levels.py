@@ -26,17 +26,17 @@ def first_levels(blocks: PixelBlocks, model: RingModel) -> Tensor:
 
     A third of a ring may be covered: a least-squares fit of gradients would bend towards the cover and stay there.
     """
-    columns = torch.stack([*_basis(model), tiled(blocks.grey)], 2)
+    basis = torch.stack(_basis(model), 2)
+    columns, used = torch.cat([basis, tiled(blocks.grey)[:, :, None]], 2), blocks.valid * blocks.seen
     ring, paper = _pure_levels(blocks, model.fraction.flatten(1))
     none = torch.zeros_like(ring)
     levels = torch.stack([ring, none, none, paper, none, none], -1).nan_to_num(0.0, 0.0, 0.0).double()
     for _ in range(_FIRST_STEPS):
-        predicted = (levels.float()[:, None, :, None] * columns[:, :, :LEVELS]).sum(2).flatten(1)
+        predicted = (levels.float().view(-1, 1, LEVELS, 1) * basis).sum(2).flatten(1)
         residual = blocks.grey - predicted
-        weight = blocks.valid * blocks.seen * geman_mcclure(residual / (2 * noise_spread(residual, blocks)[:, None]))
-        sums = sum_products(columns, weight)
-        levels = solve_scaled(sums[:, :LEVELS, :LEVELS], sums[:, :LEVELS, LEVELS:]).squeeze(-1)
-    return levels
+        weight = used * geman_mcclure(residual / (2 * noise_spread(residual, blocks)[:, None]))
+        levels = solve_scaled(*sum_products(columns, weight)[:, :LEVELS].split_with_sizes([LEVELS, 1], -1))
+    return levels.squeeze(-1)
 
 
 def _pure_levels(blocks: PixelBlocks, fraction: Tensor) -> tuple[Tensor, Tensor]:
@@ -55,11 +55,11 @@ def _pure_levels(blocks: PixelBlocks, fraction: Tensor) -> tuple[Tensor, Tensor]
     return ring - at_ring * slope, paper + (1 - at_paper) * slope
 
 
-def columns_of(blocks: PixelBlocks, model: RingModel, levels: Tensor) -> tuple[Tensor, Tensor]:
-    """Derivatives by pose (6), blur (3) and levels (L), the residual, and the derivative by the edge gain, by tiles:
-    (K, P / 256, 11 + L, 256) float32.
+def columns_of(blocks: PixelBlocks, model: RingModel, levels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Derivatives by pose (6), blur (3) and levels (L), the residual, and the derivative by the edge gain where
+    the model has it, by tiles: (K, P / 256, 11 + L, 256) float32.
 
-    Also the derivative by the distance from the edges (K, P).
+    Also the derivative by the distance from the edges, and the residual, (K, P).
     """
     a0, ax, ay, p0, px, py, *curved = levels.float()[..., None, None].unbind(1)
     x, y = model.x, model.y
@@ -74,7 +74,9 @@ def columns_of(blocks: PixelBlocks, model: RingModel, levels: Tensor) -> tuple[T
     basis = _basis(model, bool(curved))
     by_blur = (contrast * v for v in model.by_blur)
     by_pose = (by_d[:, :, None] * model.by_pose).unbind(2)
-    return torch.stack([*by_pose, *by_blur, *basis, residual, contrast * model.by_gain], 2), by_d.flatten(1)
+    by_gain = () if model.by_gain is None else (contrast * model.by_gain,)
+    columns = torch.stack([*by_pose, *by_blur, *basis, residual, *by_gain], 2)
+    return columns, by_d.flatten(1), residual.flatten(1)
 
 
 def _basis(model: RingModel, curved: bool = False) -> tuple[Tensor, ...]:
@@ -94,8 +96,8 @@ def tiled(plane: Tensor) -> Tensor:
 
 def sum_products(columns: Tensor, weight: Tensor) -> Tensor:
     """Sums over all pixels of weight times the products of every two columns: (K, n, n) float64."""
-    weighted = columns * weight.unflatten(1, (-1, 1, TILE))
-    products = torch.bmm(weighted.flatten(0, 1), columns.flatten(0, 1).mT)
+    tiles = columns.flatten(0, 1)
+    products = torch.bmm(tiles * weight.view(-1, 1, TILE), tiles.mT)
     return products.unflatten(0, columns.shape[:2]).sum(1, dtype=torch.float64)
 
 
@@ -123,9 +125,8 @@ def noise_spread(residual: Tensor, blocks: PixelBlocks) -> Tensor:
     All markers of a frame share its noise, so none may claim much more than the best of them: cover would.
     """
     own = (1.4826 * _median(residual.abs(), blocks.valid)).nan_to_num(nan=1.0).clamp_min(math.sqrt(blocks.quantisation))
-    least = torch.full((int(blocks.row.max()) + 1 if len(own) else 0,), torch.inf, dtype=own.dtype, device=own.device)
-    least = least.scatter_reduce(0, blocks.row, own, "amin")
-    return torch.minimum(own, _MOST_SPREAD * least[blocks.row])
+    least = own.new_full((blocks.rows,), torch.inf).scatter_reduce_(0, blocks.row, own, "amin")
+    return torch.minimum(own, _MOST_SPREAD * least.index_select(0, blocks.row))
 
 
 def _median(values: Tensor, where: Tensor) -> Tensor:

@@ -6,19 +6,24 @@ it is not. So they have a normal prior about 0 whose width is found in the frame
 the mean square of its gradients beyond what their noise explains.
 """
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
 from torchpose.geometry.blurred_edge import BLUR
+from torchpose.geometry.constants import constant
 from torchpose.geometry.least_squares import Eliminated, Normal, solve_scaled
+from torchpose.geometry.rows import replace
 from torchpose.geometry.segments import segment_mean, segment_sum
 from torchpose.pose import MarkerNormals
 
 # unknowns of a frame (translation, rotation, blur) and of a marker, at least (derived: they are counted)
 POSE, LEVELS = 6 + BLUR, 6
 _PLANE = 3  # levels of ring, then of paper, each with its gradient; curvatures in the same order where there are any
+# which levels are of which group, that of gradients and of curvatures where there are any
+_GROUPS = (
+    ((0.0, 1.0, 1.0, 0.0, 1.0, 1.0),),
+    ((0.0, 1.0, 1.0, 0.0, 1.0, 1.0, *[0.0] * 6), (*[0.0] * 6, *[1.0] * 6)),
+)
 _BLUR_KNOWN = 1e-4  # information about each number of a blur, px^-4: a disc has two, so that the third is open
 _LEAST_WIDTH = 0.01  # variance of the prior over that of a gradient's noise: as good as none
 _RIDGE = 1e-9  # of a marker's information: sums in float32 make up as much
@@ -38,7 +43,7 @@ def normal_equations(
 
     Args:
         sums: (K, 11 + L, 11 + L), of every marker, weight times products of the derivatives by pose (9) and levels (L),
-            the residual, and the derivative by the edge gain.
+            the residual, and the derivative by the edge gain; the latter may be left out where it is no unknown.
         used: (K,) sum of weights.
         levels: (K, L) so far, L = 6, or 12 with the light's curvature.
         owner: (K,) int64, frame of every marker.
@@ -47,19 +52,20 @@ def normal_equations(
         gain: the edge gain is an unknown of the frame, too, the tenth; the prior is about it as well.
     """
     rows, chosen = len(least), POSE + gain
-    each = torch.stack([sums[:, -2, -2], used - levels.shape[1]], -1)
+    error = POSE + levels.shape[1]  # where the residual stands
+    each = torch.stack([sums[:, error, error], used - levels.shape[1]], -1)
     chi2, freedom = segment_sum(each, owner, rows).unbind(-1)
     variance = (chi2 / (freedom - chosen).clamp_min(1)).maximum(least)
     sums = sums / variance.index_select(0, owner)[:, None, None]
     by_own = torch.cat([sums[:, :POSE], sums[:, -1:]], 1) if gain else sums[:, :POSE]
-    of_levels = sums[:, POSE:-2, POSE:-2].clone()
+    of_levels = sums[:, POSE:error, POSE:error].clone()
     diagonal = of_levels.diagonal(dim1=-2, dim2=-1)
-    diagonal += _RIDGE * diagonal.mean(-1, keepdim=True)
-    part = Eliminated(by_own[..., POSE:-2], of_levels, sums[:, POSE:-2, -2], owner)
-    # of pose and blur, and of the gain behind the residual
-    own = segment_sum(torch.cat([by_own[..., :POSE], by_own[..., -2:]], -1), owner, rows)
-    right, own = own[..., POSE], torch.cat([own[..., :POSE], own[..., POSE + 1 :]], -1) if gain else own[..., :POSE]
-    own.diagonal(dim1=-2, dim2=-1)[:, POSE - BLUR : POSE] += _BLUR_KNOWN
+    diagonal.add_(diagonal.mean(-1, keepdim=True), alpha=_RIDGE)
+    part = Eliminated(by_own[..., POSE:error], of_levels, sums[:, POSE:error, error], owner)
+    # of pose and blur, and of the gain, which stands behind the residual
+    every = segment_sum(by_own, owner, rows)
+    right, own = every[..., error], torch.cat([every[..., :POSE], every[..., -1:]], -1) if gain else every[..., :POSE]
+    own.diagonal(dim1=-2, dim2=-1)[:, POSE - BLUR : POSE].add_(_BLUR_KNOWN)
     normal = Normal(own, right, chi2 / variance, part)
     normal = normal if prior is None else normal.with_prior(*prior)
     precision = _precision(normal, part, levels)
@@ -79,15 +85,14 @@ def of_markers(sums: Tensor, variance: Tensor, levels: Eliminated, mask: Tensor,
         mask: (N, M), markers seen.
         step: (N, 9), of pose and blur, made since; (N, 10) where the edge gain is an unknown, too.
     """
-    scaled = sums / variance[levels.owner, None, None]
-    chosen, moved = _chosen(sums), step.shape[-1]
-    by_level = scaled[:, chosen, POSE:-2]
-    taken = by_level @ solve_scaled(levels.information, torch.cat([by_level.mT, levels.right[..., None]], -1))
-    information = scaled[:, chosen][:, :, chosen] - taken[..., :-1]
-    right = scaled[:, chosen, -2] - taken[..., -1]
-    right = right - (information[..., :moved] @ step[levels.owner, :, None])[..., 0]
-    held = torch.zeros(POSE + 1, dtype=right.dtype, device=right.device)
-    held[POSE - BLUR : POSE] = _BLUR_KNOWN
+    scaled = (sums / variance[levels.owner, None, None]).index_select(1, _chosen(sums))
+    by_level, right = scaled[..., POSE:-2], scaled[..., -2:-1]
+    part = torch.cat([by_level.mT, levels.right[..., None]], -1)
+    told = torch.cat([scaled.index_select(2, _chosen(sums)), right], -1)
+    told = told - torch.bmm(by_level, solve_scaled(levels.information, part))
+    information, moved = told[..., :-1], step.shape[-1]
+    right = (told[..., -1:] - torch.bmm(information[..., :moved], step[levels.owner, :, None]))[..., 0]
+    held = constant((*[0.0] * (POSE - BLUR), *[_BLUR_KNOWN] * BLUR, 0.0), right)
     count = mask.sum(-1)[levels.owner].clamp_min(1)
     return MarkerNormals.laid_out(information + torch.diag(held) / count[:, None, None], right, mask)
 
@@ -102,25 +107,23 @@ def pulled_by_levels(sums: Tensor, variance: Tensor, levels: Eliminated, mask: T
     scaled = sums / variance[levels.owner, None, None]
     of_levels = scaled[:, POSE:-2, POSE:-2]
     deviation = more.sqrt().repeat_interleave(_PLANE, 1).repeat(1, 2)[:, : of_levels.shape[-1]]
-    pull = scaled[:, _chosen(sums), POSE:-2] @ solve_scaled(levels.information, torch.diag_embed(deviation))
+    pull = scaled.index_select(1, _chosen(sums))[..., POSE:-2] @ solve_scaled(
+        levels.information, torch.diag_embed(deviation)
+    )
     every = pull.new_zeros(*mask.shape, pull.shape[1], pull.shape[1])
     return every.index_put(tuple(mask.nonzero().unbind(-1)), pull @ of_levels @ pull.mT)
 
 
-def _chosen(sums: Tensor) -> list[int]:
+def _chosen(sums: Tensor) -> Tensor:
     """Columns of pose, blur and edge gain: the latter stands last."""
-    return [*range(POSE), sums.shape[-1] - 1]
+    return constant((*range(POSE), sums.shape[-1] - 1), sums, torch.int64)
 
 
 def _precision(normal: Normal, part: Eliminated, levels: Tensor) -> Tensor:
     """Information (K, L) of the prior about the levels, from those that the data alone give."""
     rows, owner = len(normal), part.owner
     free = normal.solve(variances=True)
-    # which levels are of which group: its means are sums of these
-    groups = torch.zeros(2, levels.shape[1], dtype=levels.dtype, device=levels.device)
-    groups[0, 1:_PLANE] = groups[0, _PLANE + 1 : LEVELS] = 1.0
-    groups[1, LEVELS:] = 1.0
-    groups = groups[: 1 + (levels.shape[1] > LEVELS)]
+    groups = constant(_GROUPS[levels.shape[1] > LEVELS], levels)
     both = torch.stack([(levels + free.eliminated).square(), free.variances], 1) @ (groups / groups.sum(1, True)).mT
     square, mean_noise = segment_mean(both, owner, rows).unbind(1)  # (N, G)
     width2 = (square - mean_noise).maximum(_LEAST_WIDTH * mean_noise).clamp_min(1e-12)

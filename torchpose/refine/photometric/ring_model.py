@@ -9,19 +9,23 @@ each pixel.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchpose.camera import Camera
+from torchpose.camera.model import Slopes
 from torchpose.geometry import blur as blurs
 from torchpose.geometry.blurred_edge import HOLDS, Spread
+from torchpose.geometry.constants import constant, either, finite
 from torchpose.geometry.grey import full_scale
 from torchpose.geometry.robust import CUT, LEAST_KEPT
 from torchpose.geometry.rotations import plane_axes
-from torchpose.geometry.rows import Rows, shared
+from torchpose.geometry.rows import Rows, replace, shared
 from torchpose.geometry.sectors import SECTORS, sector_about
 from torchpose.geometry.segments import values_at
 from torchpose.refine.photometric.band import band_pixels
@@ -54,6 +58,7 @@ class PixelBlocks(Rows):
         polarity: as in `Sight`.
         limits: the grey levels at which the frame's noise is clipped, -inf and inf where it is not.
         quantisation: variance of rounding, grey levels^2.
+        rows: how many there are.
     """
 
     row: Int[Tensor, " K"]
@@ -71,6 +76,7 @@ class PixelBlocks(Rows):
     polarity: Float[Tensor, " K"]
     limits: Float[Tensor, "K 2"]
     quantisation: float = shared()
+    rows: int = shared()
 
     def wider(self, gain: Tensor) -> PixelBlocks:
         """The same with every dark edge outwards by the edge gain (N,) of its row, mm."""
@@ -111,7 +117,7 @@ class RingModel(NamedTuple):
     """Prediction and derivatives at one pose; planes (K, T, S) in float32.
 
     fraction: of paper, F. by_d: dF/dd through both circles. by_blur: 3 planes. by_pose: (K, T, 6, S), derivative of d.
-    by_gain: dF/d(edge gain), 1/mm.
+    by_gain: dF/d(edge gain), 1/mm; None if not asked for.
     x, y: plane coordinates over the outer radius. sound: bool, False where the expansions below do not hold: deep in
     a hole that is small for its blur, or where it is flat; None if not asked for.
     """
@@ -120,7 +126,7 @@ class RingModel(NamedTuple):
     by_d: Tensor
     by_blur: tuple[Tensor, ...]
     by_pose: Tensor
-    by_gain: Tensor
+    by_gain: Tensor | None
     x: Tensor
     y: Tensor
     sound: Tensor | None
@@ -147,18 +153,15 @@ def gather_pixels(sight: Sight, band: Tensor) -> PixelBlocks:
     grey = values_at(frames, (frame.index_select(0, of) * height + v) * width + u)
     limits = _clipping(grey, of, frame.numel()).index_select(0, row)
     low, high = limits.mT.contiguous().index_select(1, block)
-    x, y, slopes = camera.rays(torch.stack([u, v]).double().mT)
+    xy, slopes = camera.rays(torch.stack([u, v]).double())
     # what is clipped is no measurement
-    sound = (x + y).isfinite() & grey.isfinite() & (grey > low) & (grey < high)
+    sound = finite(xy, 0) & (grey > low) & (grey < high)  # NaN is neither
     # rays count from that of the marker's middle pixel; what is not sound gets one of the marker, too, and stays finite
-    xy = torch.stack([x, y])
     origin = xy.index_select(1, (first + size // 2).clamp_max(block.numel() - 1)).nan_to_num(nan=0.0)
     aside = (both[:, 0, 2] / camera.matrix[0, 0]).to(xy).index_select(0, block)
     xy = torch.where(sound, xy - origin.index_select(1, block), aside).index_select(1, index).view(2, count, most)
-    j00, j01, j10, j11 = (torch.where(sound, j.float(), s) for j, s in zip(slopes, (1.0, 0.0, 0.0, 1.0), strict=True))
-    det = (j00 * j11 - j01 * j10).reciprocal()
-    warp = (j11 * det, -j01 * det, -j10 * det, j00 * det, det.abs())
-    flat = torch.stack([*warp, torch.where(sound, grey, 0.0), sound.float()])
+    flat = torch.cat([_by_pixel(slopes, camera).float(), torch.stack([grey, torch.ones_like(grey)])])
+    flat = torch.where(sound, flat, constant(((1.0,), (0.0,), (0.0,), (1.0,), (1.0,), (0.0,), (0.0,)), flat))
     *warped, grey, valid = flat.index_select(1, index).view(len(flat), count, most)
     sector = sector_about(u, v, both[:, 0], block).index_select(0, index).view(count, most)
     normal = sight.normals[row, marker]
@@ -178,7 +181,16 @@ def gather_pixels(sight: Sight, band: Tensor) -> PixelBlocks:
         sight.polarity[row, marker],
         limits,
         sight.quantisation,
+        len(sight),
     )
+
+
+def _by_pixel(slopes: Slopes, camera: Camera) -> Tensor:
+    """d(ray)/d(pixel) (5, P) as in `PixelBlocks.warp`, by the slopes of the lens."""
+    back = slopes.inverse()
+    fx, fy = camera.matrix.diagonal()[:2]
+    (xx, yy), mixed = back.straight, back.mixed
+    return torch.stack([xx / fx, mixed / fy, mixed / fx, yy / fy, back.determinant.abs() / (fx * fy)])
 
 
 def _tiled(*planes: Tensor) -> Tensor:
@@ -191,15 +203,14 @@ def _seen(sight: Sight, row: Tensor, marker: Tensor) -> Tensor:
     if sight.seen is None:
         return torch.ones(len(row), SECTORS, dtype=torch.float32, device=row.device)
     seen = sight.seen[row, marker].float()
-    return torch.where(seen.mean(-1, keepdim=True) < LEAST_KEPT, 1.0, seen)
+    return either(seen.mean(-1, keepdim=True) < LEAST_KEPT, 1.0, seen)
 
 
 def _clipping(grey: Tensor, row: Tensor, rows: int) -> Tensor:
     """Limits (N, 2) at which each row's grey values are clipped: 0, and the full scale of its brightest pixel."""
-    ends = grey.new_tensor([torch.inf, -torch.inf]).repeat(rows, 1)
-    darkest = ends[:, 0].scatter_reduce(0, row, grey, "amin")
-    brightest = ends[:, 1].scatter_reduce(0, row, grey, "amax")
-    low = torch.where(darkest <= 0, 0.0, -torch.inf)
+    darkest = grey.new_full((rows,), torch.inf).scatter_reduce_(0, row, grey, "amin")
+    brightest = grey.new_full((rows,), -torch.inf).scatter_reduce_(0, row, grey, "amax")
+    low = either(darkest <= 0, 0.0, -torch.inf)
     return torch.stack([low, full_scale(brightest)], -1)
 
 
@@ -228,7 +239,7 @@ def _feet(blocks: PixelBlocks, R: Tensor, t: Tensor) -> _Foot:
     """The radius in the plane is formed in float64, what is small beside it in float32."""
     # the arm: marker's centre about the target's origin, camera axes
     frame = torch.bmm(R.index_select(0, blocks.row), blocks.frame)
-    plane, normal, arm = frame.split([2, 1, 1], -1)
+    plane, normal, arm = frame.split_with_sizes([2, 1, 1], -1)
     center = arm + t.index_select(0, blocks.row)[..., None]
     away = (normal * center).sum(1, keepdim=True)
     # a displacement w of the ray's foot, or of the plane against it, changes x and y by these times w
@@ -256,8 +267,15 @@ def _feet(blocks: PixelBlocks, R: Tensor, t: Tensor) -> _Foot:
 def by_tiles(matrix: Tensor, planes: Tensor) -> Tensor:
     """Matrices (K, n, m) times the planes (K, T, m, S) of every tile."""
     count, tiles, _, size = planes.shape
-    each = matrix[:, None].expand(-1, tiles, -1, -1).flatten(0, 1)
+    each = matrix.index_select(0, _of_tiles(count, tiles, matrix.device))
     return torch.bmm(each, planes.flatten(0, 1)).view(count, tiles, matrix.shape[-2], size)
+
+
+@lru_cache(maxsize=64)
+def _of_tiles(count: int, tiles: int, device: torch.device) -> Tensor:
+    """Which of K blocks each of their tiles is of, (K T,) int64."""
+    with torch.inference_mode(False):
+        return torch.arange(count, device=device).repeat_interleave(tiles)
 
 
 class _Rim(NamedTuple):
@@ -320,7 +338,9 @@ def _normals(rim: _Rim, distance: Tensor) -> tuple[Tensor, Tensor]:
     return (nu + turn * nv) * length, (nv - turn * nu) * length
 
 
-def ring_model(blocks: PixelBlocks, R: Tensor, t: Tensor, spread: Spread, *, check: bool = False) -> RingModel:
+def ring_model(
+    blocks: PixelBlocks, R: Tensor, t: Tensor, spread: Spread, *, check: bool = False, gain: bool = True
+) -> RingModel:
     """Predicts every pixel at poses (N, 3, 3), (N, 3) and N blurs, and with ``check`` says where that is sound."""
     foot = _feet(blocks, R, t)
     rim = _rims(blocks, foot, turning=spread.kind == "line")
@@ -329,7 +349,7 @@ def ring_model(blocks: PixelBlocks, R: Tensor, t: Tensor, spread: Spread, *, che
     edges = spread.at(blocks.row, *_normals(rim, distance), dims=2)
     sound = None
     if check:
-        blur = spread.covariance[blocks.row].float()
+        blur = spread.covariance.index_select(0, blocks.row).float()
         most, across = blurs.axes(blur)[1][:, None, None], edges.across
         if across is None:
             across = blurs.across(blur[:, None, None], *rim.normal)
@@ -339,7 +359,8 @@ def ring_model(blocks: PixelBlocks, R: Tensor, t: Tensor, spread: Spread, *, che
     by_blur = tuple(one - other for one, other in both.by_blur)
     place = foot.place / blocks.radii[:, :1, None, None].float()
     fraction, by_d = both.fraction[0] + 1 - both.fraction[1], both.by_distance[0] - both.by_distance[1]
-    # dark edges move outwards: those of a dark ring away from each other
-    by_gain = both.by_distance.sum(0) * rim.per_mm * -blocks.polarity[:, None, None].float()
+    by_gain = None
+    if gain:  # dark edges move outwards: those of a dark ring away from each other
+        by_gain = both.by_distance.sum(0) * rim.per_mm * -blocks.polarity[:, None, None].float()
     x, y = place.unbind(2)
     return RingModel(fraction, by_d, by_blur, rim.by_pose, by_gain, x, y, sound)

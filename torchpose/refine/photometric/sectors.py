@@ -12,16 +12,18 @@ and these displacements are independent and of zero mean where the model holds (
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cache
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchpose.geometry import conics
+from torchpose.geometry.constants import either
 from torchpose.geometry.least_squares import scaled_inverse, solve_scaled
 from torchpose.geometry.robust import CUT, of_chance
-from torchpose.geometry.rows import Rows
+from torchpose.geometry.rows import Rows, replace
 from torchpose.geometry.sectors import MOST, SECTORS, middles
 from torchpose.geometry.segments import segment_mean, segment_sum
 from torchpose.refine.photometric.light import POSE
@@ -65,8 +67,8 @@ class Sectors(Rows):
         return values.flatten()[self.cell.flatten()].view(self.cell.shape)
 
     def scaled(self, factor: Tensor) -> Sectors:
-        """With the weights of every sector multiplied by ``factor`` (K, 96)."""
-        return replace(self, **{n: getattr(self, n) * factor for n in ("used", "square", "pull", "hold")})
+        """With the weights of every sector multiplied by ``factor`` (K, 96), as far as its displacement tells."""
+        return replace(self, pull=self.pull * factor, hold=self.hold * factor)
 
 
 def sum_sectors(
@@ -74,7 +76,7 @@ def sum_sectors(
 ) -> Sectors:
     """Sums of residuals (K, P) with derivatives by the edge ``slope``, and weights, of which ``usable`` is the most."""
     middle = 0.5 * (1 + blocks.radii[:, 1] / blocks.radii[:, 0])
-    outer = torch.hypot(model.x, model.y).flatten(1) > middle[:, None].float()
+    outer = torch.addcmul(model.x * model.x, model.y, model.y).flatten(1) > middle.square()[:, None].float()
     count = len(blocks.row)
     block = torch.arange(count, device=blocks.row.device)[:, None]
     cell = (2 * block + outer) * SECTORS + blocks.sector
@@ -138,7 +140,7 @@ def _cells(sectors: Sectors, noise: Tensor, allowed: float = 0.0) -> tuple[Tenso
     """Chi-squared of the displacement of every cell, given ``allowed`` px besides noise, and its hold: (K, 24)."""
     pull, hold = (v.unflatten(1, (-1, _CELL)).sum(-1) for v in (sectors.pull, sectors.hold))
     variance = noise * hold + (allowed * hold).square()
-    return torch.where(hold > 0, pull.square() / variance.clamp_min(_TINY), 0.0), hold
+    return either(hold > 0, pull.square() / variance.clamp_min(_TINY), 0.0), hold
 
 
 def misfit(sectors: Sectors, clear: Tensor, variance: Tensor, row: Tensor, rows: int) -> Tensor:
@@ -162,12 +164,12 @@ def overdispersion(sectors: Sectors, variance: Tensor, row: Tensor, rows: int) -
     """
     pull, hold = (v.double().unflatten(1, (2, -1, _CELL)).sum(-1) for v in (sectors.pull, sectors.hold))
     hold = hold / variance[:, None, None]
-    error = torch.where(hold > 0, pull / variance[:, None, None] / hold.clamp_min(_TINY), 0.0)
+    error = either(hold > 0, pull / variance[:, None, None] / hold.clamp_min(_TINY), 0.0)
     each, free = _beyond_harmonics(error, hold)
     chi2, freedom = segment_sum(each, row, rows), segment_sum(free, row, rows).clamp_min(1)
     factor = chi2 / freedom
     more = of_more(factor, freedom)
-    return torch.where(more, factor, 1.0), torch.where(more, 0.0, freedom)
+    return either(more, factor, 1.0), either(more, 0.0, freedom)
 
 
 def of_more(factor: Tensor, freedom: Tensor) -> Tensor:
@@ -185,7 +187,8 @@ def _beyond_harmonics(error: Tensor, hold: Tensor) -> tuple[Tensor, Tensor]:
     basis = _harmonics(hold)
     weighted = hold[..., None] * basis
     right = (weighted * error[..., None]).sum(-2)
-    taken = (solve_scaled((weighted.mT @ basis).flatten(0, 1), right.flatten(0, 1)).view_as(right) * right).sum(-1)
+    held = (weighted.flatten(0, 1).mT @ basis).view(-1, *basis.shape[-1:] * 2)
+    taken = (solve_scaled(held, right.flatten(0, 1)).view_as(right) * right).sum(-1)
     free = ((hold > 0).sum(-1) - basis.shape[-1]).clamp_min(0).sum(-1).double()
     return ((hold * error.square()).sum(-1) - taken).sum(-1), free
 
@@ -193,15 +196,20 @@ def _beyond_harmonics(error: Tensor, hold: Tensor) -> tuple[Tensor, Tensor]:
 def _displacements(sectors: Sectors, variance: Tensor) -> tuple[Tensor, Tensor]:
     """Displacements (K, 2, 48) in px of the rims in single sectors, inner circle first, and their information."""
     pull, hold = (v.double().unflatten(1, (2, SECTORS)) / variance[:, None, None] for v in (sectors.pull, sectors.hold))
-    return torch.where(hold > 0, pull / hold.clamp_min(_TINY), 0.0), hold
+    return either(hold > 0, pull / hold.clamp_min(_TINY), 0.0), hold
 
 
 def _harmonics(around: Tensor) -> Tensor:
     """A mean and two harmonics (S, 5) of what goes around a circle in S parts, the last dimension."""
-    parts = around.shape[-1]
-    angle = (torch.arange(parts, dtype=around.dtype, device=around.device) + 0.5) * (2 * math.pi / parts)
-    harmonics = [of(k * angle) for k in (1, 2) for of in (torch.cos, torch.sin)]
-    return torch.stack([torch.ones_like(angle), *harmonics], -1)
+    return _made_harmonics(around.shape[-1], around.dtype, around.device)
+
+
+@cache
+def _made_harmonics(parts: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    with torch.inference_mode(False):
+        angle = (torch.arange(parts, dtype=dtype, device=device) + 0.5) * (2 * math.pi / parts)
+        harmonics = [of(k * angle) for k in (1, 2) for of in (torch.cos, torch.sin)]
+        return torch.stack([torch.ones_like(angle), *harmonics], -1)
 
 
 def in_step(
@@ -300,7 +308,7 @@ def level_scatter(
         empty.flatten().scatter_add(0, flat, plane.flatten()).view(len(row), 2, -1, _CELL).sum(-1).double()
         for plane in planes
     )
-    chi2, freedom = _beyond_harmonics(torch.where(usual > 0, sums / usual.clamp_min(_TINY), 0.0), usual)
+    chi2, freedom = _beyond_harmonics(either(usual > 0, sums / usual.clamp_min(_TINY), 0.0), usual)
     return segment_sum(chi2, row, rows) / segment_sum(freedom, row, rows).clamp_min(1)
 
 
