@@ -84,27 +84,35 @@ def on_frames(refine: Callable[..., Refined]) -> Step:
     """
 
     def step(rows: Solutions, seen: Evidence, sight: Sight) -> Solutions:
-        start, place = _start(rows, seen, sight.camera)
-        found, good = rows, torch.zeros_like(rows.status, dtype=torch.bool)
+        start, first = _start(rows, seen, sight.camera)
+        found, good, place = rows, torch.zeros_like(rows.status, dtype=torch.bool), first
         active = torch.arange(len(rows), device=good.device)
+        moved = good
         for number in range(ROUNDS):
             some = (rows, seen, sight) if number == 0 else (rows[active], seen[active], sight[active])
             some = (*some[:2], some[2].displaced(beyond(place[active], some[1])))
             # what seems to contradict the model may be a marker beside its place
             refined = refine(some[2], start.R[active], start.t[active], thorough=number > 0)
             now, joint, held = _on_print(refined, *some, place[active])
-            if number > 0:
-                # markers looked for where they are leave less to noise: if not, they are elsewhere
-                held &= torch.logdet(now.noise) < torch.logdet(found.noise[active])
+            aside = (joint.look - place[active]).abs().amax((-1, -2)) * seen.matrix[0, 0] / now.t[:, 2] > BESIDE
+            back = torch.zeros_like(held)
+            if number == 0:
+                moved = aside
+                if refined.look is not None:
+                    sight = replace(sight, look=replace(refined.look, doubt=refined.doubt & ~aside))
+            else:
+                # markers looked for where they are leave less to noise: if not, they are elsewhere. A fit that leaves
+                # out what contradicts the model claims less than it should, and decides nothing
+                less = torch.logdet(now.noise) < torch.logdet(found.noise[active])
+                fresh = refined.rough if refined.rough is not None and number == 1 else torch.zeros_like(less)
+                back = fresh & moved[active] & ~less
+                held &= less | fresh
             better = held.nonzero()[:, 0]
             found, good = found.replaced(active[better], now[better]), good.index_fill(0, active[better], True)
-            beside = (joint.look - place[active]).abs().amax((-1, -2)) * seen.matrix[0, 0] / now.t[:, 2]
-            if number == 0 and refined.look is not None:
-                sight = replace(sight, look=replace(refined.look, doubt=refined.doubt & (beside <= BESIDE)))
-            start, place = start.replaced(active, Pose(now.R, now.t)), place.index_copy(0, active, joint.look)
+            start = start.replaced(active, Pose(now.R, now.t))
+            place = place.index_copy(0, active, joint.look.where(~back[:, None, None], first[active]))
             # rows in doubt are looked at once more, without what contradicts the model
-            amiss = refined.doubt & (number == 0)
-            active = active[(held & (beside > BESIDE)) | amiss]
+            active = active[(held & aside) | back | (refined.doubt & (number == 0))]
             if active.numel() == 0:
                 break
         bad = (~good).nonzero()[:, 0]

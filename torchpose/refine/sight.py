@@ -220,6 +220,7 @@ class Refined(Rows):
         normals: what each marker tells, at the pose.
         gain: by which every dark edge lies outwards, mm, where it was an unknown.
         even: degrees of freedom in which edges along the rims scatter as noise does, 0 where by more, if it is known.
+        rough: most edges of all rings are displaced by more than noise, and that is counted; where it is known.
         look: where the fit may have seen its rows in several ways.
     """
 
@@ -234,6 +235,7 @@ class Refined(Rows):
     normals: MarkerNormals
     gain: Float[Tensor, " N"] | None = None
     even: Float[Tensor, " N"] | None = None
+    rough: Bool[Tensor, " N"] | None = None
     look: Look | None = None
 
     @property

@@ -59,6 +59,7 @@ from torchpose.refine.photometric.sectors import (
     level_scatter,
     of_more,
     overdispersion,
+    roughness,
     shift_scatter,
     sum_sectors,
     trust,
@@ -291,7 +292,7 @@ class _Fits:
         good = result.good & told.covariance.isfinite().all(-1).all(-1)
         of_fit = (result.spread, result.noise, result.kept, good, result.doubt)
         return Refined(
-            result.pose.R, result.pose.t, told.covariance, *of_fit, told.normals, told.gain, told.even, result.look
+            result.pose.R, result.pose.t, told.covariance, *of_fit, told.normals, told.gain, told.even, told.rough, result.look
         )
 
 
@@ -302,6 +303,7 @@ class _Told(Rows):
     covariance: Float[Tensor, "N 6 6"]
     normals: MarkerNormals
     even: Float[Tensor, " N"]
+    rough: Bool[Tensor, " N"]
     gain: Float[Tensor, " N"] | None
 
 
@@ -320,7 +322,8 @@ def _told(fit: _Fit, found: Minimum) -> _Told:
         covariance = covariance + covariance @ more.sum(1)[:, :n, :n] @ covariance
         normals = normals.scattered(more)
     gain = found.unknowns.values("gain")[:, 0] if fit.gain else None
-    return _Told(covariance[:, :6, :6], normals, even, gain)
+    of_rough = marked(owner[fit.give > 0], rows)
+    return _Told(covariance[:, :6, :6], normals, even, of_rough, gain)
 
 
 def _beyond_rims(fit: _Fit, found: Minimum, normals: MarkerNormals, wider: Tensor) -> Tensor:
@@ -420,12 +423,18 @@ class _Fit:
         self.residual, self.of_ring = residual, columns[:, :, POSE].flatten(1)
         noise = noise_spread(residual, part), model_misfit(levels)
         self.usable, self.weight = inliers(residual, part, model, *noise)
+        give = torch.zeros_like(noise[0])
+        if stage.wary:
+            seen = sum_sectors(residual, slope, self.usable, self.usable, part, model)
+            give = roughness(seen, noise[0], part.row)
+            self.usable, self.weight = inliers(residual, part, model, *noise, give[:, None] * slope)
+        self.give = give
         if stage.coarse:  # the first steps begin with what was seen so far, the others see for themselves
             self.weight = self.weight * part.seen
         else:
             self.slope, self.inlying = slope, self.weight
             self.sectors = sum_sectors(residual, slope, self.usable, self.weight, part, model)
-            factor = self._trusted(*noise)
+            factor = self._trusted(*noise, give)
             self.factor = factor.to(self.weight.dtype)
             self.weight = self.weight * self.sectors.of_pixels(self.factor)
         self.sums = sum_products(columns, self.weight)
@@ -466,9 +475,9 @@ class _Fit:
         matters = at_edges - everywhere > (_MATTERS * contrast).square()
         return matters & (at_edges > everywhere * of_chance(one.square() / two))
 
-    def _trusted(self, spread: Tensor, misfit: Tensor) -> Tensor:
+    def _trusted(self, spread: Tensor, misfit: Tensor, give: Tensor) -> Tensor:
         """Weights (K, 96) of the sectors."""
-        clear = clear_sectors(self.sectors, spread, misfit)
+        clear = clear_sectors(self.sectors, spread, misfit, give)
         if self.stage.wary:
             clear = away_from_unclear(self.sectors, clear)
         if not self.stage.tempered:
@@ -476,4 +485,4 @@ class _Fit:
             return clear
         # what levels without curvature could not explain stays out: curved ones bend into covers
         self.clear = clear & self.clear
-        return trust(self.sectors, self.clear, self.variance[self.blocks.row])
+        return trust(self.sectors, self.clear, self.variance[self.blocks.row], give)
