@@ -38,7 +38,6 @@ _ODD = (3, 5, 7)
 # 1/e: white, and down to a correlation over half of the radius (convention: none is told better)
 _WIDTHS = (0.0, 0.03, 0.06, 0.12, 0.24)
 _DISPLACED = 0.005  # px, displacement that a camera or print slightly off may cause: no reason for doubt
-_MEDIAN = 0.4549  # of the square of a normal deviate (derived)
 _TINY = 1e-12  # least divisor (convention: below any sum that counts)
 
 
@@ -122,11 +121,11 @@ def roughness(sectors: Sectors, spread: Tensor, row: Tensor) -> Tensor:
         sectors: with the weights of all usable pixels. spread: (K,) deviation of noise. row: (K,).
     """
     hold = sectors.hold.clamp_min(_TINY).masked_fill(sectors.hold <= 0, torch.nan)
-    noise = spread[:, None].square() / hold
-    square = (sectors.pull / hold).square()
-    factor = ((square / noise).nanmedian(-1).values / _MEDIAN).nan_to_num(nan=1.0)
-    factor = torch.where(of_more(factor, (sectors.hold > 0).sum(-1)), factor, 1.0)
-    own = (square.nanmedian(-1).values / _MEDIAN - noise.nanmedian(-1).values) * (factor > 1)
+    noise = spread[:, None] / hold.sqrt()
+    error = (sectors.pull / hold).abs()
+    factor = (1.4826 * (error / noise).nanmedian(-1).values).square()
+    more = of_more(factor, (sectors.hold > 0).sum(-1))
+    own = ((1.4826 * error.nanmedian(-1).values).square() - noise.nanmedian(-1).values.square()) * more
     own = own.nan_to_num(nan=0.0).clamp_min(0.0)
     least = own.new_full((int(row.max()) + 1 if len(own) else 0,), torch.inf).scatter_reduce(0, row, own, "amin")
     return torch.minimum(own, MOST_SPREAD**2 * least[row]).sqrt()
