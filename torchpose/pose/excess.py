@@ -32,6 +32,7 @@ OF_MARKER = 5  # two along the print, one across, and two turns of a ring that g
 # both edges of a ring lie further out
 OF_EDGES = 3
 OF_CAMERA = 8  # numbers of a camera that may be off: linear (focal length, aspect, skew), principal point, k1, p1, p2
+SKEW = 2  # which of them
 _EDGES_OFF = ((1, 0, 0), (0, 1, 0), (1, 0, 1))  # what may be off of the edges, in that order
 _OFF = (  # what may be off of a camera's numbers, in the order of `OF_CAMERA`: one thing, or all
     (1, 0, 0, 0, 0, 0, 0, 0),
@@ -176,9 +177,7 @@ def excess_of(
     )
 
 
-def _explanations(
-    modes: _Modes, none: Excess, even: Tensor | None
-) -> tuple[Tensor, list[_Family], Tensor]:
+def _explanations(modes: _Modes, none: Excess, even: Tensor | None) -> tuple[Tensor, list[_Family], Tensor]:
     """Rows (K,) of which an explanation is likelier than that there is nothing to explain, or which chance does not
     reach, and the three of them, in the order of `Misfit`.
 
@@ -305,28 +304,28 @@ def _camera(modes: _Modes) -> tuple[_Family, Tensor]:
     have to a factor only, but the numbers themselves to a deviation: the mean over all that remains possible is that of
     what residuals say of them and of what they leave open.
     """
-    freedom, chi2 = modes.there.sum(-1, keepdim=True), modes.residual.square().sum(-1, keepdim=True)
-    bent = 1 + _BENT**2 * chi2 / freedom.clamp_min(1)
-    modes = modes._replace(residual=modes.residual / bent.sqrt(), by=modes.by / bent.sqrt()[..., None])
     variance, factor = _values(_CAMERA, modes.residual).square(), _values(_SCALE, modes.residual, _FEW_FACTORS)
     off, by = variance.new_tensor(_OFF), by_kind(modes.by)[2]
     told = off[:, :, None] * (by.mT @ by)[:, None] * off[:, None]
     values, vectors = torch.linalg.eigh(told)  # (N, S, C), of the things that may be off
     pull = (vectors.mT @ (off * (modes.residual[:, None] @ by))[..., None])[..., 0]
-    values, pull = (x[:, None, :, None] / factor[:, None, None, None] for x in (values.clamp_min(0.0), pull))
-    gain = 1 + variance[:, None] * values  # (N, F, S, V, C)
-    number = variance[:, None] * pull / gain
-    square = modes.residual.square().sum(-1)[:, None] / factor
-    chi2 = square[..., None, None] - (number * pull).sum(-1)
-    usual = (0.5 * freedom + 1) * factor.log() + 0.5 * freedom * bent.log()
-    likelihood = -0.5 * (chi2 + gain.log().sum(-1)) - usual[..., None, None]
+    values, pull = values.clamp_min(0.0)[:, None, :, None], pull[:, None, :, None]
+    square, freedom = (x.sum(-1)[:, None, None, None] for x in (modes.residual.square(), modes.there))
+    # noise (N, F, S, V): scatter, and what derivatives leave of what is displaced by so much
+    displaced = (values * (variance[:, None] * pull / (1 + variance[:, None] * values)).square()).sum(-1)
+    factor = factor[:, None, None]
+    noise = (factor * (1 + _BENT**2 * displaced / freedom.clamp_min(1))).clamp_max(_SCALE[1])
+    gain = 1 + variance[:, None] * values / noise[..., None]  # (N, F, S, V, C)
+    number = variance[:, None] * pull / noise[..., None] / gain
+    chi2 = (square - (number * pull).sum(-1)) / noise
+    likelihood = -0.5 * (chi2 + gain.log().sum(-1) + freedom * noise.log()) - factor.log()
     weight = torch.softmax(likelihood.flatten(1), -1).view_as(likelihood)
     open_ = (weight[..., None] * variance[:, None] / gain).sum((1, 3))
     said = torch.einsum("nfsv,nfsvc,nfsvd->nscd", weight, number, number) + torch.diag_embed(open_)
     said = (off[:, :, None] * (vectors @ said @ vectors.mT) * off[:, None]).sum(1)
     markers, edges, _ = by_kind(torch.zeros_like(modes.by[:, 0]))
     size = torch.einsum("nfsv,v,sc->nc", weight, variance, off).sqrt()
-    mean, left = torch.einsum("nfsv,f->n", weight, factor) * bent[:, 0], (weight * chi2).sum((1, 2, 3))
+    mean, left = ((weight * x).sum((1, 2, 3)) for x in (noise, chi2))
     return _Family(_mean(likelihood.flatten(1)), torch.cat([markers, edges, size], -1), mean, left), said
 
 

@@ -32,6 +32,7 @@ from torchpose.pose.excess import (
     OF_CAMERA,
     OF_EDGES,
     OF_MARKER,
+    SKEW,
     Excess,
     Picture,
     beyond_chance,
@@ -174,22 +175,23 @@ def on_print(
         beside = further * excess.deviation[:, None, None]
         printed = torch.cat([by_target, beside[..., :-OF_CAMERA]], -1)
         off = excess.lens[:, None]
-        lens = torch.cat([by_camera, further[..., -OF_CAMERA:] @ off, _turned(setting) * off[:, :, 2].norm(dim=-1)[..., None, None]], -1)
+        turned = _turned(setting) * torch.linalg.vector_norm(off[..., SKEW, :], dim=-1)[..., None, None]
+        lens = torch.cat([by_camera, further[..., -OF_CAMERA:] @ off, turned], -1)
     lens = torch.cat([lens, bent], -1)
     noisy = normals if further is None else _scattered(normals, setting, excess)
     joint = JointSolution.of(noisy, own, among(printed, n), among(lens, n), estimate)
     place = look = places_of(printed, joint, setting, excess.deviation)
+    if further is not None:  # of a camera that is off, they stay where they were looked for
+        look = moved.where((excess.misfit == Misfit.CAMERA)[:, None, None], place)
     other = (excess.misfit == Misfit.SCATTER).nonzero()[:, 0]
     if other.numel() and further is not None:
         # a fit that looks for the markers where they are not may only seem to scatter
         if_printed = torch.cat([by_target, (further * excess.printed[:, None, None])[..., :-OF_CAMERA]], -1)[other]
         alone = JointSolution.of(normals[other], own[other], among(if_printed, n), among(lens[other], n), True)
-        look = place.index_copy(0, other, places_of(if_printed, alone, setting.of_rows(other), excess.printed[other]))
+        look = look.index_copy(0, other, places_of(if_printed, alone, setting.of_rows(other), excess.printed[other]))
         noisy = normals[other].over(excess.printed_factor[other])
         alone = JointSolution.of(noisy, own[other], among(if_printed, n), among(lens[other], n), estimate)
         joint = joint.perhaps(other, alone, excess.maybe[other])
-    # of a camera that is off, the markers stay where they were looked for
-    look = torch.where((excess.misfit == Misfit.CAMERA)[:, None, None], moved, look)
     sure = joint.known & (torch.linalg.cholesky_ex(joint.covariance)[1] == 0)
     parts = (joint.by_camera[..., : by_camera.shape[-1]], joint.by_print[..., : by_target.shape[-1]])
     common = torch.cat(parts, -1)

@@ -86,33 +86,30 @@ def on_frames(refine: Callable[..., Refined]) -> Step:
     def step(rows: Solutions, seen: Evidence, sight: Sight) -> Solutions:
         start, first = _start(rows, seen, sight.camera)
         found, good, place = rows, torch.zeros_like(rows.status, dtype=torch.bool), first
-        active = torch.arange(len(rows), device=good.device)
-        moved = good
+        active, moved = torch.arange(len(rows), device=good.device), good
         for number in range(ROUNDS):
             some = (rows, seen, sight) if number == 0 else (rows[active], seen[active], sight[active])
             some = (*some[:2], some[2].displaced(beyond(place[active], some[1])))
             # what seems to contradict the model may be a marker beside its place
             refined = refine(some[2], start.R[active], start.t[active], thorough=number > 0)
             now, joint, held = _on_print(refined, *some, place[active])
-            aside = (joint.look - place[active]).abs().amax((-1, -2)) * seen.matrix[0, 0] / now.t[:, 2] > BESIDE
-            back = torch.zeros_like(held)
+            beside = (joint.look - place[active]).abs().amax((-1, -2)) * seen.matrix[0, 0] / now.t[:, 2]
+            look, onwards = joint.look, refined.doubt & (number == 0)
             if number == 0:
-                moved = aside
+                moved = beside > BESIDE
                 if refined.look is not None:
-                    sight = replace(sight, look=replace(refined.look, doubt=refined.doubt & ~aside))
+                    sight = replace(sight, look=replace(refined.look, doubt=refined.doubt & (beside <= BESIDE)))
             else:
-                # markers looked for where they are leave less to noise: if not, they are elsewhere. A fit that leaves
-                # out what contradicts the model claims less than it should, and decides nothing
-                less = torch.logdet(now.noise) < torch.logdet(found.noise[active])
-                fresh = refined.rough if refined.rough is not None and number == 1 else torch.zeros_like(less)
-                back = fresh & moved[active] & ~less
-                held &= less | fresh
+                # markers looked for where they are leave less to noise: if not, they are elsewhere. Where rims scatter,
+                # a fit that drops what does claims too little: it decides nothing, and they are looked at once more
+                less, fresh = torch.logdet(now.noise) < torch.logdet(found.noise[active]), refined.rough & (number == 1)
+                held, onwards = held & (less | fresh), fresh & moved[active] & ~less
+                look = look.where(~onwards[:, None, None], first[active])
             better = held.nonzero()[:, 0]
             found, good = found.replaced(active[better], now[better]), good.index_fill(0, active[better], True)
-            start = start.replaced(active, Pose(now.R, now.t))
-            place = place.index_copy(0, active, joint.look.where(~back[:, None, None], first[active]))
+            start, place = start.replaced(active, Pose(now.R, now.t)), place.index_copy(0, active, look)
             # rows in doubt are looked at once more, without what contradicts the model
-            active = active[(held & aside) | back | (refined.doubt & (number == 0))]
+            active = active[(held & (beside > BESIDE)) | onwards]
             if active.numel() == 0:
                 break
         bad = (~good).nonzero()[:, 0]

@@ -291,9 +291,8 @@ class _Fits:
         told = parts[0] if len(parts) == 1 else _Told.cat(parts)[torch.argsort(torch.cat(order))]
         good = result.good & told.covariance.isfinite().all(-1).all(-1)
         of_fit = (result.spread, result.noise, result.kept, good, result.doubt)
-        return Refined(
-            result.pose.R, result.pose.t, told.covariance, *of_fit, told.normals, told.gain, told.even, told.rough, result.look
-        )
+        of_markers = (told.normals, told.rough, told.gain, told.even)
+        return Refined(result.pose.R, result.pose.t, told.covariance, *of_fit, *of_markers, result.look)
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,8 +301,8 @@ class _Told(Rows):
 
     covariance: Float[Tensor, "N 6 6"]
     normals: MarkerNormals
-    even: Float[Tensor, " N"]
     rough: Bool[Tensor, " N"]
+    even: Float[Tensor, " N"]
     gain: Float[Tensor, " N"] | None
 
 
@@ -322,8 +321,8 @@ def _told(fit: _Fit, found: Minimum) -> _Told:
         covariance = covariance + covariance @ more.sum(1)[:, :n, :n] @ covariance
         normals = normals.scattered(more)
     gain = found.unknowns.values("gain")[:, 0] if fit.gain else None
-    of_rough = marked(owner[fit.give > 0], rows)
-    return _Told(covariance[:, :6, :6], normals, even, of_rough, gain)
+    scatters = torch.zeros_like(rough) if fit.rough is None else marked(owner[fit.rough > 0], rows)
+    return _Told(covariance[:, :6, :6], normals, scatters, even, gain)
 
 
 def _beyond_rims(fit: _Fit, found: Minimum, normals: MarkerNormals, wider: Tensor) -> Tensor:
@@ -377,6 +376,7 @@ class _Fit:
     residual: Tensor
     slope: Tensor
     inlying: Tensor
+    rough: Tensor | None
 
     def __init__(self, sight: Sight, band: Tensor, prior: PosePrior | None, most_coarse: int | None = None) -> None:
         self.mask, self.band, self.by = sight.mask, band, sight.reduction
@@ -423,18 +423,17 @@ class _Fit:
         self.residual, self.of_ring = residual, columns[:, :, POSE].flatten(1)
         noise = noise_spread(residual, part), model_misfit(levels)
         self.usable, self.weight = inliers(residual, part, model, *noise)
-        give = torch.zeros_like(noise[0])
+        self.rough = None
         if stage.wary:
-            seen = sum_sectors(residual, slope, self.usable, self.usable, part, model)
-            give = roughness(seen, noise[0], part.row)
-            self.usable, self.weight = inliers(residual, part, model, *noise, give[:, None] * slope)
-        self.give = give
+            every = sum_sectors(residual, slope, self.usable, self.usable, part, model)
+            self.rough = roughness(every, noise[0], part.row)
+            self.usable, self.weight = inliers(residual, part, model, *noise, self.rough[:, None] * slope)
         if stage.coarse:  # the first steps begin with what was seen so far, the others see for themselves
             self.weight = self.weight * part.seen
         else:
             self.slope, self.inlying = slope, self.weight
             self.sectors = sum_sectors(residual, slope, self.usable, self.weight, part, model)
-            factor = self._trusted(*noise, give)
+            factor = self._trusted(*noise)
             self.factor = factor.to(self.weight.dtype)
             self.weight = self.weight * self.sectors.of_pixels(self.factor)
         self.sums = sum_products(columns, self.weight)
@@ -475,9 +474,9 @@ class _Fit:
         matters = at_edges - everywhere > (_MATTERS * contrast).square()
         return matters & (at_edges > everywhere * of_chance(one.square() / two))
 
-    def _trusted(self, spread: Tensor, misfit: Tensor, give: Tensor) -> Tensor:
+    def _trusted(self, spread: Tensor, misfit: Tensor) -> Tensor:
         """Weights (K, 96) of the sectors."""
-        clear = clear_sectors(self.sectors, spread, misfit, give)
+        clear = clear_sectors(self.sectors, spread, misfit, self.rough)
         if self.stage.wary:
             clear = away_from_unclear(self.sectors, clear)
         if not self.stage.tempered:
@@ -485,4 +484,4 @@ class _Fit:
             return clear
         # what levels without curvature could not explain stays out: curved ones bend into covers
         self.clear = clear & self.clear
-        return trust(self.sectors, self.clear, self.variance[self.blocks.row], give)
+        return trust(self.sectors, self.clear, self.variance[self.blocks.row], self.rough)

@@ -110,7 +110,8 @@ def inliers(
     """Pixels (K, P) whose noise is not clipped, by what they should show, and of these the ones that do show it.
 
     Args:
-        spread: (K,), as `noise_spread`. misfit: (K,), as `model_misfit`.
+        spread: (K,), as `noise_spread`. misfit: (K,), as `model_misfit`. rough: (K, P) grey levels, deviation of what
+            edges that scatter do.
     """
     spread = spread[:, None]
     predicted = blocks.grey - residual
@@ -119,8 +120,7 @@ def inliers(
     usable = blocks.valid * ((predicted > low + margin) & (predicted < high - margin))
     if model.sound is not None:
         usable = usable * model.sound.flatten(1)
-    if rough is not None:
-        spread = torch.hypot(spread, rough.to(spread))
+    spread = spread if rough is None else torch.hypot(spread, rough.to(spread))
     return usable, usable * (residual.abs() < CUT * spread + misfit[:, None])
 
 

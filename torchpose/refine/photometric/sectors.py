@@ -99,6 +99,7 @@ def clear_sectors(sectors: Sectors, spread: Tensor, misfit: Tensor, rough: Tenso
 
     Args:
         spread: (K,) standard deviation of noise. misfit: (K,) what the model itself may be off by; grey levels.
+        rough: (K,), as `roughness`.
     """
     limit = spread[:, None].square() * of_chance(sectors.used.clamp_min(1)) + misfit[:, None].square()
     allowed = sectors.used * limit
@@ -143,10 +144,12 @@ def trust(sectors: Sectors, clear: Tensor, variance: Tensor, rough: Tensor | Non
 
     What is left of a circle may still pull more than noise does. The excess of the chi-squared of cells of four sectors
     is the variance tau^2 of a displacement of their own (random effects; DerSimonian and Laird 1986), and weights are
-    1 / (v + tau^2) instead of 1 / v.
+    1 / (v + tau^2) instead of 1 / v. Where all rims scatter, what moves a circle as a whole or draws it out is not part
+    of that: it shows in what the rings say against each other.
 
     Args:
         variance: (K,) of noise.
+        rough: (K,), as `roughness`.
     """
     noise = variance[:, None].to(sectors.pull.dtype)
     # in deviations of noise; where all sectors scatter by more (paper, compression), more is no reason to drop one
@@ -154,14 +157,13 @@ def trust(sectors: Sectors, clear: Tensor, variance: Tensor, rough: Tensor | Non
     usual = 1.4826 * deviation.abs().masked_fill(~clear, torch.nan).nanmedian(-1, keepdim=True).values
     good = clear & (deviation.abs() < CUT * usual.nan_to_num(nan=1.0).clamp_min(1.0))
     error, hold = _cell_displacements(sectors.scaled(good.to(sectors.pull.dtype)), variance)
-    chi2, free = (hold * error.square()).sum((1, 2)), (hold > 0).sum((1, 2)).double()
+    cells = (hold > 0).sum((1, 2)).double()
+    chi2, free = (hold * error.square()).sum((1, 2)), cells
     if rough is not None:
-        beyond, left = _beyond_harmonics(error, hold)
-        chi2, free = torch.where(rough > 0, beyond, chi2), torch.where(rough > 0, left, free)
-    hold = hold.flatten(1)
-    share = free / (hold > 0).sum(-1).clamp_min(1)
-    excess = (chi2 - free).clamp_min(0) / (share * hold.sum(-1)).clamp_min(_TINY)
-    spread = excess[:, None] * hold  # tau^2 over the variance of each cell
+        beyond = _beyond_harmonics(error, hold)
+        chi2, free = (x.where(rough > 0, y) for x, y in zip(beyond, (chi2, free), strict=True))
+    tau2 = (chi2 - free).clamp_min(0) * cells / (free * hold.sum((1, 2))).clamp_min(_TINY)
+    spread = (tau2[:, None, None] * hold).flatten(1)  # tau^2 over the variance of each cell
     return good / (1 + spread.repeat_interleave(_CELL, 1))
 
 
