@@ -116,18 +116,20 @@ def roughness(sectors: Sectors, spread: Tensor, row: Tensor) -> Tensor:
     they have none.
 
     Air and coarse prints displace all edges, a cover some. Medians tell the one from the other: where most of every
-    ring scatters, a pixel or a sector that does is no outlier.
+    ring scatters, a pixel or a sector that does is no outlier. That it does is told by what differs over 30 degrees: a
+    circle beside its place, or of another size, does not scatter.
 
     Args:
         sectors: with the weights of all usable pixels. spread: (K,) deviation of noise. row: (K,).
     """
-    hold = sectors.hold.clamp_min(_TINY).masked_fill(sectors.hold <= 0, torch.nan)
-    noise = spread[:, None] / hold.sqrt()
-    error = (sectors.pull / hold).abs()
-    factor = (1.4826 * (error / noise).nanmedian(-1).values).square()
+    hold = sectors.hold.clamp_min(_TINY).masked_fill(sectors.hold <= 0, torch.nan).unflatten(1, (2, SECTORS))
+    error, noise = sectors.pull.view_as(hold) / hold, spread[:, None, None].square() / hold
+    apart = error - 0.5 * (error.roll(_CELL, -1) + error.roll(-_CELL, -1))
+    usual = noise + 0.25 * (noise.roll(_CELL, -1) + noise.roll(-_CELL, -1))
+    factor = (1.4826 * (apart.abs() / usual.sqrt()).flatten(1).nanmedian(-1).values).square()
     more = of_more(factor, (sectors.hold > 0).sum(-1))
-    own = ((1.4826 * error.nanmedian(-1).values).square() - noise.nanmedian(-1).values.square()) * more
-    own = own.nan_to_num(nan=0.0).clamp_min(0.0)
+    own = (1.4826 * error.abs().flatten(1).nanmedian(-1).values).square() - noise.flatten(1).nanmedian(-1).values
+    own = (own * more).nan_to_num(nan=0.0).clamp_min(0.0)
     least = own.new_full((int(row.max()) + 1 if len(own) else 0,), torch.inf).scatter_reduce(0, row, own, "amin")
     return torch.minimum(own, MOST_SPREAD**2 * least[row]).sqrt()
 
