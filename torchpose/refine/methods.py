@@ -27,7 +27,7 @@ from torchpose.refine.decide import decide, decide_on_grey
 from torchpose.refine.edges.fit import refine_edges
 from torchpose.refine.photometric.fit import refine_photometric
 from torchpose.refine.sight import LEAST_KEPT, Refined, Sight
-from torchpose.results import Reason, Status
+from torchpose.results import Misfit, Reason, Status
 
 # of the pixels, where the pose stays near: of wires over half of every ring 0.27 (measured: `wires 3` of
 # `scripts/corruption_statistics.py`)
@@ -102,7 +102,8 @@ def on_frames(refine: Callable[..., Refined]) -> Step:
                 # markers looked for where they are leave less to noise: if not, they are elsewhere. Where rims scatter,
                 # a fit that drops what does claims too little: it decides nothing, and they are looked at once more
                 less = torch.logdet(now.noise) < torch.logdet(found.noise[active])
-                less, fresh = less & (refined.rough | ~rough[active]), refined.rough & (number == 1)
+                less &= refined.rough | ~rough[active]
+                fresh = refined.rough & (joint.misfit != Misfit.PRINT) & (number == 1)
                 moved = (place[active] - filed[active]).abs().amax((-1, -2)) * pixels > BESIDE
                 held, onwards = held & (less | fresh), fresh & moved & ~less
                 look, rough = look.where(~onwards[:, None, None], filed[active]), rough.index_copy(0, active, fresh)
