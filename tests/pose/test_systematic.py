@@ -179,6 +179,31 @@ def test_what_is_off_is_told_and_measured(kind: str) -> None:
     assert found.explained.double().mean() > 0.97
 
 
+def test_a_camera_counts_by_what_residuals_say_of_it() -> None:
+    """Of 300 cameras that are off in one number or in all: the mean square of the numbers is that of what they are, in
+    place of the deviation that they may have, of which one residual tells next to nothing.
+    """
+    for chosen in ([ALONG], [ALONG + 5], list(range(ALONG, ALONG + OF_CAMERA))):
+        deviation = of_places(0.0)
+        deviation[chosen] = 3.0
+        g = torch.Generator().manual_seed(8)
+        by = torch.randn(300, 40, ALONG + OF_CAMERA, dtype=F64, generator=g)
+        by[..., :ALONG] *= 3000
+        true = deviation * torch.randn(300, ALONG + OF_CAMERA, dtype=F64, generator=g)
+        measured = (by @ true[..., None])[..., 0] + torch.randn(300, 40, dtype=F64, generator=g)
+        found = excess_of(by.mT @ by, (by.mT @ measured[..., None])[..., 0])
+        lens = found.misfit == Misfit.CAMERA
+        assert lens.double().mean() > 0.75
+        assert (found.lens[~lens] == 0).all()
+        said = (found.lens @ found.lens.mT).diagonal(dim1=-2, dim2=-1)[lens]
+        off = true[lens, ALONG:].square()
+        at = [k - ALONG for k in chosen]
+        assert abs(float(said[:, at].mean() / off[:, at].mean()) - 1) < 0.1
+        # row by row, to the noise of what they tell
+        assert float((said[:, at].sqrt() - off[:, at].sqrt()).square().mean()) < 0.3**2
+        assert float(found.deviation[lens][:, chosen].square().mean() / off[:, at].mean()) > 1.5 or len(chosen) > 1
+
+
 @pytest.mark.parametrize("size", [0.0131, 0.0177, 0.0236])
 def test_many_residuals_tell_the_size_of_print_errors(size: float) -> None:
     """To some per cent, wherever it lies between the sizes that are tried, and the residuals are explained."""

@@ -18,6 +18,7 @@ from torchpose.refine.photometric.sectors import (
     doubtful,
     in_step,
     level_scatter,
+    roughness,
     shift_scatter,
     trust,
 )
@@ -63,6 +64,37 @@ def test_trust_finds_the_variance_of_the_displacements() -> None:
     used = weight > 0
     assert used.float().mean() > 0.9
     assert abs(float((weight / expected)[used].mean()) - 1) < 0.2
+
+
+def test_roughness_is_what_most_edges_of_all_rings_have() -> None:
+    """Four rings a row whose edges scatter by 0.3 px; by noise; that are shifted; and with much of two covered."""
+    row, one = torch.arange(40) // 4, torch.ones(40)
+    angle = (torch.arange(SECTORS) + 0.5) * (2 * torch.pi / SECTORS)
+    rough, still = random_sectors(40, tau=0.3), random_sectors(40)
+    found = roughness(rough, one, row)  # the median of 24 cells, and no ring much more than the best one of its row
+    assert 0.75 < float(found.mean()) / 0.3 < 1.1
+    assert (found > 0.1).all()
+    assert (roughness(still, one, row) == 0).double().mean() > 0.95
+    shifted = dataclasses.replace(still, pull=still.pull + still.hold * 0.1 * angle.cos().repeat(2))
+    assert (roughness(shifted, one, row) == 0).double().mean() > 0.9
+    # two thirds of two rings of each row: their own medians would say 0.2 px
+    pull, cover = still.pull.clone(), torch.zeros(40, 2 * SECTORS, dtype=torch.bool)
+    cover[::2, : SECTORS // 3 * 4] = True
+    covered = dataclasses.replace(still, pull=torch.where(cover, pull + rough.pull, pull))
+    assert (roughness(covered, one, row) < 0.02).all()
+
+
+def test_what_moves_a_ring_is_no_scatter_where_rims_scatter() -> None:
+    """Rings shifted by 0.2 px whose edges scatter by 0.05: weights are those of the scatter alone."""
+    clear, one = torch.ones(40, 2 * SECTORS, dtype=torch.bool), torch.ones(40)
+    angle = (torch.arange(SECTORS) + 0.5) * (2 * torch.pi / SECTORS)
+    s = random_sectors(40, tau=0.05)
+    shifted = dataclasses.replace(s, pull=s.pull + s.hold * 0.2 * angle.cos().repeat(2))
+    without, rough = trust(shifted, clear, one), trust(shifted, clear, one, one)
+    hold = s.hold.unflatten(1, (-1, 4)).sum(-1).repeat_interleave(4, 1)
+    expected = 1 / (1 + 0.05**2 * hold)
+    assert abs(float((rough / expected)[rough > 0].mean()) - 1) < 0.2
+    assert float((without / expected)[without > 0].mean()) < 0.4
 
 
 def test_edges_in_step_along_lines_tell_the_variance_of_shifts() -> None:

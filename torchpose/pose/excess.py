@@ -8,8 +8,9 @@ Of every row three explanations are weighed by their evidence (the likelihood, a
 - all else: whatever it is, it makes the scatter larger by one factor (Birge 1932).
 
 The likeliest becomes part of the row's problem with the variance that it has on average over what remains possible: a
-few residuals tell a variance to a factor only, and the mean counts that, as Student's t does. Where it is scatter, it
-may yet be a print whose residuals are small by chance, and the pose's covariance is the mean of both.
+few residuals tell a variance to a factor only, and the mean counts that, as Student's t does. A camera, which the pose
+does not follow, counts by the mean square of its numbers, which residuals tell better than what they may be. Where it
+is scatter, it may yet be a print whose residuals are small by chance, and the pose's covariance is the mean of both.
 """
 
 import math
@@ -33,6 +34,7 @@ OF_MARKER = 5  # two along the print, one across, and two turns of a ring that g
 # both edges of a ring lie further out
 OF_EDGES = 3
 OF_CAMERA = 8  # numbers of a camera that may be off: linear (focal length, aspect, skew), principal point, k1, p1, p2
+SKEW = 2  # which of them
 _EDGES_OFF = ((1, 0, 0), (0, 1, 0), (1, 0, 1))  # what may be off of the edges, in that order
 _OFF = (  # what may be off of a camera's numbers, in the order of `OF_CAMERA`: one thing, or all
     (1, 0, 0, 0, 0, 0, 0, 0),
@@ -49,8 +51,10 @@ _FIELD = (1e-3, 1.0)  # px, of displacements of the picture: more would be no ri
 SURE = 2.33  # deviations: one row in 100 that is as its files say is looked at as closely as can be (derived)
 _GRID = 16  # values, logarithmic, apart by a factor of 1.5, of a camera 2.3, which few residuals do not tell
 _COARSE = 10  # of each of three: 2.3
+# of what a wrong camera displaces, that derivatives by its numbers leave: of 10 px 0.03 (measured: decisions/0077)
+_BENT = 0.05
 _FEW_FACTORS = 4  # of ten, of the scatter beside a print or a camera (convention)
-_SCATTER = int(Misfit.SCATTER) - 1  # among the explanations
+_LENS, _SCATTER = int(Misfit.CAMERA) - 1, int(Misfit.SCATTER) - 1  # among the explanations
 _AS_NOTHING = _SCATTER + 1  # how many explanations are together as likely beforehand as that there is nothing
 _AT_ONCE = 10_000_000  # numbers: 80 MB
 
@@ -74,6 +78,7 @@ class Excess(Rows):
     Attributes:
         deviation: standard deviations of the further unknowns: places (by marker `OF_MARKER`, mm), edges
             (`OF_EDGES`, mm), camera (px); 0 where they need not be off.
+        lens: factor of the mean square of the camera's numbers, px, by all that residuals say; 0 where it is as filed.
         printed: the same if the print is behind it; 0 where nothing is.
         factor: of the variance of all noise, 1 where it suffices, or where ``field`` stands for it.
         printed_factor: the same if the print is behind it.
@@ -86,6 +91,7 @@ class Excess(Rows):
     """
 
     deviation: Float[Tensor, "N E"]
+    lens: Float[Tensor, "N C C"]
     printed: Float[Tensor, "N E"]
     factor: Float[Tensor, " N"]
     printed_factor: Float[Tensor, " N"]
@@ -140,7 +146,7 @@ def excess_of(
     modes = _modes(information, right)
     none = _none(right, modes)
     none = replace(none, explained=(none.chi2 < _most(none.freedom)) & (True if refuted is None else ~refuted))
-    row, families = _explanations(modes, none, even)
+    row, families, said = _explanations(modes, none, even)
     if row.numel() == 0:
         return none
     evidence = torch.stack([f.evidence for f in families], -1)
@@ -153,6 +159,8 @@ def excess_of(
         found = _displaced(picture(row[scatters]))
         field = field.new_zeros(len(row), found.shape[1]).index_copy(0, scatters, found)
         factor = factor.index_fill(0, scatters, 1.0)
+    values, vectors = torch.linalg.eigh(said * (best == _LENS)[:, None, None])
+    lens = vectors * values.clamp_min(0.0).sqrt()[:, None]
     misfit = torch.where((best == 0) & _is_tone(deviation), int(Misfit.TONE), best + 1)
     every = replace(none, field=field.new_zeros(len(none.chi2), field.shape[1]))
     return every.replaced(
@@ -160,6 +168,7 @@ def excess_of(
         replace(
             every[row],
             deviation=deviation,
+            lens=lens,
             printed=families[0].deviation,
             factor=factor,
             printed_factor=families[0].factor,
@@ -171,7 +180,7 @@ def excess_of(
     )
 
 
-def _explanations(modes: _Modes, none: Excess, even: Tensor | None) -> tuple[Tensor, list[_Family]]:
+def _explanations(modes: _Modes, none: Excess, even: Tensor | None) -> tuple[Tensor, list[_Family], Tensor]:
     """Rows (K,) of which an explanation is likelier than that there is nothing to explain, or which chance does not
     reach, and the three of them, in the order of `Misfit`.
 
@@ -183,14 +192,14 @@ def _explanations(modes: _Modes, none: Excess, even: Tensor | None) -> tuple[Ten
     # beforehand as likely as all three; where noise is known to be more than that of independent pixels, as each
     expected = torch.ones_like(none.explained) if even is None else even > 0
     nothing = math.log(_AS_NOTHING) * expected[row].to(some.residual) - 0.5 * some.residual.square().sum(-1)
-    camera = _beside_scatter(_camera, some)
+    camera, said = _camera(some)
     kept = (none.chi2[row] > quantile(none.freedom[row].clamp_min(1), SURE)) | (camera.evidence > nothing)
     kept |= ~none.explained[row]
-    row, some, nothing = row[kept], _Modes(*(x[kept] for x in some)), nothing[kept]
+    row, some, nothing, said = row[kept], _Modes(*(x[kept] for x in some)), nothing[kept], said[kept]
     scatter = _scatter(some, (silent if even is None else even)[row])
     families = [_beside_scatter(_print, some), _Family(*(x[kept] for x in camera)), scatter]
     likelier = (torch.stack([f.evidence for f in families]).amax(0) > nothing) | ~none.explained[row]
-    return row[likelier], [_Family(*(x[likelier] for x in f)) for f in families]
+    return row[likelier], [_Family(*(x[likelier] for x in f)) for f in families], said[likelier]
 
 
 def _is_tone(deviation: Tensor) -> Tensor:
@@ -220,7 +229,8 @@ def _none(right: Tensor, modes: _Modes) -> Excess:
     zero, one = torch.zeros_like(right), torch.ones_like(chi2)
     by_chance = chi2 < _usual(freedom)
     nothing = torch.zeros_like(freedom)
-    return Excess(zero, zero, one, one, zero[:, :1], zero[:, 0], nothing, by_chance, chi2, freedom)
+    lens = zero[:, :1, None].expand(-1, OF_CAMERA, OF_CAMERA)
+    return Excess(zero, lens, zero, one, one, zero[:, :1], zero[:, 0], nothing, by_chance, chi2, freedom)
 
 
 def _usual(freedom: Tensor) -> Tensor:
@@ -289,15 +299,37 @@ def _between(chi2: Tensor, freedom: Tensor, values: Tensor) -> Tensor:
     return torch.where(chi2 > quantile(freedom, SURE), (chi2 / freedom).minimum(most), 1.0)
 
 
-def _camera(modes: _Modes) -> _Family:
-    """One thing may be off, or all: of another focal length alone the mean over all tells too little."""
-    variance = _values(_CAMERA, modes.residual).square()
-    off = variance.new_tensor(_OFF)
-    every = (off[:, None] * variance[:, None]).flatten(0, 1)  # (S G, OF_CAMERA)
-    evidence, weight, chi2 = _weighed(modes, by_kind(modes.by)[2], off, variance)
+def _camera(modes: _Modes) -> tuple[_Family, Tensor]:
+    """One thing may be off, or all: of another focal length alone the mean over all tells too little. With scatter
+    besides, as `_beside_scatter` has it.
+
+    Also the mean square (N, C, C) of what the numbers of the camera are. Few residuals tell the variance that they may
+    have to a factor only, but the numbers themselves to a deviation: the mean over all that remains possible is that of
+    what residuals say of them and of what they leave open.
+    """
+    variance, factor = _values(_CAMERA, modes.residual).square(), _values(_SCALE, modes.residual, _FEW_FACTORS)
+    off, by = variance.new_tensor(_OFF), by_kind(modes.by)[2]
+    told = off[:, :, None] * (by.mT @ by)[:, None] * off[:, None]
+    values, vectors = torch.linalg.eigh(told)  # (N, S, C), of the things that may be off
+    pull = (vectors.mT @ (off * (modes.residual[:, None] @ by))[..., None])[..., 0]
+    values, pull = values.clamp_min(0.0)[:, None, :, None], pull[:, None, :, None]
+    square, freedom = (x.sum(-1)[:, None, None, None] for x in (modes.residual.square(), modes.there))
+    # noise (N, F, S, V): scatter, and what derivatives leave of what is displaced by so much
+    displaced = (values * (variance[:, None] * pull / (1 + variance[:, None] * values)).square()).sum(-1)
+    factor = factor[:, None, None]
+    noise = (factor * (1 + _BENT**2 * displaced / freedom.clamp_min(1))).clamp_max(_SCALE[1])
+    gain = 1 + variance[:, None] * values / noise[..., None]  # (N, F, S, V, C)
+    number = variance[:, None] * pull / noise[..., None] / gain
+    chi2 = (square - (number * pull).sum(-1)) / noise
+    likelihood = -0.5 * (chi2 + gain.log().sum(-1) + freedom * noise.log()) - factor.log()
+    weight = torch.softmax(likelihood.flatten(1), -1).view_as(likelihood)
+    open_ = (weight[..., None] * variance[:, None] / gain).sum((1, 3))
+    said = torch.einsum("nfsv,nfsvc,nfsvd->nscd", weight, number, number) + torch.diag_embed(open_)
+    said = (off[:, :, None] * (vectors @ said @ vectors.mT) * off[:, None]).sum(1)
     markers, edges, _ = by_kind(torch.zeros_like(modes.by[:, 0]))
-    deviation = torch.cat([markers, edges, (weight[:, 0] @ every).sqrt()], -1)
-    return _Family(evidence, deviation, torch.ones_like(evidence), chi2)
+    size = torch.einsum("nfsv,v,sc->nc", weight, variance, off).sqrt()
+    mean, left = ((weight * x).sum((1, 2, 3)) for x in (noise, chi2))
+    return _Family(_mean(likelihood.flatten(1)), torch.cat([markers, edges, size], -1), mean, left), said
 
 
 @checked

@@ -17,7 +17,7 @@ _SIZE_ERROR = 0.1
 
 def sizes_beyond(evidence: Evidence, predicted: Tensor) -> tuple[Tensor, Tensor]:
     """By how many codes (N,) at least the sums of the rings' radii differ from those of their markers, in the mean, and
-    how far (N,) all edges of the rings, or discs, lie further from their centres, mm, where it is certain.
+    how far (N,) all edges of most rings, or discs, lie further from their centres, mm, where it is certain.
 
     Args:
         evidence: N rows.
@@ -29,11 +29,13 @@ def sizes_beyond(evidence: Evidence, predicted: Tensor) -> tuple[Tensor, Tensor]
     further = either(there[..., None], evidence.radii[..., None] * excess, 0.0)
     difference, edge = further.sum(-2), further.sum((-2, -1)) / (2 * there.sum(-1))
     error = 2 * _SIZE_ERROR * evidence.blur.sqrt().clamp_min(1.0) / evidence.shape[..., 0, 3]
-    each = torch.cat([difference / outer[..., None], torch.stack([edge, error, 0.5 * error * outer], -1)], -1)
+    each = torch.cat([difference / outer[..., None], torch.stack([error, 0.5 * error * outer], -1)], -1)
     seen = evidence.mask[..., None]
-    one, two, larger, error, error_mm = (either(seen, each, 0.0).sum(1) / seen.sum(1)).unbind(-1)
+    one, two, error, error_mm = (either(seen, each, 0.0).sum(1) / seen.sum(1)).unbind(-1)
     # blur that bends the shapes draws one axis alone
     both = either(one * two > 0, torch.minimum(one.abs(), two.abs()), 0.0)
+    # one ring of another size is not all of them
+    larger = torch.where(evidence.mask, edge, torch.nan).nanmedian(1).values
     beyond = either(larger.abs() > error_mm, larger, 0.0)
     return (both - error).clamp_min(0) / _code_gap(inner / outer), beyond
 

@@ -33,6 +33,7 @@ from torchpose.pose.excess import (
     OF_CAMERA,
     OF_EDGES,
     OF_MARKER,
+    SKEW,
     Excess,
     Picture,
     beyond_chance,
@@ -176,17 +177,21 @@ def on_print(
     if further is not None:
         beside = further * excess.deviation[:, None, None]
         printed = torch.cat([by_target, beside[..., :-OF_CAMERA]], -1)
-        lens = torch.cat([by_camera, beside[..., -OF_CAMERA:]], -1)
+        off = excess.lens[:, None]
+        turned = _turned(setting) * torch.linalg.vector_norm(off[..., SKEW, :], dim=-1)[..., None, None]
+        lens = torch.cat([by_camera, further[..., -OF_CAMERA:] @ off, turned], -1)
     lens = torch.cat([lens, bent], -1)
     noisy = normals if further is None else _scattered(normals, setting, excess)
     joint = JointSolution.of(noisy, own, among(printed, n), among(lens, n), estimate)
     place = look = places_of(printed, joint, setting, excess.deviation)
-    other = ((excess.misfit == Misfit.CAMERA) | (excess.misfit == Misfit.SCATTER)).nonzero()[:, 0]
+    if further is not None:  # of a camera that is off, they stay where they were looked for
+        look = moved.where((excess.misfit == Misfit.CAMERA)[:, None, None], place)
+    other = (excess.misfit == Misfit.SCATTER).nonzero()[:, 0]
     if other.numel() and further is not None:
         # a fit that looks for the markers where they are not may only seem to scatter
         if_printed = torch.cat([by_target, (further * excess.printed[:, None, None])[..., :-OF_CAMERA]], -1)[other]
         alone = JointSolution.of(normals[other], own[other], among(if_printed, n), among(lens[other], n), True)
-        look = place.index_copy(0, other, places_of(if_printed, alone, setting.of_rows(other), excess.printed[other]))
+        look = look.index_copy(0, other, places_of(if_printed, alone, setting.of_rows(other), excess.printed[other]))
         noisy = normals[other].over(excess.printed_factor[other])
         alone = JointSolution.of(noisy, own[other], among(if_printed, n), among(lens[other], n), estimate)
         joint = joint.perhaps(other, alone, excess.maybe[other])
@@ -404,11 +409,25 @@ def _camera_shifts(setting: Setting) -> Tensor:
         at = xy / reach
         x, y = at.unbind(-1)
         square = at.square().sum(-1)
-        linear = torch.stack([at, torch.stack([x, -y], -1), torch.stack([y, x], -1)], -1)
+        # axes that are not square, half of the way from those turned alike to those of which v alone is, see `_turned`
+        skew = torch.stack([1.5 * y, 0.5 * x], -1)
+        linear = torch.stack([at, torch.stack([x, -y], -1), skew], -1)
         tangential = square[..., None, None] * eye + 2 * at[..., :, None] * at[..., None, :]
         return torch.cat([linear, eye, (square[..., None] * at)[..., None], tangential / 3], -1)
 
     return _as_motions(setting, by)
+
+
+def _turned(setting: Setting) -> Tensor:
+    """The same (N, 1, 7, 1) by what is open of axes that are not square: which of them is as filed.
+
+    Nothing in the frame tells, for the picture of one is that of the other, turned: where lines are read one after the
+    other, those of u are.
+    """
+    turn = torch.zeros_like(setting.t)
+    turn[:, 2] = 0.5 / (_reach(setting.camera) * setting.camera.matrix.diagonal()[:2].mean())
+    both = torch.cat([torch.linalg.cross(turn, setting.t), turn, torch.zeros_like(turn[:, :1])], -1)
+    return both[:, None, :, None].expand(-1, setting.evidence.mask.shape[1], -1, -1)
 
 
 def _reach(camera: Camera) -> float:

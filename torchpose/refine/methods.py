@@ -29,7 +29,7 @@ from torchpose.refine.decide import decide, decide_on_grey
 from torchpose.refine.edges.fit import refine_edges
 from torchpose.refine.photometric.fit import refine_photometric
 from torchpose.refine.sight import LEAST_KEPT, Refined, Sight
-from torchpose.results import Reason, Status
+from torchpose.results import Misfit, Reason, Status
 
 # of the pixels, where the pose stays near: of wires over half of every ring 0.27 (measured: `wires 3` of
 # `scripts/corruption_statistics.py`)
@@ -86,27 +86,34 @@ def on_frames(refine: Callable[..., Refined]) -> Step:
     """
 
     def step(rows: Solutions, seen: Evidence, sight: Sight) -> Solutions:
-        start, place = _start(rows, seen, sight.camera)
+        start, place, filed = _start(rows, seen, sight.camera)
         found, good = rows, torch.zeros_like(rows.status, dtype=torch.bool)
-        active = torch.arange(len(rows), device=good.device)
+        active, rough = torch.arange(len(rows), device=good.device), good
         for number in range(ROUNDS):
             some = (rows, seen, sight) if number == 0 else (rows[active], seen[active], sight[active])
             some = (*some[:2], some[2].displaced(beyond(place[active], some[1])))
             # what seems to contradict the model may be a marker beside its place
             refined = refine(some[2], start.R[active], start.t[active], thorough=number > 0)
             now, joint, held = _on_print(refined, *some, place[active])
-            if number > 0:
-                # markers looked for where they are leave less to noise: if not, they are elsewhere
-                held &= torch.logdet(now.noise) < torch.logdet(found.noise[active])
-            better = held.nonzero()[:, 0]
-            found, good = found.replaced(active[better], now[better]), good.index_fill(0, active[better], True)
-            beside = (joint.look - place[active]).abs().amax((-1, -2)) * seen.matrix[0, 0] / now.t[:, 2]
+            pixels = seen.matrix[0, 0] / now.t[:, 2]
+            beside = (joint.look - place[active]).abs().amax((-1, -2)) * pixels
+            look, onwards = joint.look, refined.doubt & (number == 0)
             if number == 0 and refined.look is not None:
                 sight = replace(sight, look=replace(refined.look, doubt=refined.doubt & (beside <= BESIDE)))
-            start, place = start.replaced(active, Pose(now.R, now.t)), place.index_copy(0, active, joint.look)
+            if number > 0:
+                # markers looked for where they are leave less to noise: if not, they are elsewhere. Where rims scatter,
+                # a fit that drops what does claims too little: it decides nothing, and they are looked at once more
+                less = torch.logdet(now.noise) < torch.logdet(found.noise[active])
+                less &= refined.rough | ~rough[active]
+                fresh = refined.rough & (joint.misfit != Misfit.PRINT) & (number == 1)
+                moved = (place[active] - filed[active]).abs().amax((-1, -2)) * pixels > BESIDE
+                held, onwards = held & (less | fresh), fresh & moved & ~less
+                look, rough = look.where(~onwards[:, None, None], filed[active]), rough.index_copy(0, active, fresh)
+            better = held.nonzero()[:, 0]
+            found, good = found.replaced(active[better], now[better]), good.index_fill(0, active[better], True)
+            start, place = start.replaced(active, Pose(now.R, now.t)), place.index_copy(0, active, look)
             # rows in doubt are looked at once more, without what contradicts the model
-            amiss = refined.doubt & (number == 0)
-            active = active[(held & (beside > BESIDE)) | amiss]
+            active = active[(held & (beside > BESIDE)) | onwards]
             if active.numel() == 0:
                 break
         bad = (~good).nonzero()[:, 0]
@@ -128,8 +135,9 @@ def _as_wholes(found: Solutions, rows: Solutions, seen: Evidence, sight: Sight) 
     return found.replaced(index[agreed], whole[agreed])
 
 
-def _start(rows: Solutions, seen: Evidence, camera: Camera) -> tuple[Pose, Tensor]:
-    """Poses, and places (N, M, 5) of markers beside those of the file, as `OnPrint.look`, by the ellipses."""
+def _start(rows: Solutions, seen: Evidence, camera: Camera) -> tuple[Pose, Tensor, Tensor]:
+    """Poses, and places (N, M, 5) of markers beside those of the file, as `OnPrint.look`, by the ellipses; and where
+    the file has them."""
     start, place = Pose(rows.R, rows.t), -beyond(rows.t.new_zeros(*seen.mask.shape, PLACE), seen)
     place = torch.cat([place[..., :4], rows.larger[:, None, None].expand_as(place[..., 4:])], -1)
     freedom = (2 * seen.mask.sum(-1) - start.size).clamp_min(1)
@@ -139,10 +147,10 @@ def _start(rows: Solutions, seen: Evidence, camera: Camera) -> tuple[Pose, Tenso
         amiss |= (seen.placed > BESIDE**2).flatten(1).any(-1)
     off = ((rows.rms > BESIDE) & amiss).nonzero()[:, 0]
     if off.numel() == 0:
-        return start, place
+        return start, place, place
     found, joint = _by_centers(rows[off], seen[off], camera)
     beside = torch.cat([joint.look[..., :3], place[off][..., 3:]], -1)  # centres tell of no gain
-    return start.replaced(off, Pose(found.R, found.t)), place.index_copy(0, off, beside)
+    return start.replaced(off, Pose(found.R, found.t)), place.index_copy(0, off, beside), place
 
 
 def beyond(place: Tensor, seen: Evidence) -> Tensor:

@@ -225,6 +225,7 @@ class Refined(Rows):
         good: where False the refinement failed and the other fields mean nothing.
         doubt: something in the frame contradicts the model of the rings.
         normals: what each marker tells, at the pose.
+        rough: most edges of all rings are displaced by more than noise, and that is counted.
         gain: by which every dark edge lies outwards, mm, where it was an unknown.
         even: degrees of freedom in which edges along the rims scatter as noise does, 0 where by more, if it is known.
         look: where the fit may have seen its rows in several ways.
@@ -239,6 +240,7 @@ class Refined(Rows):
     good: Bool[Tensor, " N"]
     doubt: Bool[Tensor, " N"]
     normals: MarkerNormals
+    rough: Bool[Tensor, " N"]
     gain: Float[Tensor, " N"] | None = None
     even: Float[Tensor, " N"] | None = None
     look: Look | None = None

@@ -81,9 +81,8 @@ def _refined_in(sight: Sight, start: Pose, known: PosePrior | None) -> Refined:
     step = torch.nn.functional.pad(found.step.own, (0, 1))[:, None, :, None]
     at = fit.normals
     normals = MarkerNormals(at.information, at.right - (at.information @ step)[..., 0])
-    return Refined(
-        unknowns.pose.R, unknowns.pose.t, covariance, fit.blur, noise, kept, good, torch.zeros_like(good), normals
-    )
+    none = torch.zeros_like(good)
+    return Refined(unknowns.pose.R, unknowns.pose.t, covariance, fit.blur, noise, kept, good, none, normals, none)
 
 
 class _Fit:

@@ -60,6 +60,7 @@ from torchpose.refine.photometric.sectors import (
     level_scatter,
     of_more,
     overdispersion,
+    roughness,
     shift_scatter,
     sum_sectors,
     trust,
@@ -291,9 +292,8 @@ class _Fits:
         told = parts[0] if len(parts) == 1 else _Told.cat(parts)[torch.argsort(torch.cat(order))]
         good = result.good & finite(told.covariance, (1, 2))
         of_fit = (result.spread, result.noise, result.kept, good, result.doubt)
-        return Refined(
-            result.pose.R, result.pose.t, told.covariance, *of_fit, told.normals, told.gain, told.even, result.look
-        )
+        of_markers = (told.normals, told.rough, told.gain, told.even)
+        return Refined(result.pose.R, result.pose.t, told.covariance, *of_fit, *of_markers, result.look)
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,6 +302,7 @@ class _Told(Rows):
 
     covariance: Float[Tensor, "N 6 6"]
     normals: MarkerNormals
+    rough: Bool[Tensor, " N"]
     even: Float[Tensor, " N"]
     gain: Float[Tensor, " N"] | None
 
@@ -322,7 +323,8 @@ def _told(fit: _Fit, found: Minimum, covariance: Tensor) -> _Told:
         covariance = covariance + covariance @ more.sum(1)[:, :n, :n] @ covariance
         normals = normals.scattered(more)
     gain = found.unknowns.values("gain")[:, 0] if fit.gain else None
-    return _Told(covariance[:, :6, :6], normals, even, gain)
+    scatters = torch.zeros_like(rough) if fit.rough is None else marked(owner[fit.rough > 0], rows)
+    return _Told(covariance[:, :6, :6], normals, scatters, even, gain)
 
 
 def _beyond_rims(fit: _Fit, found: Minimum, normals: MarkerNormals, wider: Tensor) -> Tensor:
@@ -376,6 +378,7 @@ class _Fit:
     residual: Tensor
     slope: Tensor
     inlying: Tensor
+    rough: Tensor | None
 
     def __init__(self, sight: Sight, band: Tensor, prior: PosePrior | None, most_coarse: int | None = None) -> None:
         self.mask, self.band, self.by = sight.mask, band, sight.reduction
@@ -421,6 +424,11 @@ class _Fit:
         self.residual, self.of_ring = residual, 1 - model.fraction.flatten(1)
         noise = noise_spread(residual, part), model_misfit(levels)
         self.usable, self.weight = inliers(residual, part, model, *noise)
+        self.rough = None
+        if stage.wary:
+            every = sum_sectors(residual, slope, self.usable, self.usable, part, model)
+            self.rough = roughness(every, noise[0], part.row)
+            self.usable, self.weight = inliers(residual, part, model, *noise, self.rough[:, None] * slope)
         if stage.coarse:  # the first steps begin with what was seen so far, the others see for themselves
             self.weight = self.weight * part.seen
         else:
@@ -474,7 +482,7 @@ class _Fit:
 
     def _trusted(self, spread: Tensor, misfit: Tensor) -> Tensor:
         """Weights (K, 96) of the sectors."""
-        clear = clear_sectors(self.sectors, spread, misfit)
+        clear = clear_sectors(self.sectors, spread, misfit, self.rough)
         if self.stage.wary:
             clear = away_from_unclear(self.sectors, clear)
         if not self.stage.tempered:
@@ -482,4 +490,4 @@ class _Fit:
             return clear
         # what levels without curvature could not explain stays out: curved ones bend into covers
         self.clear = clear & self.clear
-        return trust(self.sectors, self.clear, self.variance[self.blocks.row])
+        return trust(self.sectors, self.clear, self.variance[self.blocks.row], self.rough)

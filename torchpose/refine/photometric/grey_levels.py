@@ -16,7 +16,7 @@ from torchpose.refine.photometric.ring_model import TILE, PixelBlocks, RingModel
 
 _CLEAR_OF_LIMITS = 3.0  # deviations from where noise is clipped: its mean is off by 0.0004 of one there (derived)
 _MISFIT = 0.02  # of the contrast: what a point-spread function that is not Gaussian leaves at the edges of quiet frames
-_MOST_SPREAD = 1.5  # of a marker's residuals, in those of the best marker of its frame
+MOST_SPREAD = 1.5  # of a marker's residuals, in those of the best marker of its frame
 _NEAR_PURE = 0.05  # of paper in a pixel, beside the most and the least of its marker (convention)
 _FIRST_STEPS = 3  # reweighted fits of the levels before the pose is moved
 
@@ -102,12 +102,18 @@ def sum_products(columns: Tensor, weight: Tensor) -> Tensor:
 
 
 def inliers(
-    residual: Tensor, blocks: PixelBlocks, model: RingModel, spread: Tensor, misfit: Tensor
+    residual: Tensor,
+    blocks: PixelBlocks,
+    model: RingModel,
+    spread: Tensor,
+    misfit: Tensor,
+    rough: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Pixels (K, P) whose noise is not clipped, by what they should show, and of these the ones that do show it.
 
     Args:
-        spread: (K,), as `noise_spread`. misfit: (K,), as `model_misfit`.
+        spread: (K,), as `noise_spread`. misfit: (K,), as `model_misfit`. rough: (K, P) grey levels, deviation of what
+            edges that scatter do.
     """
     spread = spread[:, None]
     predicted = blocks.grey - residual
@@ -116,6 +122,7 @@ def inliers(
     usable = blocks.valid * ((predicted > low + margin) & (predicted < high - margin))
     if model.sound is not None:
         usable = usable * model.sound.flatten(1)
+    spread = spread if rough is None else torch.hypot(spread, rough.to(spread))
     return usable, usable * (residual.abs() < CUT * spread + misfit[:, None])
 
 
@@ -126,7 +133,7 @@ def noise_spread(residual: Tensor, blocks: PixelBlocks) -> Tensor:
     """
     own = (1.4826 * _median(residual.abs(), blocks.valid)).nan_to_num(nan=1.0).clamp_min(math.sqrt(blocks.quantisation))
     least = own.new_full((blocks.rows,), torch.inf).scatter_reduce_(0, blocks.row, own, "amin")
-    return torch.minimum(own, _MOST_SPREAD * least.index_select(0, blocks.row))
+    return torch.minimum(own, MOST_SPREAD * least.index_select(0, blocks.row))
 
 
 def _median(values: Tensor, where: Tensor) -> Tensor:

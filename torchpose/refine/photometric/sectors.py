@@ -26,6 +26,7 @@ from torchpose.geometry.robust import CUT, of_chance
 from torchpose.geometry.rows import Rows, replace
 from torchpose.geometry.sectors import MOST, SECTORS, middles
 from torchpose.geometry.segments import segment_mean, segment_sum
+from torchpose.refine.photometric.grey_levels import MOST_SPREAD
 from torchpose.refine.photometric.light import POSE
 from torchpose.refine.photometric.ring_model import PixelBlocks, RingModel
 
@@ -92,7 +93,7 @@ def sum_sectors(
     return Sectors(total, used, square, pulls, hold, cell)
 
 
-def clear_sectors(sectors: Sectors, spread: Tensor, misfit: Tensor) -> Tensor:
+def clear_sectors(sectors: Sectors, spread: Tensor, misfit: Tensor, rough: Tensor | None = None) -> Tensor:
     """(K, 96) bool, False for sectors where many usable pixels do not follow the model.
 
     What covers an edge agrees with it by chance wherever the edge passes through the cover's own grey, and where both
@@ -100,12 +101,39 @@ def clear_sectors(sectors: Sectors, spread: Tensor, misfit: Tensor) -> Tensor:
 
     Args:
         spread: (K,) standard deviation of noise. misfit: (K,) what the model itself may be off by; grey levels.
+        rough: (K,), as `roughness`.
     """
     limit = spread[:, None].square() * of_chance(sectors.used.clamp_min(1)) + misfit[:, None].square()
-    clear = (sectors.used > _KEPT * sectors.total) & (sectors.square < sectors.used * limit)
+    allowed = sectors.used * limit
+    if rough is not None:
+        allowed = allowed + (CUT * rough[:, None]).square().to(allowed) * sectors.hold
+    clear = (sectors.used > _KEPT * sectors.total) & (sectors.square < allowed)
     # where half of a ring is gone, the rest of the marker is not to be trusted either
     seen = (sectors.total > 0).sum(-1, keepdim=True)
     return clear & (clear.sum(-1, keepdim=True) > MOST * seen)
+
+
+def roughness(sectors: Sectors, spread: Tensor, row: Tensor) -> Tensor:
+    """Deviation (K,) in px of displacements that most of the sectors of all rings of a row have beyond noise, 0 where
+    they have none.
+
+    Air and coarse prints displace all edges, a cover some. Medians tell the one from the other: where most of every
+    ring scatters, a pixel or a sector that does is no outlier. That it does is told by what differs over 30 degrees: a
+    circle beside its place, or of another size, does not scatter.
+
+    Args:
+        sectors: with the weights of all usable pixels. spread: (K,) deviation of noise. row: (K,).
+    """
+    hold = sectors.hold.clamp_min(_TINY).masked_fill(sectors.hold <= 0, torch.nan).unflatten(1, (2, SECTORS))
+    error, noise = sectors.pull.view_as(hold) / hold, spread[:, None, None].square() / hold
+    apart = error - 0.5 * (error.roll(_CELL, -1) + error.roll(-_CELL, -1))
+    usual = noise + 0.25 * (noise.roll(_CELL, -1) + noise.roll(-_CELL, -1))
+    factor = (1.4826 * (apart.abs() / usual.sqrt()).flatten(1).nanmedian(-1).values).square()
+    more = of_more(factor, (sectors.hold > 0).sum(-1))
+    own = (1.4826 * error.abs().flatten(1).nanmedian(-1).values).square() - noise.flatten(1).nanmedian(-1).values
+    own = (own * more).nan_to_num(nan=0.0).clamp_min(0.0)
+    least = own.new_full((int(row.max()) + 1 if len(own) else 0,), torch.inf).scatter_reduce(0, row, own, "amin")
+    return torch.minimum(own, MOST_SPREAD**2 * least[row]).sqrt()
 
 
 def away_from_unclear(sectors: Sectors, clear: Tensor) -> Tensor:
@@ -115,24 +143,31 @@ def away_from_unclear(sectors: Sectors, clear: Tensor) -> Tensor:
     return clear & ~(run.roll(1, -1) | run.roll(-1, -1)).flatten(1)
 
 
-def trust(sectors: Sectors, clear: Tensor, variance: Tensor) -> Tensor:
+def trust(sectors: Sectors, clear: Tensor, variance: Tensor, rough: Tensor | None = None) -> Tensor:
     """Weights (K, 96) of the sectors beside those of their pixels: 0 where they are not clear or pull too hard.
 
     What is left of a circle may still pull more than noise does. The excess of the chi-squared of cells of four sectors
     is the variance tau^2 of a displacement of their own (random effects; DerSimonian and Laird 1986), and weights are
-    1 / (v + tau^2) instead of 1 / v.
+    1 / (v + tau^2) instead of 1 / v. Where all rims scatter, what moves a circle as a whole or draws it out is not part
+    of that: it shows in what the rings say against each other.
 
     Args:
         variance: (K,) of noise.
+        rough: (K,), as `roughness`.
     """
     noise = variance[:, None].to(sectors.pull.dtype)
     # in deviations of noise; where all sectors scatter by more (paper, compression), more is no reason to drop one
     deviation = sectors.pull / (noise * sectors.hold.clamp_min(_TINY)).sqrt()
     usual = 1.4826 * deviation.abs().masked_fill(~clear, torch.nan).nanmedian(-1, keepdim=True).values
     good = clear & (deviation.abs() < CUT * usual.nan_to_num(nan=1.0).clamp_min(1.0))
-    chi2, hold = _cells(sectors.scaled(good.to(sectors.pull.dtype)), noise)
-    excess = (chi2 - (hold > 0).to(chi2.dtype)).sum(-1).clamp_min(0)
-    spread = (excess / hold.sum(-1).clamp_min(_TINY))[:, None] * hold  # tau^2 over the variance of each cell
+    error, hold = _cell_displacements(sectors.scaled(good.to(sectors.pull.dtype)), variance)
+    cells = (hold > 0).sum((1, 2)).double()
+    chi2, free = (hold * error.square()).sum((1, 2)), cells
+    if rough is not None:
+        beyond = _beyond_harmonics(error, hold)
+        chi2, free = (x.where(rough > 0, y) for x, y in zip(beyond, (chi2, free), strict=True))
+    tau2 = (chi2 - free).clamp_min(0) * cells / (free * hold.sum((1, 2))).clamp_min(_TINY)
+    spread = (tau2[:, None, None] * hold).flatten(1)  # tau^2 over the variance of each cell
     return good / (1 + spread.repeat_interleave(_CELL, 1))
 
 
@@ -162,14 +197,19 @@ def overdispersion(sectors: Sectors, variance: Tensor, row: Tensor, rows: int) -
     Args:
         sectors: weighted as in the fit. variance: (K,) of noise. row: (K,) of ``rows``.
     """
-    pull, hold = (v.double().unflatten(1, (2, -1, _CELL)).sum(-1) for v in (sectors.pull, sectors.hold))
-    hold = hold / variance[:, None, None]
-    error = either(hold > 0, pull / variance[:, None, None] / hold.clamp_min(_TINY), 0.0)
+    error, hold = _cell_displacements(sectors, variance)
     each, free = _beyond_harmonics(error, hold)
     chi2, freedom = segment_sum(each, row, rows), segment_sum(free, row, rows).clamp_min(1)
     factor = chi2 / freedom
     more = of_more(factor, freedom)
     return either(more, factor, 1.0), either(more, 0.0, freedom)
+
+
+def _cell_displacements(sectors: Sectors, variance: Tensor) -> tuple[Tensor, Tensor]:
+    """Displacements (K, 2, C) in px of the rims over cells, inner circle first, and their information."""
+    pull, hold = (v.double().unflatten(1, (2, -1, _CELL)).sum(-1) for v in (sectors.pull, sectors.hold))
+    hold = hold / variance[:, None, None]
+    return either(hold > 0, pull / variance[:, None, None] / hold.clamp_min(_TINY), 0.0), hold
 
 
 def of_more(factor: Tensor, freedom: Tensor) -> Tensor:
