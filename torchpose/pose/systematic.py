@@ -178,8 +178,8 @@ def on_print(
         beside = further * excess.deviation[:, None, None]
         printed = torch.cat([by_target, beside[..., :-OF_CAMERA]], -1)
         off = excess.lens[:, None]
-        turned = _turned(setting) * torch.linalg.vector_norm(off[..., SKEW, :], dim=-1)[..., None, None]
-        lens = torch.cat([by_camera, further[..., -OF_CAMERA:] @ off, turned], -1)
+        rolled = _turned(setting) * torch.linalg.vector_norm(off[..., SKEW, :], dim=-1)[..., None, None]
+        lens = torch.cat([by_camera, further[..., -OF_CAMERA:] @ off, rolled], -1)
     lens = torch.cat([lens, bent], -1)
     noisy = normals if further is None else _scattered(normals, setting, excess)
     joint = JointSolution.of(noisy, own, among(printed, n), among(lens, n), estimate)
