@@ -1,4 +1,7 @@
-"""Small tables of numbers, made once for each dtype and device: a tensor of a list costs as much as ten sums."""
+"""Small tables of numbers, made once for each dtype and device: a tensor of a list costs as much as ten sums.
+
+They are kept for good: for numbers that are written in the code, not for those that are computed anew.
+"""
 
 from functools import cache
 from typing import Any
