@@ -510,6 +510,8 @@ def _placed(scene: Scene, near: Near) -> tuple[Tensor, Tensor]:
             shapes = f"{tuple(R.shape)} and {tuple(t.shape)}"
             raise ArgumentError(f"near: has shapes {shapes}; give R {(*each, 3, 3)} and t {(*each, 3)}")
         return R.flatten(0, 1), t.flatten(0, 1)
+    if not isinstance(near, Poses):
+        raise ArgumentError(f"near: is {type(near).__name__}; give Poses, or tensors R and t")
     if len(near) and int(near.target.max()) >= len(scene.table):
         raise ConfigError(f"near: poses of {int(near.target.max()) + 1} targets, but there are {len(scene.table)}")
     some = near[(near.instance == 0) & (near.frame < len(scene.frames))]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import fields
+from typing import Any
 
 import cv2
 import numpy as np
@@ -41,6 +42,15 @@ def test_exact_points_give_the_exact_pose(points: Tensor, camera: Camera | Tenso
     assert angle.max() < 1e-9
     assert distance.max() < 1e-9
     assert result.rms.max() < 1e-8
+
+
+def test_arrays_are_taken_as_tensors() -> None:
+    r, t, xy = views(GRID, 6, tilt_deg=(20, 60))
+    weights, image = torch.linspace(0.5, 1, 9, dtype=F64), pixels(xy)
+    wanted = pnp.solve(GRID, image, MATRIX, initial=(r, t), weights=weights)
+    arrays: list[Any] = [value.numpy() for value in (GRID, image, MATRIX, weights, r, t)]
+    found = pnp.solve(*arrays[:3], initial=(arrays[4], arrays[5]), weights=arrays[3])
+    torch.testing.assert_close(found.t, wanted.t, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("camera", [MATRIX, LENS], ids=["matrix", "lens"])

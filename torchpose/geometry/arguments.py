@@ -76,6 +76,23 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
     return wrapper
 
 
+def taking_arrays(function: Callable[P, T]) -> Callable[P, T]:
+    """The function, given NumPy arrays, alone or in tuples, as tensors; it checks its arguments itself."""
+
+    def taken(value: Any) -> Any:
+        return tuple(map(tensor_of, value)) if type(value) is tuple else tensor_of(value)
+
+    @functools.wraps(function)
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> T:
+        inner: Callable[..., T] = wrapper.__wrapped__  # as of `checked`
+        if unasked():
+            return inner(*args, **kwargs)
+        return inner(*map(taken, args), **{name: taken(value) for name, value in kwargs.items()})
+
+    wrapper.checks_arguments = True  # type: ignore[attr-defined]
+    return wrapper
+
+
 def checked_values(values: Mapping[str, Any], hints: Mapping[str, Any]) -> dict[str, Any]:
     """The values by name, arrays as tensors; raises ArgumentError where one does not fit its hint."""
     sizes: dict[str, int] = {}

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchpose.camera import Camera, CameraRig
 from torchpose.camera.plausible import check_pinhole
 from torchpose.errors import ArgumentError
-from torchpose.geometry.arguments import expect_not_negative, expect_positive, one_device
+from torchpose.geometry.arguments import expect_not_negative, expect_positive, one_device, taking_arrays
 from torchpose.kernels import LEAST, compiled, padded
 from torchpose.pnp.candidates import Candidates, expect, expect_mask, expect_pixels
 from torchpose.pnp.dlt import dlt
@@ -49,6 +49,7 @@ _CHUNK = 16384
 _COMPILED_POINTS = 128
 
 
+@taking_arrays
 def solve(
     object_points: Tensor,
     image_points: Tensor,
@@ -66,7 +67,7 @@ def solve(
     compile: bool = False,
     raise_on_failure: bool = False,
 ) -> PnPResult:
-    """Poses of B sets of N points; of lines, see `torchpose.pnp.lines`.
+    """Poses of B sets of N points; of lines, see `torchpose.pnp.lines`. Tensors may be NumPy arrays.
 
     Args:
         object_points: (N, 3) shared by all poses, or (B, N, 3).
@@ -125,6 +126,8 @@ def _rig_of(
     camera: Camera | CameraRig | Tensor, index: Tensor | None, method: Method, huber: float
 ) -> tuple[tuple[CameraRig, Tensor] | None, Camera | Tensor]:
     """The rig with the camera of each point, if it is one; and a camera, of which nothing is used then."""
+    if not isinstance(camera, Camera | CameraRig | Tensor):
+        raise ArgumentError(f"camera: is {type(camera).__name__}; give a Camera, a CameraRig or a 3 x 3 matrix")
     if not isinstance(camera, CameraRig):
         if index is not None:
             raise ArgumentError("camera_index: goes with a CameraRig; give one, or leave it out")
