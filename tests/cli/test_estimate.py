@@ -324,7 +324,7 @@ MISTAKES = {
     "missing input": (["gone"], {}, {}, "gone: INPUT"),
     "folder without images": (["empty"], {}, {"empty/notes.txt": ""}, "empty: INPUT"),
     "file of another kind": (["a.raw"], {}, {"a.raw": "x"}, "a.raw: INPUT"),
-    "same name twice": (["f", "f/x.png"], {}, {}, "same name"),
+    "one file twice": (["f", "f/x.png"], {}, {}, "f/x.png: INPUT: is given twice"),
     "broken manifest": (["m.jsonl"], {}, {"m.jsonl": "{broken\n{}\n"}, "m.jsonl: line 1"),
     "unknown output type": (["f"], {"out": "poses.txt"}, {}, "poses.txt: --out"),
     "output is a folder": (["f"], {"out": "d.csv"}, {"d.csv/x": ""}, "d.csv: --out"),

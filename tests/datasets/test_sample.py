@@ -41,8 +41,9 @@ def test_truth_is_reproduced(truth: Truth) -> None:
     assert (made.frame, made.target, list(made.extra)) == (truth.frame, truth.target, list(truth.extra))
     torch.testing.assert_close(made.t, truth.t, rtol=0, atol=1e-12)
     torch.testing.assert_close(made.rotation_vector, truth.rotation_vector, rtol=0, atol=1e-12)
+    # bounds leave out the tails of the blur
     for name, column in truth.extra.items():
-        torch.testing.assert_close(made.extra[name], column, rtol=1e-6, atol=0)
+        torch.testing.assert_close(made.extra[name], column, rtol=1e-4, atol=0)
 
 
 def test_conditions(truth: Truth) -> None:

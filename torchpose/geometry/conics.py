@@ -188,7 +188,7 @@ def seen_circle(matrix: Float[Tensor, "3 3"], center: Vector, normal: Vector, ra
     # from space to homogeneous pixels about the image of the centre: the centre itself comes to (0, 0, depth)
     change = matrix - torch.nn.functional.pad(at, (0, 1))[..., None] * matrix[2]
     turned = (change * normal[..., None, :]).sum(-1)
-    flat_change = change.flatten(0, -3)
+    flat_change = change.reshape(-1, 3, 3)
     dual = torch.bmm(flat_change, flat_change.mT).view_as(change) - turned[..., :, None] * turned[..., None, :]
     dual = radius.square()[..., None, None] * dual
     whole = dual[..., 2, 2, None] - depth.square()  # below 0 in front of the camera
