@@ -14,7 +14,8 @@ from torchpose.geometry import rotations
 from torchpose.identify import MarkerTable
 from torchpose.pose import Evidence, Solutions, compensate, gather_evidence, solve_poses
 from torchpose.pose import solve as pose
-from torchpose.results import Reason, Status
+from torchpose.pose.outcome import _vouched
+from torchpose.results import Misfit, Reason, Status
 from torchpose.target import Target
 
 CAMERA = pinhole()
@@ -144,3 +145,22 @@ def test_rows_do_not_depend_on_each_other() -> None:
         alone = solve_poses(e[one], (r[one], t[one]))
         assert (alone.t[0] - together.t[k]).abs().max() < 1e-9
         assert (alone.R[0] - together.R[k]).abs().max() < 1e-9
+
+
+def test_three_markers_whose_rims_scatter_do_not_say_which_fourth_is_wrong() -> None:
+    """A marker was left out: scatter among the others is told as such, or counts as noise that chi-squared contradicts."""
+    numbers = {"status": torch.int64, "reason": torch.int64, "misfit": torch.int64, "freedom": torch.int64}
+    wide = {"R": (3, 3), "R_alt": (3, 3), "t": (3,), "t_alt": (3,), "covariance": (6, 6), "noise": (6, 6)}
+    wide |= {"systematic": (6, 1), "mask": (4,), "place": (4, 5)}
+    blank = {
+        field.name: torch.zeros(6, *wide.get(field.name, ()), dtype=numbers.get(field.name, F64))
+        for field in dataclasses.fields(Solutions)
+    }
+    mask = torch.tensor([True, True, True, False]).repeat(6, 1)
+    mask[4, 3] = True  # a row with all four, in which nothing was left out
+    misfit = torch.tensor([Misfit.NONE, Misfit.NONE, Misfit.SCATTER, Misfit.PRINT, Misfit.NONE, Misfit.NONE])
+    chi2 = torch.tensor([7.0, 170, 170, 170, 170, torch.nan], dtype=F64)
+    given = {"mask": mask, "misfit": misfit, "chi2": chi2, "freedom": torch.full((6,), 6)}
+    found = _vouched(Solutions(**{**blank, **given}), torch.ones(6, 4, dtype=torch.bool))
+    rejected = (found.status == Status.REJECTED).tolist()
+    assert rejected == [False, True, True, False, False, False]

@@ -216,7 +216,7 @@ def by_kind(unknowns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def beyond_chance(excess: Excess) -> Bool[Tensor, " N"]:
     """Rows (N,) whose residuals noise does not reach."""
-    return excess.chi2 > _most(excess.freedom)
+    return improbable(excess.chi2, excess.freedom)
 
 
 def no_excess(information: Float[Tensor, "N E E"], right: Float[Tensor, "N E"]) -> Excess:
@@ -237,6 +237,11 @@ def _usual(freedom: Tensor) -> Tensor:
     """What chi-squared (N,) of noise stays below by one of its deviations: five times in six."""
     freedom = freedom.double()  # torch takes roots of integers in its default type
     return freedom + (2 * freedom).sqrt()
+
+
+def improbable(chi2: Tensor, freedom: Tensor) -> Tensor:
+    """Whether chi-squared (N,) is more than chance makes of what should explain it."""
+    return chi2 > _most(freedom)
 
 
 def _most(freedom: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ from torchpose.geometry.segments import marked, rank_in_group
 from torchpose.identify import MIN_MARKERS, Identified, Scene
 from torchpose.pose.centers import raw_centers
 from torchpose.pose.evidence import Evidence
+from torchpose.pose.excess import improbable
 from torchpose.pose.solutions import Solutions
 from torchpose.results import Detections, Misfit, Poses, Reason, Status
 from torchpose.rings import Rings
@@ -106,9 +107,10 @@ def _vouched(solutions: Solutions, identified: Tensor) -> Solutions:
     """
     few = solutions.mask.sum(-1) <= MIN_MARKERS
     left_out = (identified & ~solutions.mask).any(-1)
-    return solutions.marked(
-        solutions.ok & few & left_out & (solutions.misfit == Misfit.SCATTER), Status.REJECTED, Reason.RESIDUAL
-    )
+    # rims may scatter so evenly that they count as so much noise
+    beyond_noise = (solutions.misfit == Misfit.NONE) & improbable(solutions.chi2, solutions.freedom)
+    scatter = (solutions.misfit == Misfit.SCATTER) | beyond_noise
+    return solutions.marked(solutions.ok & few & left_out & scatter, Status.REJECTED, Reason.RESIDUAL)
 
 
 def _positive(covariance: Tensor) -> Tensor:
