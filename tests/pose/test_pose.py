@@ -148,7 +148,7 @@ def test_rows_do_not_depend_on_each_other() -> None:
 
 
 def test_three_markers_whose_rims_scatter_do_not_say_which_fourth_is_wrong() -> None:
-    """A marker was left out: scatter among the others is told as such, or counts as noise that chi-squared contradicts."""
+    """A marker was left out: scatter among the others is told, or counts as noise that chi-squared contradicts."""
     numbers = {"status": torch.int64, "reason": torch.int64, "misfit": torch.int64, "freedom": torch.int64}
     wide = {"R": (3, 3), "R_alt": (3, 3), "t": (3,), "t_alt": (3,), "covariance": (6, 6), "noise": (6, 6)}
     wide |= {"systematic": (6, 1), "mask": (4,), "place": (4, 5)}
