@@ -24,7 +24,7 @@ from torchpose.identify import drawn_radii
 from torchpose.target import Target
 
 _TURNED = 0.02  # rad, deviation of a ring's tilt against the plane of the file: a plate of 100 mm bent by 0.5 mm
-_GAIN = 0.1  # of the width of a ring, deviation of a gain that a file leaves open: enough for any print
+GAIN_SIGMA = 0.1  # of the width of a ring, deviation of a gain that nothing is known of: enough for any print
 _NOTHING = 1e-12  # of the largest variance, below which a direction is as good as known
 
 
@@ -147,7 +147,7 @@ def stated_plate(target: Target) -> Plate | None:
     some = values > _NOTHING * values[-1].clamp_min(torch.finfo(values.dtype).tiny)
     places = (vectors * values.clamp_min(0).sqrt())[:, some]
     outer, inner = drawn_radii(target).unbind(-1)
-    gain = torch.where(stated_gain > 0, stated_gain, _GAIN * (outer - inner).mean())
+    gain = torch.where(stated_gain > 0, stated_gain, GAIN_SIGMA * (outer - inner).mean())
     # a disc of another gain is one of another size
     of_gain = pad(gain / outer, (1, 0)) if target.discs else pad(gain[None], (0, len(outer)))
     # a print that misplaces a ring misplaces its rims by as much

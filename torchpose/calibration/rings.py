@@ -7,6 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from torchpose.calibration.plate import GAIN_SIGMA
 from torchpose.calibration.views import Rims, Views
 from torchpose.camera import Camera
 from torchpose.camera.derivatives import by_intrinsics
@@ -28,7 +29,6 @@ _TURNED = 3e-3  # rad: a plate out of flat by 40 um turns its markers by so much
 _GAIN_OPEN = 1e-8  # information about the edge gain, mm^-2: none
 _RIM_POINTS = 24  # of a circle: sums over it are exact up to the perspective's high orders
 _LEAST_TURN = 1e-6  # px^2 of displacement a rad^2 that a turn must make to count: one about the normal makes none
-_GAIN_SIGMA = 0.1  # of the width of a ring, where only centres are asked for: enough for any print
 
 
 def find_rings(names: Sequence[str], frames: Tensor, cameras: Sequence[Camera], target: Target) -> list[Views]:
@@ -91,7 +91,7 @@ def measure_centers(
     points, rotation = target.centers[marker], poses.R[found.frame]
     arm = (rotation @ points[..., None])[..., 0]
     radii = drawn_radii(target)[marker]
-    gain: Tensor | float = _GAIN_OPEN if rims else (_GAIN_SIGMA * (radii[:, 0] - radii[:, 1])) ** -2
+    gain: Tensor | float = _GAIN_OPEN if rims else (GAIN_SIGMA * (radii[:, 0] - radii[:, 1])) ** -2
     if target.discs:  # a larger disc, or a nearer one
         gain = _HELD
     prior = points.new_zeros(len(points), 7)

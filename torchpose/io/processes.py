@@ -133,8 +133,7 @@ class Crew(Generic[Item, Result]):
 
 def one_thread() -> None:
     """Has torch and OpenCV use one thread in this process, and OpenCV print nothing."""
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
+    _set_threads(1, 1)
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 
@@ -142,13 +141,16 @@ def one_thread() -> None:
 def _without_threads() -> Iterator[None]:
     """Ends the threads of OpenCV and torch meanwhile: a forked process has none of them, and waits for them in vain."""
     before = torch.get_num_threads(), cv2.getNumThreads()
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
+    _set_threads(1, 1)
     try:
         yield
     finally:
-        torch.set_num_threads(before[0])
-        cv2.setNumThreads(before[1])
+        _set_threads(*before)
+
+
+def _set_threads(of_torch: int, of_opencv: int) -> None:
+    torch.set_num_threads(of_torch)
+    cv2.setNumThreads(of_opencv)
 
 
 def _context(fresh: bool) -> BaseContext:
