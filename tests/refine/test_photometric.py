@@ -232,7 +232,7 @@ def test_rows_that_are_alike_are_treated_alike(spoilt: int, all_again: bool) -> 
 
 
 def test_a_further_fit_begins_where_the_last_one_ended() -> None:
-    """A sharp, a smeared and a defocused frame: 20 um beside, the kind of blur known, as before to half a deviation.
+    """A sharp, a smeared and a defocused frame: 10 um beside, the kind of blur known, as before to half a deviation.
 
     Alone and in a batch to 1e-9.
     """
@@ -252,12 +252,12 @@ def test_a_further_fit_begins_where_the_last_one_ended() -> None:
     assert first.look is not None
     assert first.look.kind.tolist() == [0, 1, 2]
     sight = replace(sight, look=first.look)
-    again = refine_photometric(sight, r, t + 0.02)
+    again = refine_photometric(sight, r, t + 0.01)
     deviation = first.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     assert ((again.t - first.t).abs() < 0.5 * deviation[:, :3]).all()
     assert again.look is not None
     assert again.look.kind.tolist() == [0, 1, 2]
     assert (again.noise - math.hypot(2.0, 0.29)).abs().max() < 0.1
     for k in range(3):
-        alone = refine_photometric(sight[k : k + 1], r[k, None], t[k, None] + 0.02)
+        alone = refine_photometric(sight[k : k + 1], r[k, None], t[k, None] + 0.01)
         assert (alone.t[0] - again.t[k]).abs().max() < 1e-9

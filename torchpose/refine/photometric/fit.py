@@ -59,6 +59,7 @@ from torchpose.refine.photometric.sectors import (
     in_step,
     level_scatter,
     of_more,
+    of_noise,
     overdispersion,
     roughness,
     shift_scatter,
@@ -78,22 +79,26 @@ class _Stage(NamedTuple):
 
     coarse: some pixels only. wary: those where the model is sound, and in sectors clear of what stands beside them.
     tempered: light may be curved, and sectors that pull at the pose count for less.
+    far: of rows alone that the step before moved by more than noise does, or in which some pixels did not follow the
+        model: others hardly move (measured: decisions/0117).
     """
 
     steps: int
     coarse: bool = False
     wary: bool = False
     tempered: bool = False
+    far: bool = False
 
 
 # of the contrast, RMS at the edges: that of a disc of 2 px, which costs a tenth in the covariance (measured:
 # `scripts/corruption_statistics.py --only defocus`)
 _MATTERS = 0.004
-# of the pixels that a shape of the blur may keep less than a Gaussian, and still explain them better (convention)
+# of the pixels: so many a shape of the blur may keep less than a Gaussian, and still explain them better (convention)
 _FEWER = 0.02
 # of what would close the smallest hole, or the thinnest ring (convention)
 _MOST_GAIN = 0.5
-_COARSELY = _Stage(2, coarse=True)
+_COARSELY = (_Stage(1, coarse=True), _Stage(1, coarse=True, far=True))  # before all pixels
+_BY_SOME = _Stage(2, coarse=True)  # on its own
 _QUICK = (_Stage(1),)  # after the coarse steps
 _AGAIN = (_Stage(2),)  # from where a fit of the same rows ended
 _THOROUGH = (_Stage(1, wary=True), _Stage(2, wary=True, tempered=True))
@@ -191,7 +196,7 @@ class _Fits:
     def first(self) -> _Result:
         look = self.sight.look
         if look is None:
-            return self.refined(self.fit, self.start, self.spread, (_COARSELY, *_QUICK))
+            return self.refined(self.fit, self.start, self.spread, (*_COARSELY, *_QUICK))
         return self.refined(self.fit, self.start, self.spread, _AGAIN, look.levels)
 
     def again(self, result: _Result, rows: Tensor, kind: int, stages: tuple[_Stage, ...]) -> tuple[Tensor, _Result]:
@@ -206,7 +211,7 @@ class _Fits:
             if case % 2:
                 spread, levels, steps = Spread(look.blur[some], KINDS[kind]), look.levels[some], stages
             else:
-                spread, levels, steps = Spread.of(result.spread[some], KINDS[kind]), None, (_COARSELY, *stages)
+                spread, levels, steps = Spread.of(result.spread[some], KINDS[kind]), None, (*_COARSELY, *stages)
             begin = self.start[some].where(~result.good[some], result.pose[some])
             parts.append((some, self.refined(fit, begin, spread, steps, levels)))
         index, other = torch.cat([some for some, _ in parts]), _Result.cat([part for _, part in parts])
@@ -245,7 +250,7 @@ class _Fits:
         if index.numel() == 0:
             return result, rows
         fit, spread = self.fit.of(index), Spread.of(result.spread[index], KINDS[kind])
-        found = _minimised(fit, result.pose[index], spread, (_COARSELY,), result.look.levels[index][fit.mask])
+        found = _minimised(fit, result.pose[index], spread, (_BY_SOME,), result.look.levels[index][fit.mask])
         unknowns = found.unknowns
         look = fit.look(cast(Spread, unknowns.own["blur"]), unknowns.values("levels"))
         begun = replace(result, pose=result.pose.replaced(index, unknowns.pose), look=result.look.replaced(index, look))
@@ -355,13 +360,20 @@ def _minimised(fit: _Fit, start: Pose, spread: Spread, stages: tuple[_Stage, ...
         own["gain"] = Vector(torch.zeros_like(start.t[:, :1]), low=-most, high=most)
     levels = fit.first_levels(start, spread) if levels is None else levels
     unknowns = Unknowns(own, {"levels": Vector(levels)}, fit.blocks.row)
+    found: Minimum | None = None
     for stage in stages:
         if stage.tempered:
             levels = torch.nn.functional.pad(unknowns.values("levels"), (0, LEVELS))
             unknowns = replace(unknowns, eliminated={"levels": Vector(levels)})
+        far = None
+        if stage.far and found is not None:
+            far = (found.step.own_chi2 > of_noise(_COARSE)) | (fit.lost > _FEWER)
+            if not bool(far.any()):
+                continue
         fit.stage = stage
         found = minimise(fit, unknowns, stage.steps, settle=False)
-        unknowns = found.unknowns
+        unknowns = found.unknowns if far is None else found.unknowns.where(far, unknowns)
+    assert found is not None
     return found
 
 
@@ -441,6 +453,14 @@ class _Fit:
         used, known = self.weight.sum(-1), self._known(unknowns)
         normal, self.variance = normal_equations(self.sums, used, levels, part.row, self.least, known, gain=self.gain)
         return normal
+
+    @property
+    def lost(self) -> Tensor:
+        """Share (N,) of the coarse pixels that did not follow the model."""
+        part = self.coarse
+        kept = torch.stack([self.weight.sum(-1), (part.valid * part.seen).sum(-1)], -1)
+        kept, every = segment_sum(kept, part.row, part.rows).unbind(-1)
+        return 1 - kept / every
 
     def _model(self, part: PixelBlocks, pose: Pose, spread: Spread) -> RingModel:
         # what markers tell of the gain is asked of all pixels

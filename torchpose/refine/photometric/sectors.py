@@ -22,7 +22,7 @@ from torch import Tensor
 from torchpose.geometry import conics
 from torchpose.geometry.constants import either
 from torchpose.geometry.least_squares import scaled_inverse, solve_scaled
-from torchpose.geometry.robust import CUT, of_chance
+from torchpose.geometry.robust import CUT, Value, of_chance
 from torchpose.geometry.rows import Rows, replace
 from torchpose.geometry.sectors import MOST, SECTORS, middles
 from torchpose.geometry.segments import segment_mean, segment_sum
@@ -361,13 +361,18 @@ def _edges(rings: Tensor) -> tuple[Tensor, Tensor]:
     return rings[..., None, :2] + around @ shape, normal
 
 
+def of_noise(more: Value) -> Value:
+    """Most that noise alone takes off chi-squared in a step from some pixels to ``more`` times as many: more - 1 times
+    its usual, or by chance."""
+    return POSE * of_chance(float(POSE)) * (more - 1)
+
+
 def doubtful(sectors: Sectors, clear: Tensor, variance: Tensor, row: Tensor, step_chi2: Tensor, more: Tensor) -> Tensor:
     """Rows (N,) bool whose grey values contradict the model, or that have not come to rest.
 
     Args:
         variance: (K,) of noise. row: (K,) int64. step_chi2: (N,) chi-squared by which the last step lowered the sum.
-            more: (N,) how many times the pixels of the steps before it saw; from some pixels to ``more`` times as many
-            noise alone makes a step of more - 1 times its usual chi-squared.
+            more: (N,) how many times the pixels of the steps before it saw.
     """
     rows = step_chi2.numel()
     unclear = (~clear & (sectors.total > 0))[:, SECTORS:].sum(-1) > _UNCLEAR
@@ -377,8 +382,4 @@ def doubtful(sectors: Sectors, clear: Tensor, variance: Tensor, row: Tensor, ste
     total = segment_sum(chi2.double().sum(-1), row, rows) - step_chi2
     freedom = segment_sum((hold > 0).double().sum(-1), row, rows).clamp_min(1)
     pulled = total > freedom * of_chance(freedom)
-    return (
-        pulled
-        | (step_chi2 > POSE * of_chance(float(POSE)) * (more - 1))
-        | (segment_sum(unclear.double(), row, rows) > 0)
-    )
+    return pulled | (step_chi2 > of_noise(more)) | (segment_sum(unclear.double(), row, rows) > 0)
