@@ -59,7 +59,6 @@ from torchpose.refine.photometric.sectors import (
     in_step,
     level_scatter,
     of_more,
-    of_noise,
     overdispersion,
     roughness,
     shift_scatter,
@@ -71,6 +70,9 @@ from torchpose.refine.sight import Look, Refined, Sight, refined_by_blur
 _COARSE = 6  # the first steps take one pixel of so many
 # px, of a blur's minor axis, in frames as they are: a pixel twice as wide adds 4 % of its variance (derived)
 _WIDEST = 2.4
+# chi-squared that a step on these takes off, pose and blur: one of less leaves 2 to a second one, where noise leaves 9
+# (measured: decisions/0117)
+_FAR = 500.0
 _MOST_COARSE = 512  # of a marker whose edges are sharp: the last step, on all pixels, mends what they leave
 
 
@@ -79,8 +81,7 @@ class _Stage(NamedTuple):
 
     coarse: some pixels only. wary: those where the model is sound, and in sectors clear of what stands beside them.
     tempered: light may be curved, and sectors that pull at the pose count for less.
-    far: of rows alone that the step before moved by more than noise does, or in which some pixels did not follow the
-        model: others hardly move (measured: decisions/0117).
+    far: of rows alone that the step before moved far, or in which some pixels did not follow the model.
     """
 
     steps: int
@@ -367,7 +368,7 @@ def _minimised(fit: _Fit, start: Pose, spread: Spread, stages: tuple[_Stage, ...
             unknowns = replace(unknowns, eliminated={"levels": Vector(levels)})
         far = None
         if stage.far and found is not None:
-            far = (found.step.own_chi2 > of_noise(_COARSE)) | (fit.lost > _FEWER)
+            far = (found.step.own_chi2 > _FAR) | (fit.lost > _FEWER)
             if not bool(far.any()):
                 continue
         fit.stage = stage
