@@ -4,6 +4,11 @@ python scripts/bench_simulation.py [--plan configs/plans/paper_grid.yaml] [--fra
 
 All on one thread, so that the ratios do not depend on the cores. A figure is the median over batches, with the
 quartiles. Run it on an otherwise idle machine.
+
+    python scripts/bench_simulation.py --command [--rounds 3]
+
+times `torchpose simulate` instead, with the Cramer-Rao bounds and without, on one core and on two: the difference
+between many and few frames of random poses, so that no start is in it.
 """
 
 from __future__ import annotations
@@ -11,19 +16,26 @@ from __future__ import annotations
 import argparse
 import resource
 import statistics
+import subprocess
 import sys
+import tempfile
 import time
+from collections import defaultdict
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 
 import cv2
 import torch
+import yaml
 
 from torchpose.datasets.dataset import analytic
 from torchpose.datasets.plan import Plan, load_plan
 from torchpose.errors import ConfigError
 from torchpose.sim.sensor import add_noise
 
+RANDOM = Path(__file__).parents[1] / "configs" / "plans" / "random.yaml"
+COUNTS = (20, 140)
 BATCH = 3  # as the data set writer for 2 megapixels
 
 
@@ -60,12 +72,50 @@ def blender_times(plan: Plan, frames: int) -> list[float]:
     return times[1:]
 
 
+def simulated(count: int, bounds: bool, cores: int) -> tuple[float, float]:
+    """Seconds of CPU and of the clock of the command for so many frames of random poses."""
+    plan = yaml.safe_load(RANDOM.read_text())
+    plan["poses"]["random"]["count"] = count
+    plan |= {"bounds": bounds, "camera": str((RANDOM.parent / plan["camera"]).resolve())}
+    with tempfile.TemporaryDirectory() as scratch:
+        file = Path(scratch, "plan.yaml")
+        file.write_text(yaml.safe_dump(plan))
+        words = ["simulate", str(file), "--out", str(Path(scratch, "set")), "--quiet", "--threads", str(cores)]
+        before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+        subprocess.run([sys.executable, "-m", "torchpose", *words], check=True)
+        after, wall = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter() - start
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, wall
+
+
+def bench_command(rounds: int) -> None:
+    cpu: dict[tuple[bool, int], list[float]] = defaultdict(list)
+    busy: dict[tuple[bool, int], list[float]] = defaultdict(list)
+    few, many = COUNTS
+    for _ in range(rounds):
+        for bounds, cores in product((False, True), (1, 2)):
+            short, long = simulated(few, bounds, cores), simulated(many, bounds, cores)
+            spent, wall = (b - a for a, b in zip(short, long, strict=True))
+            cpu[bounds, cores].append(1e3 * spent / (many - few))
+            busy[bounds, cores].append(spent / wall)
+    for (bounds, cores), times in cpu.items():
+        what = f"{'with' if bounds else 'without'} bounds, {cores} core{'s' * (cores > 1)}"
+        used = statistics.median(busy[bounds, cores])
+        print(f"{what:28s} {statistics.median(times):9.2f} ms CPU a frame, {used:.2f} cores used")
+    ratio = statistics.median(b / a for a, b in zip(cpu[False, 1], cpu[True, 1], strict=True))
+    print(f"with / without {ratio:.2f}")
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--plan", type=Path, default=Path("configs/plans/paper_grid.yaml"))
     parser.add_argument("--frames", type=int, default=64)
     parser.add_argument("--blender", type=int, default=0, metavar="N", help="time N frames of Blender as well")
+    parser.add_argument("--command", action="store_true", help="time the whole command with and without bounds")
+    parser.add_argument("--rounds", type=int, default=3, help="of --command")
     options = parser.parse_args()
+    if options.command:
+        bench_command(options.rounds)
+        return 0
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     try:
