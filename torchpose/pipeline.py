@@ -49,6 +49,7 @@ from torchpose.identify import (
     outlines,
 )
 from torchpose.kernels import find_compiler
+from torchpose.kernels.memory import keep_memory
 from torchpose.moments import Moments, Start, View, begin, joined, refine_moments
 from torchpose.moments.outcome import Alone
 from torchpose.pose import (
@@ -143,6 +144,7 @@ class PoseEstimator(nn.Module):
         compile: bool = False,
     ) -> None:
         super().__init__()
+        keep_memory()
         if not isinstance(camera, Camera):
             raise ConfigError(f"camera: is of type {type(camera).__name__}; pass a Camera, such as Camera.load(path)")
         check_intrinsics(camera.matrix, camera.width, camera.height, camera.model)

@@ -1,5 +1,7 @@
 """Whether intrinsics can be those of a camera, in px: what a wrong unit or a wrong lens would make of them."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -61,6 +63,8 @@ def check_pinhole(matrix: Tensor, pixels: Tensor, seen: Tensor | None = None) ->
         ConfigError: it is no pinhole matrix, or most points lie impossibly far off its axis.
     """
     matrix, pixels = matrix.detach(), pixels.detach()
+    if _plainly_right(matrix, pixels):
+        return
     lowest = matrix.new_tensor([0.0, 0.0, 1.0])
     finite = matrix.isfinite().flatten(-2).all(-1)
     if bool((finite & ((matrix[..., 2, :] != lowest).any(-1) | (matrix[..., 1, 0] != 0))).any()):
@@ -83,6 +87,18 @@ def check_pinhole(matrix: Tensor, pixels: Tensor, seen: Tensor | None = None) ->
             f"camera: half of the image points lie {float(median):.3g} focal lengths and more off the axis, an"
             " impossible field of view; give the matrix in the unit of image_points, px as a rule"
         )
+
+
+def _plainly_right(matrix: Tensor, pixels: Tensor) -> bool:
+    """Whether one matrix is that of a pinhole, and all points lie well in view: then nothing else need be asked."""
+    if matrix.ndim > 2 or pixels.numel() == 0:
+        return False
+    (fx, _, cx), (below, fy, cy), lowest = matrix.tolist()
+    if not (fx > 0 and fy > 0 and below == 0 and lowest == [0.0, 0.0, 1.0]):
+        return False
+    low, high = (end.tolist() for end in pixels.flatten(0, 1).aminmax(dim=0))  # not a number where one point has none
+    u, v = ((max(abs(a - c), abs(b - c)) / f) for a, b, c, f in zip(low, high, (cx, cy), (fx, fy), strict=True))
+    return math.hypot(u, v) <= _FARTHEST_POINTS
 
 
 def share_without_ray(camera: Camera) -> float:

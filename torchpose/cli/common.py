@@ -52,7 +52,7 @@ def use_threads(threads: int | None, *, share: float = 1.0) -> int:
     """Has torch use a share of the threads; how many there are in all. More than cores would only wait."""
     import torch
 
-    from torchpose.io.processes import keep_memory
+    from torchpose.kernels.memory import keep_memory
 
     keep_memory()
     wanted = threads or cores()

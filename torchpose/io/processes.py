@@ -9,10 +9,8 @@ has fresh ones everywhere: a connection cannot be forked.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import multiprocessing
 import pickle
-import platform
 import signal
 import sys
 import traceback
@@ -27,12 +25,10 @@ import cv2
 import torch
 
 from torchpose.errors import ConfigError
+from torchpose.kernels.memory import keep_memory
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
-_KEPT = 2**31 - 1  # bytes at the top of the heap: all that an int holds
-_MOST_ON_HEAP = 2**25  # bytes of one tensor: more GNU's library does not take
 _AHEAD = 4  # results of a process that wait for their turn (convention): none idles while another has a slow item
 
 
@@ -137,24 +133,10 @@ class Crew(Generic[Item, Result]):
 
 
 def one_thread() -> None:
-    """Has torch and OpenCV use one thread in this process, and OpenCV print nothing; memory is kept."""
+    """Has torch and OpenCV use one thread in this process, and OpenCV print nothing."""
     keep_memory()
     _set_threads(1, 1)
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-
-
-def keep_memory() -> None:
-    """Has this process keep freed memory for what it allocates next, where its C library is GNU's.
-
-    A batch frees its tensors and the next one allocates the same again. Pages that went back to the system in between
-    come cleared: a tenth of the CPU of `estimate` (`scripts/bench_pipeline.py`). The most that a process holds at a
-    time stays the same.
-    """
-    if platform.libc_ver()[0] != "glibc":
-        return
-    of_c = ctypes.CDLL(None)
-    of_c.mallopt(_M_TRIM_THRESHOLD, _KEPT)
-    of_c.mallopt(_M_MMAP_THRESHOLD, _MOST_ON_HEAP)
 
 
 @contextlib.contextmanager

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 from itertools import pairwise
 from typing import Literal
 
@@ -14,6 +13,7 @@ from torchpose.camera.plausible import check_pinhole
 from torchpose.errors import ArgumentError
 from torchpose.geometry.arguments import expect_not_negative, expect_positive, one_device, taking_arrays
 from torchpose.kernels import LEAST, compiled, padded
+from torchpose.kernels.memory import keep_memory
 from torchpose.pnp.candidates import Candidates, expect, expect_mask, expect_pixels
 from torchpose.pnp.dlt import dlt
 from torchpose.pnp.epnp import epnp
@@ -199,22 +199,11 @@ def _checked_starts(initial: tuple[Tensor, Tensor], method: Method, pixels: Tens
     return rotation.to(pixels), translation.to(pixels)
 
 
-@cache
-def _keep_memory() -> None:
-    """Lets the process keep what chunks free.
-
-    glibc gives freed memory above a threshold back to the system, and every chunk would fault it in again, which takes
-    as long as its arithmetic. Freeing one large block (the most that the threshold grows to is 32 MiB) raises it to its
-    size for good; not touched, the block costs nothing.
-    """
-    torch.empty(30 << 20, dtype=torch.uint8)
-
-
 def _solve(
     inputs: Inputs, method: Method, initial: tuple[Tensor, Tensor] | None, max_iterations: int, compile: bool
 ) -> PnPResult:
     """Chunk by chunk; whenever a chunk's worth of poses is left over by the first pass, they have their second one."""
-    _keep_memory()
+    keep_memory()
     inputs, asked = inputs.with_body(sums=not compile), len(inputs.pixels)
     if compile and asked < LEAST:
         index = padded(torch.arange(asked))
