@@ -52,9 +52,6 @@ def use_threads(threads: int | None, *, share: float = 1.0) -> int:
     """Has torch use a share of the threads; how many there are in all. More than cores would only wait."""
     import torch
 
-    from torchpose.kernels.memory import keep_memory
-
-    keep_memory()
     wanted = threads or cores()
     torch.set_num_threads(max(1, min(int(share * wanted), cores())))
     return wanted

@@ -133,7 +133,7 @@ class Crew(Generic[Item, Result]):
 
 
 def one_thread() -> None:
-    """Has torch and OpenCV use one thread in this process, and OpenCV print nothing."""
+    """Has torch and OpenCV use one thread in this process, and OpenCV print nothing; freed memory is kept."""
     keep_memory()
     _set_threads(1, 1)
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
