@@ -28,7 +28,8 @@ def test_paths_and_images_have_the_same_poses_as_the_estimator() -> None:
     assert by_path["part"].tolist() == [0, 1, 2, 3, 4]
     assert np.isnan(by_path["tx"][3])
     for columns in ({name: values[:3] for name, values in by_path.items()}, by_image):
-        np.testing.assert_array_equal(np.stack([columns[name] for name in ("tx", "ty", "tz")], 1), poses.t.numpy())
+        found = np.stack([columns[name] for name in ("tx", "ty", "tz")], 1)
+        np.testing.assert_allclose(found, poses.t.numpy(), rtol=0, atol=1e-7)  # batches of other sizes round otherwise
     assert by_image["frame"].tolist() == ["0", "1", "2"]
 
 

@@ -212,7 +212,8 @@ class _Moments:
         by_x = -torch.cat([by_pose(rx, t @ x[0].T), torch.cat([zero, rx], -1)], -2)
         # Z moves by (d, w): t_Z by d, R_Z by w, both turned into the camera
         by_z = torch.cat([torch.cat([to_x[0], zero], -1), torch.cat([zero, to_x[0]], -1)], -2)
-        weight = torch.linalg.inv(self.covariance + self.robot_covariance(x, (r, t), noise))
+        weight, info = torch.linalg.inv_ex(self.covariance + self.robot_covariance(x, (r, t), noise))
+        weight = torch.where((info == 0)[:, None, None], weight, torch.nan)  # of a fit that is lost, see `shown`
         return residual, torch.cat([by_x, by_z], -1), weight
 
     def robot_covariance(self, x: Transform, target: Transform, noise: Noise) -> Tensor:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import os
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -143,6 +144,8 @@ class Arrivals:
                     whole = event.event_type in ("closed", "moved")
                     hint(event.dest_path if event.event_type == "moved" else event.src_path, whole, event.is_directory)
 
+        # a folder that is made while its own folder is read is seen twice, with the same result
+        warnings.filterwarnings("ignore", "Callback with id", RuntimeWarning)
         observer = Observer()
         try:
             observer.schedule(Handler(), os.fspath(self._folder), recursive=True)
