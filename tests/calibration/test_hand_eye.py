@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from tests.calibration import calibration_scenes as scenes
 from torchpose.calibration import calibrate_hand_eye
-from torchpose.calibration.hand_eye import linear_start
+from torchpose.calibration.hand_eye import calibrate_mount, linear_start
 from torchpose.calibration.intrinsics import locate_views
 from torchpose.calibration.session import calibrate_robot
 from torchpose.errors import ConfigError
@@ -36,6 +36,16 @@ def test_linear_start_is_exact_without_noise(seed: int, mount: str) -> None:
     for found, true in zip(linear_start(a, b), scenes.rig(mount), strict=True):
         assert torch.allclose(found[0], true[0], atol=1e-9)
         assert torch.allclose(found[1], true[1], atol=1e-6)
+
+
+def test_a_fit_that_is_lost_is_no_mount() -> None:
+    """Covariances that have no inverse, as where the wrong mount's fit has gone to infinity."""
+    true = scenes.poses(scenes.camera(), 12, seed=3)
+    exact = torch.zeros(12, 6, 6, dtype=torch.float64)
+    lost = calibrate_hand_eye(scenes.robot_poses("tool", true), true, exact, "tool", robot_sigma=(0.0, 0.0))
+    assert math.isnan(lost.chi2)
+    with pytest.raises(ConfigError, match="robot and target poses disagree"):
+        calibrate_mount(scenes.robot_poses("tool", true), true, exact, robot_sigma=(0.0, 0.0))
 
 
 @pytest.mark.parametrize("mount", MOUNTS)

@@ -128,7 +128,7 @@ def calibrate_mount(
         for mount in mounts
     ]
     fit = min(fits, key=lambda one: one.shown[0])
-    if fit.shown[0] > _MOST_NOISE[0] or fit.shown[1] > _MOST_NOISE[1]:
+    if not (fit.shown[0] <= _MOST_NOISE[0] and fit.shown[1] <= _MOST_NOISE[1]):  # nor where it is no number
         raise ConfigError(
             f"robot_pose: robot and target poses disagree by {fit.shown[0]:.1f} mm and {fit.shown[1]:.2g} rad; check "
             "the units and that each pose was read when its frame was taken"
