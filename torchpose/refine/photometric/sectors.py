@@ -22,7 +22,7 @@ from torch import Tensor
 from torchpose.geometry import conics
 from torchpose.geometry.constants import either
 from torchpose.geometry.least_squares import scaled_inverse, solve_scaled
-from torchpose.geometry.robust import CUT, Value, of_chance
+from torchpose.geometry.robust import CUT, of_chance
 from torchpose.geometry.rows import Rows, replace
 from torchpose.geometry.sectors import MOST, SECTORS, middles
 from torchpose.geometry.segments import segment_mean, segment_sum
@@ -361,9 +361,10 @@ def _edges(rings: Tensor) -> tuple[Tensor, Tensor]:
     return rings[..., None, :2] + around @ shape, normal
 
 
-def of_noise(more: Value) -> Value:
-    """Most that noise alone takes off chi-squared in a step from some pixels to ``more`` times as many: more - 1 times
-    its usual, or by chance."""
+def of_noise(more: Tensor) -> Tensor:
+    """Most (N,) that noise takes off chi-squared, by chance, in a step from some pixels to ``more`` (N,) times as many:
+    alone it takes more - 1 times its usual.
+    """
     return POSE * of_chance(float(POSE)) * (more - 1)
 
 
